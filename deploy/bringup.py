@@ -15,6 +15,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -26,9 +27,9 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.bus.description import GATEWAY, REMOTE, BusDescription
-from deploy.policy.policy_process import REASONS, AdviceStatus
-from deploy.recorder import capture_reader
 from deploy.recorder.capture import MCAP, CaptureConfig
+from deploy.recorder.capture_reader import read_capture
+from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.process_group import BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import TargetSelector
@@ -37,11 +38,104 @@ log = logging.getLogger(__name__)
 
 REPORT = "bringup.json"
 POLL_S = 0.01
+"""Between looks at the state: the cycle of the bus process."""
+WATCH_S = 1.0
+"""Piece of motion between two evaluations of the joints. Chosen by hand."""
+
+SMALLEST_FLOW = 0.1
+"""Flow, of full, that counts as a command; less may lie in a valve's dead band. Chosen by hand."""
+MOVED = 0.004
+"""Part of the travel that counts as motion. Chosen by hand: well above the noise of a position."""
+LONGEST_S = 2.0
+"""Time after the beginning of flow within which the joint must have moved. Chosen by hand: longer than
+any dead time that a policy could be trained for."""
+REST_S = 0.5
+"""Time for which the joint must have been at rest before. Chosen by hand."""
+ONSET_S = 0.15
+"""Length of the line that is drawn back to the beginning of a motion. Chosen by hand: longer averages
+more noise, shorter bends less with the acceleration."""
+SPEED_S = 0.2
+"""Time over which a speed is measured. Chosen by hand: longer averages more noise."""
+
+
+@dataclass(frozen=True)
+class JointResponse:
+    """Response of a joint to the flow of its valve.
+
+    Attributes:
+        agrees: Whether it moves in the direction of its flow, both ways.
+        dead_time_s: From the beginning of flow to the first motion, median.
+        speed: Largest speed seen, rad/s or m/s.
+    """
+
+    agrees: bool
+    dead_time_s: float
+    speed: float
+
+    @property
+    def text(self) -> str:
+        """The response in words."""
+        sign = "sign agrees" if self.agrees else "SIGN TURNED"
+        return f"{sign}, dead time {self.dead_time_s:.2f} s, up to {self.speed:.2f} rad/s"
+
+
+def measure_joint_response(
+    t_s: np.ndarray, q: np.ndarray, flow: np.ndarray, travel: float
+) -> JointResponse | None:
+    """Return the response of a joint; `None` before it has moved after flow of both signs.
+
+    Args:
+        t_s: Times, `(T,)`.
+        q: Positions of the joint, `(T,)`, rad or m.
+        flow: Flow of its valve, `(T,)`, of full.
+        travel: Length of its travel.
+    """
+    is_flowing = np.abs(flow) >= SMALLEST_FLOW
+    began = np.flatnonzero(is_flowing[1:] & ~is_flowing[:-1]) + 1
+    found: dict[int, list[tuple[bool, float]]] = {1: [], -1: []}
+    for row in began:
+        # at rest before; otherwise the motion answers something else
+        before = t_s[: row + 1] > t_s[row] - REST_S
+        if np.ptp(q[: row + 1][before]) > MOVED * travel / 2:
+            continue
+        window = (t_s >= t_s[row]) & (t_s <= t_s[row] + LONGEST_S)
+        moved = q[window] - q[row]
+        away = np.flatnonzero(np.abs(moved) > MOVED * travel)
+        if len(away):
+            sign = int(np.sign(flow[row]))
+            agrees = bool(np.sign(moved[away[0]]) == sign)
+            onset_s = _estimate_onset_s(t_s[window], moved, away[0])
+            found[sign].append((agrees, onset_s - float(t_s[row])))
+    if not found[1] or not found[-1]:
+        return None
+    both = [*found[1], *found[-1]]
+    period_s = max(1e-3, float(np.median(np.diff(t_s))))  # of a log that is not empty
+    step = max(1, round(SPEED_S / period_s))
+    speed = np.abs(q[step:] - q[:-step]) / np.maximum(t_s[step:] - t_s[:-step], 1e-6)
+    return JointResponse(
+        all(agrees for agrees, _ in both),
+        float(np.median([dead_s for _, dead_s in both])),
+        float(speed.max()),
+    )
+
+
+def _estimate_onset_s(t_s: np.ndarray, moved: np.ndarray, row: int) -> float:
+    """Return the beginning of a motion noticed at `row`: a line through the motion, back to zero."""
+    later = min(len(t_s) - 1, int(np.searchsorted(t_s, t_s[row] + ONSET_S)))
+    speed = (moved[later] - moved[row]) / max(1e-6, t_s[later] - t_s[row])
+    return float(t_s[row] - (moved[row] / speed if speed * moved[row] > 0 else 0.0))
 
 
 @dataclass(frozen=True)
 class BringupResult:
-    """What one check has found: its name, whether it passed, and what there is to say and to know."""
+    """Result of one check.
+
+    Attributes:
+        check: Its name.
+        passed: Whether it passed.
+        text: The result in words.
+        values: The measured values.
+    """
 
     check: str
     passed: bool
@@ -53,9 +147,9 @@ class BringupResult:
 class BringupChecklist(BusAndPolicySettings):
     """The checklist; policy and borehole are those of the shadow run.
 
-    Attributes (and those of `Listener`):
-        listen_s: How long to listen at rest.
-        patience_s: How long to wait for each thing that the operator is asked to do.
+    Attributes (and those of `BusAndPolicySettings`):
+        listen_s: Time to listen at rest.
+        patience_s: Time that the operator gets for each task.
         shadow_s: Length of the shadow run.
         quiet: Largest standard deviation of a position at rest (rad or m).
         rate: Smallest part of a message's nominal rate.
@@ -77,294 +171,211 @@ class BringupChecklist(BusAndPolicySettings):
     def run(
         self, machine: Machine, session: Session, say: Callable[[str], None]
     ) -> list[BringupResult]:
-        """Runs the checks in order, writes `bringup.json` and the capture, and returns what was found.
+        """Run the checks in order; write `bringup.json` and the capture.
 
         Args:
             machine: The machine.
             session: Where to write.
-            say: Tells the operator what to do, and what was found.
+            say: Shows the operator a task, or a result.
 
         Raises:
             LinkError: nothing is heard at all, or one of the processes has died.
             CheckpointError: the policy cannot be used on this machine.
         """
-        self.refuse(machine)
+        self.check_machine(machine)
         memory = LoopMemory.new(machine.num_joints, commands=False)
-        children = ProcessGroup(memory, self.realtime)
+        group = ProcessGroup(memory, self.realtime)
         try:
-            self.listen(children, machine, target_s=math.inf, pitch_rad=None)
-            capture = CaptureConfig(
-                session.folder, self.dbc, machine, {"source": "bring-up"}, pictures_hz=0.0
-            )
-            children.start("log", "deploy.recorder.capture:run", (capture,))
-            findings = _Checks(self, machine, children, say).all()
+            self.start_processes(group, machine, target_s=math.inf, pitch_rad=None)
+            facts = {"source": "bring-up"}
+            capture = CaptureConfig(session.folder, self.dbc, machine, facts, pictures_hz=0.0)
+            group.start("log", "deploy.recorder.capture:run", (capture,))
+            results = _StateChecks(self, machine, group, say).run()
         finally:
-            children.end()
+            group.end()
             memory.close()
-        findings.insert(0, self._rates(machine, session))
+        results.insert(0, self._check_rates(machine, session))
         write_json(
             session.folder / REPORT,
-            {"machine": machine.name, "findings": [asdict(one) for one in findings]},
+            {"machine": machine.name, "findings": [asdict(one) for one in results]},
         )
-        for one in findings:
+        for one in results:
             say(f"{'passed' if one.passed else 'FAILED':7} {one.check:10} {one.text}")
-        return findings
+        return results
 
-    def _rates(self, machine: Machine, session: Session) -> BringupResult:
-        """Holds what was captured against the rates of the DBC."""
-        description, contents = (
-            BusDescription(self.dbc, machine),
-            capture_reader.read_capture(session.folder / MCAP),
-        )
-        values, poor = {}, []
+    def _check_rates(self, machine: Machine, session: Session) -> BringupResult:
+        """Compare the captured messages with the rates of the DBC."""
+        description = BusDescription(self.dbc, machine)
+        messages = read_capture(session.folder / MCAP).messages
+        values, faults = {}, []
         for layout in (*description.sent_by(GATEWAY), *description.sent_by(REMOTE)):
-            times = (
-                contents.messages[layout.name].series("t_s")
-                if layout.name in contents.messages
-                else ()
-            )
-            rate_hz = (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 else 0.0
-            values[layout.name] = {
-                "rate_hz": rate_hz,
-                "nominal_hz": 1 / layout.period_s if layout.period_s else None,
-            }
-            if layout.period_s and rate_hz * layout.period_s < self.rate:
-                poor.append(f"{layout.name} {rate_hz:.0f} of {1 / layout.period_s:.0f} Hz")
-        refused = len(contents.messages.get("refused", [])) + len(
-            contents.messages.get("fault", [])
-        )
-        text = (
-            "; ".join([*poor, f"{refused} messages refused"])
-            if poor or refused
-            else "every message at its rate, none refused"
-        )
-        return BringupResult(
-            "bus", not poor and not refused, text, {"messages": values, "refused": refused}
-        )
+            name, rate_hz = layout.name, 0.0
+            if name in messages and len(times := messages[name].series("t_s")) > 1:
+                rate_hz = (len(times) - 1) / (times[-1] - times[0])
+            nominal_hz = 1 / layout.period_s if layout.period_s else None
+            values[name] = {"rate_hz": rate_hz, "nominal_hz": nominal_hz}
+            if nominal_hz and rate_hz * layout.period_s < self.rate:
+                faults.append(f"{name} {rate_hz:.0f} of {nominal_hz:.0f} Hz")
+        refused = len(messages.get("refused", [])) + len(messages.get("fault", []))
+        text = "every message at its rate, none refused"
+        passed = not faults and not refused
+        if not passed:
+            text = "; ".join([*faults, f"{refused} messages refused"])
+        return BringupResult("bus", passed, text, {"messages": values, "refused": refused})
 
 
-class _Checks:
-    """The checks that go by the machine's state."""
+@dataclass(frozen=True)
+class _Sample:
+    t_s: float
+    q: np.ndarray
+    flow: np.ndarray
+
+
+class _StateChecks:
+    """The checks of the machine's state."""
 
     def __init__(
         self,
-        bringup: BringupChecklist,
+        checklist: BringupChecklist,
         machine: Machine,
-        children: ProcessGroup,
+        group: ProcessGroup,
         say: Callable[[str], None],
     ) -> None:
-        self._bringup, self._machine, self._children, self._say = bringup, machine, children, say
-        self._memory = children.memory
-        self._samples: list[tuple[float, np.ndarray, np.ndarray]] = []
+        self._checklist, self._machine, self._group, self._say = checklist, machine, group, say
+        self._memory = group.memory
+        self._samples: list[_Sample] = []
 
-    def all(self) -> list[BringupResult]:
-        """Runs them."""
+    def run(self) -> list[BringupResult]:
+        """Run them."""
         self._say("listening for the machine")
-        if self._until(lambda state: float(state["q_t_s"]) > 0) is None:
+        patience_s = self._checklist.patience_s
+        if self._wait_until(lambda state: state.q_t_s > 0) is None:
             raise LinkError(
-                f"no joint positions within {self._bringup.patience_s:g} s; is the machine on, and the bus connected?"
+                f"no joint positions within {patience_s:g} s; is the machine on, and the bus connected?"
             )
         return [
-            self._positions(),
-            self._seen("dead-man", "deadman", "press the dead-man, then release it"),
-            self._seen("e-stop", "estop", "press the emergency stop, then release it"),
-            self._joints(),
-            self._shadow(),
+            self._check_positions(),
+            self._check_switch("dead-man", "deadman", "press the dead-man, then release it"),
+            self._check_switch("e-stop", "estop", "press the emergency stop, then release it"),
+            self._check_joints(),
+            self._run_shadow(),
         ]
 
-    def _positions(self) -> BringupResult:
+    def _check_positions(self) -> BringupResult:
         self._say("leave the machine at rest")
-        self._watch(self._bringup.listen_s)
-        q = np.array([q for _, q, _ in self._samples])
-        scatter, machine, last = q.std(0), self._machine, self._memory.state.read()
-        outside = [
-            name
-            for j, name in enumerate(machine.joint_names)
-            if not machine.lower[j] <= q[-1, j] <= machine.upper[j]
-        ]
-        noisy = [
-            name for j, name in enumerate(machine.joint_names) if scatter[j] > self._bringup.quiet
-        ]
-        wrong = [f"{', '.join(outside)} outside the limits"] * bool(outside) + [
-            f"{', '.join(noisy)} not quiet"
-        ] * bool(noisy)
-        if last is None or not last["q_plausible"]:
-            wrong.append("not plausible")
+        self._collect(self._checklist.listen_s)
+        q, machine = np.array([one.q for one in self._samples]), self._machine
+        scatter, last = q.std(0), self._memory.state.read()
+        outside, noisy = [], []
+        for j, name in enumerate(machine.joint_names):
+            if not machine.lower[j] <= q[-1, j] <= machine.upper[j]:
+                outside.append(name)
+            if scatter[j] > self._checklist.quiet:
+                noisy.append(name)
+        faults = []
+        if outside:
+            faults.append(f"{', '.join(outside)} outside the limits")
+        if noisy:
+            faults.append(f"{', '.join(noisy)} not quiet")
+        if last is None or not last.q_plausible:
+            faults.append("not plausible")
+        text = "; ".join(faults) or "valid, inside the limits, quiet"
         values = {"q": q[-1].tolist(), "standard_deviation": scatter.tolist()}
-        return BringupResult(
-            "positions", not wrong, "; ".join(wrong) or "valid, inside the limits, quiet", values
-        )
+        return BringupResult("positions", not faults, text, values)
 
-    def _seen(self, check: str, field: str, request: str) -> BringupResult:
-        self._say(request)
-        pressed_s = self._until(lambda state: bool(state[field]))
-        released_s = None if pressed_s is None else self._until(lambda state: not state[field])
-        if pressed_s is None or released_s is None:
-            what = "pressed" if pressed_s is None else "released"
-            return BringupResult(
-                check, False, f"not seen to be {what} within {self._bringup.patience_s:g} s", {}
-            )
-        return BringupResult(
-            check, True, "pressed and released", {"held_s": released_s - pressed_s}
-        )
+    def _check_switch(self, check: str, field: str, task: str) -> BringupResult:
+        """Check that a switch of the state is seen pressed and released."""
+        self._say(task)
+        patience_s, missing = self._checklist.patience_s, "pressed"
+        pressed_s = self._wait_until(lambda state: getattr(state, field))
+        if pressed_s is not None:
+            missing = "released"
+            released_s = self._wait_until(lambda state: not getattr(state, field))
+            if released_s is not None:
+                values = {"held_s": released_s - pressed_s}
+                return BringupResult(check, True, "pressed and released", values)
+        return BringupResult(check, False, f"not seen to be {missing} within {patience_s:g} s", {})
 
-    def _joints(self) -> BringupResult:
-        machine, found = self._machine, dict[str, JointResponse]()
+    def _check_joints(self) -> BringupResult:
+        machine, names = self._machine, self._machine.joint_names
         self._say(
-            f"move one joint after the other, both ways, a second or more each: {', '.join(machine.joint_names)}"
+            f"move one joint after the other, both ways, a second or more each: {', '.join(names)}"
         )
-        self._samples.clear()
-        end_s = time.monotonic() + self._bringup.patience_s
-        while time.monotonic() < end_s:
-            self._watch(1.0)
-            times, q, flow = (np.array(column) for column in zip(*self._samples, strict=True))
-            for j, name in enumerate(machine.joint_names):
-                motion = measure_joint_response(
-                    times, q[:, j], flow[:, j], machine.upper[j] - machine.lower[j]
-                )
-                if motion is not None and name not in found:
-                    found[name] = motion
-                    self._say(f"{name}: {motion.text}")
-            if len(found) == machine.num_joints:
-                break
-        missing = [name for name in machine.joint_names if name not in found]
-        turned = [name for name, motion in found.items() if not motion.agrees]
-        wrong = [f"not seen to move both ways: {', '.join(missing)}"] * bool(missing)
-        wrong += [f"sign turned: {', '.join(turned)}"] * bool(turned)
-        dead_s = [motion.dead_time_s for motion in found.values()]
+        found = self._watch_joints()
+        missing = [name for name in names if name not in found]
+        turned = [name for name, response in found.items() if not response.agrees]
+        dead_s = [response.dead_time_s for response in found.values()]
+        faults = []
+        if missing:
+            faults.append(f"not seen to move both ways: {', '.join(missing)}")
+        if turned:
+            faults.append(f"sign turned: {', '.join(turned)}")
         if dead_s and max(dead_s) > (machine.num_history - 1) * machine.period_s:
-            wrong.append(
+            faults.append(
                 f"dead time of up to {max(dead_s):.2f} s is longer than the policy's history"
             )
-        text = (
-            "; ".join(wrong) or f"signs agree; dead times {min(dead_s):.2f} to {max(dead_s):.2f} s"
-        )
-        return BringupResult(
-            "joints", not wrong, text, {name: asdict(motion) for name, motion in found.items()}
-        )
+        text = "; ".join(faults)
+        if not faults:
+            text = f"signs agree; dead times {min(dead_s):.2f} to {max(dead_s):.2f} s"
+        values = {name: asdict(response) for name, response in found.items()}
+        return BringupResult("joints", not faults, text, values)
 
-    def _shadow(self) -> BringupResult:
+    def _watch_joints(self) -> dict[str, JointResponse]:
+        """Return the responses of the joints that the operator moves in time."""
+        machine, found = self._machine, dict[str, JointResponse]()
+        travel = machine.upper - machine.lower
+        self._samples.clear()
+        end_s = time.monotonic() + self._checklist.patience_s
+        while time.monotonic() < end_s and len(found) < machine.num_joints:
+            self._collect(WATCH_S)
+            t_s = np.array([one.t_s for one in self._samples])
+            q = np.array([one.q for one in self._samples])
+            flow = np.array([one.flow for one in self._samples])
+            for j, name in enumerate(machine.joint_names):
+                response = measure_joint_response(t_s, q[:, j], flow[:, j], travel[j])
+                if response is not None and name not in found:
+                    found[name] = response
+                    self._say(f"{name}: {response.text}")
+        return found
+
+    def _run_shadow(self) -> BringupResult:
         self._say("shadow run: the policy runs along, nothing is shown")
-        TargetSelector(
-            self._bringup.target.build(), self._memory.target, self._memory.holes
-        ).refresh()
-        reasons: list[str] = []
-        end_s, number = time.monotonic() + self._bringup.shadow_s, -1
+        target = self._checklist.target.build()
+        TargetSelector(target, self._memory.target, self._memory.holes).refresh()
+        counts: Counter[AdviceStatus] = Counter()
+        end_s, number = time.monotonic() + self._checklist.shadow_s, -1
         while time.monotonic() < end_s:
             advice = self._memory.advice.read()
-            if advice is not None and int(advice["number"]) != number:
-                number = int(advice["number"])
-                reasons.append(REASONS[int(advice["reason"])].value)
+            if advice is not None and advice.number != number:
+                number = advice.number
+                counts[advice.reason] += 1
             time.sleep(POLL_S)
-        share = reasons.count(AdviceStatus.VALID.value) / max(1, len(reasons))
-        others = sorted(set(reasons) - {AdviceStatus.VALID.value})
-        text = f"{share:.0%} of {len(reasons)} advices valid" + (
-            f" ({', '.join(others)})" if others else ""
-        )
-        return BringupResult(
-            "shadow", share >= self._bringup.rate, text, {"advices": len(reasons), "valid": share}
-        )
+        count = counts.total()
+        share = counts[AdviceStatus.VALID] / max(1, count)
+        others = sorted(one.value for one in counts if one is not AdviceStatus.VALID)
+        text = f"{share:.0%} of {count} advices valid"
+        if others:
+            text += f" ({', '.join(others)})"
+        passed = share >= self._checklist.rate
+        return BringupResult("shadow", passed, text, {"advices": count, "valid": share})
 
-    def _watch(self, seconds: float) -> None:
+    def _collect(self, seconds: float) -> None:
+        """Collect samples of the state for some time."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
-            self._children.check()
+            self._group.check()
             state = self._memory.state.read()
-            if state is not None and (
-                not self._samples or float(state["t_s"]) > self._samples[-1][0]
-            ):
-                self._samples.append(
-                    (float(state["t_s"]), np.array(state["q"]), np.array(state["flow"]))
-                )
+            if state is not None and (not self._samples or state.t_s > self._samples[-1].t_s):
+                self._samples.append(_Sample(state.t_s, state.q, state.flow))
             time.sleep(POLL_S)
 
-    def _until(self, holds: Callable[[Any], bool]) -> float | None:
-        """Returns when the state first `holds`; `None` if it does not in all of the operator's time."""
-        end_s = time.monotonic() + self._bringup.patience_s
+    def _wait_until(self, holds: Callable[[OperatorState], bool]) -> float | None:
+        """Return when the state first `holds`; `None` if it does not in all of the time."""
+        end_s = time.monotonic() + self._checklist.patience_s
         while time.monotonic() < end_s:
-            self._children.check()
+            self._group.check()
             state = self._memory.state.read()
             if state is not None and holds(state):
                 return time.monotonic()
             time.sleep(POLL_S)
         return None
-
-
-SMALLEST_FLOW = 0.1
-"""Of full; less may lie in a valve's dead band."""
-MOVED = 0.004
-"""Part of the travel that counts as motion."""
-LONGEST_S = 2.0
-"""Time after the beginning of flow within which the joint must have moved."""
-
-
-@dataclass(frozen=True)
-class JointResponse:
-    """How a joint answers.
-
-    Attributes:
-        agrees: Whether it moves in the direction of its flow, both ways.
-        dead_time_s: From the beginning of flow to the first motion, the middle of what was seen.
-        speed: Largest speed seen, rad/s or m/s.
-    """
-
-    agrees: bool
-    dead_time_s: float
-    speed: float
-
-    @property
-    def text(self) -> str:
-        """In words."""
-        sign = "sign agrees" if self.agrees else "SIGN TURNED"
-        return f"{sign}, dead time {self.dead_time_s:.2f} s, up to {self.speed:.2f} rad/s"
-
-
-def measure_joint_response(
-    t_s: np.ndarray, q: np.ndarray, flow: np.ndarray, travel: float
-) -> JointResponse | None:
-    """Returns how a joint answers, or `None` before it was seen to move after flow of both signs.
-
-    Args:
-        t_s: Times, `(T,)`.
-        q: Positions of the joint, `(T,)`, rad or m.
-        flow: What its valve gets, `(T,)`, of full.
-        travel: Length of its travel.
-    """
-    began = (
-        np.flatnonzero((np.abs(flow[1:]) >= SMALLEST_FLOW) & (np.abs(flow[:-1]) < SMALLEST_FLOW))
-        + 1
-    )
-    found: dict[int, list[tuple[bool, float]]] = {1: [], -1: []}
-    for row in began:
-        # at rest before, or what moves is the answer to something else
-        before = t_s > t_s[row] - 0.5
-        if np.ptp(q[: row + 1][before[: row + 1]]) > MOVED * travel / 2:
-            continue
-        window = (t_s >= t_s[row]) & (t_s <= t_s[row] + LONGEST_S)
-        away = np.flatnonzero(np.abs(q[window] - q[row]) > MOVED * travel)
-        if len(away):
-            sign = int(np.sign(flow[row]))
-            agrees = bool(np.sign(q[window][away[0]] - q[row]) == sign)
-            found[sign].append(
-                (
-                    agrees,
-                    _estimate_onset_s(t_s[window], q[window] - q[row], away[0]) - float(t_s[row]),
-                )
-            )
-    if not found[1] or not found[-1]:
-        return None
-    both = [*found[1], *found[-1]]
-    step = max(1, round(0.2 / max(1e-3, float(np.median(np.diff(t_s))))))
-    speed = np.abs(q[step:] - q[:-step]) / np.maximum(t_s[step:] - t_s[:-step], 1e-6)
-    return JointResponse(
-        all(agrees for agrees, _ in both),
-        float(np.median([dead_s for _, dead_s in both])),
-        float(speed.max()),
-    )
-
-
-def _estimate_onset_s(t_s: np.ndarray, moved: np.ndarray, row: int) -> float:
-    """Returns when a motion began that was noticed at `row`: a line through it and what follows, back to zero."""
-    later = min(len(t_s) - 1, int(np.searchsorted(t_s, t_s[row] + 0.15)))
-    speed = (moved[later] - moved[row]) / max(1e-6, t_s[later] - t_s[row])
-    return float(t_s[row] - (moved[row] / speed if speed * moved[row] > 0 else 0.0))

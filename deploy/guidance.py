@@ -1,9 +1,9 @@
-"""From commands to lever positions that a person can follow, and back (paper, equations 2 and 3).
+"""Lever positions for commands, and back (paper, equations 2 and 3).
 
-A lever angle is the joint's command times the angle at full command. Which joint hangs on which
-axis is the machine's business (`machine.levers`) or that of a pattern here; a joint that is never
-moved together with others shares an axis and needs the button of that lever held. What is shown
-changes no faster than a hand can, and an axis passes through neutral before the button changes.
+A lever angle is the joint's command times the angle at full command. The machine (`machine.levers`)
+or a pattern here assigns each joint to an axis. A joint that is never moved together with others
+shares an axis and needs the button of that lever held. The displayed positions change no faster than
+a hand can, and an axis passes through neutral before the button changes.
 """
 
 from __future__ import annotations
@@ -18,12 +18,15 @@ from brokk_rl.machine import Lever, Machine
 from brokk_rl.spec import spec
 
 AXES = (("left", "theta"), ("left", "psi"), ("right", "theta"), ("right", "psi"))
-"""Order of the four axes everywhere in this room."""
+"""Order of the four axes everywhere in `deploy`."""
 
 
 @dataclass(frozen=True)
 class LeverPositions:
-    """Positions of both levers, of full, in [-1, 1]: theta fore and aft, psi sideways; and whether the right button is held."""
+    """Positions of both levers, of full, in [-1, 1], and whether the right button is held.
+
+    Theta is fore and aft, psi sideways.
+    """
 
     left_theta: float
     left_psi: float
@@ -34,33 +37,20 @@ class LeverPositions:
 
 @dataclass(frozen=True)
 class LeverAngles:
-    """Positions of both levers as angles; else as `Levers`."""
+    """Lever angles of the four `AXES` in rad, and whether the right button is to be held."""
 
-    left_theta_rad: float
-    left_psi_rad: float
-    right_theta_rad: float
-    right_psi_rad: float
+    angles_rad: np.ndarray
     button_right: bool
-
-    def parts(self, full_rad: tuple[float, ...]) -> LeverPositions:
-        """Returns them as parts of `full_rad`, the angle at full deflection of each of the four `AXES`."""
-        parts = (angle / full for angle, full in zip(self.angles_rad, full_rad, strict=True))
-        return LeverPositions(*parts, button_right=self.button_right)
-
-    @property
-    def angles_rad(self) -> tuple[float, ...]:
-        """Angles of the four `AXES`."""
-        return self.left_theta_rad, self.left_psi_rad, self.right_theta_rad, self.right_psi_rad
 
 
 @spec
 class LeverGuidance:
-    """How commands are shown as lever positions.
+    """Mapping and pace of the displayed lever positions.
 
     Attributes:
         levers: Axis of each joint; `null` for those of the machine.
-        dead_zone: Deflection, of full, that is shown as neutral: hands cannot hold less.
-        max_rate_rad_s: Fastest change of what is shown.
+        dead_zone: Deflection, of full, below which neutral is displayed: a hand cannot hold less.
+        max_rate_rad_s: Fastest change of the displayed angle.
     """
 
     levers: tuple[Lever, ...] | None
@@ -74,16 +64,25 @@ class LeverGuidance:
             )
 
 
-def find_full_angles_rad(levers: Sequence[Lever]) -> tuple[float, ...]:
-    """Returns the angle at full deflection of each of the four `AXES`; 1 where no joint hangs on it."""
-    return tuple(
-        max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0)
-        for axis in AXES
-    )
+def find_full_angles_rad(levers: Sequence[Lever]) -> np.ndarray:
+    """Return the angle at full deflection of each of the four `AXES`, `(4,)`; 1 without a joint."""
+    full_rad = np.ones(len(AXES))
+    for index, axis in enumerate(AXES):
+        angles_rad = [one.max_angle_rad for one in levers if (one.side, one.axis) == axis]
+        if angles_rad:
+            full_rad[index] = max(angles_rad)
+    return full_rad
+
+
+def convert_to_positions(
+    angles_rad: np.ndarray, full_rad: np.ndarray, button_right: bool
+) -> LeverPositions:
+    """Return angles of the four `AXES`, `(4,)`, as parts of those at full deflection."""
+    return LeverPositions(*(angles_rad / full_rad).tolist(), button_right=button_right)
 
 
 class LeverMap:
-    """The bare mapping between commands and levers.
+    """Mapping between commands and levers.
 
     Args:
         levers: Axis of each joint.
@@ -116,31 +115,23 @@ class LeverMap:
             raise ConfigError("guidance: two joints that may move together share a lever's axis")
 
     def levers(self, u: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Returns the angles of the four `AXES` in rad, and whether the button is held, for commands `(J,)`."""
+        """Return the angles of the four `AXES` in rad, and the button, for commands `(J,)`."""
         angles, button = np.zeros(len(AXES)), bool((u[self._exclusive] != 0).any())
         for j in np.flatnonzero(self._exclusive == button):
             angles[self._axis[j]] = u[j] * self.full_rad[j]
         return angles, button
 
     def command(self, angles_rad: np.ndarray, button: bool) -> np.ndarray:
-        """Returns the commands, `(J,)` in [-1, 1], that levers in these positions give."""
+        """Return the commands, `(J,)` in [-1, 1], of levers at these angles."""
         u = np.where(self._exclusive == button, angles_rad[self._axis] / self.full_rad, 0.0)
         return u.clip(-1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class DisplayedLevers:
-    """Lever positions to show: angles of the four `AXES` in rad, and whether the right button is to be held."""
-
-    angles_rad: np.ndarray
-    button_right: bool
-
-
 class LeverDisplay:
-    """What is shown, period by period.
+    """Displayed lever positions, period by period.
 
     Args:
-        guidance: How.
+        guidance: Mapping and pace.
         machine: The machine.
     """
 
@@ -149,8 +140,8 @@ class LeverDisplay:
         self.map = LeverMap(guidance.levers or machine.levers, machine)
         self._angles_rad, self._button = np.zeros(len(AXES)), False
 
-    def show(self, u: np.ndarray, period_s: float) -> DisplayedLevers:
-        """Returns what to show for commands `(J,)`, one period after what was shown last."""
+    def show(self, u: np.ndarray, period_s: float) -> LeverAngles:
+        """Return the angles to display for commands `(J,)`, one period after the last ones."""
         wanted = np.where(np.abs(u) < self._guidance.dead_zone, 0.0, u)
         angles_rad, button = self.map.levers(wanted)
         moves = bool(wanted.any())
@@ -161,4 +152,4 @@ class LeverDisplay:
             self._button = button
         step = self._guidance.max_rate_rad_s * period_s
         self._angles_rad = self._angles_rad + np.clip(angles_rad - self._angles_rad, -step, step)
-        return DisplayedLevers(self._angles_rad.copy(), self._button)
+        return LeverAngles(self._angles_rad.copy(), self._button)

@@ -1,8 +1,8 @@
-"""The link to a real machine, or its twin, for whoever commands it directly: `mode=collect link=can`.
+"""The link to a real machine, or its twin, for direct commands: `mode=collect link=can`.
 
 The bus process is the loop's own, guard included. Before the first command the operator has to
-release the dead-man and press it; letting go of it stops the machine for as long, anything else
-that the guard objects to ends the run.
+release the dead-man and press it. Releasing it stops the machine for as long; any other objection
+of the guard ends the run.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from deploy.bus.can_bus import CanBus
 from deploy.guard.guard import GuardState
 from deploy.guard.limits import GuardLimits
 from deploy.runtime.bus_process import BusProcessConfig
-from deploy.runtime.operator_state import read_snapshot
+from deploy.runtime.operator_state import OperatorControls, OperatorState, RequestedCommand
 from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_priority
 from deploy.runtime.process_group import BUS_PRIORITY, PATIENCE_S
 from deploy.runtime.shm_layout import LoopMemory
@@ -30,9 +30,13 @@ from deploy.runtime.shm_layout import LoopMemory
 log = logging.getLogger(__name__)
 
 COMMANDER_PRIORITY = 40
-"""Of the process that commands, below that of the bus."""
+"""Of SCHED_FIFO for the process that commands, below that of the bus process. Chosen by hand."""
 ANSWER_S = 0.2
-"""Time for the bus process to act on a command."""
+"""Time for the bus process to act on a command: 20 of its cycles. Chosen by hand."""
+POLL_S = 0.002
+"""Between looks for the answer to a command, within a cycle of the bus process."""
+WAIT_S = 0.02
+"""Between looks while the machine or its operator is waited for."""
 
 
 @spec
@@ -59,7 +63,7 @@ class CanConnection:
         return f"machine: {self.wire.interface} {self.wire.channel}"
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> CanLink:
-        """Returns the link, not yet opened.
+        """Return the link, not yet opened.
 
         Raises:
             ConfigError: more than one machine is asked for.
@@ -80,17 +84,20 @@ class CanLink:
         self._was_active = False
 
     def read(self) -> JointState:
-        """Returns the newest positions and when they were measured."""
-        state = self._state()
-        return JointState(float(state["q_t_s"]), np.array(state["q"]))
+        """Return the newest positions and when they were measured."""
+        state = self._read_state()
+        return JointState(state.q_t_s, np.array(state.q))
 
     def send(self, command: Command) -> Command:
-        """Asks the guard to send a command; returns its mean over the coming control period, zero where nothing was let pass.
+        """Ask the guard to send a command; return its mean over the coming control period.
+
+        The mean is zero where the guard lets nothing pass.
 
         Raises:
             LinkError: the guard objects, and not only because the dead-man was released.
         """
-        memory, u = self._opened(), np.asarray(command.u, dtype=float)
+        u = np.asarray(command.u, dtype=float)
+        self._opened()
         if not np.isfinite(u).all():
             raise LinkError(f"link: a command that is no number cannot be sent: {u}")
         if not u.any():
@@ -100,45 +107,35 @@ class CanLink:
         self._wait_for_operator()
         asked_s = self._ask(u)
         until_s = asked_s + ANSWER_S
-        while float((state := self._state())["t_s"]) <= asked_s:
+        while (state := self._read_state()).t_s <= asked_s:
             if time.monotonic() > until_s:
                 raise LinkError("link: the bus process does not answer")
-            time.sleep(0.002)
-        if int(state["guard"]) == GuardState.LATCHED.value:
-            safety = read_snapshot(memory).safety
-            raise LinkError(
-                f"link: the guard has stopped the machine: {safety.cause if safety else 'unknown'}"
-            )
-        if int(state["guard"]) != GuardState.ACTIVE.value:
+            time.sleep(POLL_S)
+        if state.guard is GuardState.LATCHED:
+            raise LinkError(f"link: the guard has stopped the machine: {state.cause.value}")
+        if state.guard is not GuardState.ACTIVE:
             self._reached = np.zeros_like(u)
             return Command(np.zeros_like(u))
-        passed = np.where(
-            np.array(state["sent"]) != 0,
-            u.clip(-self._can.limits.max_command, self._can.limits.max_command),
-            0.0,
-        )
-        return Command(self._mean(passed))
+        most = self._can.limits.max_command
+        passed = np.where(state.sent != 0, u.clip(-most, most), 0.0)
+        return Command(self._average_growth(passed))
 
     def extra(self) -> dict[str, float]:
-        """Returns the oil's temperature where the machine tells it."""
-        oil_c = float(self._state()["oil_c"])
+        """Return the oil's temperature where the machine measures it."""
+        oil_c = self._read_state().oil_c
         return {"oil_c": oil_c} if np.isfinite(oil_c) else {}
 
     def __enter__(self) -> Self:
         can, machine = self._can, self._machine
         self._memory = LoopMemory.new(machine.num_joints, commands=True)
-        setting = BusProcessConfig(can.wire, can.dbc, machine, can.limits)
+        config = BusProcessConfig(can.wire, can.dbc, machine, can.limits)
+        arguments, files = (config, self._memory), self._memory.files
         priority = BUS_PRIORITY if can.realtime else None
-        self._child = ChildProcess(
-            "bus",
-            "deploy.runtime.bus_process:run",
-            (setting, self._memory),
-            self._memory.files,
-            priority,
-        )
+        target = "deploy.runtime.bus_process:run"
+        self._child = ChildProcess("bus", target, arguments, files, priority)
         until_s = time.monotonic() + can.patience_s
         try:
-            while (state := self._memory.state.read()) is None or float(state["q_t_s"]) == 0.0:
+            while (state := self._memory.state.read()) is None or state.q_t_s == 0.0:
                 if self._child.code is not None:
                     raise LinkError(
                         f"link: the bus process has died (exit code {self._child.code})"
@@ -147,7 +144,7 @@ class CanLink:
                     raise LinkError(
                         f"link: no joint positions on {can.source} within {can.patience_s:g} s; is the machine on?"
                     )
-                time.sleep(0.02)
+                time.sleep(WAIT_S)
         except BaseException:
             self.__exit__()
             raise
@@ -166,46 +163,44 @@ class CanLink:
         self._child = self._memory = None
 
     def _ask(self, u: np.ndarray) -> float:
-        memory = self._opened()
+        memory, now_s = self._opened(), time.monotonic()
         assert memory.request is not None
-        request, now_s = memory.request.new(), time.monotonic()
-        request["t_s"], request["u"] = now_s, u
-        memory.request.write(request)
+        memory.request.write(RequestedCommand(now_s, u))
         return now_s
 
     def _wait_for_operator(self) -> None:
-        """Waits, before the first motion, until the guard lets commands pass."""
+        """Wait, before the first motion, until the guard lets commands pass."""
         if self._was_active:
             return
         until_s = time.monotonic() + self._can.patience_s
         log.warning("release the dead-man, then press and hold it: the machine will move")
-        while int(self._state()["guard"]) != GuardState.ACTIVE.value:
+        while (state := self._read_state()).guard is not GuardState.ACTIVE:
             if time.monotonic() > until_s:
-                safety = read_snapshot(self._opened()).safety
                 raise LinkError(
-                    f"link: the machine was not released for motion: {safety.trip if safety else 'no state'}"
+                    f"link: the machine was not released for motion: {state.trip.value}"
                 )
             self._ask(np.zeros(self._machine.num_joints))
-            time.sleep(0.02)
+            time.sleep(WAIT_S)
         self._was_active = True
 
     def _arm(self) -> None:
-        controls = self._opened().controls.new()
-        controls["t_s"], controls["armed"] = time.monotonic(), True
-        self._opened().controls.write(controls)
+        armed = OperatorControls(time.monotonic(), armed=True, recording=False, recording_t_s=0.0)
+        self._opened().controls.write(armed)
 
-    def _mean(self, wanted: np.ndarray) -> np.ndarray:
-        """Returns the mean over a period of commands that grow towards `wanted`, `(J,)`, no faster than the guard allows."""
+    def _average_growth(self, wanted: np.ndarray) -> np.ndarray:
+        """Return the mean over a period of commands that grow towards `wanted`, `(J,)`.
+
+        They grow no faster than the guard allows; towards zero they fall at once.
+        """
         rate, period_s = self._can.limits.max_rate_1_s, self._machine.period_s
-        start = np.where(
-            wanted * self._reached > 0, np.minimum(np.abs(self._reached), np.abs(wanted)), 0.0
-        )
+        kept = np.minimum(np.abs(self._reached), np.abs(wanted))
+        start = np.where(wanted * self._reached > 0, kept, 0.0)
         grow_s = np.minimum((np.abs(wanted) - start) / rate, period_s)
         end = start + rate * grow_s
         self._reached = np.sign(wanted) * end
         return np.sign(wanted) * (end - rate * grow_s**2 / (2.0 * period_s))
 
-    def _state(self) -> Any:
+    def _read_state(self) -> OperatorState:
         state = self._opened().state.read()
         if state is None:
             raise LinkError("link: nothing has come from the bus yet")

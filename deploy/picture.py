@@ -7,15 +7,18 @@ import numpy as np
 
 
 def encode_jpeg(color: np.ndarray, quality: int) -> bytes:
-    """Returns an RGB picture, `(h, w, 3)` uint8, as JPEG of `quality`, 1 to 100."""
-    done, data = cv2.imencode(
+    """Return an RGB picture, `(h, w, 3)` uint8, as JPEG of `quality`, 1 to 100."""
+    encoded, data = cv2.imencode(
         ".jpg", cv2.cvtColor(color, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality]
     )
-    assert done, "OpenCV codes any RGB picture"
+    assert encoded, "OpenCV encodes any RGB picture"
     return data.tobytes()
 
 
 def shrink_picture(picture: np.ndarray, width: int, height: int) -> np.ndarray:
-    """Returns a picture, `(h, w)` or `(h, w, 3)`, of `width` times `height` px: colours averaged, depths picked."""
-    way = cv2.INTER_AREA if picture.ndim == 3 else cv2.INTER_NEAREST
-    return cv2.resize(picture, (width, height), interpolation=way)
+    """Return a picture, `(h, w)` or `(h, w, 3)`, shrunk to `width` times `height` px.
+
+    Colours are averaged; depths are picked, since a mean over an edge is no depth.
+    """
+    interpolation = cv2.INTER_AREA if picture.ndim == 3 else cv2.INTER_NEAREST
+    return cv2.resize(picture, (width, height), interpolation=interpolation)

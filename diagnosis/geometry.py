@@ -115,16 +115,16 @@ def _fit_size(column: np.ndarray, off: np.ndarray, whole: float) -> tuple[float,
 
 COLUMNS_TOOL = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SECONDS = 40
-"""Least time with measured tool points, s; chosen by hand: about twice the unknowns of a set."""
+"""Least time with measured tool points, s; chosen by hand."""
 NUM_ROUNDS = 3
 """Rounds of linearisation: about no error, then about the errors of the round before. Chosen by
-hand; the set does not change after the second."""
+hand."""
 MAX_ERRORS = 3
 """Most errors in a set: all sets are compared, and their number grows with this power."""
 DIFFERENCE_STEP = 0.2
 """Step of the finite difference, of the typical size; the rounds correct the curvature."""
 MIN_NOISE_M = 3e-4
-"""Smallest noise of a tool point, m: the accuracy of a good laser tracker at some metres."""
+"""Smallest noise of a tool point, m: chosen by hand, no instrument outdoors is better."""
 MIN_SIZE = 0.3
 """Smallest size, over the typical one, that is named; chosen by hand: trackers see millimetres
 below the accuracy of any drawing or zero."""

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 from composed import option
 
@@ -23,12 +24,13 @@ from deploy.page.protocol import (
     OperatorRequest,
     PageState,
     RecordingStatus,
-    Safety,
     ShownAdvice,
     SourceAge,
 )
 from deploy.page.server import PageServer
 from deploy.page.settings import PageSettings
+from deploy.runtime.operator_state import OperatorState
+from deploy.runtime.shared_memory import RecordLayout
 
 TOKEN = "correct horse battery staple"
 CHROMIUM = (
@@ -47,11 +49,18 @@ FLAGS = [
 ]
 
 LEVERS = LeverPositions(0.0, 0.0, 0.0, 0.0, False)
+STATE = replace(
+    RecordLayout(OperatorState, 5).new(),
+    q=np.array([0.0, -0.95, 0.55, 1.15, 0.6]),
+    deadman=True,
+    bus_up=True,
+)
+"""A guard that sends nothing and a dead-man that is held; all levers in neutral."""
 SHOWN = PageState(
-    t_s=0.0, alive=True, guiding=True, advice=ShownAdvice(True, "valid", 1, LEVERS, None), own=LEVERS,
-    q=(0.0, -0.95, 0.55, 1.15, 0.6),
+    t_s=0.0, alive=True, guiding=True, advice=ShownAdvice(True, "valid", 1, LEVERS, None), state=STATE,
+    commands=False,
     streams=tuple(SourceAge(name, 0.0, 1e6) for name in ("positions", "levers", "advice", "borehole")),
-    safety=Safety(False, "SILENT", "nothing", True, False, True), recording=RecordingStatus(False, 0.0, 0),
+    recording=RecordingStatus(False, 0.0, 0),
     targets=(
         BoreholeChoice("A", (2.6, 0.0, 0.75), (0.0, 0.0, 1.0), 0.05, 0.002, 0.97, True),
         BoreholeChoice("B", (2.2, 0.4, 0.75), (0.0, 0.0, 1.0), 0.05, None, None, False),
@@ -61,29 +70,42 @@ SHOWN = PageState(
 """All is well, all levers in neutral."""
 
 
+def change_state(shown: PageState, **changes: Any) -> PageState:
+    """Return what is shown with changes of the machine's, operator's or guard's state."""
+    assert shown.state is not None
+    return replace(shown, state=replace(shown.state, **changes))
+
+
+def lever(
+    left_theta: float = 0.0, left_psi: float = 0.0, right_theta: float = 0.0, right_psi: float = 0.0
+) -> np.ndarray:
+    """Return positions of the operator's own levers."""
+    return np.array([left_theta, left_psi, right_theta, right_psi])
+
+
 class Scripted:
-    """Shows `now` and remembers what came back."""
+    """A feed that shows `now` and remembers requests and draw reports."""
 
     def __init__(self, now: PageState = SHOWN) -> None:
         self.now, self.picture = now, None
-        self.wishes: list[OperatorRequest] = []
+        self.requests: list[OperatorRequest] = []
         self.seen: list[DrawReport] = []
 
-    def news(self) -> int | None:
+    def read_advice_number(self) -> int | None:
         return self.now.advice.number if self.now.advice else None
 
-    def shown(self) -> PageState:
+    def read_state(self) -> PageState:
         return self.now
 
-    def frame(self, after_s: float) -> Frame | None:
+    def read_frame(self, after_s: float) -> Frame | None:
         return self.picture if self.picture is not None and self.picture.t_s > after_s else None
 
-    def wish(self, wish: OperatorRequest) -> bool:
-        self.wishes.append(wish)
+    def submit(self, request: OperatorRequest) -> bool:
+        self.requests.append(request)
         return True
 
-    def drawn(self, drawn: DrawReport) -> None:
-        self.seen.append(drawn)
+    def report_drawn(self, report: DrawReport) -> None:
+        self.seen.append(report)
 
     def advise(self, number: int, due_s: float | None = None, **axes: Any) -> None:
         """Advises these lever positions, of full."""
@@ -94,11 +116,11 @@ class Scripted:
 
 @contextmanager
 def served(
-    feed: Any, port: int = 0, machine: Machine | None = None, annex: Any = None, **changes: Any
+    feed: Any, port: int = 0, machine: Machine | None = None, extension: Any = None, **changes: Any
 ) -> Iterator[int]:
-    """Serves the page of `conf/page/local.yaml` with `changes`, and what `annex` has; yields the port."""
+    """Serves the page of `conf/page/local.yaml` with `changes`, and the pages of `extension`; yields the port."""
     page: PageSettings = replace(option("page", "local"), port=port, token=TOKEN, **changes)
-    server = PageServer(page, machine or option("machine", "brokk170"), feed, TOKEN, annex)
+    server = PageServer(page, machine or option("machine", "brokk170"), feed, TOKEN, extension)
     ready, ending, found, failed = (
         threading.Event(),
         threading.Event(),

@@ -21,7 +21,7 @@ from deploy.bus.description import BusDescription
 from deploy.bus.protection import MessageFault
 from deploy.guard.limits import GuardLimits
 from deploy.runtime.bus_process import BusProcessConfig
-from deploy.runtime.operator_state import read_snapshot
+from deploy.runtime.operator_state import OperatorControls, RequestedCommand
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import request_fault
@@ -38,12 +38,11 @@ def command(stop: Callable[[], bool], home: np.ndarray, memory: LoopMemory) -> N
     assert memory.request is not None
     u = np.array(COMMAND)
     while not stop():
-        request, state = memory.request.new(), memory.state.read()
-        if state is not None and state["q_t_s"] > 0:
-            away = state["q"] - home
+        state = memory.state.read()
+        if state is not None and state.q_t_s > 0:
+            away = state.q - home
             u = np.where(np.abs(away) > REACH_RAD, -np.sign(away) * np.abs(u), u)
-        request["t_s"], request["u"] = time.monotonic(), u
-        memory.request.write(request)
+        memory.request.write(RequestedCommand(time.monotonic(), u))
         time.sleep(0.05)
 
 
@@ -125,8 +124,7 @@ class Desk:
 
     def arm(self, armed: bool = True) -> None:
         """Arms or disarms."""
-        controls = self.memory.controls.new()
-        controls["t_s"], controls["armed"] = time.monotonic(), armed
+        controls = OperatorControls(time.monotonic(), armed, recording=False, recording_t_s=0.0)
         self.memory.controls.write(controls)
 
     def heard(self, message: str, seconds: float) -> list[tuple[float, dict[str, float]]]:
@@ -158,7 +156,7 @@ class Desk:
                 for _, values in self.heard("ValveFeedback", 0.05)
             ):
                 return
-        raise AssertionError(f"the machine does not move: {read_snapshot(self.memory).plain()}")
+        raise AssertionError(f"the machine does not move: {self.memory.read_snapshot().to_plain()}")
 
     def still_after(self, since_s: float, seconds: float = 1.0) -> Stop:
         """Returns how long after `since_s` the valves got nothing any more, and zero was commanded, to the end of `seconds`.
@@ -201,7 +199,7 @@ class Desk:
         end_s = time.monotonic() + patience_s
         while time.monotonic() < end_s:
             state = self.memory.state.read()
-            if state is not None and float(state["q_t_s"]) > 0 and np.isfinite(state["q"]).all():
+            if state is not None and state.q_t_s > 0 and np.isfinite(state.q).all():
                 return
             time.sleep(0.02)
         raise AssertionError("nothing comes from the twin")

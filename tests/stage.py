@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,7 +27,7 @@ from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
 from deploy.runtime.bus_process import BusProcess, BusProcessConfig
-from deploy.runtime.operator_state import LoopSnapshot, read_snapshot
+from deploy.runtime.operator_state import LoopSnapshot
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import FaultPort
 from deploy.twin.twin import RunningTwin, Twin
@@ -125,7 +126,7 @@ class Stage:
             )
             self.twin = RunningTwin(twin, machine, link, Gateway(self), FaultPort(None))
             limits, wire = option("guard", "default"), self.air
-            self.station = BusProcess(BusProcessConfig(wire, DBC, machine, limits), self.memory)  # type: ignore[arg-type]
+            self.bus_process = BusProcess(BusProcessConfig(wire, DBC, machine, limits), self.memory)  # type: ignore[arg-type]
             policy = "tasks:policies/borehole_insertion"
             counsel = PolicyProcessConfig(
                 machine, policy, option("guidance", "machine"), limits.joints_s, 600.0, None
@@ -145,9 +146,9 @@ class Stage:
         end_ms = self.ms + round(1e3 * seconds)
         with self._time():
             while self.ms < end_ms and not until():
-                self.station._receive()
-                self.station._pace.begin()
-                self.station._cycle()
+                self.bus_process.receive()
+                self.bus_process._timer.begin()
+                self.bus_process.run_cycle()
 
     def pause(self, seconds: float) -> None:
         """Lets time go by in which the bus process stands still: stopped, asleep, or without a processor."""
@@ -161,7 +162,7 @@ class Stage:
         if self.ms % 10 == 0:
             self.twin.cycle(self.now_s)
         if self.mode != "collect" and self.ms % 50 == 3 and self.adviser is not None:
-            self.adviser.cycle(0, self.now_s)
+            self.adviser.run_cycle(0, self.now_s)
         if self.mode == "collect" and self.ms % round(1e3 * self.request_s) == 3:
             self._write("request", t_s=self.now_s, u=self.wanted)
         if not self.moves:
@@ -215,7 +216,7 @@ class Stage:
     @property
     def view(self) -> LoopSnapshot:
         with self._time():
-            return read_snapshot(self.memory)
+            return self.memory.read_snapshot()
 
     @property
     def advised(self) -> bool:
@@ -229,8 +230,11 @@ class Stage:
     def _write(self, name: str, **values: Any) -> None:
         slot = getattr(self.memory, name)
         record = slot.new()
-        for key, value in values.items():
-            record[key] = np.asarray(value)
+        if name == "target":
+            for key, value in values.items():
+                record[key] = np.asarray(value)
+        else:
+            record = replace(record, **values)
         slot.write(record)
 
     @contextmanager

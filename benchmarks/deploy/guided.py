@@ -68,7 +68,7 @@ def main(folder: Path, trials: int, at_once: int) -> None:
 
 
 def summary(results: list[dict[str, object]]) -> dict[str, object]:
-    """Returns what the trials so far come to."""
+    """Return what the trials so far come to."""
     found, rate = {}, {}
     for kind in SECONDS:
         good = [bool(one.get("success")) for one in results if one["kind"] == kind]

@@ -83,7 +83,7 @@ def main(path: Path, trials: int) -> None:
 
 
 def row(stops: list[Stop]) -> dict[str, float]:
-    """Returns what the trials of one event come to."""
+    """Return what the trials of one event come to."""
     flow_ms = sorted(round(1e3 * stop.flow_s, 1) for stop in stops)
     command_ms = sorted(
         round(1e3 * stop.command_s, 1) for stop in stops if stop.command_s is not None

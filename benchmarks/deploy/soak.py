@@ -29,7 +29,7 @@ LONG_S = 300.0
 
 
 def memory_mb(pid: int) -> tuple[float, float] | None:
-    """Returns a process's own and shared resident memory, MB."""
+    """Return a process's own and shared resident memory, MB."""
     try:
         _, resident, shared, *_ = map(int, Path(f"/proc/{pid}/statm").read_text().split())
     except (FileNotFoundError, ProcessLookupError):
@@ -39,7 +39,7 @@ def memory_mb(pid: int) -> tuple[float, float] | None:
 
 
 def watched(run: subprocess.Popen[bytes], folder: Path) -> list[dict[str, Any]]:
-    """Moves the borehole about and looks at memory and load until the run is over."""
+    """Move the borehole about and looks at memory and load until the run is over."""
     found, began_s, place = [], time.monotonic(), random.Random(0)
     moved_s = looked_s = -1e9
     while run.poll() is None:

@@ -27,7 +27,7 @@ OPEN = " is open"
 
 
 def computed_s(pid: int) -> float:
-    """Returns the processor time that a process has taken so far."""
+    """Return the processor time that a process has taken so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

@@ -47,10 +47,10 @@ class Timed(DemoFeed):
         self.latency_s: list[tuple[float, float]] = []
         self.round_trip_s = np.inf
 
-    def drawn(self, drawn: DrawReport) -> None:
-        made_s = self._began_s + drawn.number * self.period_s
-        self.latency_s.append((time.monotonic(), drawn.t_s - made_s))
-        self.round_trip_s = min(self.round_trip_s, drawn.round_trip_s)
+    def report_drawn(self, report: DrawReport) -> None:
+        made_s = self._began_s + report.number * self.period_s
+        self.latency_s.append((time.monotonic(), report.t_s - made_s))
+        self.round_trip_s = min(self.round_trip_s, report.round_trip_s)
 
 
 class Parted(PageClock):
@@ -59,17 +59,17 @@ class Parted(PageClock):
     in_browser_ms: ClassVar[list[float]] = []
     on_the_way_ms: ClassVar[list[float]] = []
 
-    def heard(self, text: str | bytes, now_s: float) -> DrawAcknowledgement | None:
+    def read_acknowledgement(self, text: str | bytes, now_s: float) -> DrawAcknowledgement | None:
         number, came_ms, drawn_ms, _ = json.loads(text)
         sent_s = self._sent.get(number, (np.nan, None))[0]
-        said = super().heard(text, now_s)
+        said = super().read_acknowledgement(text, now_s)
         if said is not None and said.advice is not None:
             self.in_browser_ms.append(drawn_ms - came_ms)
             self.on_the_way_ms.append(1e3 * (said.drawn_s - sent_s) - self.in_browser_ms[-1])
         return said
 
 
-def quantiles(values_ms: Any) -> dict[str, float]:
+def compute_quantiles(values_ms: Any) -> dict[str, float]:
     return {name: round(float(np.quantile(values_ms, part)), 1) for name, part in QUANTILES.items()}
 
 
@@ -96,7 +96,7 @@ def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
         took_s, after = time.monotonic() - begun_s, page.evaluate("window.measured")
         bytes_a_frame = 0
         if scene:
-            frame = feed.frame(-1.0)
+            frame = feed.read_frame(-1.0)
             assert frame is not None
             bytes_a_frame = len(encode_frame(frame, 640, 80))
         context.close()
@@ -107,9 +107,9 @@ def measure(browser: Any, rate_hz: float, scene: bool) -> dict[str, Any]:
         "scene": scene,
         "points": after["points"],
         "load": round(os.getloadavg()[0], 1),
-        "lever_latency_ms": quantiles(1e3 * latency_s),
-        "of_it_on_the_way_ms": quantiles(Parted.on_the_way_ms),
-        "of_it_in_browser_ms": quantiles(Parted.in_browser_ms),
+        "lever_latency_ms": compute_quantiles(1e3 * latency_s),
+        "of_it_on_the_way_ms": compute_quantiles(Parted.on_the_way_ms),
+        "of_it_in_browser_ms": compute_quantiles(Parted.in_browser_ms),
         "clock_error_ms": round(500 * feed.round_trip_s, 2),
         "advices_drawn_share": round(len(latency_s) * machine.period_s / took_s, 3),
         "page_drawn_hz": round((after["drawn"] - before["drawn"]) / took_s, 1),

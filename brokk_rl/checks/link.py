@@ -14,10 +14,10 @@ from brokk_rl.signals import Command
 
 
 def check_link(link: Link, machine: Machine, num_runs: int = 1) -> None:
-    """Checks a closed link to a machine, real or simulated, or to `num_runs` simulated ones, against `Link`.
+    """Check a closed link to a machine, or to `num_runs` simulated ones, against `Link`.
 
-    Sends nothing but a standstill, and a command that is no number: it must be refused by a
-    `BrokkError` or sent as a standstill.
+    It sends only a standstill, and a command that is no number: the link must refuse that by a
+    `BrokkError` or send a standstill.
     """
     with link as open_link:
         first = open_link.read()

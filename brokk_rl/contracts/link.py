@@ -26,11 +26,11 @@ class Link(Protocol):
     """
 
     def read(self) -> JointState:
-        """Returns the newest measured state; its `t_s` is the clock by which the control periods are counted."""
+        """Return the newest measured state; its `t_s` is the clock of the control periods."""
         ...
 
     def send(self, command: Command) -> Command:
-        """Sends a command and returns the command that was really sent."""
+        """Send a command and returns the command that was really sent."""
         ...
 
     def __enter__(self) -> Link: ...
@@ -43,11 +43,13 @@ class Connection(Protocol):
 
     @property
     def source(self) -> str:
-        """What recordings say they come from."""
+        """Source that recordings name."""
         ...
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> Link:
-        """Returns a link, not yet opened, to `num_runs` machines side by side; its random numbers come from the session's streams.
+        """Return a link, not yet opened, to `num_runs` machines side by side.
+
+        Its random numbers come from the session's streams.
 
         Raises:
             ConfigError: there are not as many machines.

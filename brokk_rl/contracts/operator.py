@@ -1,4 +1,4 @@
-"""People at the levers, and the ground of their trials.
+"""Simulated operators at the levers, and the ground of their trials.
 
 `brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
 extensions.
@@ -44,12 +44,12 @@ class TrialBatch:
 
 @dataclass(frozen=True)
 class OperatorView:
-    """What simulated operators can see at the start of a control period, numpy.
+    """View of simulated operators at the start of a control period, numpy.
 
     Attributes:
         q: Joint positions, `(N, J)`.
-        rim_in_base_m: Centre of the hole's rim, `(N, 3)`; how well it is seen is the operator's
-            matter.
+        rim_in_base_m: Centre of the hole's rim, `(N, 3)`; the operator model adds its errors of
+            vision.
         advice: Commands that are advised, `(N, J)`; NaN where none is shown.
     """
 
@@ -62,7 +62,10 @@ class OperatorModel(Protocol):
     """Simulated operators at the levers of `N` machines, in numpy; one control period a call."""
 
     def step(self, view: OperatorView) -> np.ndarray:
-        """Returns the commands given during the coming period, `(N, J)` in [-1, 1]; exclusive joints never together with others."""
+        """Return the commands of the coming period, `(N, J)` in [-1, 1].
+
+        Exclusive joints never move together with others.
+        """
         ...
 
 
@@ -70,7 +73,10 @@ class Operator(Protocol):
     """A spec in `conf/operator`: a kind of simulated operator."""
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
-        """Returns operators at work; `persons`, `(N,)`, numbers them: the same number and seed is the same person."""
+        """Return a model of the operators `persons`, `(N,)`.
+
+        The same number and seed is the same person.
+        """
         ...
 
 
@@ -80,5 +86,5 @@ class TrialGround(Protocol):
     def run(
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
     ) -> list[Recording]:
-        """Does the trials; returns a recording of each, in order, with advice where it was shown."""
+        """Do the trials; return a recording of each, in order, with advice where it was shown."""
         ...

@@ -1,1 +1,1 @@
-"""The bus: its description (a DBC), protection against faults on the way, and the wires that python-can knows."""
+"""The CAN bus: description, end-to-end protection, and access through python-can."""

@@ -1,8 +1,8 @@
-"""Wires: how frames get onto a bus and off it, through python-can.
+"""CAN buses through python-can, and the replay of recorded frames.
 
-Only `recv` and `send` of python-can are used. Its `Notifier` dies silently of the first exception,
-and its cyclic senders either die too or, in the kernel, go on repeating the last command while the
-program hangs; nothing here uses them.
+Only `recv` and `send` of python-can are used. Its `Notifier` dies silently of the first exception.
+Its cyclic senders die too or, in the kernel, go on repeating the last command while the program
+hangs. Nothing here uses them.
 """
 
 from __future__ import annotations
@@ -22,12 +22,18 @@ from brokk_rl.spec import spec
 log = logging.getLogger(__name__)
 
 BUS_OFF = 0x40
-"""Bit of an error frame of Linux (CAN_ERR_BUSOFF)."""
+"""Bit of an error frame of Linux (CAN_ERR_BUSOFF in linux/can/error.h)."""
+LARGEST_STANDARD_ID = 0x7FF
+"""Identifiers above it have 29 bits."""
+EXTENDED_MASK = 0x1FFFFFFF
+"""All 29 bits of an identifier."""
+QUEUE_FRAMES = 1000
+"""Queue of a virtual bus; its memory grows without end otherwise when nobody reads. By hand."""
 
 
 @dataclass(frozen=True)
 class CanFrame:
-    """A frame as the bus carries it.
+    """One frame on the bus.
 
     Attributes:
         frame_id: Identifier.
@@ -59,10 +65,10 @@ class CanBus:
     port: int | None
 
     def open(self, frame_ids: Sequence[int] | None = None) -> OpenCanBus:
-        """Opens the bus.
+        """Open the bus.
 
         Args:
-            frame_ids: Only these are received; the kernel leaves out others where it can. `None`:
+            frame_ids: Identifiers to receive; the kernel leaves out others where it can. `None`:
                 all.
 
         Raises:
@@ -70,26 +76,25 @@ class CanBus:
         """
         options = {"bitrate": self.bitrate, "port": self.port}
         options = {key: value for key, value in options.items() if value is not None}
-        if self.interface != "socketcan":
+        if self.interface == "udp_multicast":
             options["fd"] = False
         if self.interface == "virtual":
-            options.pop("fd")
-            options["rx_queue_size"] = 1000  # else its memory grows without end when nobody reads
+            options["rx_queue_size"] = QUEUE_FRAMES
         try:
             bus = can.Bus(interface=self.interface, channel=self.channel, **options)  # type: ignore[arg-type]
             if frame_ids is not None:
-                bus.set_filters(
-                    [
-                        {"can_id": one, "can_mask": 0x1FFFFFFF, "extended": one > 0x7FF}
-                        for one in frame_ids
-                    ]
-                )
+                bus.set_filters([_build_filter(one) for one in frame_ids])
         except (can.CanError, OSError, ValueError, ImportError) as error:
             raise LinkError(
                 f"bus.interface={self.interface} bus.channel={self.channel}: cannot be opened ({error}). `ip link` shows the CAN "
                 "interfaces of this computer; bus=udp needs none"
             ) from error
         return OpenCanBus(bus)
+
+
+def _build_filter(frame_id: int) -> can.typechecking.CanFilter:
+    extended = frame_id > LARGEST_STANDARD_ID
+    return {"can_id": frame_id, "can_mask": EXTENDED_MASK, "extended": extended}
 
 
 class OpenCanBus:
@@ -99,7 +104,7 @@ class OpenCanBus:
         self._bus = bus
 
     def recv(self, timeout_s: float) -> CanFrame | None:
-        """Returns the next data frame, or `None` when none came in time, or an error frame that says nothing of its own.
+        """Return the next data frame; `None` when none came in time, or for an error frame.
 
         Raises:
             LinkError: the bus is down.
@@ -115,7 +120,7 @@ class OpenCanBus:
         return CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id)
 
     def send(self, frame: CanFrame) -> None:
-        """Sends a frame.
+        """Send a frame.
 
         Raises:
             LinkError: it could not be sent; it is not sent later either.
@@ -132,7 +137,7 @@ class OpenCanBus:
             raise LinkError(f"bus: cannot send ({error})") from error
 
     def close(self) -> None:
-        """Closes the bus; twice is once."""
+        """Close the bus; a second call does nothing."""
         try:
             self._bus.shutdown()
         except (can.CanError, OSError) as error:
@@ -147,10 +152,10 @@ class OpenCanBus:
 
 @spec
 class BusReplay:
-    """Frames that were recorded once, said again in their own time: the same loop over yesterday's run. Nothing is sent.
+    """Recorded frames, received again at the times of the recording; nothing is sent.
 
     Attributes:
-        path: BLF file; what the loop itself sent then is left out.
+        path: BLF file; frames that the loop itself sent are left out.
         speed: Times real time.
     """
 
@@ -169,23 +174,20 @@ class BusReplay:
         return self.path
 
     def open(self, frame_ids: Sequence[int] | None = None) -> OpenBusReplay:
-        """Begins the replay; see `Wire.open`.
+        """Begin the replay; see `CanBus.open`.
 
         Raises:
             LinkError: the file cannot be read.
         """
+        wanted = None if frame_ids is None else frozenset(frame_ids)
         try:
-            return OpenBusReplay(
-                BLFReader(self.path),
-                self.speed,
-                None if frame_ids is None else frozenset(frame_ids),
-            )
+            return OpenBusReplay(BLFReader(self.path), self.speed, wanted)
         except (OSError, ValueError, BLFParseError) as error:
             raise LinkError(f"bus.path={self.path}: nothing can be replayed ({error})") from error
 
 
 class OpenBusReplay:
-    """A running replay; as `OpenWire`."""
+    """A running replay; used as `OpenCanBus`."""
 
     def __init__(self, reader: BLFReader, speed: float, frame_ids: frozenset[int] | None) -> None:
         self._reader, self._speed, self._frame_ids = reader, speed, frame_ids
@@ -193,14 +195,14 @@ class OpenBusReplay:
         self._offset_s: float | None = None
 
     def recv(self, timeout_s: float) -> CanFrame | None:
-        """Returns the next frame when its time has come; see `OpenWire.recv`.
+        """Return the next frame when its time has come; see `OpenCanBus.recv`.
 
         Raises:
             LinkError: the replay is over.
         """
         end_s = time.monotonic() + max(0.0, timeout_s)
         if self._next is None:
-            self._next = self._following()
+            self._next = self._read_next()
         if self._offset_s is None:
             self._offset_s = time.monotonic() - self._next.timestamp / self._speed
         due_s = self._next.timestamp / self._speed + self._offset_s
@@ -211,10 +213,10 @@ class OpenBusReplay:
         return CanFrame(message.arbitration_id, bytes(message.data), message.is_extended_id)
 
     def send(self, frame: CanFrame) -> None:
-        """Sends nothing."""
+        """Send nothing."""
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         self._reader.stop()
 
     def __enter__(self) -> Self:
@@ -223,14 +225,10 @@ class OpenBusReplay:
     def __exit__(self, *exc: object) -> None:
         self.close()
 
-    def _following(self) -> can.Message:
+    def _read_next(self) -> can.Message:
         for message in self._messages:
             wanted = self._frame_ids is None or message.arbitration_id in self._frame_ids
-            if (
-                wanted
-                and message.is_rx
-                and not message.is_error_frame
-                and not message.is_remote_frame
-            ):
+            has_data = not message.is_error_frame and not message.is_remote_frame
+            if wanted and has_data and message.is_rx:
                 return message
         raise LinkError("bus: the replay is over")

@@ -1,12 +1,16 @@
-"""The bus description: one DBC that says what is sent, how, how often and by whom.
+"""The bus description: one DBC that defines each message, its rate and its sender.
 
-Signals are found by their names, whatever message they travel in, so that a DBC of another gateway
-takes the place of the example
-as long as it names them alike: `Command_<joint>`, `CommandMode`, `Position_<joint>`,
-`Valid_<joint>`, `Flow_<joint>`, `FlowSource`, `Lever_<left|right>_<theta|psi>`, `ButtonRight`,
-`DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`; optional are `Stamp`, `OilTemperature` and all
-others, which are recorded. Protected messages have a `Counter`, a `Crc` of one whole byte and the
-attribute `E2EDataId`. Cycle times are the DBC's (`GenMsgCycleTime`): no rate is written down twice.
+Signals are found by their names, whatever message they travel in. A DBC of another gateway takes
+the place of the example as long as it names them alike: `Command_<joint>`, `CommandMode`,
+`Position_<joint>`, `Valid_<joint>`, `Flow_<joint>`, `FlowSource`, `Lever_<left|right>_<theta|psi>`,
+`ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`. Optional are `Stamp`,
+`OilTemperature` and all others, which are recorded. Protected messages have a `Counter`, a `Crc` of
+one whole byte and the attribute `E2EDataId`. Cycle times are the DBC's (`GenMsgCycleTime`): no rate
+is written down twice.
+
+`generate_c_header` writes a header for the gateway's firmware. cantools generates the C source that
+packs and unpacks (`cantools generate_c_source <dbc>`); the header adds the end-to-end protection and
+the times, so that gateway and PC go by one file.
 """
 
 from __future__ import annotations
@@ -26,7 +30,14 @@ from brokk_rl.machine import Machine
 from deploy.bus.protection import FINAL, MAX_STEP, START, TABLE, MessageFault, compute_crc8
 
 COUNTER, CRC = "Counter", "Crc"
+"""Signals of the end-to-end protection."""
+CRC_BITS = 8
 PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
+"""Nodes of the bus."""
+PREFIX = "BROKK"
+"""Of all names in the C header."""
+ROW_BYTES = 16
+"""Of the CRC table in a row of the C header."""
 LEVER_AXES = ("left_theta", "left_psi", "right_theta", "right_psi")
 
 
@@ -82,16 +93,12 @@ class BusDescription:
             message.name: _build_layout(message, name) for message in self._database.messages
         }
         self.by_id = {layout.frame_id: layout for layout in self.layouts.values()}
-        self._home = {
-            signal.name: message.name
-            for message in self._database.messages
-            for signal in message.signals
-        }
-        required = [
-            f"{what}_{joint}"
-            for what in ("Command", "Position", "Valid", "Flow")
-            for joint in machine.joint_names
-        ]
+        self._home: dict[str, str] = {}
+        for message in self._database.messages:
+            self._home |= {signal.name: message.name for signal in message.signals}
+        required = []
+        for kind in ("Command", "Position", "Valid", "Flow"):
+            required += [f"{kind}_{joint}" for joint in machine.joint_names]
         required += [f"Lever_{axis}" for axis in LEVER_AXES]
         required += [
             "CommandMode",
@@ -111,7 +118,7 @@ class BusDescription:
         """The message with the valve commands."""
 
     def message_of(self, signal: str) -> str:
-        """Returns the message in which `signal` travels.
+        """Return the message in which `signal` travels.
 
         Raises:
             ConfigError: there is none.
@@ -123,7 +130,7 @@ class BusDescription:
         return self._home[signal]
 
     def signals(self, message: str) -> list[str]:
-        """Returns the names of the signals of `message`, without counter and CRC."""
+        """Return the names of the signals of `message`, without counter and CRC."""
         return [
             signal.name
             for signal in self._messages[message].signals
@@ -131,15 +138,15 @@ class BusDescription:
         ]
 
     def unit(self, message: str, signal: str) -> str:
-        """Returns the unit of a signal, '' for none."""
+        """Return the unit of a signal, '' for none."""
         return self._messages[message].get_signal_by_name(signal).unit or ""
 
     def sent_by(self, node: str) -> list[MessageLayout]:
-        """Returns what `node` sends."""
+        """Return what `node` sends."""
         return [layout for layout in self.layouts.values() if layout.sender == node]
 
     def encode(self, name: str, values: Mapping[str, float], counter: int) -> bytes:
-        """Returns the data of message `name`; signals that `values` leaves out are 0. Counter and CRC are put in here."""
+        """Return the data of message `name`; signals that `values` leaves out are 0. Counter and CRC are put in here."""
         layout, message = self.layouts[name], self._messages[name]
         data = {signal.name: values.get(signal.name, 0) for signal in message.signals}
         if layout.data_id is None:
@@ -149,7 +156,7 @@ class BusDescription:
         return bytes(encoded)
 
     def decode(self, layout: MessageLayout, data: bytes) -> dict[str, float] | MessageFault:
-        """Returns the signals of a message, its counter among them, or what is wrong with it."""
+        """Return the signals of a message, its counter among them, or what is wrong with it."""
         if len(data) != layout.length:
             return MessageFault.LENGTH
         if layout.data_id is not None:
@@ -163,7 +170,7 @@ class BusDescription:
 
 
 def resolve_package_path(name: str) -> Path:
-    """Returns the path of a file: a path, or `package:path` within an installed package."""
+    """Return the path of a file: a path, or `package:path` within an installed package."""
     package, colon, inside = name.partition(":")
     if not colon or Path(name).exists():
         return Path(name)
@@ -197,14 +204,18 @@ def _build_layout(message: Message, dbc: str) -> MessageLayout:
         if (
             counter is None
             or crc is None
-            or crc.length != 8
-            or crc.start % 8
+            or crc.length != CRC_BITS
+            or crc.start % CRC_BITS
             or crc.byte_order != "little_endian"
         ):
             raise ConfigError(
                 f"bus: message {message.name} of {dbc} has E2EDataId; it needs {COUNTER}, and {CRC} of one whole byte"
             )
-        data_id, crc_byte, modulus = int(attribute.value), crc.start // 8, 1 << counter.length
+        data_id, crc_byte, modulus = (
+            int(attribute.value),
+            crc.start // CRC_BITS,
+            1 << counter.length,
+        )
     return MessageLayout(
         name=message.name,
         frame_id=message.frame_id,
@@ -218,11 +229,8 @@ def _build_layout(message: Message, dbc: str) -> MessageLayout:
     )
 
 
-PREFIX = "BROKK"
-
-
 def generate_c_header(description: BusDescription) -> str:
-    """Returns the text of the header."""
+    """Return the text of the header."""
     lines = [
         f"/* Made from {description.name}: do not edit. Packing and unpacking: cantools generate_c_source. */",
         f"#ifndef {PREFIX}_BUS_H",
@@ -246,13 +254,16 @@ def generate_c_header(description: BusDescription) -> str:
                 f"#define {name}_CRC_BYTE {layout.crc_byte}u",
                 f"#define {name}_COUNTER_MODULUS {layout.modulus}u",
             ]
-    values = ", ".join(f"0x{value:02X}" for value in TABLE)
-    rows = re.findall(r"(?:0x..(?:, )?){1,16}", values)
+    rows = []
+    for first in range(0, len(TABLE), ROW_BYTES):
+        row = ", ".join(f"0x{value:02X}" for value in TABLE[first : first + ROW_BYTES])
+        rows.append(f"  {row},")
+    rows[-1] = rows[-1].removesuffix(",")
     lines += [
         "",
         "/* CRC-8 SAE J1850 over the data, its CRC byte taken as zero, then the data id, low byte first. */",
         "static const uint8_t brokk_crc8_table[256] = {",
-        *(f"  {row.rstrip(' ')}" for row in rows),
+        *rows,
         "};",
         "static inline uint8_t brokk_crc8(const uint8_t *data, uint8_t length, uint8_t crc_byte, uint16_t data_id) {",
         f"  uint8_t crc = 0x{START:02X}u, i;",
@@ -267,5 +278,5 @@ def generate_c_header(description: BusDescription) -> str:
 
 
 def _convert_to_upper_snake(name: str) -> str:
-    """Returns `ValveCmd` as `VALVE_CMD`."""
+    """Return `ValveCmd` as `VALVE_CMD`."""
     return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).upper()

@@ -1,13 +1,15 @@
-"""End-to-end protection of messages in the manner of AUTOSAR's profiles: CRC-8 with a data id, counter, and a small state machine.
+"""End-to-end protection of messages in the manner of AUTOSAR: CRC-8 with a data id, and a counter.
 
 It finds repetition, loss, delay, insertion, masquerade, wrong sequence, corruption and a blocked
-channel. It detects errors; it is
-no security: whoever knows the bus description can write valid messages.
+channel. It detects errors; it is no security: whoever knows the bus description can write valid
+messages.
 
-    CRC wrong, or counter repeated, or counter further on than `MAX_STEP`: an error, the message is
-    not used INIT     --two good in a row--> VALID
+A wrong CRC, a repeated counter, or a counter more than `MAX_STEP` further on is an error, and the
+message is not used. Each channel has a state:
+
+    INIT     --two good messages in a row--> VALID
     VALID    --two errors in a row, or a score of five (error +1, good -1)--> INVALID
-    INVALID  --RECOVERY good in a row--> VALID
+    INVALID  --RECOVERY good messages in a row--> VALID
 """
 
 from __future__ import annotations
@@ -15,14 +17,20 @@ from __future__ import annotations
 from enum import Enum
 
 POLYNOMIAL, START, FINAL = 0x1D, 0xFF, 0xFF
-"""CRC-8 SAE J1850."""
+"""CRC-8 SAE J1850: polynomial, initial value, and the value that the result is XORed with."""
 MAX_STEP = 4
-"""Largest step of a counter: up to three messages lost in a row are let pass; age says whether that
-is too long."""
-IN_A_ROW, SCORE, RECOVERY = 2, 5, 10
+"""Largest step of a counter. Up to three messages lost in a row are accepted; whether that takes too
+long is decided by age."""
+IN_A_ROW = 2
+"""Good messages that make a channel valid, and errors in a row that make it invalid."""
+SCORE = 5
+"""Score of errors that makes a channel invalid though good messages lie between them."""
+RECOVERY = 10
+"""Good messages in a row that make an invalid channel valid again."""
 
 
 def _build_table() -> bytes:
+    """Return the CRC of each byte, so that a message takes one look-up a byte."""
     values = []
     for value in range(256):
         for _ in range(8):
@@ -35,7 +43,7 @@ TABLE = _build_table()
 
 
 def compute_crc8(data: bytes | bytearray, data_id: int) -> int:
-    """Returns the CRC of `data` followed by the two bytes of `data_id`, low byte first."""
+    """Return the CRC of `data` followed by the two bytes of `data_id`, low byte first."""
     crc = START
     for byte in data:
         crc = TABLE[crc ^ byte]
@@ -44,7 +52,7 @@ def compute_crc8(data: bytes | bytearray, data_id: int) -> int:
 
 
 class ChannelTrust(Enum):
-    """How far a channel is to be believed."""
+    """State of a channel; see the module."""
 
     INIT = 0
     VALID = 1
@@ -52,7 +60,7 @@ class ChannelTrust(Enum):
 
 
 class MessageFault(Enum):
-    """What was wrong with a message."""
+    """Why a message was refused."""
 
     CRC = "wrong CRC"
     REPEATED = "counter repeated"
@@ -67,7 +75,7 @@ class ProtectedChannel:
         modulus: The counter counts 0 … modulus - 1.
 
     Attributes:
-        trust: Whether the channel is to be believed.
+        trust: State of the channel.
         errors: Messages refused so far, by kind.
         lost: Messages that the counter has skipped.
     """
@@ -81,7 +89,7 @@ class ProtectedChannel:
         self.lost = 0
 
     def take(self, counter: int) -> MessageFault | None:
-        """Judges a message whose CRC is right by its counter; returns what is wrong with it."""
+        """Check the counter of a message whose CRC is right; return its fault, if any."""
         before, self._last = self._last, counter
         if before is None:
             return self._count(None)
@@ -94,7 +102,7 @@ class ProtectedChannel:
         return self._count(None)
 
     def refuse(self, fault: MessageFault) -> MessageFault:
-        """Counts a message that could not even be read; returns `fault`."""
+        """Count a message that could not be decoded; return `fault`."""
         self._count(fault)
         return fault
 

@@ -1,18 +1,20 @@
-"""The guard: the last to see a command before it is sent.
+"""The guard: the last check of a command before it is sent.
 
 Pure: no clock, no bus, no file, no tensor; the caller hands in everything.
 
     SILENT   nothing is sent. The default.
     LATCHED  zero is sent. Left only by hand: dead-man released, levers in neutral, nothing wrong.
     READY    zero is sent, until the dead-man is pressed, levers in neutral.
-    ACTIVE   what is asked for is sent, within the limits.
+    ACTIVE   the requested command is sent, within the limits.
 
-    SILENT --armed on purpose--> LATCHED --released, neutral, healthy--> READY --pressed, neutral,
-    healthy--> ACTIVE ACTIVE --released--> READY; ACTIVE or READY --anything wrong--> LATCHED; any
-    --no longer armed--> SILENT
+    SILENT --armed on purpose--> LATCHED --released, neutral, healthy--> READY
+    READY --pressed, neutral, healthy--> ACTIVE
+    ACTIVE --released--> READY
+    ACTIVE or READY --anything wrong--> LATCHED
+    any --no longer armed--> SILENT
 
 Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once.
-Nothing is ever sent that the guard has not seen in the same cycle.
+Nothing is ever sent that the guard has not checked in the same cycle.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from deploy.guard.limits import GuardLimits, JointBounds, Numbers
 
 
 class GuardState(Enum):
-    """What the guard lets pass; the number travels on the bus."""
+    """State of the guard; its number travels on the bus."""
 
     SILENT = 0
     LATCHED = 1
@@ -34,7 +36,7 @@ class GuardState(Enum):
 
 
 class GuardTrip(Enum):
-    """Why the guard does not let pass what is asked for."""
+    """Why the guard does not pass a requested command."""
 
     NONE = "nothing"
     BUS_DOWN = "bus down"
@@ -57,13 +59,13 @@ class GuardTrip(Enum):
 
 @dataclass(frozen=True)
 class GuardInput:
-    """What is known in one cycle. Ages in s, infinite where nothing has come yet.
+    """Known values in one cycle. Ages in s, infinite where nothing has come yet.
 
     Attributes:
         q: Joint positions, `(J,)`, rad or m.
         joints_age_s: Age of the oldest of them.
         joints_plausible: Whether the sensors call them valid and they did not jump.
-        trusted: Whether all channels are to be believed.
+        trusted: Whether no needed channel is invalid.
         levers_age_s: Age of the remote's message.
         lever: Largest deflection of the operator's own levers, of full.
         deadman: Whether the dead-man is held.
@@ -90,7 +92,7 @@ class GuardInput:
 
 @dataclass(frozen=True)
 class CommandRequest:
-    """A command that somebody wants sent.
+    """A command to be sent.
 
     Attributes:
         u: Commands, `(J,)`.
@@ -103,13 +105,13 @@ class CommandRequest:
 
 @dataclass(frozen=True)
 class GuardDecision:
-    """What the guard makes of it.
+    """Decision of the guard in one cycle.
 
     Attributes:
         state: See the module.
-        u: What to send, `(J,)`; all zero unless ACTIVE.
-        trip: Why not what was asked for, now.
-        cause: What latched it last.
+        u: Command to send, `(J,)`; all zero unless ACTIVE.
+        trip: Why the requested command is not sent now.
+        cause: Why the guard latched last.
     """
 
     state: GuardState
@@ -127,69 +129,66 @@ class Guard:
     """See the module.
 
     Args:
-        limits: What is allowed.
-        body: The machine.
+        limits: Limits on commands, ages and positions.
+        bounds: The machine.
     """
 
-    def __init__(self, limits: GuardLimits, body: JointBounds) -> None:
-        self._limits, self._body = limits, body
-        self._still = (0.0,) * len(body.lower)
+    def __init__(self, limits: GuardLimits, bounds: JointBounds) -> None:
+        self._limits, self._bounds = limits, bounds
+        self._still = (0.0,) * len(bounds.lower)
         self._state, self._cause = GuardState.SILENT, GuardTrip.NONE
-        self._sent, self._before_s, self._followed_s = (
-            self._still,
-            math.nan,
-            math.nan,
-        )  # never: no comparison with nan holds
+        # NaN stands for never: no comparison with it holds
+        self._sent, self._before_s, self._followed_s = self._still, math.nan, math.nan
 
     def decide(
         self, now_s: float, armed: bool, seen: GuardInput, request: CommandRequest | None
     ) -> GuardDecision:
-        """Returns what to send in this cycle.
+        """Return the command to send in this cycle.
 
         Args:
             now_s: Monotonic time.
-            armed: Whether somebody wants commands sent, on purpose.
-            seen: What is known.
-            request: What is asked for, `None` for nothing yet.
+            armed: Whether commands are to be sent at all.
+            seen: Known values.
+            request: The requested command, `None` for nothing yet.
         """
         elapsed_s, self._before_s = now_s - self._before_s, now_s
-        wrong = self._health(seen, elapsed_s)
+        wrong = self._check_health(seen, elapsed_s)
         if seen.followed or self._state is not GuardState.ACTIVE:
             self._followed_s = now_s
         elif now_s - self._followed_s > self._limits.ignored_s and wrong is GuardTrip.NONE:
             wrong = GuardTrip.IGNORED
         if not armed:
             self._state, self._cause = GuardState.SILENT, GuardTrip.NONE
-            return self._say(
+            return self._conclude(
                 self._still, wrong if wrong is not GuardTrip.NONE else GuardTrip.NOT_ARMED
             )
         if self._state is GuardState.SILENT:
             self._state, self._cause = GuardState.LATCHED, GuardTrip.NOT_ARMED
         if wrong is GuardTrip.NONE and self._state is GuardState.ACTIVE and seen.deadman:
-            wrong = self._objection(request)
+            wrong = self._check_request(request)
         if wrong is not GuardTrip.NONE:
             if self._state is not GuardState.LATCHED:
                 self._state, self._cause = GuardState.LATCHED, wrong
-            return self._say(self._still, wrong)
+            return self._conclude(self._still, wrong)
         if not seen.deadman:
             self._state = GuardState.READY  # released, in neutral, nothing wrong: may be pressed
-            return self._say(self._still, GuardTrip.DEADMAN)
+            return self._conclude(self._still, GuardTrip.DEADMAN)
         if self._state is GuardState.LATCHED:
-            return self._say(self._still, self._cause)
+            return self._conclude(self._still, self._cause)
         if self._state is GuardState.READY:
             self._state, self._cause = GuardState.ACTIVE, GuardTrip.NONE
-            return self._say(self._still, GuardTrip.NONE)
+            return self._conclude(self._still, GuardTrip.NONE)
         assert request is not None
-        return self._say(self._limited(request.u, seen.q, elapsed_s), GuardTrip.NONE)
+        return self._conclude(self._limit_command(request.u, seen.q, elapsed_s), GuardTrip.NONE)
 
     def stops(self, seen: GuardInput) -> bool:
-        """Says whether what is seen now ends a motion: then the caller decides at once, not in its next cycle."""
+        """Return whether the motion must end: then the caller decides at once, not next cycle."""
         return self._state is GuardState.ACTIVE and (
-            not seen.deadman or self._health(seen, 0.0) is not GuardTrip.NONE
+            not seen.deadman or self._check_health(seen, 0.0) is not GuardTrip.NONE
         )
 
-    def _health(self, seen: GuardInput, elapsed_s: float) -> GuardTrip:
-        """Returns the first thing that is wrong, whatever is asked for."""
+    def _check_health(self, seen: GuardInput, elapsed_s: float) -> GuardTrip:
+        """Return the first fault, whatever command is requested."""
         limits = self._limits
         checks = (
             (seen.bus_up, GuardTrip.BUS_DOWN),
@@ -205,8 +204,8 @@ class Guard:
         )
         return next((trip for fine, trip in checks if not fine), GuardTrip.NONE)
 
-    def _objection(self, request: CommandRequest | None) -> GuardTrip:
-        """Returns what is wrong with a request."""
+    def _check_request(self, request: CommandRequest | None) -> GuardTrip:
+        """Return the fault of a request."""
         if request is None or not request.age_s <= self._limits.request_s:
             return GuardTrip.REQUEST_STALE
         full = 1.0 + self._limits.overrun
@@ -216,7 +215,7 @@ class Guard:
             return GuardTrip.REQUEST_INVALID
         moved = {
             exclusive
-            for exclusive, value in zip(self._body.exclusive, request.u, strict=True)
+            for exclusive, value in zip(self._bounds.exclusive, request.u, strict=True)
             if value != 0
         }
         alone = sum(value != 0 for value in request.u) == 1
@@ -224,13 +223,13 @@ class Guard:
             return GuardTrip.REQUEST_EXCLUSIVE
         return GuardTrip.NONE
 
-    def _limited(self, u: Numbers, q: Numbers, elapsed_s: float) -> Numbers:
-        """Returns the command within magnitude, growth and joint limits."""
-        limits, body = self._limits, self._body
+    def _limit_command(self, u: Numbers, q: Numbers, elapsed_s: float) -> Numbers:
+        """Return the command within magnitude, growth and joint limits."""
+        limits, bounds = self._limits, self._bounds
         most = limits.max_rate_1_s * elapsed_s
         values = []
         for wanted, sent, at, lower, upper in zip(
-            u, self._sent, q, body.lower, body.upper, strict=True
+            u, self._sent, q, bounds.lower, bounds.upper, strict=True
         ):
             value = max(-limits.max_command, min(limits.max_command, wanted))
             start = abs(sent) if value * sent > 0 else 0.0
@@ -241,6 +240,6 @@ class Guard:
             values.append(0.0 if outward else value)
         return tuple(values)
 
-    def _say(self, u: Numbers, trip: GuardTrip) -> GuardDecision:
+    def _conclude(self, u: Numbers, trip: GuardTrip) -> GuardDecision:
         self._sent = u
         return GuardDecision(self._state, u, trip, self._cause)

@@ -1,4 +1,4 @@
-"""What the guard allows, and what it knows of the machine. Pure data."""
+"""Limits of the guard, and the machine's bounds that it goes by. Pure data."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Numbers = tuple[float, ...]
 
 @spec
 class GuardLimits:
-    """What the guard allows.
+    """Limits of the guard.
 
     Attributes:
         max_command: Largest command, of full.
         max_rate_1_s: Largest growth of a command per second.
-        overrun: Command beyond full that counts as rounding; more is refused.
+        overrun: Command beyond full that counts as rounding; a larger one is refused.
         neutral: Deflection of the operator's own levers, of full, below which they count as
             released.
         stop_margin: Distance to the joint limits (rad or m) within which commands further outward
@@ -28,10 +28,9 @@ class GuardLimits:
         levers_s: Age of the remote's message from which it is stale.
         status_s: Age of the machine's status from which it is stale.
         request_s: Age of a command from which it is stale.
-        ignored_s: Time for which the gateway may give the valves to somebody else, or nobody, while
+        ignored_s: Time for which the gateway may give the valves to another sender, or none, while
             commands are sent.
-        gap_s: Time between two cycles from which time is said to have stood still (a stopped
-            process, a sleeping computer).
+        gap_s: Time between two cycles above which the process was stopped, or the computer asleep.
         jump_margin: Speed over the machine's fastest, beyond which a joint has jumped.
         jump_slack: Jump (rad or m) that noise alone may make.
         range_slack: Distance beyond the joint limits (rad or m) at which a position is still
@@ -86,7 +85,7 @@ class GuardLimits:
 
 @dataclass(frozen=True)
 class JointBounds:
-    """What the guard knows of the machine, each of length `J`.
+    """Bounds of the machine's joints, each of length `J`.
 
     Attributes:
         lower: Lower joint limits, rad or m.
@@ -107,7 +106,7 @@ def build_joint_bounds(
     max_speed: Sequence[float],
     exclusive: Sequence[bool],
 ) -> JointBounds:
-    """Returns the machine as the guard knows it, from arrays of length `J`."""
+    """Return the bounds of the joints, from arrays of length `J`."""
     return JointBounds(
         tuple(map(float, lower)),
         tuple(map(float, upper)),

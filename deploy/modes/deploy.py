@@ -1,45 +1,28 @@
-"""`brokk mode=deploy`: listens to a machine, advises its operator, records; commands valves only where that was asked for."""
+"""`brokk mode=deploy`: runs the loop on the machine's computer."""
 
 from __future__ import annotations
-
-from typing import Any, Protocol
 
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-
-
-class Deployment(Protocol):
-    """A spec in `conf/deploy`: the loop on the machine's computer."""
-
-    def run(self, machine: Machine, session: Session, companions: Any) -> None:
-        """Runs until its time is over or a person stops it."""
-        ...
-
-
-class Bench(Protocol):
-    """A spec in `conf/bench`: what stands in for machine and operator on a desk."""
-
-    def companions(self, machine: Machine, session: Session) -> Any:
-        """Returns the processes to run beside the loop."""
-        ...
+from deploy.runtime.supervisor import BenchSpec, DeploymentLoop
 
 
 @spec
 class DeployMode:
-    """Listens to a machine and shows the operator where to move the levers; `deploy=auto` sends the policy's commands itself."""
+    """Listen to a machine and show the operator lever positions; `deploy=auto` commands the valves."""
 
     session: Session
     machine: Machine
-    deploy: Deployment
-    bench: Bench | None
+    deploy: DeploymentLoop
+    bench: BenchSpec | None
 
     def run(self) -> None:
-        """Leaves `capture.mcap` and `frames.blf` (recorded), `timing.json` and `processes.json` in the run folder.
+        """Write `capture.mcap` and `frames.blf` (recorded), `timing.json` and `processes.json`.
 
         Raises:
             CheckpointError: the policy was made for another machine, or is damaged.
             LinkError: the bus or the policy process died.
         """
-        beside = self.bench.companions(self.machine, self.session) if self.bench else ()
-        self.deploy.run(self.machine, self.session, beside)
+        companions = self.bench.companions(self.machine, self.session) if self.bench else ()
+        self.deploy.run(self.machine, self.session, companions)

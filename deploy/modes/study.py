@@ -1,33 +1,17 @@
-"""`brokk mode=study`: does guidance help people? Plans the study, leads people through it, simulates and reports it, forgets."""
+"""`brokk mode=study`: plans, runs, simulates and reports a study of operators with and without advice."""
 
 from __future__ import annotations
-
-from typing import Protocol
 
 from brokk_rl.contracts.operator import Operator, TrialGround
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-
-
-class Steps(Protocol):
-    """What a study is made of; the room of the machine's computer has it."""
-
-    def run(
-        self,
-        machine: Machine,
-        session: Session,
-        ground: TrialGround,
-        guided: Operator,
-        unguided: Operator,
-    ) -> float | None:
-        """Does the step that was asked for; simulated operators work on `ground`, with advice shown and without."""
-        ...
+from deploy.study.study import Steps
 
 
 @spec
 class StudyMode:
-    """Studies whether guidance helps people: `study.do=plan`, `run`, `simulate` (operators are simulated), `report` or `erase`.
+    """Study of guidance: `study.do=plan`, `run`, `simulate` (simulated operators), `report`, `erase`.
 
     Attributes:
         session: Folder, seed, device.
@@ -45,6 +29,9 @@ class StudyMode:
     guided: Operator
     unguided: Operator
 
-    def run(self) -> float | None:
-        """Leaves `plan.{json,html}`, or `report.html` with pictures and tables, in the run folder; sittings into `study.folder`."""
-        return self.study.run(self.machine, self.session, self.ground, self.guided, self.unguided)
+    def run(self) -> None:
+        """Leave `plan.{json,html}`, or `report.html` with pictures and tables, in the run folder.
+
+        Sittings go into `study.folder`.
+        """
+        self.study.run(self.machine, self.session, self.ground, self.guided, self.unguided)

@@ -1,1 +1,1 @@
-"""The operator's page: a server of its own that shows the newest state of the loop in a browser and takes few wishes back."""
+"""The operator's page: a server of its own between the loop and browsers."""

@@ -1,4 +1,4 @@
-"""The clock of one page, as it shows in what the page says of each message: when it came, when it was drawn, when that was said."""
+"""The clock of one page, compared with this computer's by the page's answers to messages."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ import math
 from dataclasses import dataclass
 
 KEPT = 64
-"""Messages of which the sending time is remembered; a page has at most a few that it has not
-answered."""
+"""Messages of which the sending time is remembered. Chosen by hand: a page has at most four that it
+has not drawn."""
 
 
 @dataclass(frozen=True)
 class DrawAcknowledgement:
-    """What a page said of a message.
+    """Answer of a page to a message.
 
     Attributes:
         number: Of the message.
@@ -43,14 +43,17 @@ class PageClock:
         self._sent: dict[int, tuple[float, int | None]] = {}
         self._advice: int | None = None
 
-    def sent(self, number: int, advice: int | None, now_s: float) -> None:
-        """Notes that message `number` went out, with the advice of that number."""
+    def note_sent(self, number: int, advice: int | None, now_s: float) -> None:
+        """Note that message `number` went out, with the advice of that number."""
         self._sent[number] = (now_s, advice)
         if len(self._sent) > KEPT:
             del self._sent[next(iter(self._sent))]
 
-    def heard(self, text: str | bytes, now_s: float) -> DrawAcknowledgement | None:
-        """Returns what the page says in `text`: `[number, came_ms, drawn_ms, said_ms]` by its own clock; `None` for nonsense."""
+    def read_acknowledgement(self, text: str | bytes, now_s: float) -> DrawAcknowledgement | None:
+        """Return the page's answer in `text`, `None` where it holds none.
+
+        It is `[number, came_ms, drawn_ms, said_ms]`, by the page's own clock.
+        """
         try:
             number, came_ms, drawn_ms, said_ms = json.loads(text)
             came_s, drawn_s, said_s = (

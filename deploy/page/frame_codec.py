@@ -1,9 +1,10 @@
-"""A frame on its way to the page: depth in whole millimetres, coded by differences along each row and zstd, and colour as JPEG.
+"""Encoding of a frame for the page: depth in whole millimetres, and colour as JPEG.
 
-Small differences are small numbers (zigzag), and low and high bytes stand apart: 206 KiB for 640 x
-360 px, where plain differences take 262, 32-bit points and colours 3.2 MB, and Draco 702 KiB and a
-second. The page makes points of it on the graphics card. A message is the length of a JSON header,
-4 bytes little-endian, the header, the depth, and the JPEG, which also is the camera's picture.
+Depth is coded by differences along each row, then zstd. Small differences are small numbers (zigzag),
+and low and high bytes stand apart: 206 KiB for 640 x 360 px, where plain differences take 262, 32-bit
+points and colours 3.2 MB, and Draco 702 KiB and a second. The page makes points of it on the graphics
+card. A message is the length of a JSON header, 4 bytes little-endian, the header, the depth, and the
+JPEG, which also is the camera's picture.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from deploy.picture import encode_jpeg, shrink_picture
 
 LENGTH = struct.Struct("<I")
 M_PER_UNIT = 0.001
+"""Of the 16-bit depths; the page reads it from the header."""
 FAR = 65_535
 """Depths from here on, in units, are not known: 65 m is further than a stereo camera sees."""
 LEVEL = 1
@@ -27,11 +29,11 @@ LEVEL = 1
 
 
 def encode_frame(frame: Frame, width: int, quality: int) -> bytes:
-    """Returns the message of a frame, shrunk to `width` px where it is wider.
+    """Return the message of a frame, shrunk to `width` px where it is wider.
 
     Args:
         frame: Depth and colour of one size.
-        width: Of what is sent, px.
+        width: Of the message, px.
         quality: Of the JPEG, 1 to 100.
 
     Raises:
@@ -51,21 +53,26 @@ def encode_frame(frame: Frame, width: int, quality: int) -> bytes:
     matrix[:2] *= part  # the half pixel that the grid moves by is a millimetre at 4 m
     pose = np.eye(4) if frame.base_from_camera is None else frame.base_from_camera
     depth = zstandard.ZstdCompressor(level=LEVEL).compress(encode_depth_planes(depth_m).tobytes())
-    header = json.dumps(
-        {
-            "t_s": frame.t_s, "width": size[0], "height": size[1], "m_per_unit": M_PER_UNIT, "depth_bytes": len(depth),
-            "focal_px": [matrix[0, 0], matrix[1, 1]], "center_px": [matrix[0, 2], matrix[1, 2]],
-            "base_from_camera": pose.astype(float).ravel().tolist(), "placed": frame.base_from_camera is not None,
-        }
-    ).encode()  # fmt: skip
-    return b"".join((LENGTH.pack(len(header)), header, depth, encode_jpeg(color, quality)))
+    header = {
+        "t_s": frame.t_s,
+        "width": size[0],
+        "height": size[1],
+        "m_per_unit": M_PER_UNIT,
+        "depth_bytes": len(depth),
+        "focal_px": [matrix[0, 0], matrix[1, 1]],
+        "center_px": [matrix[0, 2], matrix[1, 2]],
+        "base_from_camera": pose.astype(float).ravel().tolist(),
+        "placed": frame.base_from_camera is not None,
+    }
+    text = json.dumps(header).encode()
+    return b"".join((LENGTH.pack(len(text)), text, depth, encode_jpeg(color, quality)))
 
 
 def encode_depth_planes(depth_m: np.ndarray) -> np.ndarray:
-    """Returns the low and the high bytes, `(2, h, w)`, of depths, `(h, w)` in m, as 16-bit millimetres (0: unknown).
+    """Return the low and high bytes, `(2, h, w)`, of depths, `(h, w)` in m.
 
-    Each stands as its difference to its left neighbour, modulo 2^16, from 0 outwards: 0, -1, 1, -2,
-    ….
+    Depths are 16-bit millimetres (0: unknown), each as its difference to its left neighbour modulo
+    2^16, counted from 0 outwards: 0, -1, 1, -2, ….
     """
     units = np.nan_to_num(depth_m / M_PER_UNIT, nan=0.0, posinf=0.0, neginf=0.0).round()
     units = np.where((units > 0) & (units < FAR), units, 0).astype("<u2")
@@ -76,12 +83,9 @@ def encode_depth_planes(depth_m: np.ndarray) -> np.ndarray:
 
 
 def decode_depth_m(data: bytes, width: int, height: int) -> np.ndarray:
-    """Returns the depths, `(h, w)` float32 in m and NaN where unknown, that `data` holds: as the page has them."""
-    low, high = (
-        np.frombuffer(zstandard.ZstdDecompressor().decompress(data), np.uint8)
-        .reshape(2, height, width)
-        .astype(np.uint16)
-    )
+    """Return the depths that `data` holds, `(h, w)` float32 in m, NaN where unknown."""
+    planes = np.frombuffer(zstandard.ZstdDecompressor().decompress(data), np.uint8)
+    low, high = planes.reshape(2, height, width).astype(np.uint16)
     outwards = low | high << 8
     units = ((outwards >> 1) ^ -(outwards & 1)).cumsum(1, dtype=np.uint16).astype(np.float32)
     return np.where(units > 0, units * np.float32(M_PER_UNIT), np.float32(np.nan))

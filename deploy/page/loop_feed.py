@@ -1,8 +1,8 @@
-"""The page beside the loop: a process of its own that reads the outlet and hands wishes to the supervisor.
+"""The page process: reads the state of the loop and passes requests on to the supervisor.
 
-The slots it reads are overwritten by their writers, who wait for nobody; what it writes are two
-pipes that count what they must drop. However slow a browser is, or if this process dies, the loop
-feels nothing of it.
+The slots that it reads are overwritten by their writers, who wait for nobody; it writes into two
+pipes that count their losses. However slow a browser is, or if this process dies, the loop feels
+nothing of it.
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.guidance import LeverGuidance, find_full_angles_rad
+from deploy.guidance import LeverGuidance, convert_to_positions, find_full_angles_rad
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
     OperatorRequest,
     PageState,
     RecordingStatus,
-    Safety,
     ShownAdvice,
     SourceAge,
     Vector,
 )
 from deploy.page.scene import locate_borehole, plan_approach
+from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
-from deploy.runtime import operator_state
 from deploy.runtime.bus_process import TEXT
+from deploy.runtime.operator_state import LoopSnapshot, PolicyAdvice
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -44,16 +44,17 @@ from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, rea
 log = logging.getLogger(__name__)
 
 ADVICE_PERIODS = 3
-"""Control periods without a new advice from which the last one is stale."""
+"""Control periods without a new advice from which the last one is stale. Chosen by hand: one late
+period must not grey the levers."""
 UP: Vector = (0.0, 0.0, 1.0)
-GIVEN = "+"
+UNNAMED = "+"
 """Name of a borehole that perception does not know: one from a file, from the configuration, or
 pointed at."""
 
 
 @dataclass(frozen=True)
 class PageProcessConfig:
-    """What a page process is to do.
+    """Settings of a page process.
 
     Attributes:
         page: How to serve.
@@ -76,112 +77,88 @@ class PageProcessConfig:
     camera_s: float | None = None
 
 
-def run(stop: Stop, beside: PageProcessConfig, memory: LoopMemory) -> None:
-    """Serves the page until it is asked to stop.
+def run(stop: Stop, config: PageProcessConfig, memory: LoopMemory) -> None:
+    """Serve the page until asked to stop.
 
     Raises:
         LinkError: the address is taken.
     """
-    link = beside.session.folder / LINK
+    link = config.session.folder / LINK
 
-    def tell(address: str) -> None:
-        log.info(
-            "%s; the link that may also have things done stands in %s",
-            address.partition("#")[0],
-            link,
-        )
+    def announce(address: str) -> None:
+        host = address.partition("#")[0]
+        log.info("%s; the link with the token, for requests, stands in %s", host, link)
 
-    beside.page.serve(stop, beside.machine, LoopFeed(beside, memory), beside.session, tell)
+    feed = LoopFeed(config, memory)
+    serve_page(config.page, stop, config.machine, feed, config.session, announce)
 
 
 class LoopFeed:
     """See `deploy.page.protocol.PageFeed`.
 
     Args:
-        beside: What is shown, and how.
+        config: Settings.
         memory: Where to read and write.
         clock: Monotonic time in s.
     """
 
     def __init__(
         self,
-        beside: PageProcessConfig,
+        config: PageProcessConfig,
         memory: LoopMemory,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._beside, self._memory, self._clock = beside, memory, clock
-        self._guiding, self._began_s = True, clock()
-        machine = beside.machine
-        self._full_rad = find_full_angles_rad(beside.guidance.levers or machine.levers)
+        self._config, self._memory, self._clock = config, memory, clock
+        self._guiding = True
+        machine = config.machine
+        self._full_rad = find_full_angles_rad(config.guidance.levers or machine.levers)
         self._exclusive = machine.is_exclusive
 
-    def news(self) -> int | None:
-        """See `Feed`."""
+    def read_advice_number(self) -> int | None:
+        """See `PageFeed`."""
         return self._memory.advice.peek("number")
 
-    def shown(self) -> PageState:
-        """See `Feed`."""
-        seen, beside = operator_state.read_snapshot(self._memory), self._beside
-        target, controls = self._memory.target.read(), self._memory.controls.read()
-        found = self._targets(target)
-        aimed = next((one for one in found if one.chosen), None)
-        machine, proposed, safety = seen.machine, seen.advice, seen.safety
-        recording = controls is not None and bool(controls["recording"])
-        ages_s = {
-            "positions": (machine and machine.q_age_s, beside.positions_s),
-            "levers": (machine and machine.levers_age_s, beside.levers_s),
-            "advice": (proposed and proposed.age_s, ADVICE_PERIODS * beside.machine.period_s),
-            "borehole": (
-                None if target is None else seen.t_s - float(target["t_s"]),
-                beside.borehole_s,
-            ),
-        }
-        if beside.camera_s is not None:
-            taken_s = self._frame_t_s()
-            ages_s["camera"] = (None if taken_s is None else seen.t_s - taken_s, beside.camera_s)
+    def read_state(self) -> PageState:
+        """See `PageFeed`."""
+        snapshot = self._memory.read_snapshot()
+        aim = self._memory.target.read()
+        targets = self._list_targets(aim)
+        chosen = next((one for one in targets if one.chosen), None)
+        state, advice = snapshot.state, snapshot.advice
+        path: tuple[Vector, ...] = ()
+        if chosen is not None and state is not None:
+            path = self._plan_path(state.q, chosen)
         return PageState(
-            t_s=seen.t_s,
-            alive=seen.alive,
+            t_s=snapshot.t_s,
+            alive=snapshot.alive,
             guiding=self._guiding,
-            advice=proposed and self._advice(proposed),
-            own=machine and machine.levers,
-            q=machine and machine.q,
-            streams=tuple(SourceAge(name, *age) for name, age in ages_s.items()),
-            safety=safety
-            and Safety(
-                safety.commands,
-                safety.state,
-                safety.trip,
-                safety.deadman,
-                safety.estop,
-                safety.bus_up,
-            ),
-            recording=RecordingStatus(
-                recording,
-                seen.t_s - float(controls["recording_t_s"])
-                if recording and controls is not None
-                else 0.0,
-                safety.log_dropped if safety else 0,
-            ),
-            targets=found,
-            path_in_base_m=() if aimed is None or machine is None else self._path(machine.q, aimed),
+            advice=None if advice is None else self._convert_advice(advice),
+            state=state,
+            commands=snapshot.commands,
+            streams=self._measure_ages(snapshot, aim),
+            recording=self._describe_recording(snapshot),
+            targets=targets,
+            path_in_base_m=path,
             block_in_base_m=None,
         )
 
-    def frame(self, after_s: float) -> Frame | None:
-        """See `Feed`."""
-        slot, taken_s = self._memory.frame, self._frame_t_s()
-        if slot is None or taken_s is None or taken_s <= after_s or (record := slot.read()) is None:
+    def read_frame(self, after_s: float) -> Frame | None:
+        """See `PageFeed`."""
+        slot, taken_s = self._memory.frame, self._read_frame_t_s()
+        if slot is None or taken_s is None or taken_s <= after_s:
             return None
-        return read_frame(record)
+        record = slot.read()
+        return None if record is None else read_frame(record)
 
-    def wish(self, wish: OperatorRequest) -> bool:
-        """See `Feed`."""
+    def submit(self, request: OperatorRequest) -> bool:
+        """See `PageFeed`."""
         facts: dict[str, Any] = {}
-        if wish.kind in ("target", "point"):
-            if any(one.chosen and one.name == wish.value for one in self.shown().targets):
+        if request.kind in ("target", "point"):
+            targets = self._list_targets(self._memory.target.read())
+            if any(one.chosen and one.name == request.value for one in targets):
                 return True
-            place = self._named(wish.value) if wish.kind == "target" else self._pointed(wish.value)
+            find = self._find_named if request.kind == "target" else self._find_pointed
+            place = find(request.value)
             if place is None:
                 return False
             facts = {
@@ -189,102 +166,123 @@ class LoopFeed:
                 "std_m": place.std_m,
                 "t_s": place.t_s,
             }
-        taken = self._memory.wishes.put(
-            json.dumps({"kind": wish.kind, "value": wish.value, **facts}).encode()
-        )
-        self._say("wish", {"kind": wish.kind, "value": wish.value, "taken": taken, **facts})
-        if wish.kind in ("start", "stop"):
-            self._guiding = wish.kind == "start"
-            return taken or wish.kind == "stop"
+        values = {"kind": request.kind, "value": request.value}
+        taken = self._memory.requests.put(json.dumps(values | facts).encode())
+        self._log_text("wish", values | {"taken": taken} | facts)
+        if request.kind in ("start", "stop"):
+            # guiding stops on the page even where the supervisor has no room for the request
+            self._guiding = request.kind == "start"
+            return taken or request.kind == "stop"
         return taken
 
-    def drawn(self, drawn: DrawReport) -> None:
-        """See `Feed`; goes into the recording as topic `drawn`."""
-        self._say(
-            "drawn",
-            {
-                "advice": drawn.number,
-                "at_s": drawn.t_s,
-                "round_trip_s": drawn.round_trip_s,
-                "page": drawn.page,
-            },
-        )
+    def report_drawn(self, report: DrawReport) -> None:
+        """See `PageFeed`; goes into the recording as topic `drawn`."""
+        values = {
+            "advice": report.number,
+            "at_s": report.t_s,
+            "round_trip_s": report.round_trip_s,
+            "page": report.page,
+        }
+        self._log_text("drawn", values)
 
-    def _say(self, topic: str, values: dict[str, Any]) -> None:
-        self._memory.page_log.put(
-            TEXT + json.dumps({"topic": topic, "t_s": self._clock(), **values}).encode()
-        )
+    def _log_text(self, topic: str, values: dict[str, Any]) -> None:
+        text = json.dumps({"topic": topic, "t_s": self._clock(), **values})
+        self._memory.page_log.put(TEXT + text.encode())
 
-    def _advice(self, proposed: operator_state.Advice) -> ShownAdvice:
-        levers = proposed.levers.parts(self._full_rad)
-        due_s = 0.0 if levers.button_right else None
-        if (
-            not levers.button_right
-            and proposed.valid
-            and np.asarray(proposed.command)[self._exclusive].any()
-        ):
-            # the policy wants it already; what is shown goes through neutral first, as fast as a
+    def _convert_advice(self, advice: PolicyAdvice) -> ShownAdvice:
+        button = advice.button_right
+        levers = convert_to_positions(advice.lever_rad, self._full_rad, button)
+        due_s = 0.0 if button else None
+        if not button and advice.valid and advice.u[self._exclusive].any():
+            # the policy wants it already; the shown levers go through neutral first, as fast as a
             # hand can
-            most_rad = max(map(abs, proposed.levers.angles_rad))
-            due_s = max(
-                self._beside.machine.period_s, most_rad / self._beside.guidance.max_rate_rad_s
-            )
-        return ShownAdvice(proposed.valid, proposed.reason, proposed.number, levers, due_s)
+            most_rad = float(np.abs(advice.lever_rad).max())
+            neutral_s = most_rad / self._config.guidance.max_rate_rad_s
+            due_s = max(self._config.machine.period_s, neutral_s)
+        return ShownAdvice(advice.valid, advice.reason.value, advice.number, levers, due_s)
 
-    def _frame_t_s(self) -> float | None:
+    def _measure_ages(self, snapshot: LoopSnapshot, aim: Any | None) -> tuple[SourceAge, ...]:
+        config, now_s = self._config, snapshot.t_s
+        state, advice = snapshot.state, snapshot.advice
+        advice_s = ADVICE_PERIODS * config.machine.period_s
+        sources: list[tuple[str, float | None, float]] = [
+            ("positions", None if state is None else state.q_t_s, config.positions_s),
+            ("levers", None if state is None else state.levers_t_s, config.levers_s),
+            ("advice", None if advice is None else advice.t_s, advice_s),
+            ("borehole", None if aim is None else float(aim["t_s"]), config.borehole_s),
+        ]
+        if config.camera_s is not None:
+            sources.append(("camera", self._read_frame_t_s(), config.camera_s))
+        ages = []
+        for name, t_s, limit_s in sources:
+            ages.append(SourceAge(name, None if t_s is None else now_s - t_s, limit_s))
+        return tuple(ages)
+
+    def _describe_recording(self, snapshot: LoopSnapshot) -> RecordingStatus:
+        controls = self._memory.controls.read()
+        on = controls is not None and controls.recording
+        seconds = snapshot.t_s - controls.recording_t_s if controls is not None and on else 0.0
+        dropped = snapshot.log_dropped if snapshot.state is not None else 0
+        return RecordingStatus(on, seconds, dropped)
+
+    def _read_frame_t_s(self) -> float | None:
         return self._memory.frame and self._memory.frame.peek("t_s")
 
-    def _targets(self, aim: Any | None) -> tuple[BoreholeChoice, ...]:
-        """Returns the boreholes that perception knows, and the one that the advice is for, whoever named it."""
+    def _list_targets(self, aim: Any | None) -> tuple[BoreholeChoice, ...]:
+        """Return the boreholes that perception knows, and the one that the advice is for."""
         holes = read_holes(self._memory.holes)
         chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
-        found = [
-            BoreholeChoice(
-                str(int(hole["name"])), _to_vector(hole["center_in_base_m"]), _to_vector(hole["axis_in_base"]),
-                float(hole["radius_m"]), float(hole["std_m"]), float(hole["score"]), hole is chosen,
+        found = []
+        for hole in holes:
+            choice = BoreholeChoice(
+                name=str(int(hole["name"])),
+                center_in_base_m=_to_vector(hole["center_in_base_m"]),
+                axis_in_base=_to_vector(hole["axis_in_base"]),
+                radius_m=float(hole["radius_m"]),
+                std_m=float(hole["std_m"]),
+                confidence=float(hole["score"]),
+                chosen=hole is chosen,
             )
-            for hole in holes
-        ]  # fmt: skip
+            found.append(choice)
         if aim is not None and chosen is None:
-            radius_m = self._beside.page.borehole_radius_m
-            found.append(
-                BoreholeChoice(
-                    GIVEN,
-                    _to_vector(aim["center_in_base_m"]),
-                    UP,
-                    radius_m,
-                    float(aim["std_m"]) or None,
-                    None,
-                    True,
-                )
+            choice = BoreholeChoice(
+                name=UNNAMED,
+                center_in_base_m=_to_vector(aim["center_in_base_m"]),
+                axis_in_base=UP,
+                radius_m=self._config.page.borehole_radius_m,
+                std_m=float(aim["std_m"]) or None,
+                confidence=None,
+                chosen=True,
             )
+            found.append(choice)
         return tuple(found)
 
-    def _named(self, name: str) -> TargetPosition | None:
-        """Returns where the borehole of that name is."""
-        one = next(
-            (hole for hole in read_holes(self._memory.holes) if str(int(hole["name"])) == name),
-            None,
-        )
-        return None if one is None else locate_hole(one)
+    def _find_named(self, name: str) -> TargetPosition | None:
+        """Return the position of the borehole of that name."""
+        for hole in read_holes(self._memory.holes):
+            if str(int(hole["name"])) == name:
+                return locate_hole(hole)
+        return None
 
-    def _pointed(self, value: str) -> TargetPosition | None:
-        """Returns the borehole that a person points at: one that perception knows, else what is measured there."""
-        frame = self.frame(-1.0)
+    def _find_pointed(self, value: str) -> TargetPosition | None:
+        """Return the borehole at a point of the picture: one of perception's, else as measured."""
+        frame = self.read_frame(-1.0)
+        if frame is None:
+            return None
         x, y = (float(part) for part in value.split(","))
-        found = frame and locate_borehole(frame, x, y, self._beside.page.borehole_radius_m)
-        if not frame or not found:
+        found = locate_borehole(frame, x, y, self._config.page.borehole_radius_m)
+        if found is None:
             return None
         known = find_nearest(read_holes(self._memory.holes), found[0])
         return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
 
-    def _path(self, q: tuple[float, ...], target: BoreholeChoice) -> tuple[Vector, ...]:
-        if not self._guiding or not self._beside.machine.has_bodies:
+    def _plan_path(self, q: np.ndarray, target: BoreholeChoice) -> tuple[Vector, ...]:
+        machine = self._config.machine
+        if not self._guiding or not machine.has_bodies:
             return ()
-        tip_m = compute_tool_kinematics(self._beside.machine, np.array(q)).tip_in_base_m
-        return plan_approach(
-            tip_m, np.array(target.center_in_base_m), np.array(target.axis_in_base)
-        )
+        tip_m = compute_tool_kinematics(machine, q).tip_in_base_m
+        center_m, axis = np.array(target.center_in_base_m), np.array(target.axis_in_base)
+        return plan_approach(tip_m, center_m, axis)
 
 
 def _to_vector(values: Any) -> Vector:

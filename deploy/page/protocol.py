@@ -1,33 +1,34 @@
-"""What the page and whoever feeds it promise each other: `Shown` goes out, `Wish` and `Drawn` come back.
+"""Protocol between the page and its feed: `PageState` goes out, requests and draw reports come back.
 
-Plain data in SI units, made anew at every moment and never queued: a reader takes the newest and
-misses the rest. Nothing is left out because it is old; its age says so, and the page greys it.
+Plain data in SI units, made anew at every moment and never queued: a reader takes the newest state
+and misses the rest. Old values are never left out: their age is part of the state, and the page
+greys them.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, Protocol, get_args
 
+from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from deploy.guidance import LeverPositions
+from deploy.runtime.operator_state import OperatorState, convert_to_plain
 
 Vector = tuple[float, float, float]
 RequestKind = Literal["start", "stop", "record", "target", "point"]
 REQUEST_KINDS: tuple[RequestKind, ...] = get_args(RequestKind)
-"""What can be wished for."""
 
 
 @dataclass(frozen=True)
 class ShownAdvice:
-    """Where the levers should go; drawn green.
+    """Advised lever positions; drawn green.
 
     Attributes:
         valid: Whether there is an advice; if not, `reason` says why.
-        reason: Why there is none, as `deploy.policy.policy_process.AdviceStatus` has it.
-        number: Counts up; draw times refer to it.
-        levers: Where to.
+        reason: Value of `deploy.runtime.operator_state.AdviceStatus`.
+        number: Counts up; draw reports refer to it.
+        levers: Positions to move to.
         button_due_s: Time until the right button is to be held, 0 where that is now; `None` where
             it is not coming.
     """
@@ -41,12 +42,12 @@ class ShownAdvice:
 
 @dataclass(frozen=True)
 class SourceAge:
-    """How fresh one source is.
+    """Age of one source of the state.
 
     Attributes:
         name: `positions`, `levers`, `advice`, `camera`, `borehole`; the page has a word for each in
             both languages.
-        age_s: Age of the newest; `None` where nothing has come yet.
+        age_s: Age of the newest value; `None` where nothing has come yet.
         limit_s: Age from which it is stale.
     """
 
@@ -61,34 +62,13 @@ class SourceAge:
 
 
 @dataclass(frozen=True)
-class Safety:
-    """What stands between the loop and the valves.
-
-    Attributes:
-        commands: Whether this loop can command valves at all.
-        state: The guard's: `SILENT`, `LATCHED`, `READY`, `ACTIVE`.
-        trip: What is wrong now, `nothing` where all is well.
-        deadman: Whether the dead-man is held.
-        estop: Whether an emergency stop is on.
-        bus_up: Whether the bus works.
-    """
-
-    commands: bool
-    state: str
-    trip: str
-    deadman: bool
-    estop: bool
-    bus_up: bool
-
-
-@dataclass(frozen=True)
 class RecordingStatus:
-    """Whether this is written down.
+    """State of the recording.
 
     Attributes:
-        on: Whether it is.
-        seconds: For how long.
-        dropped: Records that found no room: what is written has gaps.
+        on: Whether it is running.
+        seconds: Its length so far.
+        dropped: Records that found no room: the recording has gaps.
     """
 
     on: bool
@@ -101,12 +81,12 @@ class BoreholeChoice:
     """A borehole that can be chosen.
 
     Attributes:
-        name: For people and for `Wish.value`.
+        name: For people, and the value of a `target` request.
         center_in_base_m: Centre of its rim.
         axis_in_base: Unit vector out of it.
         radius_m: Its radius.
-        std_m: Standard deviation of the centre; `None` where nobody has said.
-        confidence: That it is one, in [0, 1]; `None` where nobody has said.
+        std_m: Standard deviation of the centre; `None` where unknown.
+        confidence: Probability that it is one, in [0, 1]; `None` where unknown.
         chosen: Whether the advice is for it.
     """
 
@@ -121,57 +101,91 @@ class BoreholeChoice:
 
 @dataclass(frozen=True)
 class PageState:
-    """All that the page shows at one moment.
+    """Everything that the page shows at one moment.
 
     Attributes:
-        t_s: Monotonic time it stands for.
-        alive: Whether the loop is at work.
+        t_s: Monotonic time of the state.
+        alive: Whether the loop is running.
         guiding: Whether advice is to be followed: a person has pressed start and not stop.
-        advice: Where to; `None` before the first.
-        own: The operator's own levers, drawn blue; `None` before the first.
-        q: Joint positions in machine order, rad or m; `None` before the first.
-        streams: How fresh each source is.
-        safety: What may be sent; `None` before the first.
-        recording: Whether it is written down.
+        advice: Advised levers; `None` before the first.
+        state: Of machine, operator and guard; `None` before the first.
+        commands: Whether this loop can command valves at all.
+        streams: Age of each source.
+        recording: State of the recording.
         targets: Boreholes to choose from.
-        path_in_base_m: Where the tool is going, from its tip; empty where nothing is planned.
-        block_in_base_m: Two opposite corners of a block to draw; `None` where the point cloud is
-            all that is known.
+        path_in_base_m: Way of the tool from its tip; empty where nothing is planned.
+        block_in_base_m: Two opposite corners of a block to draw; `None` where only the point cloud
+            is known.
     """
 
     t_s: float
     alive: bool
     guiding: bool
     advice: ShownAdvice | None
-    own: LeverPositions | None
-    q: tuple[float, ...] | None
+    state: OperatorState | None
+    commands: bool
     streams: tuple[SourceAge, ...]
-    safety: Safety | None
     recording: RecordingStatus
     targets: tuple[BoreholeChoice, ...]
     path_in_base_m: tuple[Vector, ...]
     block_in_base_m: tuple[Vector, Vector] | None
 
     @property
+    def own(self) -> LeverPositions | None:
+        """The operator's own levers, drawn blue."""
+        return None if self.state is None else self.state.levers
+
+    @property
+    def q(self) -> tuple[float, ...] | None:
+        """Joint positions in machine order, rad or m."""
+        return None if self.state is None else tuple(self.state.q.tolist())
+
+    @property
+    def safety(self) -> dict[str, Any] | None:
+        """Plain data on what stands between the loop and the valves."""
+        state = self.state
+        if state is None:
+            return None
+        return {
+            "commands": self.commands,
+            "state": state.guard.name,
+            "trip": state.trip.value,
+            "deadman": state.deadman,
+            "estop": state.estop,
+            "bus_up": state.bus_up,
+        }
+
+    @property
     def deadman(self) -> bool:
         """Whether the dead-man is known to be held now."""
-        fresh = not any(stream.stale for stream in self.streams if stream.name == "levers")
-        return (
-            self.alive
-            and fresh
-            and self.safety is not None
-            and self.safety.deadman
-            and not self.safety.estop
-        )
+        state = self.state
+        if state is None or not self.alive or state.estop:
+            return False
+        stale = any(one.stale for one in self.streams if one.name == "levers")
+        return state.deadman and not stale
 
-    def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data; what is not finite is null."""
-        return _to_plain(asdict(self))
+    def to_plain(self) -> dict[str, Any]:
+        """Return it as plain JSON data for the page; a number that is not finite is null."""
+        found = {
+            "t_s": self.t_s,
+            "alive": self.alive,
+            "guiding": self.guiding,
+            "advice": self.advice and asdict(self.advice),
+            "own": self.own and asdict(self.own),
+            "q": self.q,
+            "streams": [asdict(one) for one in self.streams],
+            "safety": self.safety,
+            "recording": asdict(self.recording),
+            "targets": [asdict(one) for one in self.targets],
+            "path_in_base_m": self.path_in_base_m,
+            "block_in_base_m": self.block_in_base_m,
+        }
+        return convert_to_plain(found)
 
 
 @dataclass(frozen=True)
 class OperatorRequest:
-    """What a person wants done, checked already: token, origin, dead-man.
+    """A request of the operator; token, origin and dead-man are checked already.
 
     Attributes:
         kind: `start` and `stop` guiding, `record` on or off, choose a `target`, `point` at a
@@ -186,14 +200,14 @@ class OperatorRequest:
 
 @dataclass(frozen=True)
 class DrawReport:
-    """When an advice became visible on a page; reaction times count from then.
+    """Time at which an advice became visible on a page; reaction times count from then.
 
     Attributes:
         number: Of the advice.
         t_s: Monotonic time of this computer at which its frame was drawn, by the browser's clock
             and half the round trip.
-        round_trip_s: Of the shortest memory with that page so far; half of it is how wrong `t_s`
-            may be.
+        round_trip_s: Of the shortest exchange with that page so far; `t_s` is wrong by at most half
+            of it.
         page: Counts the pages that were opened.
     """
 
@@ -204,32 +218,38 @@ class DrawReport:
 
 
 class PageFeed(Protocol):
-    """Where the page gets its state from, and where wishes go. No method waits: the loop must never feel the page."""
+    """Source of the page's state, and receiver of its requests.
 
-    def news(self) -> int | None:
-        """Returns the number of the newest advice, `None` where there is none: whether `shown` has a new one, at little cost."""
+    No method waits: the loop must never feel the page.
+    """
+
+    def read_advice_number(self) -> int | None:
+        """Return the number of the newest advice, `None` where there is none.
+
+        It tells at little cost whether `read_state` has a new one.
+        """
         ...
 
-    def shown(self) -> PageState:
-        """Returns the newest state."""
+    def read_state(self) -> PageState:
+        """Return the newest state."""
         ...
 
-    def frame(self, after_s: float) -> Frame | None:
-        """Returns the newest frame if it is later than `after_s`, else `None`."""
+    def read_frame(self, after_s: float) -> Frame | None:
+        """Return the newest frame if it is later than `after_s`, else `None`."""
         ...
 
-    def wish(self, wish: OperatorRequest) -> bool:
-        """Hands a wish on; says whether it was taken."""
+    def submit(self, request: OperatorRequest) -> bool:
+        """Pass a request on; return whether it was accepted."""
         ...
 
-    def drawn(self, drawn: DrawReport) -> None:
-        """Hands on when something became visible."""
+    def report_drawn(self, report: DrawReport) -> None:
+        """Pass on when an advice became visible."""
         ...
 
 
-def _to_plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _to_plain(one) for key, one in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_to_plain(one) for one in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+class FeedSpec(Protocol):
+    """A spec in `conf/feed`: source of the page's state."""
+
+    def build(self, machine: Machine) -> PageFeed:
+        """Return the feed."""
+        ...

@@ -1,25 +1,22 @@
-"""How the page is served and what it looks like: the spec in `conf/page`."""
+"""Settings of the operator's page: the spec in `conf/page`."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import os
-import secrets
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Literal
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.page.protocol import PageFeed
+from deploy.guidance import AXES
 from deploy.page.scene import describe_geometry
-from deploy.page.server import PageExtension, PageServer
 
 LINK = "page.url"
 """File in the run folder with the address that carries the token; only its owner may read it."""
+LAST_PORT = 65535
+LEAST_TOKEN = 16
+"""Characters of a token; 16 of base64 are 96 bits."""
+LEAST_PX, MOST_PX = 16, 4096
+"""Width of a picture that is sent. Chosen by hand: no camera is narrower or wider."""
 
 
 @spec
@@ -32,12 +29,12 @@ class PageSettings:
         port: TCP port; 0: any free one.
         names: Further names that browsers may use for this computer, where `host` is not this
             computer's alone.
-        token: What a browser must show to have something done; `null`: a new one each time, in the
+        token: Secret that a browser must show with a request; `null`: a new one each time, in the
             link that is shown at the start.
         language: `auto`: the browser's.
-        rate_hz: Fastest rate of levers and state; what changes is sent at once up to that.
+        rate_hz: Fastest rate of levers and state; changes are sent at once up to that.
         frames_hz: Fastest rate of camera pictures and point clouds.
-        picture_px: Width of what is sent of them.
+        picture_px: Width to which they are shrunk.
         jpeg_quality: Of the picture, 1 to 100.
         points: Points to draw at most; every second pixel, third, … is drawn until that is kept.
         tolerance: Distance of own lever and advice, of full, up to which they count as together.
@@ -62,73 +59,35 @@ class PageSettings:
     clients: int
 
     def check(self) -> None:
-        if not 0 <= self.port < 65536:
-            raise ConfigError(f"page.port: expected 0 to 65535, got {self.port}")
-        if self.token is not None and len(self.token) < 16:
+        if not 0 <= self.port <= LAST_PORT:
+            raise ConfigError(f"page.port: expected 0 to {LAST_PORT}, got {self.port}")
+        if self.token is not None and len(self.token) < LEAST_TOKEN:
             raise ConfigError(
-                "page.token: expected at least 16 characters, or null for a new one each time"
+                f"page.token: expected at least {LEAST_TOKEN} characters, or null for a new one each time"
             )
-        if (
-            min(self.rate_hz, self.frames_hz, self.stale_s, self.tolerance) <= 0
-            or min(self.points, self.clients) < 1
-        ):
+        smallest = min(self.rate_hz, self.frames_hz, self.stale_s, self.tolerance)
+        if smallest <= 0 or min(self.points, self.clients) < 1:
             raise ConfigError("page: rates, stale_s, tolerance, points and clients are more than 0")
-        if not 1 <= self.jpeg_quality <= 100 or not 16 <= self.picture_px <= 4096:
-            raise ConfigError("page: expected jpeg_quality in 1 … 100 and picture_px in 16 … 4096")
+        if not 1 <= self.jpeg_quality <= 100 or not LEAST_PX <= self.picture_px <= MOST_PX:
+            raise ConfigError(
+                f"page: expected jpeg_quality in 1 … 100 and picture_px in {LEAST_PX} … {MOST_PX}"
+            )
 
-    def serve(
-        self,
-        stop: Callable[[], bool],
-        machine: Machine,
-        feed: PageFeed,
-        session: Session,
-        tell: Callable[[str], None],
-        annex: PageExtension | None = None,
-    ) -> None:
-        """Serves the page, and what `annex` has, until `stop` says so or a person stops it.
-
-        It tells the link to open, and leaves it in `page.url`.
-
-        Raises:
-            LinkError: the address is taken or not this computer's.
-        """
-        token = self.token or secrets.token_urlsafe(24)
-
-        def ready(port: int) -> None:
-            address = build_link(self, port, token)
-            write_link(session, address)
-            tell(address)
-
-        with contextlib.suppress(KeyboardInterrupt):
-            asyncio.run(PageServer(self, machine, feed, token, annex).run(stop, ready))
-
-    def setup(self, machine: Machine) -> dict[str, Any]:
-        """Returns what a page needs to know once, as plain data; nothing secret."""
+    def describe_setup(self, machine: Machine) -> dict[str, Any]:
+        """Return the plain data that a page needs once; nothing secret."""
+        shared: dict[str, list[str]] = {f"{side}_{axis}": [] for side, axis in AXES}
+        for lever in machine.levers:
+            shared[f"{lever.side}_{lever.axis}"].append(lever.joint)
         return {
-            "machine": machine.name, "title": machine.title, "joints": list(machine.joint_names),
-            "exclusive": list(machine.exclusive), "geometry": describe_geometry(machine), "language": self.language,
-            "tolerance": self.tolerance, "stale_s": self.stale_s, "points": self.points,
+            "machine": machine.name,
+            "title": machine.title,
+            "joints": list(machine.joint_names),
+            "exclusive": list(machine.exclusive),
+            "geometry": describe_geometry(machine),
+            "language": self.language,
+            "tolerance": self.tolerance,
+            "stale_s": self.stale_s,
+            "points": self.points,
             "axes": {f"{lever.side}_{lever.axis}": lever.max_angle_rad for lever in machine.levers},
-            "shared": {
-                f"{side}_{axis}": [lever.joint for lever in machine.levers if (lever.side, lever.axis) == (side, axis)]
-                for side in ("left", "right") for axis in ("theta", "psi")
-            },
-        }  # fmt: skip
-
-
-def build_link(page: PageSettings, port: int, token: str) -> str:
-    """Returns the address to open; the token stands behind `#`, which browsers keep to themselves."""
-    host = (
-        "localhost"
-        if page.host in ("127.0.0.1", "::1")
-        else (page.names[0] if page.names else page.host)
-    )
-    return f"http://{host}:{port}/#token={token}"
-
-
-def write_link(session: Session, address: str) -> Path:
-    """Writes the link into the run folder for its owner alone; returns the file."""
-    path = session.folder / LINK
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
-        file.write(address + "\n")
-    return path
+            "shared": shared,
+        }

@@ -1,1 +1,1 @@
-"""The policy on the machine: its bundle, what it is told, and what it proposes to the operator's hands."""
+"""The policy process, and the policy bundles that it runs."""

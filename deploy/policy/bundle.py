@@ -1,8 +1,8 @@
-"""A policy bundle, as a trainer leaves it: `policy.onnx`, `policy.json` (the contract) and `golden.json` (what it must answer).
+"""A policy bundle of a trainer: `policy.onnx`, `policy.json` (the contract) and `golden.json`.
 
-The file holds everything from the observation vector to the masked command. It is refused when it
-was made for another machine, joint order, history or rate, when contract and file do not belong
-together, or when it answers otherwise here than where it was made.
+The network goes from the observation vector to the masked command; the golden answers are those that
+it gave where it was made. A bundle is refused when it was made for another machine, joint order,
+history or rate, when contract and network do not belong together, or when its answers differ here.
 """
 
 from __future__ import annotations
@@ -21,8 +21,12 @@ from deploy.bus.description import resolve_package_path
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
 SCHEMA = 1
+ERRORS_ONLY = 3
+"""Severity of onnxruntime's log."""
+ROUNDING = 1e-6
+"""Largest difference of two equal numbers of a contract."""
 TOLERANCE = 1e-3
-"""Largest difference of a command (of full) to the golden answers; that of the export."""
+"""Largest difference of a command (of full) to the golden answers; the same as at the export."""
 
 
 class PolicyBundle:
@@ -34,7 +38,7 @@ class PolicyBundle:
 
     Attributes:
         encoder: The training's own observation code, with the bundle's scaling.
-        contract: What `policy.json` says.
+        contract: Contents of `policy.json`.
 
     Raises:
         CheckpointError: see the module; the message says what differs.
@@ -78,16 +82,14 @@ class PolicyBundle:
         self._check_golden(_read(place / GOLDEN, folder), folder)
 
     def command(self, observation: np.ndarray) -> np.ndarray:
-        """Returns masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
+        """Return masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
         return np.asarray(
             self._session.run(None, {"observation": observation.astype(np.float32)})[0]
         )
 
     def _check_golden(self, golden: dict[str, Any], folder: str) -> None:
-        observations, expected = (
-            np.array(golden["observation"], np.float32),
-            np.array(golden["command"], np.float32),
-        )
+        observations = np.array(golden["observation"], np.float32)
+        expected = np.array(golden["command"], np.float32)
         for one, answer in zip(observations, expected, strict=True):
             found = self.command(one[None])[0]
             if found.shape != answer.shape or not np.abs(found - answer).max() <= TOLERANCE:
@@ -121,7 +123,7 @@ def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> 
 
 
 def _is_different(mine: Any, other: Any) -> bool:
-    """Says whether two pieces of plain data differ by more than rounding."""
+    """Return whether two pieces of plain data differ by more than rounding."""
     if isinstance(mine, dict):
         return (
             not isinstance(other, dict)
@@ -135,7 +137,7 @@ def _is_different(mine: Any, other: Any) -> bool:
             or any(map(_is_different, mine, other))
         )
     if isinstance(mine, (int, float)) and isinstance(other, (int, float)):
-        return abs(mine - other) > 1e-6
+        return abs(mine - other) > ROUNDING
     return mine != other
 
 
@@ -159,10 +161,9 @@ def _open_session(
     path: Path, folder: str, contract: dict[str, Any]
 ) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = (
-        1  # a pool of threads would only wake up late
-    )
-    options.log_severity_level = 3
+    # a pool of threads would only wake up late
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.log_severity_level = ERRORS_ONLY
     try:
         session = onnxruntime.InferenceSession(
             path.read_bytes(), options, providers=["CPUExecutionProvider"]

@@ -1,10 +1,7 @@
-"""What the policy remembers, sampled from a faster bus at its own rate.
+"""The policy process: in each control period from the state of the machine to an advice.
 
-One sample a control period: the newest measured position, and the mean of what the valves really
-got over the period, as a recording holds it. A single missed period is filled in halfway between
-its neighbours, and valves of which nothing was heard in
-one period still get what they got. After more, or after anything stale, the ring is filled anew
-before the policy speaks again: a history with a hole is one that it has never seen in training.
+It never touches the bus. Where commands are sent at all (`deploy=auto`) it also writes them into the
+request slot, which the guard reads; otherwise there is no such slot.
 """
 
 from __future__ import annotations
@@ -12,8 +9,6 @@ from __future__ import annotations
 import json
 import time
 from dataclasses import dataclass
-from enum import Enum
-from typing import Any
 
 import numpy as np
 
@@ -21,12 +16,27 @@ from brokk_rl.machine import Machine
 from deploy.guidance import LeverDisplay, LeverGuidance
 from deploy.policy.bundle import PolicyBundle
 from deploy.runtime.bus_process import TEXT
+from deploy.runtime.operator_state import (
+    AdviceStatus,
+    OperatorState,
+    PolicyAdvice,
+    RequestedCommand,
+)
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
 
+ROUNDING = 1e-6
+"""By which a command in float32 may exceed full and still count as full."""
+
 
 class PolicyHistory:
-    """The last `H` samples, oldest first.
+    """The last `H` samples of the state, oldest first, sampled from a faster bus at the policy's rate.
+
+    One sample a control period: the newest measured position, and the mean feedback of the valves
+    over the period, as in a recording. A single missed period is interpolated; valves of which
+    nothing was heard in one period keep their last feedback. After a longer gap, or after stale
+    values, the history is filled anew before the policy gives advice again: it has never seen a
+    history with a hole in training.
 
     Args:
         machine: Gives `H` and `J`.
@@ -34,8 +44,8 @@ class PolicyHistory:
     Attributes:
         q: Positions, `(H, J)`.
         u: Commands in force in the period that ended with each position, `(H, J)`.
-        proposed: What was proposed, `(H, J)`.
-        filled: Samples since it was last emptied.
+        proposed: Commands that the policy proposed, `(H, J)`.
+        filled: Samples since the history was last emptied.
     """
 
     def __init__(self, machine: Machine) -> None:
@@ -50,60 +60,40 @@ class PolicyHistory:
         return self.filled >= len(self.q)
 
     def empty(self) -> None:
-        """Forgets all samples."""
+        """Drop all samples."""
         self.filled, self._flow_number, self._silent = 0, -1, 0
 
-    def sample(self, state: Any, missed: int) -> None:
-        """Takes a sample of a fresh record of `STATE`; `missed` periods went by without one."""
-        number, before = int(state["flow_number"]), self._flow_number
-        u = (
-            (state["flow_sum"] - self._flow_sum) / (number - before)
-            if 0 <= before < number
-            else np.array(state["flow"])
-        )
+    def sample(self, state: OperatorState, missed: int) -> None:
+        """Take a sample of a fresh state; `missed` periods went by without one."""
+        number, before = state.flow_number, self._flow_number
+        u = np.array(state.flow)
+        if 0 <= before < number:
+            u = (state.flow_sum - self._flow_sum) / (number - before)
         self._silent = self._silent + 1 if number == before else 0
         if self._silent > 1:  # the valves' messages have stopped
             self.filled = 0
-        self._flow_sum, self._flow_number = np.array(state["flow_sum"]), number
+        self._flow_sum, self._flow_number = np.array(state.flow_sum), number
         if missed > 1:
             self.filled = 0
         if missed == 1 and self.filled:
-            self._push((self.q[-1] + state["q"]) / 2, u)
-        self._push(np.array(state["q"]), u)
+            self._push((self.q[-1] + state.q) / 2, u)
+        self._push(np.array(state.q), u)
 
     def propose(self, u: np.ndarray) -> None:
-        """Notes what was proposed."""
+        """Append the commands that were proposed."""
         self.proposed = np.concatenate([self.proposed[1:], u[None]])
 
     def _push(self, q: np.ndarray, u: np.ndarray) -> None:
         if not self.filled:
             self.proposed = np.zeros_like(self.proposed)
-        self.q, self.u = (
-            np.concatenate([self.q[1:], q[None]]),
-            np.concatenate([self.u[1:], u[None]]),
-        )
+        self.q = np.concatenate([self.q[1:], q[None]])
+        self.u = np.concatenate([self.u[1:], u[None]])
         self.filled += 1
-
-
-class AdviceStatus(Enum):
-    """Why there is an advice, or none; the order is that of `reason` in the record."""
-
-    VALID = "valid"
-    NO_STATE = "nothing from the bus"
-    STALE = "positions are stale"
-    IMPLAUSIBLE = "positions are not plausible"
-    WARMING_UP = "history is filling"
-    NO_TARGET = "no borehole is known"
-    TARGET_OLD = "the borehole was found too long ago"
-    REJECTED = "the policy's answer makes no sense"
-
-
-REASONS = tuple(AdviceStatus)
 
 
 @dataclass(frozen=True)
 class PolicyProcessConfig:
-    """What a policy process is to do.
+    """Settings of a policy process.
 
     Attributes:
         machine: The machine.
@@ -122,95 +112,97 @@ class PolicyProcessConfig:
     pitch_rad: float | None
 
 
-def run(stop: Stop, counsel: PolicyProcessConfig, memory: LoopMemory) -> None:
-    """Runs until it is asked to stop.
+def run(stop: Stop, config: PolicyProcessConfig, memory: LoopMemory) -> None:
+    """Run until asked to stop.
 
     Raises:
         CheckpointError: the bundle cannot be used.
     """
-    adviser = PolicyAdviser(counsel, PolicyBundle(counsel.folder, counsel.machine), memory)
-    pace = CycleTimer(counsel.machine.period_s)
+    adviser = PolicyAdviser(config, PolicyBundle(config.folder, config.machine), memory)
+    timer = CycleTimer(config.machine.period_s)
     while not stop():
-        pace.wait()
-        adviser.cycle(pace.begin(), time.monotonic())
-    memory.reports.put(json.dumps({"process": "policy"} | pace.report()).encode())
+        timer.wait()
+        adviser.run_cycle(timer.begin(), time.monotonic())
+    report = {"process": "policy"} | timer.report()
+    memory.reports.put(json.dumps(report).encode())
 
 
 class PolicyAdviser:
     """See the module.
 
     Args:
-        counsel: What to do.
+        config: Settings.
         bundle: The policy.
         memory: Where to read and write.
     """
 
     def __init__(
-        self, counsel: PolicyProcessConfig, bundle: PolicyBundle, memory: LoopMemory
+        self, config: PolicyProcessConfig, bundle: PolicyBundle, memory: LoopMemory
     ) -> None:
-        self._counsel, self._bundle, self._memory = counsel, bundle, memory
-        self._machine = counsel.machine
-        self._ring = PolicyHistory(counsel.machine)
-        self._display = LeverDisplay(counsel.guidance, counsel.machine)
+        self._config, self._bundle, self._memory = config, bundle, memory
+        self._machine = config.machine
+        self._history = PolicyHistory(config.machine)
+        self._display = LeverDisplay(config.guidance, config.machine)
         self._number = 0
-        self._exclusive = counsel.machine.is_exclusive
-        size = bundle.encoder.size
-        bundle.command(np.zeros((1, size)))  # the first call is slow
+        self._exclusive = config.machine.is_exclusive
+        bundle.command(np.zeros((1, bundle.encoder.size)))  # the first call is slow
 
-    def cycle(self, missed: int, now_s: float) -> AdviceStatus:
-        """Runs one control period; `missed` ones went by before it."""
+    def run_cycle(self, missed: int, now_s: float) -> AdviceStatus:
+        """Run one control period; `missed` ones went by before it."""
         state, target = self._memory.state.read(), self._memory.target.read()
-        reason = self._sample(state, missed, now_s)
+        status = self._sample(state, missed, now_s)
         u, infer_s = np.zeros(self._machine.num_joints), 0.0
         target_m = np.zeros(3) if target is None else np.array(target["center_in_base_m"])
-        if reason is AdviceStatus.VALID:
+        if status is AdviceStatus.VALID:
             if target is None:
-                reason = AdviceStatus.NO_TARGET
-            elif now_s - float(target["t_s"]) > self._counsel.target_s:
-                reason = AdviceStatus.TARGET_OLD
-        if reason is AdviceStatus.VALID:
+                status = AdviceStatus.NO_TARGET
+            elif now_s - float(target["t_s"]) > self._config.target_s:
+                status = AdviceStatus.TARGET_OLD
+        if status is AdviceStatus.VALID:
             begun = time.perf_counter()
             answer = self._infer(target_m)
             infer_s = time.perf_counter() - begun
             if answer is None:
-                reason = AdviceStatus.REJECTED
+                status = AdviceStatus.REJECTED
             else:
                 u = answer
-        self._ring.propose(u)
-        self._publish(reason, u, target_m, infer_s, now_s)
-        return reason
+        self._history.propose(u)
+        self._publish(status, u, target_m, infer_s, now_s)
+        return status
 
-    def _sample(self, state: np.ndarray | None, missed: int, now_s: float) -> AdviceStatus:
+    def _sample(self, state: OperatorState | None, missed: int, now_s: float) -> AdviceStatus:
         if state is None:
             return AdviceStatus.NO_STATE
-        if (
-            now_s - float(state["q_t_s"]) > self._counsel.stale_s
-            or now_s - float(state["t_s"]) > self._counsel.stale_s
-        ):
-            self._ring.empty()
+        stale_s = self._config.stale_s
+        if now_s - state.q_t_s > stale_s or now_s - state.t_s > stale_s:
+            self._history.empty()
             return AdviceStatus.STALE
-        if not state["q_plausible"] or not state["trusted"]:
-            self._ring.empty()
+        if not state.q_plausible or not state.trusted:
+            self._history.empty()
             return AdviceStatus.IMPLAUSIBLE
-        self._ring.sample(state, missed)
-        return AdviceStatus.VALID if self._ring.full else AdviceStatus.WARMING_UP
+        self._history.sample(state, missed)
+        return AdviceStatus.VALID if self._history.full else AdviceStatus.WARMING_UP
 
     def _infer(self, target_m: np.ndarray) -> np.ndarray | None:
-        """Returns masked commands, `(J,)`, or `None` where they make no sense."""
-        encoder, ring = self._bundle.encoder, self._ring
-        pitch = np.array([self._counsel.pitch_rad or 0.0]) if encoder.has_pitch else None
-        proposed = ring.proposed[None] if encoder.has_proposals else None
-        observation = encoder.encode(target_m[None], ring.q[None], ring.u[None], pitch, proposed)
+        """Return masked commands, `(J,)`; `None` where the policy's answer is not usable."""
+        encoder, history = self._bundle.encoder, self._history
+        pitch = np.array([self._config.pitch_rad or 0.0]) if encoder.has_pitch else None
+        proposed = history.proposed[None] if encoder.has_proposals else None
+        q, u = history.q[None], history.u[None]
+        observation = encoder.encode(target_m[None], q, u, pitch, proposed)
         if not np.isfinite(observation).all():
             return None
         u = self._bundle.command(observation)[0].astype(float)
         moved = u != 0
+        # the bundle masks its commands; an exclusive joint beside others means that it is damaged
         together = moved[self._exclusive].any() and moved.sum() > 1
-        return None if not np.isfinite(u).all() or np.abs(u).max() > 1.0 + 1e-6 or together else u
+        if not np.isfinite(u).all() or np.abs(u).max() > 1.0 + ROUNDING or together:
+            return None
+        return u
 
     def _publish(
         self,
-        reason: AdviceStatus,
+        status: AdviceStatus,
         u: np.ndarray,
         target_m: np.ndarray,
         infer_s: float,
@@ -218,26 +210,27 @@ class PolicyAdviser:
     ) -> None:
         self._number += 1
         shown = self._display.show(u, self._machine.period_s)
-        record = self._memory.advice.new()
-        record["t_s"], record["number"], record["reason"] = (
-            now_s,
-            self._number,
-            REASONS.index(reason),
+        advice = PolicyAdvice(
+            t_s=now_s,
+            number=self._number,
+            reason=status,
+            u=u,
+            lever_rad=shown.angles_rad,
+            button_right=shown.button_right,
+            target_in_base_m=target_m,
+            infer_s=infer_s,
         )
-        record["u"], record["lever_rad"], record["button_right"] = (
-            u,
-            shown.angles_rad,
-            shown.button_right,
-        )
-        record["target_in_base_m"], record["infer_s"] = target_m, infer_s
-        self._memory.advice.write(record)
-        if self._memory.request is not None and reason is AdviceStatus.VALID:
-            request = self._memory.request.new()
-            request["t_s"], request["u"] = now_s, u
-            self._memory.request.write(request)
+        self._memory.advice.write(advice)
+        if self._memory.request is not None and status is AdviceStatus.VALID:
+            self._memory.request.write(RequestedCommand(now_s, u))
         text = {
-            "topic": "advice", "t_s": now_s, "reason": reason.value, "u": u.round(5).tolist(),
-            "lever_rad": np.round(shown.angles_rad, 5).tolist(), "button_right": shown.button_right,
-            "target_in_base_m": target_m.round(4).tolist(), "infer_s": round(infer_s, 6),
-        }  # fmt: skip
+            "topic": "advice",
+            "t_s": now_s,
+            "reason": status.value,
+            "u": u.round(5).tolist(),
+            "lever_rad": np.round(shown.angles_rad, 5).tolist(),
+            "button_right": shown.button_right,
+            "target_in_base_m": target_m.round(4).tolist(),
+            "infer_s": round(infer_s, 6),
+        }
         self._memory.policy_log.put(TEXT + json.dumps(text).encode())

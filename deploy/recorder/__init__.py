@@ -1,1 +1,1 @@
-"""The log: decoded signals and decisions as MCAP, raw frames as BLF, and what is made of them later."""
+"""Recording: decoded signals and decisions as MCAP, raw frames as BLF, and their conversion."""

@@ -1,9 +1,9 @@
-"""The log process: writes what bus and policy hand over, and puts it safely on the disk twice a second.
+"""The log process: writes messages and decisions, and flushes them to the disk twice a second.
 
 MCAP holds every decoded message as a JSON topic of its name, `advice`, `guard`, `fault`, `bus`,
-`holes`, and pictures of the camera as topic `camera` (`foxglove.CompressedImage`); BLF holds the
-frames as they were, for any tool that reads it. Times are monotonic ones plus one constant, so that
-a step of the wall clock shows nowhere.
+`holes`, and pictures of the camera as topic `camera` (`foxglove.CompressedImage`). BLF holds the raw
+frames, for any tool that reads it. Times are monotonic ones plus one constant, so that a step of the
+wall clock shows nowhere.
 """
 
 from __future__ import annotations
@@ -37,10 +37,16 @@ from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
 log = logging.getLogger(__name__)
 
 POLL_S = 0.05
+"""Between looks into the pipes, which hold minutes. Chosen by hand."""
 FLUSH_S = 0.5
-"""What even a power failure costs at most."""
+"""Time between two flushes: the longest piece that a power failure costs. Chosen by hand."""
 MCAP, BLF = "capture.mcap", "frames.blf"
-PICTURES, JPEG_QUALITY = "camera", 80
+PICTURES = "camera"
+"""Topic of the pictures."""
+JPEG_QUALITY = 80
+"""Chosen by hand: no loss that a person sees."""
+EARLY = 0.9
+"""Part of the time between pictures from which one is due: a camera's period is not exact."""
 TIME = {
     "type": "object",
     "title": "time",
@@ -54,10 +60,10 @@ FACTS = "brokk"
 
 @dataclass(frozen=True)
 class CaptureConfig:
-    """What a log process is to do.
+    """Settings of a log process.
 
     Attributes:
-        folder: Where to.
+        folder: For the files.
         dbc: The bus description.
         machine: The machine.
         facts: Further metadata: `source`, `policy`, …
@@ -72,11 +78,13 @@ class CaptureConfig:
 
 
 def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
-    """Runs until it is asked to stop, then takes what is there: those who write may go on without being recorded.
+    """Run until asked to stop, then empty the pipes once more.
+
+    Those who write may go on unrecorded.
 
     Raises:
-        StorageError: the disk is full, or the files cannot be written; what was written stays
-            readable.
+        StorageError: the disk is full, or the files cannot be written; the files stay readable up
+            to there.
     """
     try:
         with CaptureWriter(capture) as target:
@@ -97,10 +105,10 @@ def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
 
 
 class DurableBlfWriter(BLFWriter):
-    """A BLF whose header is true at any time, not only after it was closed."""
+    """A BLF writer whose header is right after every flush, not only after closing."""
 
     def flush(self) -> None:
-        """Writes what is buffered, and the header."""
+        """Write the buffer and the header."""
         self._flush()
         end = self.file.tell()
         self.file.seek(0)
@@ -110,7 +118,7 @@ class DurableBlfWriter(BLFWriter):
 
 
 class CaptureWriter:
-    """Both files; a context manager."""
+    """Writes both files; a context manager."""
 
     def __init__(self, capture: CaptureConfig) -> None:
         self._description = BusDescription(capture.dbc, capture.machine)
@@ -139,7 +147,7 @@ class CaptureWriter:
         self._flushed_s = time.monotonic()
 
     def add(self, data: bytes) -> None:
-        """Takes one record of a pipe."""
+        """Take one record of a pipe."""
         if data[:1] == FRAMES:
             for t_s, frame_id, sent, payload in _iterate_frames(data[1:]):
                 self._add_frame(t_s, frame_id, sent, payload)
@@ -148,7 +156,7 @@ class CaptureWriter:
             self._write(values.pop("topic"), values.pop("t_s"), values)
 
     def add_picture(self, t_s: float, data: bytes) -> None:
-        """Takes a JPEG of the camera."""
+        """Take a JPEG of the camera."""
         wall_ns = int(t_s * 1e9) + self._offset_ns
         stamp = {"sec": wall_ns // 10**9, "nsec": wall_ns % 10**9}
         values = {
@@ -160,14 +168,14 @@ class CaptureWriter:
         self._write(PICTURES, t_s, values)
 
     def flush_when_due(self) -> None:
-        """Puts everything on the disk, twice a second."""
+        """Flush where it is time to."""
         now_s = time.monotonic()
         if now_s - self._flushed_s >= FLUSH_S:
             self._flushed_s = now_s
             self.flush()
 
     def flush(self) -> None:
-        """Puts everything on the disk."""
+        """Write everything to the disk."""
         self._mcap.flush()
         self._blf.flush()
         os.fsync(self._mcap_file.fileno())
@@ -177,7 +185,7 @@ class CaptureWriter:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        with contextlib.suppress(OSError):  # the disk may be full; what was flushed is whole
+        with contextlib.suppress(OSError):  # the disk may be full; flushed data is whole
             self._mcap.finish()
             self._blf.stop()
         with contextlib.suppress(OSError):
@@ -242,7 +250,7 @@ class CaptureWriter:
 
 
 class PictureSampler:
-    """Takes pictures for the record, no more often than asked for.
+    """Takes pictures for the recording, at a limited rate.
 
     Args:
         slot: The camera's newest frame; `None`: there is none.
@@ -254,14 +262,11 @@ class PictureSampler:
         self._apart_s, self._taken, self._next_s = 1.0 / rate_hz if rate_hz else 0.0, 0, 0.0
 
     def due(self) -> tuple[float, bytes] | None:
-        """Returns when the newest picture was taken, and it as a JPEG, if it is its turn."""
+        """Return time and JPEG of the newest picture, if one is due."""
         now_s = time.monotonic()
         if self._slot is None or now_s < self._next_s or self._slot.number == self._taken:
             return None
-        self._taken, self._next_s = (
-            self._slot.number,
-            now_s + 0.9 * self._apart_s,
-        )  # a camera's period is not exact
+        self._taken, self._next_s = self._slot.number, now_s + EARLY * self._apart_s
         record = self._slot.read()
         if record is None:
             return None

@@ -1,4 +1,4 @@
-"""Reading captures back, whole or cut off: what a crash left is read up to where it ends."""
+"""Reads and recovers captures, whole or cut off by a crash; those up to where they end."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ log = logging.getLogger(__name__)
 
 
 class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
-    """The messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
+    """Messages of a topic, in order: (t_s, values); `t_s` is monotonic time.
 
-    Topics of numbers alone, which is what a bus says, are kept by column: an hour of them takes a
-    tenth of the memory of as many dictionaries.
+    Topics of numbers alone, as those of the bus, are kept by column: an hour of them takes a tenth
+    of the memory of as many dictionaries.
     """
 
     def __init__(self) -> None:
@@ -41,7 +41,7 @@ class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
         self._rows: list[dict[str, Any]] = []
 
     def add(self, t_s: float, values: dict[str, Any]) -> None:
-        """Appends a message."""
+        """Append a message."""
         numbers = all(isinstance(value, (int, float)) for value in values.values())
         if not self._t_s and numbers:
             self._columns = {name: array("d") for name in values}
@@ -55,11 +55,11 @@ class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
 
     @property
     def names(self) -> frozenset[str]:
-        """What the first of them says."""
+        """Names of the values in the first message."""
         return frozenset(self._columns or self._rows[0])
 
     def series(self, name: str) -> np.ndarray:
-        """Returns a signal's values, `(T,)`, or those of `t_s`."""
+        """Return a signal's values, `(T,)`, or those of `t_s`."""
         if name == "t_s":
             return np.array(self._t_s)
         return np.array(
@@ -85,7 +85,7 @@ class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
 
 @dataclass
 class CaptureContents:
-    """What a capture holds.
+    """Contents of a capture.
 
     Attributes:
         facts: Metadata of the run: `machine`, `fingerprint`, `dbc`, `started_ns`, …
@@ -101,7 +101,7 @@ class CaptureContents:
 
 
 def read_capture(path: Path) -> CaptureContents:
-    """Reads the capture at `path` as far as it goes.
+    """Read the capture at `path` as far as it goes.
 
     Raises:
         RecordingError: there is none, or not even its beginning can be read.
@@ -126,7 +126,7 @@ def read_capture(path: Path) -> CaptureContents:
 
 
 def is_whole(path: Path) -> bool:
-    """Says whether the capture at `path` was closed properly."""
+    """Return whether the capture at `path` was closed properly."""
     try:
         with path.open("rb") as file:
             return make_reader(file).get_summary() is not None
@@ -137,7 +137,7 @@ def is_whole(path: Path) -> bool:
 
 
 def recover_mcap(path: Path, out: Path) -> int:
-    """Writes what can be read of a cut-off capture as a whole one; returns the number of messages.
+    """Write the readable part of a cut-off capture as a whole one; return its number of messages.
 
     Raises:
         RecordingError: nothing can be read.
@@ -180,7 +180,7 @@ def recover_mcap(path: Path, out: Path) -> int:
 
 
 def recover_blf(path: Path, out: Path) -> int:
-    """Writes what can be read of a cut-off BLF as a whole one; returns the number of frames."""
+    """Write the readable part of a cut-off BLF as a whole one; return its number of frames."""
     part, count = out.with_name(f".{out.name}.part"), 0
     writer = DurableBlfWriter(part)
     try:
@@ -194,7 +194,7 @@ def recover_blf(path: Path, out: Path) -> int:
 
 
 def iterate_blf_frames(path: Path) -> Iterator[can.Message]:
-    """Yields the frames of a BLF as far as it can be read."""
+    """Yield the frames of a BLF as far as it can be read."""
     try:
         with BLFReader(path) as reader:
             yield from reader
@@ -205,7 +205,7 @@ def iterate_blf_frames(path: Path) -> Iterator[can.Message]:
 
 
 def _iterate_records(path: Path) -> Iterator[Any]:
-    """Yields records as far as the file can be read; chunks are opened."""
+    """Yield records as far as the file can be read; chunks are opened."""
     try:
         file = path.open("rb")
     except OSError as error:
@@ -236,14 +236,13 @@ class CaptureRecovery:
     """Captures to recover.
 
     Attributes:
-        input: Glob, or list of globs, of `.mcap` and `.blf` files; what else lies beside them is
-            left out.
+        input: Glob, or list of globs, of `.mcap` and `.blf` files; others are left out.
     """
 
     input: str | tuple[str, ...]
 
     def run(self, folder: Path) -> None:
-        """Writes each recovered file under its own name, led by that of its folder, into `folder`.
+        """Write each recovered file under its own name, led by that of its folder, into `folder`.
 
         Raises:
             RecordingError: nothing matches, two would have the same name, or nothing can be read of

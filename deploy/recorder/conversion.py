@@ -1,8 +1,9 @@
-"""From a capture to the recordings that identification and diagnosis read (`mode=convert import=capture`).
+"""Converts a capture into recordings for identification and diagnosis.
 
-At the machine's control rate: positions linearly between messages; commands as what the valves
-really got, averaged over the period that begins at each row, as the policy's history has it. A gap
-in either splits the log; pieces of one log share the metadata `run`.
+`mode=convert import=capture`, at the machine's control rate. Positions are interpolated linearly
+between messages. Commands are the valves' feedback, averaged over the period that begins at each row,
+as in the policy's history. A gap in either splits the log; pieces of one log share the metadata
+`run`.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class CaptureLogReader:
     shortest_s: float
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Returns the pieces of the capture at `path`; see `actuators.modes.convert.LogReader`.
+        """Return the pieces of the capture at `path`; see `actuators.modes.convert.LogReader`.
 
         Raises:
             RecordingError: it cannot be read, was made on another machine, or holds no piece that
@@ -57,7 +58,7 @@ class CaptureLogReader:
         return found
 
     def between(self, path: Path, machine: Machine, begin_s: float, end_s: float) -> Recording:
-        """Returns what was captured between two times of the monotonic clock.
+        """Return the recording between two times of the monotonic clock.
 
         Raises:
             RecordingError: it cannot be read, was made on another machine, or has a gap there.
@@ -75,7 +76,7 @@ class CaptureLogReader:
     def _series(
         self, path: Path, machine: Machine
     ) -> tuple[CaptureContents, dict[str, Series], dict[str, Series]]:
-        """Returns the capture, positions, and what the valves got, by joint."""
+        """Return the capture, and positions and valve feedback by joint."""
         contents = capture_reader.read_capture(path)
         try:
             machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
@@ -122,7 +123,7 @@ class CaptureLogReader:
 
 
 def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
-    """Returns times and values of a signal, whatever message it came in; of what was called invalid nothing."""
+    """Return times and values of a signal, whatever message it came in, without invalid ones."""
     joint, positions = signal.partition("_")[2], signal.startswith("Position_")
     for messages in contents.messages.values():
         if signal in messages.names:
@@ -139,13 +140,13 @@ def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
 
 
 def _split_at_gaps(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
-    """Returns the times, begin and end, in which none of the series has a gap."""
+    """Return the spans, begin and end, in which none of the series has a gap."""
     begin_s, end_s = max(t_s[0] for t_s, _ in series), min(t_s[-1] for t_s, _ in series)
-    gaps = sorted(
-        (float(t_s[row]), float(t_s[row + 1]))
-        for t_s, _ in series
-        for row in np.flatnonzero(np.diff(t_s) > longest_gap_s)
-    )
+    gaps: list[tuple[float, float]] = []
+    for t_s, _ in series:
+        rows = np.flatnonzero(np.diff(t_s) > longest_gap_s)
+        gaps += zip(t_s[rows].tolist(), t_s[rows + 1].tolist(), strict=True)
+    gaps.sort()
     pieces, at_s = [], begin_s
     for before_s, after_s in gaps:
         if before_s > at_s:
@@ -157,7 +158,7 @@ def _split_at_gaps(series: Sequence[Series], longest_gap_s: float) -> list[tuple
 
 
 def _average_over_periods(series: Series, grid_s: np.ndarray, period_s: float) -> np.ndarray:
-    """Returns the means over the period after each grid time of a value that holds until its next message."""
+    """Return the mean of a value, held from message to message, over the period after each time."""
     t_s, values = series
     # integral of the staircase up to any time, linear in between
     integral = np.concatenate([[0.0], np.cumsum(values[:-1] * np.diff(t_s))])
@@ -167,7 +168,7 @@ def _average_over_periods(series: Series, grid_s: np.ndarray, period_s: float) -
 def _build_extra_columns(
     contents: CaptureContents, grid_s: np.ndarray, machine: Machine
 ) -> dict[str, np.ndarray]:
-    """Returns the oil's temperature and the advice shown, where there was any; NaN where not."""
+    """Return the oil's temperature and the advice shown, where there was any; NaN where not."""
     extra: dict[str, np.ndarray] = {}
     for messages in contents.messages.values():
         if "OilTemperature" in messages.names:
@@ -175,12 +176,10 @@ def _build_extra_columns(
             extra["oil_c"] = oil_c.astype(np.float32)
     if advised := contents.messages.get("advice"):
         t_s = advised.series("t_s")
-        shown = np.array(
-            [
-                values["u"] if values["reason"] == "valid" else [np.nan] * machine.num_joints
-                for _, values in advised
-            ]
-        )
+        shown = np.full((len(t_s), machine.num_joints), np.nan)
+        for row, (_, values) in enumerate(advised):
+            if values["reason"] == "valid":
+                shown[row] = values["u"]
         rows = np.searchsorted(t_s, grid_s, side="right") - 1
         for j, name in enumerate(machine.joint_names):
             extra[f"advice_{name}"] = np.where(rows >= 0, shown[rows.clip(0), j], np.nan).astype(

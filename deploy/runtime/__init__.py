@@ -1,1 +1,1 @@
-"""The loop: separate processes for bus, policy and log, what they share, and how they keep time."""
+"""The processes of the loop, the memory that they share, and their timing."""

@@ -1,181 +1,260 @@
-"""The outlet: all that is shown to an operator, taken from the slots at one moment; terminal and page read only this.
+"""The state of machine, operator and guard, and the policy's advice, as all processes read them.
 
-Plain data in SI units. What is stale is said to be so by its age, never left out; whoever draws it
-greys it by that.
+The bus process writes `OperatorState` into shared memory, the policy process `PolicyAdvice`; page,
+terminal and study read them from there. Times are monotonic, in s, and 0 where nothing has come
+yet. Old values are never left out: their age says how old they are.
 """
 
 from __future__ import annotations
 
 import math
-import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
-from deploy.guard.guard import GuardState
-from deploy.guidance import LeverAngles, LeverPositions
-from deploy.policy.policy_process import REASONS, AdviceStatus
-from deploy.runtime.bus_process import TRIPS
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.guard.guard import GuardState, GuardTrip
+from deploy.guidance import LeverPositions
+from deploy.runtime.shared_memory import Axes, Joints, Point
+
+ALIVE_S = 0.2
+"""Age of the newest state up to which the bus process counts as running: 20 of its cycles. Chosen by
+hand; longer hides a dead process, shorter takes a busy computer for one."""
 
 
-@dataclass(frozen=True)
-class Advice:
-    """What the policy proposes.
+class AdviceStatus(Enum):
+    """Why there is an advice, or none; stored by position."""
 
-    Attributes:
-        valid: Whether there is an advice; if not, `levers` are on their way to neutral and `reason`
-            says why.
-        reason: Why there is none.
-        age_s: Since it was made.
-        number: Counts up; tells a new advice from an old one.
-        levers: To show in green.
-        command: The commands behind it, in machine order.
-        target_in_base_m: The borehole it is for.
-    """
-
-    valid: bool
-    reason: str
-    age_s: float
-    number: int
-    levers: LeverAngles
-    command: tuple[float, ...]
-    target_in_base_m: tuple[float, ...]
+    VALID = "valid"
+    NO_STATE = "nothing from the bus"
+    STALE = "positions are stale"
+    IMPLAUSIBLE = "positions are not plausible"
+    WARMING_UP = "history is filling"
+    NO_TARGET = "no borehole is known"
+    TARGET_OLD = "the borehole was found too long ago"
+    REJECTED = "the policy's answer makes no sense"
 
 
-@dataclass(frozen=True)
-class Machine:
-    """What is known of the machine.
+@dataclass(frozen=True, eq=False)
+class OperatorState:
+    """Machine, operator and guard in one cycle of the bus process.
 
     Attributes:
+        t_s: Time of the cycle.
         q: Joint positions, rad or m, in machine order.
-        q_age_s: Their age.
-        flow: What the valves get, of full.
-        levers: The operator's own levers, of full; to show in blue.
-        levers_age_s: Their age.
-        exclusive_selected: Whether q2 is selected at the machine.
-        oil_c: Temperature of the oil, degrees Celsius; `None` where not measured.
-    """
-
-    q: tuple[float, ...]
-    q_age_s: float
-    flow: tuple[float, ...]
-    levers: LeverPositions
-    levers_age_s: float
-    exclusive_selected: bool
-    oil_c: float | None
-
-
-@dataclass(frozen=True)
-class Safety:
-    """Whether anything is sent, and what stands against it.
-
-    Attributes:
-        commands: Whether this loop can command valves at all; in the default mode it cannot.
-        state: The guard's: `SILENT`, `LATCHED`, `READY`, `ACTIVE`.
-        trip: What is wrong now, `nothing` where all is well.
-        cause: What latched it.
+        q_t_s: When the oldest of them was measured.
+        q_plausible: Whether the sensors call them valid and they did not jump.
+        flow: Valve feedback received last, of full.
+        flow_sum: Sum over all feedback so far, for means over any period.
+        flow_number: Number of feedback messages so far.
+        flow_t_s: When the last of them came.
+        lever: The operator's own levers, of full, in the order of `deploy.guidance.AXES`.
+        button_right: Whether the operator holds the right button.
         deadman: Whether the dead-man is held.
+        remote_on: Whether the remote is switched on.
+        levers_t_s: When the remote's last message came.
         estop: Whether an emergency stop is on.
+        exclusive_selected: Whether the exclusive joint is selected at the machine.
+        status_t_s: When the machine's last status came.
+        oil_c: Temperature of the oil, degrees Celsius; NaN where not measured.
+        held_up_s: Delay of the last positions beyond the shortest seen, by the gateway's clock.
         bus_up: Whether the bus works.
         trusted: Whether messages arrive uncorrupted.
-        plausible: Whether positions make sense.
-        sent: Commands sent, in machine order.
+        alone: Whether nobody else sends valve commands.
+        guard: State of the guard.
+        trip: Why the guard lets nothing pass now.
+        cause: Why it latched last.
+        sent: Commands sent, of full.
+        frames: Messages received so far.
         refused: Messages refused so far.
         lost: Messages lost so far.
-        log_dropped: Records that the log could not take: what is recorded has gaps.
+        missed: Cycles missed so far.
     """
 
-    commands: bool
-    state: str
-    trip: str
-    cause: str
+    t_s: float
+    q: Joints
+    q_t_s: float
+    q_plausible: bool
+    flow: Joints
+    flow_sum: Joints
+    flow_number: int
+    flow_t_s: float
+    lever: Axes
+    button_right: bool
     deadman: bool
+    remote_on: bool
+    levers_t_s: float
     estop: bool
+    exclusive_selected: bool
+    status_t_s: float
+    oil_c: float
+    held_up_s: float
     bus_up: bool
     trusted: bool
-    plausible: bool
-    sent: tuple[float, ...]
+    alone: bool
+    guard: GuardState
+    trip: GuardTrip
+    cause: GuardTrip
+    sent: Joints
+    frames: int
     refused: int
     lost: int
-    log_dropped: int
+    missed: int
+
+    @property
+    def levers(self) -> LeverPositions:
+        """The operator's own levers."""
+        return LeverPositions(*self.lever.tolist(), button_right=self.button_right)
+
+
+@dataclass(frozen=True, eq=False)
+class PolicyAdvice:
+    """Result of one control period of the policy process.
+
+    Attributes:
+        t_s: When it was made.
+        number: Counts up; tells a new advice from an old one.
+        reason: `VALID`, or why there is no advice; then the levers are on their way to neutral.
+        u: Advised commands in machine order; zero unless valid.
+        lever_rad: Lever angles to show, in the order of `deploy.guidance.AXES`.
+        button_right: Whether the right button is to be held.
+        target_in_base_m: Centre of the rim of the borehole that it is for.
+        infer_s: Time that the network took.
+    """
+
+    t_s: float
+    number: int
+    reason: AdviceStatus
+    u: Joints
+    lever_rad: Axes
+    button_right: bool
+    target_in_base_m: Point
+    infer_s: float
+
+    @property
+    def valid(self) -> bool:
+        """Whether there is an advice."""
+        return self.reason is AdviceStatus.VALID
+
+
+@dataclass(frozen=True, eq=False)
+class RequestedCommand:
+    """Commands that the policy, or whoever commands the valves on purpose, wants sent.
+
+    Attributes:
+        t_s: When they were made.
+        u: Commands in machine order, of full.
+    """
+
+    t_s: float
+    u: Joints
+
+
+@dataclass(frozen=True)
+class OperatorControls:
+    """Switches on the operator's side.
+
+    Attributes:
+        t_s: When they were written.
+        armed: Whether commands are to be sent at all.
+        recording: Whether a recording is running.
+        recording_t_s: When it began.
+    """
+
+    t_s: float
+    armed: bool
+    recording: bool
+    recording_t_s: float
 
 
 @dataclass(frozen=True)
 class LoopSnapshot:
-    """Everything at one moment; `None` where nothing has come yet.
+    """State and advice at one moment; `None` where nothing has come yet.
 
     Attributes:
-        t_s: Monotonic time.
-        alive: Whether the bus process is at work.
-        advice: What to do.
-        machine: How the machine stands.
-        safety: What may be sent.
+        t_s: Time of the snapshot.
+        state: Newest state.
+        advice: Newest advice.
+        commands: Whether this loop can command valves at all; in the default mode it cannot.
+        log_dropped: Records that the log could not take: the recording has gaps.
     """
 
     t_s: float
-    alive: bool
-    advice: Advice | None
-    machine: Machine | None
-    safety: Safety | None
+    state: OperatorState | None
+    advice: PolicyAdvice | None
+    commands: bool
+    log_dropped: int
 
-    def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data; what is not finite is null."""
-        return _to_plain(asdict(self))
+    @property
+    def alive(self) -> bool:
+        """Whether the bus process is running."""
+        return self.state is not None and self.t_s - self.state.t_s < ALIVE_S
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return it as plain JSON data; a number that is not finite is null."""
+        found = {
+            "t_s": self.t_s,
+            "alive": self.alive,
+            "advice": self._describe_advice(),
+            "machine": self._describe_machine(),
+            "safety": self._describe_safety(),
+        }
+        return convert_to_plain(found)
+
+    def _describe_advice(self) -> dict[str, Any] | None:
+        advice = self.advice
+        if advice is None:
+            return None
+        names = ("left_theta_rad", "left_psi_rad", "right_theta_rad", "right_psi_rad")
+        angles = dict(zip(names, advice.lever_rad.tolist(), strict=True))
+        return {
+            "valid": advice.valid,
+            "reason": advice.reason.value,
+            "age_s": self.t_s - advice.t_s,
+            "number": advice.number,
+            "levers": angles | {"button_right": advice.button_right},
+            "command": advice.u.tolist(),
+            "target_in_base_m": advice.target_in_base_m.tolist(),
+        }
+
+    def _describe_machine(self) -> dict[str, Any] | None:
+        state = self.state
+        if state is None:
+            return None
+        return {
+            "q": state.q.tolist(),
+            "q_age_s": self.t_s - state.q_t_s,
+            "flow": state.flow.tolist(),
+            "levers": dict(vars(state.levers)),
+            "levers_age_s": self.t_s - state.levers_t_s,
+            "exclusive_selected": state.exclusive_selected,
+            "oil_c": state.oil_c,
+        }
+
+    def _describe_safety(self) -> dict[str, Any] | None:
+        state = self.state
+        if state is None:
+            return None
+        return {
+            "commands": self.commands,
+            "state": state.guard.name,
+            "trip": state.trip.value,
+            "cause": state.cause.value,
+            "deadman": state.deadman,
+            "estop": state.estop,
+            "bus_up": state.bus_up,
+            "trusted": state.trusted,
+            "plausible": state.q_plausible,
+            "sent": state.sent.tolist(),
+            "refused": state.refused,
+            "lost": state.lost,
+            "log_dropped": self.log_dropped,
+        }
 
 
-ALIVE_S = 0.2
-"""Age of the newest state up to which the bus process is said to be at work."""
-
-
-def read_snapshot(memory: LoopMemory) -> LoopSnapshot:
-    """Returns what is to be shown now."""
-    state, advice, now_s = memory.state.read(), memory.advice.read(), time.monotonic()
-    proposed = None
-    if advice is not None:
-        proposed = Advice(
-            valid=REASONS[int(advice["reason"])] is AdviceStatus.VALID,
-            reason=REASONS[int(advice["reason"])].value,
-            age_s=now_s - float(advice["t_s"]),
-            number=int(advice["number"]),
-            levers=LeverAngles(
-                *advice["lever_rad"].tolist(), button_right=bool(advice["button_right"])
-            ),
-            command=tuple(advice["u"].tolist()),
-            target_in_base_m=tuple(advice["target_in_base_m"].tolist()),
-        )
-    if state is None:
-        return LoopSnapshot(now_s, False, proposed, None, None)
-    oil_c = float(state["oil_c"])
-    machine = Machine(
-        q=tuple(state["q"].tolist()),
-        q_age_s=now_s - float(state["q_t_s"]),
-        flow=tuple(state["flow"].tolist()),
-        levers=LeverPositions(*state["lever"].tolist(), button_right=bool(state["button_right"])),
-        levers_age_s=now_s - float(state["levers_t_s"]),
-        exclusive_selected=bool(state["exclusive_selected"]),
-        oil_c=oil_c if math.isfinite(oil_c) else None,
-    )
-    safety = Safety(
-        commands=memory.request is not None,
-        state=GuardState(int(state["guard"])).name,
-        trip=TRIPS[int(state["trip"])].value,
-        cause=TRIPS[int(state["cause"])].value,
-        deadman=bool(state["deadman"]),
-        estop=bool(state["estop"]),
-        bus_up=bool(state["bus_up"]),
-        trusted=bool(state["trusted"]),
-        plausible=bool(state["q_plausible"]),
-        sent=tuple(state["sent"].tolist()),
-        refused=int(state["refused"]),
-        lost=int(state["lost"]),
-        log_dropped=sum(pipe.dropped for pipe in memory.logs),
-    )
-    return LoopSnapshot(now_s, now_s - float(state["t_s"]) < ALIVE_S, proposed, machine, safety)
-
-
-def _to_plain(value: Any) -> Any:
+def convert_to_plain(value: Any) -> Any:
+    """Return nested data with lists for tuples, and `None` for numbers that are not finite."""
     if isinstance(value, dict):
-        return {key: _to_plain(one) for key, one in value.items()}
+        return {key: convert_to_plain(one) for key, one in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_to_plain(one) for one in value]
+        return [convert_to_plain(one) for one in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

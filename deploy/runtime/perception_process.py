@@ -104,7 +104,7 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
                 tracked = tracker.update(_find_holes(finder, frame), now_s)
                 write_holes(memory.holes, tracked, now_s)
                 text = {"topic": "holes", "t_s": now_s, "holes": _list_holes(tracked)}
-                memory.sight_log.put(TEXT + json.dumps(text).encode())
+                memory.vision_log.put(TEXT + json.dumps(text).encode())
             time.sleep(max(0.0, began_s + 1.0 / camera.rate_hz - time.monotonic()))
 
 

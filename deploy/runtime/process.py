@@ -1,6 +1,8 @@
-"""Child processes: fresh interpreters that import only what they need, die with their parent, and are asked before they are killed.
+"""Child processes and their cycles.
 
-Not `multiprocessing`: its forks inherit threads and its spawned children import the command again.
+A child is a fresh interpreter that imports only its own needs and dies with its parent; it is asked
+to stop before it is killed. Not `multiprocessing`: its forks inherit threads, and its spawned
+children import the command again.
 """
 
 from __future__ import annotations
@@ -23,23 +25,26 @@ from typing import Any, Literal
 
 log = logging.getLogger(__name__)
 
-_ENTRY = "from deploy.runtime.process import enter_child; enter_child()"
-_DIE_WITH_PARENT, _LOCK_ALL, _ON_USE = (
-    1,
-    3,
-    4,
-)  # PR_SET_PDEATHSIG; MCL_CURRENT | MCL_FUTURE; MCL_ONFAULT
-_LARGE_BYTES = 1 << 30
+ENTRY = "from deploy.runtime.process import enter_child; enter_child()"
+DIE_WITH_PARENT = 1
+"""PR_SET_PDEATHSIG (linux/prctl.h)."""
+LOCK_ALL, LOCK_ON_USE = 3, 4
+"""MCL_CURRENT | MCL_FUTURE, and MCL_ONFAULT (sys/mman.h)."""
+LARGE_BYTES = 1 << 30
+"""Mapped memory from which pages are locked only as they are used. Chosen by hand: a simulator maps
+gigabytes that it never touches."""
+MOST_LATENESS = 100_000
+"""Cycles whose lateness a timer keeps: 17 minutes of the bus process, 800 kB."""
 
 Stop = Callable[[], bool]
-"""Says whether the process is asked to end."""
+"""Returns whether the process is asked to end."""
 
 
 class ChildProcess:
     """A running child process.
 
     Args:
-        name: What it does, for people.
+        name: Of the process, for people.
         target: `module:function`, called as `function(stop, *arguments)`.
         arguments: Anything that can be pickled.
         files: File descriptors that it inherits.
@@ -55,7 +60,7 @@ class ChildProcess:
         realtime: int | None = None,
     ) -> None:
         self.name = name
-        command = [sys.executable, "-P", "-c", _ENTRY]
+        command = [sys.executable, "-P", "-c", ENTRY]
         # libraries of numbers would start threads that compete with the loop
         environment = os.environ | {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
         self._process = subprocess.Popen(
@@ -78,12 +83,12 @@ class ChildProcess:
         return self._process.poll()
 
     def ask_to_stop(self) -> None:
-        """Asks it to end."""
+        """Ask it to end."""
         with contextlib.suppress(ProcessLookupError):
             self._process.terminate()
 
     def end(self, patience_s: float) -> int:
-        """Asks it to end, waits, then kills it; returns its exit code."""
+        """Ask it to end, waits, then kills it; returns its exit code."""
         self.ask_to_stop()
         try:
             return self._process.wait(patience_s)
@@ -94,21 +99,19 @@ class ChildProcess:
 
 
 def enter_child() -> None:
-    """Where a child process begins."""
+    """Run a child process, from its first line to its last."""
     name, target, realtime, parent = pickle.load(sys.stdin.buffer)
-    _load_libc().prctl(_DIE_WITH_PARENT, signal.SIGTERM)
+    _load_libc().prctl(DIE_WITH_PARENT, signal.SIGTERM)
     if os.getppid() != parent:
         raise SystemExit(1)  # it died meanwhile
-    signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # Ctrl-C reaches the whole group; the parent asks each in turn
+    # Ctrl-C reaches the whole group; the parent asks each process in turn
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     asked: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
     logging.basicConfig(level=logging.INFO, format=f"{name}: %(message)s")
     if realtime is not None:
-        ask_for_priority(
-            realtime
-        )  # before all that has to be imported: a busy computer would take ten times as long
+        # before the imports: on a busy computer they would take ten times as long
+        ask_for_priority(realtime)
     arguments, function = pickle.load(sys.stdin.buffer), resolve_name(target)
     if realtime is not None:
         keep_in_memory()
@@ -116,21 +119,22 @@ def enter_child() -> None:
 
 
 def keep_in_memory() -> None:
-    """Asks for locked memory, and keeps the garbage collector out.
+    """Lock the memory of this process, and stop the garbage collector.
 
-    What maps gigabytes, as the simulator of a twin does, keeps what it has used; all else is there
-    from the beginning.
+    A process that maps gigabytes, such as the simulator of a twin, locks pages as it uses them; any
+    other locks all of them at once.
     """
     gc.collect()
     gc.freeze()
     gc.disable()
     mapped_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * os.sysconf("SC_PAGE_SIZE")
-    if _load_libc().mlockall(_LOCK_ALL | (_ON_USE if mapped_bytes > _LARGE_BYTES else 0)) != 0:
+    flags = LOCK_ALL | (LOCK_ON_USE if mapped_bytes > LARGE_BYTES else 0)
+    if _load_libc().mlockall(flags) != 0:
         log.debug("memory is not locked: %s", os.strerror(ctypes.get_errno()))
 
 
 def ask_for_priority(priority: int) -> Literal["fifo", "ordinary"]:
-    """Asks for SCHED_FIFO; returns what was granted."""
+    """Ask for SCHED_FIFO; return the scheduling that was granted."""
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except OSError as error:
@@ -144,7 +148,7 @@ def ask_for_priority(priority: int) -> Literal["fifo", "ordinary"]:
 
 
 def give_up_priority() -> None:
-    """Gives the priority of `ask_for_priority` back."""
+    """Return to the ordinary scheduling."""
     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
@@ -158,44 +162,46 @@ class CycleTimer:
         next_s: The coming deadline.
         cycles: Deadlines kept.
         missed: Deadlines that were over before their turn.
-        lateness_s: How late cycles began, the last `KEPT` of them, in a ring.
+        lateness_s: Lateness of the last `MOST_LATENESS` cycles, in a ring.
     """
-
-    KEPT = 100_000
 
     def __init__(self, period_s: float) -> None:
         self.period_s, self.next_s = period_s, time.monotonic() + period_s
         self.cycles, self.missed = 0, 0
-        self.lateness_s = array(
-            "d", bytes(8 * self.KEPT)
-        )  # all at once: memory that grows for an hour looks like a leak
+        # allocated at once: memory that grows for an hour looks like a leak
+        self.lateness_s = array("d", bytes(8 * MOST_LATENESS))
 
     def begin(self) -> int:
-        """Marks that the cycle of `next_s` begins now, and moves on; returns the number of deadlines missed before it."""
+        """Begin the cycle of `next_s` and move on; return the number of deadlines missed before."""
         now_s = time.monotonic()
         skipped = int((now_s - self.next_s) // self.period_s) if now_s > self.next_s else 0
         late_s = now_s - self.next_s - skipped * self.period_s
-        self.lateness_s[self.cycles % self.KEPT] = now_s - self.next_s
+        self.lateness_s[self.cycles % MOST_LATENESS] = now_s - self.next_s
         self.cycles += 1
         self.missed += skipped
         self.next_s = now_s - late_s + self.period_s
         return skipped
 
     def wait(self) -> None:
-        """Sleeps until the coming deadline."""
+        """Sleep until the coming deadline."""
         time.sleep(max(0.0, self.next_s - time.monotonic()))
 
     def report(self) -> dict[str, float]:
-        """Returns cycles, missed deadlines and lateness as plain data."""
+        """Return cycles, missed deadlines and lateness as plain data."""
         ordered = sorted(self.lateness_s[: self.cycles]) or [0.0]
 
-        def quantile(part: float) -> float:
+        def find_quantile(part: float) -> float:
             return ordered[min(len(ordered) - 1, int(part * len(ordered)))]
 
         return {
-            "period_s": self.period_s, "cycles": self.cycles, "missed": self.missed, "late_p50_s": quantile(0.5),
-            "late_p99_s": quantile(0.99), "late_p999_s": quantile(0.999), "late_max_s": ordered[-1],
-        }  # fmt: skip
+            "period_s": self.period_s,
+            "cycles": self.cycles,
+            "missed": self.missed,
+            "late_p50_s": find_quantile(0.5),
+            "late_p99_s": find_quantile(0.99),
+            "late_p999_s": find_quantile(0.999),
+            "late_max_s": ordered[-1],
+        }
 
 
 def _load_libc() -> ctypes.CDLL:

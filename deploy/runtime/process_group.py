@@ -1,4 +1,4 @@
-"""What listens to a machine and lets a policy run along: a bus and a policy process, and the processes beside them."""
+"""The processes of a run, and the settings of those that every run has: bus and policy."""
 
 from __future__ import annotations
 
@@ -23,12 +23,16 @@ from deploy.runtime.target import TargetSpec
 log = logging.getLogger(__name__)
 
 PATIENCE_S = 3.0
+"""Time that a process gets to end before it is killed. Chosen by hand."""
 BUS_PRIORITY, POLICY_PRIORITY = 55, 50
+"""Of SCHED_FIFO, 1 to 99. Chosen by hand: the bus before the policy, and both before twin (45) and
+commander (40)."""
 OPTIONAL = {"page": "nothing is shown any more", "camera": "nothing new is seen any more"}
-"""Processes without which the loop goes on, and what is lost with them."""
-ENDED = {"policy": 0, "bus": 1, "log": 3}
-"""In which order they are asked to: the policy before the bus, so that it can say goodbye, and the
-log when all has been said."""
+"""Processes without which the loop goes on, and the loss that the alarm names."""
+END_ORDER = {"policy": 0, "bus": 1, "log": 3}
+"""Order in which processes are asked to end; 2 for others. The bus ends after the policy, so that it
+can send zero, and the log last, when all has been written."""
+OTHERS_END = 2
 
 
 @dataclass
@@ -36,7 +40,7 @@ class ProcessGroup:
     """The processes of a run.
 
     Attributes:
-        memory: What they share.
+        memory: Shared by all of them.
         realtime: Whether those that ask for real-time priority get it.
     """
 
@@ -52,43 +56,37 @@ class ProcessGroup:
     def start(
         self, name: str, target: str, arguments: tuple[Any, ...], priority: int | None = None
     ) -> None:
-        """Starts `target` (`module:function`), called as `function(stop, *arguments, memory)`."""
+        """Start `target` (`module:function`), called as `function(stop, *arguments, memory)`."""
         realtime = priority if self.realtime else None
-        self._running.append(
-            ChildProcess(name, target, (*arguments, self.memory), self.memory.files, realtime)
-        )
+        arguments = (*arguments, self.memory)
+        self._running.append(ChildProcess(name, target, arguments, self.memory.files, realtime))
 
     def check(self) -> None:
-        """Says once which of the optional ones have ended.
+        """Report once each optional process that has ended.
 
         Raises:
-            LinkError: another one has died.
+            LinkError: another process has died.
         """
         for child in list(self._running):
             if child.code is None:
                 continue
             self._running.remove(child)
-            if child.name in OPTIONAL:
-                log.error(
-                    "ALARM: the %s has ended (exit code %s); %s",
-                    child.name,
-                    child.code,
-                    OPTIONAL[child.name],
-                )
-            else:
+            if child.name not in OPTIONAL:
                 raise LinkError(
-                    f"the {child.name} process has died (exit code {child.code}); what it said stands above"
+                    f"the {child.name} process has died (exit code {child.code}); its own message stands above"
                 )
+            loss = OPTIONAL[child.name]
+            log.error("ALARM: the %s has ended (exit code %s); %s", child.name, child.code, loss)
 
     def end(self) -> None:
-        """Ends them all, one after the other."""
-        for child in sorted(self._running, key=lambda child: ENDED.get(child.name, 2)):
+        """End them all, one after the other."""
+        for child in sorted(self._running, key=lambda one: END_ORDER.get(one.name, OTHERS_END)):
             child.end(PATIENCE_S)
 
 
 @spec
 class BusAndPolicySettings:
-    """Whatever listens to a machine and lets a policy run along.
+    """Settings of a run that listens to a machine and lets a policy run along.
 
     Attributes:
         wire: The bus.
@@ -96,7 +94,7 @@ class BusAndPolicySettings:
         limits: Of the guard.
         guidance: How advice is shown.
         policy: Policy bundle.
-        target: Where the borehole is.
+        target: Source of the borehole's position.
         realtime: Whether to ask for real-time priority.
     """
 
@@ -108,8 +106,8 @@ class BusAndPolicySettings:
     target: TargetSpec
     realtime: bool
 
-    def refuse(self, machine: Machine) -> None:
-        """Looks through what the processes will need, before any of them runs.
+    def check_machine(self, machine: Machine) -> None:
+        """Check before any process runs that bus, levers and policy fit the machine.
 
         Raises:
             CheckpointError: the policy cannot be used on this machine.
@@ -119,20 +117,20 @@ class BusAndPolicySettings:
         LeverMap(self.guidance.levers or machine.levers, machine)
         PolicyBundle(self.policy, machine)
 
-    def listen(
-        self, children: ProcessGroup, machine: Machine, target_s: float, pitch_rad: float | None
+    def start_processes(
+        self, group: ProcessGroup, machine: Machine, target_s: float, pitch_rad: float | None
     ) -> None:
-        """Starts bus and policy.
+        """Start bus and policy.
 
         Args:
-            children: Where to.
+            group: The processes of the run.
             machine: The machine.
             target_s: Age of the borehole from which there is no advice.
             pitch_rad: Wanted pitch of the tool, for policies that ask for one.
         """
-        setting = BusProcessConfig(self.wire, self.dbc, machine, self.limits)
-        counsel = PolicyProcessConfig(
+        bus = BusProcessConfig(self.wire, self.dbc, machine, self.limits)
+        policy = PolicyProcessConfig(
             machine, self.policy, self.guidance, self.limits.joints_s, target_s, pitch_rad
         )
-        children.start("bus", "deploy.runtime.bus_process:run", (setting,), BUS_PRIORITY)
-        children.start("policy", "deploy.policy.policy_process:run", (counsel,), POLICY_PRIORITY)
+        group.start("bus", "deploy.runtime.bus_process:run", (bus,), BUS_PRIORITY)
+        group.start("policy", "deploy.policy.policy_process:run", (policy,), POLICY_PRIORITY)

@@ -1,4 +1,4 @@
-"""The receiving side of the bus process: from frames to what is known of the machine."""
+"""The receiving side of the bus process: frames in, `OperatorState` and `GuardInput` out."""
 
 from __future__ import annotations
 
@@ -19,23 +19,29 @@ from deploy.bus.description import (
     MessageLayout,
 )
 from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel
-from deploy.guard.guard import GuardInput
+from deploy.guard.guard import GuardDecision, GuardInput
 from deploy.guard.limits import GuardLimits, build_joint_bounds
 from deploy.guard.plausibility import PlausibilityFilter
+from deploy.runtime.operator_state import OperatorState
 
-OWN = 8
-"""Commands last sent that are known again: on some buses a node hears itself."""
+NUM_OWN_COMMANDS = 8
+"""Commands sent last that are recognised as our own: on some buses a node hears itself. More than a
+bus process can send before it reads them back; chosen by hand."""
+STRANGER_S = 1.0
+"""Time for which a valve command of another node counts against commanding. Chosen by hand: many
+periods of any cyclic sender."""
 FROM_PC = 2
 """Value of `FlowSource`."""
 STAMP_MODULUS_S = 65.536
-"""The gateway's clock of the example wraps here."""
+"""Time after which the gateway's clock wraps in the example DBC: 16 bits of milliseconds."""
 FORGET_S = 60.0
-"""The best transit time is taken anew over such times, so that clocks may drift."""
+"""Time after which the best transit time is taken anew. Chosen by hand: clocks that differ by 100 ppm
+drift 6 ms in it, well below the limits on ages."""
 
 
 @dataclass
 class BusReceiver:
-    """What is known of the machine, message by message.
+    """Known values of the machine, updated message by message.
 
     Attributes:
         description: The bus.
@@ -49,64 +55,51 @@ class BusReceiver:
 
     def __post_init__(self) -> None:
         machine, described = self.machine, self.description
-        heard = [layout for node in (GATEWAY, REMOTE) for layout in described.sent_by(node)]
-        self.channels = {
-            layout.name: ProtectedChannel(layout.modulus)
-            for layout in heard
-            if layout.data_id is not None
-        }
-        self._wanted = {layout.frame_id: layout for layout in heard}
-        needed = {
-            described.message_of(name)
-            for name in ("DeadMan", "EStop", "ExclusiveSelected", f"Flow_{machine.joint_names[0]}")
-        }
-        needed |= {described.message_of(f"Position_{joint}") for joint in machine.joint_names}
-        self._needed = needed & set(self.channels)
-        self.body = build_joint_bounds(
+        heard = [*described.sent_by(GATEWAY), *described.sent_by(REMOTE)]
+        self.channels: dict[str, ProtectedChannel] = {}
+        for layout in heard:
+            if layout.data_id is not None:
+                self.channels[layout.name] = ProtectedChannel(layout.modulus)
+        self._layouts = {layout.frame_id: layout for layout in heard}
+        first_flow = f"Flow_{machine.joint_names[0]}"
+        signals = ["DeadMan", "EStop", "ExclusiveSelected", first_flow]
+        signals += [f"Position_{joint}" for joint in machine.joint_names]
+        # channels without which nothing may be commanded
+        self._needed = {described.message_of(name) for name in signals} & set(self.channels)
+        self.bounds = build_joint_bounds(
             machine.lower.tolist(),
             machine.upper.tolist(),
             machine.max_speed.tolist(),
             machine.is_exclusive.tolist(),
         )
-        self.plausibility = PlausibilityFilter(self.limits, self.body)
+        self.plausibility = PlausibilityFilter(self.limits, self.bounds)
         count = machine.num_joints
-        self.q, self.q_t_s, self.q_valid = (
-            np.zeros(count),
-            np.full(count, -math.inf),
-            np.zeros(count, dtype=bool),
-        )
-        self.flow, self.flow_sum, self.flow_number, self.flow_t_s = (
-            np.zeros(count),
-            np.zeros(count),
-            0,
-            -math.inf,
-        )
+        self.q, self.q_valid = np.zeros(count), np.zeros(count, dtype=bool)
+        self.q_t_s = np.full(count, -math.inf)
+        self.flow, self.flow_sum = np.zeros(count), np.zeros(count)
+        self.flow_number, self.flow_t_s = 0, -math.inf
         self.followed = False
-        self.lever, self.levers_t_s = np.zeros(4), -math.inf
+        self.lever, self.levers_t_s = np.zeros(len(LEVER_AXES)), -math.inf
         self.button_right = self.deadman = self.remote_on = False
-        self.estop, self.exclusive_selected, self.oil_c, self.status_t_s = (
-            False,
-            False,
-            math.nan,
-            -math.inf,
-        )
+        self.estop = self.exclusive_selected = False
+        self.oil_c, self.status_t_s = math.nan, -math.inf
         self.frames = self.refused = 0
         self.held_up_s, self._transit = 0.0, _TransitTime()
-        self._own: deque[bytes] = deque(maxlen=OWN)
+        self._own: deque[bytes] = deque(maxlen=NUM_OWN_COMMANDS)
         self._stranger_s = -math.inf
 
     @property
     def frame_ids(self) -> list[int]:
-        """Identifiers to receive: what gateway and remote send, and valve commands of others."""
-        return [*self._wanted, self.description.command.frame_id]
+        """Identifiers to receive: all of gateway and remote, and valve commands of others."""
+        return [*self._layouts, self.description.command.frame_id]
 
-    def sent(self, data: bytes) -> None:
-        """Is told the data of a command that this process sends itself, before it does."""
+    def note_own_command(self, data: bytes) -> None:
+        """Remember the data of a command that this process is about to send."""
         self._own.append(data)
 
     def take(self, frame: CanFrame, now_s: float) -> MessageFault | None:
-        """Takes in a frame; returns what is wrong with it."""
-        layout = self._wanted.get(frame.frame_id)
+        """Decode a frame and use its values; return its fault, if any."""
+        layout = self._layouts.get(frame.frame_id)
         if layout is None:
             if frame.frame_id == self.description.command.frame_id and frame.data not in self._own:
                 self._stranger_s = now_s
@@ -124,12 +117,12 @@ class BusReceiver:
         self._use(layout, values, now_s)
         return None
 
-    def seen(self, now_s: float, bus_up: bool) -> GuardInput:
-        """Returns what the guard is to know."""
+    def build_guard_input(self, now_s: float, bus_up: bool) -> GuardInput:
+        """Return the values that the guard decides by."""
         return GuardInput(
             q=tuple(self.q.tolist()),
             joints_age_s=now_s - float(self.q_t_s.min()) + self.held_up_s,
-            joints_plausible=bool(self.q_valid.all()) and self.plausibility.plausible,
+            joints_plausible=self.plausible,
             trusted=self.trusted,
             levers_age_s=now_s - self.levers_t_s if self.remote_on else math.inf,
             lever=float(np.abs(self.lever).max()),
@@ -138,23 +131,69 @@ class BusReceiver:
             estop=self.estop,
             bus_up=bus_up,
             followed=self.followed,
-            alone=now_s - self._stranger_s > 1.0,
+            alone=self._is_alone(now_s),
+        )
+
+    def build_state(
+        self, now_s: float, bus_up: bool, decision: GuardDecision, missed: int
+    ) -> OperatorState:
+        """Return the state to publish.
+
+        Args:
+            now_s: Time of the cycle.
+            bus_up: Whether the bus works.
+            decision: The guard's, in this cycle.
+            missed: Cycles missed so far.
+        """
+        return OperatorState(
+            t_s=now_s,
+            q=self.q.copy(),
+            q_t_s=max(0.0, float(self.q_t_s.min()) - self.held_up_s),
+            q_plausible=self.plausible,
+            flow=self.flow,
+            flow_sum=self.flow_sum,
+            flow_number=self.flow_number,
+            flow_t_s=max(0.0, self.flow_t_s),
+            lever=self.lever,
+            button_right=self.button_right,
+            deadman=self.deadman,
+            remote_on=self.remote_on,
+            levers_t_s=max(0.0, self.levers_t_s),
+            estop=self.estop,
+            exclusive_selected=self.exclusive_selected,
+            status_t_s=max(0.0, self.status_t_s),
+            oil_c=self.oil_c,
+            held_up_s=self.held_up_s,
+            bus_up=bus_up,
+            trusted=self.trusted,
+            alone=self._is_alone(now_s),
+            guard=decision.state,
+            trip=decision.trip,
+            cause=decision.cause,
+            sent=np.array(decision.u),
+            frames=self.frames,
+            refused=self.refused,
+            lost=sum(channel.lost for channel in self.channels.values()),
+            missed=missed,
         )
 
     @property
-    def trusted(self) -> bool:
-        """Whether none of the channels that matter has become invalid."""
-        return all(self.channels[name].trust is not ChannelTrust.INVALID for name in self._needed)
+    def plausible(self) -> bool:
+        """Whether the sensors call all positions valid, and none has jumped."""
+        return bool(self.q_valid.all()) and self.plausibility.plausible
 
     @property
-    def lost(self) -> int:
-        """Messages that the counters have skipped."""
-        return sum(channel.lost for channel in self.channels.values())
+    def trusted(self) -> bool:
+        """Whether none of the needed channels has become invalid."""
+        return all(self.channels[name].trust is not ChannelTrust.INVALID for name in self._needed)
+
+    def _is_alone(self, now_s: float) -> bool:
+        return now_s - self._stranger_s > STRANGER_S
 
     def _use(self, layout: MessageLayout, values: dict[str, float], now_s: float) -> None:
         machine, stamp = self.machine, values.get("Stamp")
         if stamp is not None:
-            self.held_up_s = self._transit.held_up(stamp, now_s)
+            self.held_up_s = self._transit.measure_delay_s(stamp, now_s)
         for j, joint in enumerate(machine.joint_names):
             position = values.get(f"Position_{joint}")
             if position is not None:
@@ -164,44 +203,36 @@ class BusReceiver:
         if f"Flow_{machine.joint_names[0]}" in values:
             self.followed = values["FlowSource"] == FROM_PC
             self.flow = np.array([values[f"Flow_{joint}"] for joint in machine.joint_names])
-            self.flow_sum, self.flow_number, self.flow_t_s = (
-                self.flow_sum + self.flow,
-                self.flow_number + 1,
-                now_s,
-            )
+            self.flow_sum, self.flow_number = self.flow_sum + self.flow, self.flow_number + 1
+            self.flow_t_s = now_s
         if "DeadMan" in values:
             self.lever = np.array([values[f"Lever_{axis}"] for axis in LEVER_AXES])
             self.button_right, self.deadman = values["ButtonRight"] == 1.0, values["DeadMan"] == 1.0
             self.remote_on, self.levers_t_s = values["RemoteOn"] == 1.0, now_s
         if "EStop" in values:
-            self.estop, self.exclusive_selected = (
-                values["EStop"] == 1.0,
-                values["ExclusiveSelected"] == 1.0,
-            )
+            self.estop = values["EStop"] == 1.0
+            self.exclusive_selected = values["ExclusiveSelected"] == 1.0
             self.oil_c, self.status_t_s = values.get("OilTemperature", math.nan), now_s
 
 
 class _TransitTime:
-    """How much longer than at best a stamped message was on its way, whatever the two clocks say."""
+    """Delay of stamped messages beyond the shortest one seen, whatever the two clocks say."""
 
     def __init__(self) -> None:
         self._offset_s: float | None = None
         self._best_s, self._recent_s, self._since_s = math.inf, math.inf, -math.inf
 
-    def held_up(self, stamp_s: float, now_s: float) -> float:
+    def measure_delay_s(self, stamp_s: float, now_s: float) -> float:
+        """Return the delay of a message with the gateway's `stamp_s` that came at `now_s`."""
         raw_s = now_s - stamp_s
         if self._offset_s is None:
             self._offset_s = raw_s
         # clocks differ by a constant and whole turns of the stamp
-        transit_s = (
-            raw_s - self._offset_s + STAMP_MODULUS_S / 2
-        ) % STAMP_MODULUS_S - STAMP_MODULUS_S / 2
+        half_s = STAMP_MODULUS_S / 2
+        transit_s = (raw_s - self._offset_s + half_s) % STAMP_MODULUS_S - half_s
         if now_s - self._since_s > FORGET_S:
-            self._best_s, self._recent_s, self._since_s = (
-                min(self._recent_s, transit_s),
-                transit_s,
-                now_s,
-            )
+            self._best_s = min(self._recent_s, transit_s)
+            self._recent_s, self._since_s = transit_s, now_s
         self._recent_s = min(self._recent_s, transit_s)
         self._best_s = min(self._best_s, transit_s)
         return transit_s - self._best_s

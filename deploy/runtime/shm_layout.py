@@ -1,10 +1,6 @@
-"""The records that the processes of the loop share, as numpy fields.
+"""Layout of the memory that the processes of the loop share.
 
-`J` joints; times are monotonic, in s; 0 where nothing has come.
-
-`STATE` is written by the bus process, `ADVICE` by the policy, `REQUEST` by whoever commands valves
-on purpose, `TARGET` by what knows the borehole, `CONTROLS` by the operator's side, `FRAME` and
-`HOLES` by perception.
+`J` joints; times are monotonic, in s, and 0 where nothing has come.
 """
 
 from __future__ import annotations
@@ -14,80 +10,48 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from deploy.runtime.shared_memory import Pipe, Slot
+from deploy.runtime.operator_state import (
+    LoopSnapshot,
+    OperatorControls,
+    OperatorState,
+    PolicyAdvice,
+    RequestedCommand,
+)
+from deploy.runtime.shared_memory import Pipe, RecordSlot, Slot
 
-PIPE_BYTES = 8 << 20
-"""About two minutes of a full bus."""
+LOG_BYTES = 8 << 20
+"""Of each pipe to the log: about two minutes of a full bus, so that a slow disk costs nothing."""
+VISION_LOG_BYTES = 1 << 20
+"""Of perception's pipe to the log, a short text a frame. Chosen by hand."""
+REQUEST_BYTES = 1 << 12
+"""Of the page's requests; the supervisor takes them 20 times a second. Chosen by hand."""
+REPORT_BYTES = 1 << 16
+"""Of the processes' reports on their timing, one each. Chosen by hand."""
+MOST_HOLES = 8
+"""Boreholes that perception hands on, the surest first. Chosen by hand."""
 
+HOLE = np.dtype(
+    [
+        ("name", np.uint16),
+        ("center_in_base_m", float, (3,)),
+        ("axis_in_base", float, (3,)),
+        ("radius_m", float),
+        ("std_m", float),
+        ("score", float),  # probability that it is one, in [0, 1]
+        ("t_s", float),  # when it was seen last
+    ]
+)
+"""A borehole that perception knows."""
 
-def build_state_fields(num_joints: int) -> np.dtype:
-    """Returns the fields of the machine's state as the bus has it."""
-    each = (float, (num_joints,))
-    return np.dtype(
-        [
-            ("t_s", float),
-            ("q", *each),  # rad or m
-            ("q_t_s", float),  # of the oldest of them
-            ("q_plausible", bool),
-            ("flow", *each),  # what the valves got last, of full
-            ("flow_sum", *each),  # over all messages so far, for means over any period
-            ("flow_number", np.uint64),
-            ("flow_t_s", float),
-            (
-                "lever",
-                float,
-                (4,),
-            ),  # the operator's own, of full: left theta, psi, right theta, psi
-            ("button_right", bool),
-            ("deadman", bool),
-            ("remote_on", bool),
-            ("levers_t_s", float),
-            ("estop", bool),
-            ("exclusive_selected", bool),
-            ("status_t_s", float),
-            ("oil_c", float),
-            (
-                "held_up_s",
-                float,
-            ),  # how much later than at best the last positions came, by the gateway's clock
-            ("bus_up", bool),
-            ("trusted", bool),
-            ("alone", bool),
-            ("guard", np.int8),  # deploy.guard.guard.GuardState
-            ("trip", np.int8),  # index into deploy.guard.guard.GuardTrip
-            ("cause", np.int8),
-            ("sent", *each),
-            ("frames", np.uint64),
-            ("refused", np.uint64),
-            ("lost", np.uint64),
-            ("missed", np.uint64),  # cycles
-        ]
-    )
+HOLES = np.dtype([("t_s", float), ("count", np.uint8), ("holes", HOLE, (MOST_HOLES,))])
+"""All boreholes that perception knows."""
 
-
-def build_advice_fields(num_joints: int) -> np.dtype:
-    """Returns the fields of what the policy proposes."""
-    return np.dtype(
-        [
-            ("t_s", float),
-            ("number", np.uint64),
-            ("reason", np.int8),  # index into deploy.runtime.adviser.Advised; 0: valid
-            ("u", float, (num_joints,)),  # zero unless valid
-            ("lever_rad", float, (4,)),  # to show: left theta, psi, right theta, psi
-            ("button_right", bool),
-            ("target_in_base_m", float, (3,)),
-            ("infer_s", float),
-        ]
-    )
-
-
-def build_request_fields(num_joints: int) -> np.dtype:
-    """Returns the fields of a command that somebody wants sent."""
-    return np.dtype([("t_s", float), ("u", float, (num_joints,))])
+TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])
+"""The borehole to drill: when it was found, the centre of its rim, and its standard deviation."""
 
 
 def build_frame_fields(num_px: int) -> np.dtype:
-    """Returns the fields of a camera's frame of `num_px` pixels at most; see `brokk_rl.signals.Frame`."""
+    """Return the fields of a frame of at most `num_px` pixels; see `brokk_rl.signals.Frame`."""
     return np.dtype(
         [
             ("t_s", float),
@@ -101,36 +65,9 @@ def build_frame_fields(num_px: int) -> np.dtype:
     )
 
 
-MOST_HOLES = 8
-HOLE = np.dtype(
-    [
-        ("name", np.uint16),
-        ("center_in_base_m", float, (3,)),
-        ("axis_in_base", float, (3,)),
-        ("radius_m", float),
-        ("std_m", float),
-        ("score", float),  # that it is one, in [0, 1]
-        ("t_s", float),  # when it was seen last
-    ]
-)
-"""A borehole that perception knows."""
-
-HOLES = np.dtype([("t_s", float), ("count", np.uint8), ("holes", HOLE, (MOST_HOLES,))])
-"""All that it knows."""
-
-TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])
-"""The borehole: when it was found, the centre of its rim, and the standard deviation of that."""
-
-CONTROLS = np.dtype(
-    [("t_s", float), ("armed", bool), ("recording", bool), ("recording_t_s", float)]
-)
-"""What the operator's side wants: commands to be sent at all; and whether all this is recorded,
-since when."""
-
-
 @dataclass
 class LoopMemory:
-    """Everything that the processes share; goes to each of them as it is.
+    """All memory that the processes share; each of them gets it as it is.
 
     Attributes:
         state: From the bus process.
@@ -143,67 +80,77 @@ class LoopMemory:
         bus_log: From the bus process to the log.
         policy_log: From the policy to the log.
         page_log: From the operator's page to the log.
-        sight_log: From perception to the log.
-        wishes: From the operator's page to the supervisor, a JSON text each.
-        reports: What each process says of its timing when it ends; one after the other.
+        vision_log: From perception to the log.
+        requests: From the operator's page to the supervisor, a JSON text each.
+        reports: On each process's timing, one after the other, written when it ends.
     """
 
-    state: Slot
-    advice: Slot
-    request: Slot | None
+    state: RecordSlot[OperatorState]
+    advice: RecordSlot[PolicyAdvice]
+    request: RecordSlot[RequestedCommand] | None
     target: Slot
-    controls: Slot
+    controls: RecordSlot[OperatorControls]
     frame: Slot | None
     holes: Slot
     bus_log: Pipe
     policy_log: Pipe
     page_log: Pipe
-    sight_log: Pipe
-    wishes: Pipe
+    vision_log: Pipe
+    requests: Pipe
     reports: Pipe
 
     @classmethod
     def new(cls, num_joints: int, commands: bool, frame_px: int = 0) -> LoopMemory:
-        """Returns a fresh one.
+        """Allocate the memory of one run.
 
         Args:
             num_joints: Of the machine.
-            commands: Without, there is no way from anybody to the valves.
+            commands: Without, there is no way from any process to the valves.
             frame_px: Pixels of a camera's frame; 0: no camera.
         """
+        request = RecordSlot("request", RequestedCommand, num_joints) if commands else None
         return cls(
-            state=Slot("state", build_state_fields(num_joints)),
-            advice=Slot("advice", build_advice_fields(num_joints)),
-            request=Slot("request", build_request_fields(num_joints)) if commands else None,
+            state=RecordSlot("state", OperatorState, num_joints),
+            advice=RecordSlot("advice", PolicyAdvice, num_joints),
+            request=request,
             target=Slot("target", TARGET),
-            controls=Slot("controls", CONTROLS),
+            controls=RecordSlot("controls", OperatorControls, num_joints),
             frame=Slot("frame", build_frame_fields(frame_px)) if frame_px else None,
             holes=Slot("holes", HOLES),
-            bus_log=Pipe("bus_log", PIPE_BYTES),
-            policy_log=Pipe("policy_log", PIPE_BYTES),
-            page_log=Pipe("page_log", PIPE_BYTES),
-            sight_log=Pipe("sight_log", 1 << 20),
-            wishes=Pipe("wishes", 1 << 12),
-            reports=Pipe("reports", 1 << 16),
+            bus_log=Pipe("bus_log", LOG_BYTES),
+            policy_log=Pipe("policy_log", LOG_BYTES),
+            page_log=Pipe("page_log", LOG_BYTES),
+            vision_log=Pipe("vision_log", VISION_LOG_BYTES),
+            requests=Pipe("requests", REQUEST_BYTES),
+            reports=Pipe("reports", REPORT_BYTES),
         )
 
     @property
     def logs(self) -> tuple[Pipe, ...]:
-        """All that goes to the log."""
-        return self.bus_log, self.policy_log, self.page_log, self.sight_log
+        """Pipes to the log."""
+        return self.bus_log, self.policy_log, self.page_log, self.vision_log
 
     @property
     def files(self) -> list[int]:
         """File descriptors that child processes inherit."""
         return [part.memory.fd for part in vars(self).values() if part is not None]
 
+    def read_snapshot(self) -> LoopSnapshot:
+        """Return the newest state and advice."""
+        state, advice = self.state.read(), self.advice.read()
+        dropped = sum(pipe.dropped for pipe in self.logs)
+        return LoopSnapshot(time.monotonic(), state, advice, self.request is not None, dropped)
+
     def close(self) -> None:
-        """Lets go of all of it."""
+        """Unmap and close all of it."""
         for part in vars(self).values():
             if part is not None:
                 part.memory.close()
 
 
 def measure_wall_offset_ns() -> int:
-    """Returns what makes a wall-clock time of a monotonic one, taken once: later steps of the wall clock change nothing."""
+    """Return the difference of wall clock and monotonic clock.
+
+    Taken once: a later step of the wall clock changes nothing.
+    """
     return time.time_ns() - time.monotonic_ns()

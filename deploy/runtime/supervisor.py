@@ -1,8 +1,7 @@
-"""The parent of the loop: starts bus, policy and log, watches over them, shows what the outlet says, reports on timing.
+"""The parent of the loop: starts its processes, watches over them, and reports on timing.
 
-A child that dies is not started again in secret: bus or policy end the run with an error, a dead
-log is an alarm beside which guidance goes on. Whoever dies, the gateway goes to zero flow by
-itself.
+A child that dies is not started again in secret: bus or policy end the run with an error, a dead log
+is an alarm beside which guidance goes on. Whoever dies, the gateway goes to zero flow by itself.
 """
 
 from __future__ import annotations
@@ -15,8 +14,9 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
+import numpy as np
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -26,12 +26,12 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from deploy.guidance import LeverPositions, find_full_angles_rad
+from deploy.guidance import LeverPositions, convert_to_positions, find_full_angles_rad
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.recorder.capture import CaptureConfig
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
-from deploy.runtime.operator_state import LoopSnapshot, read_snapshot
+from deploy.runtime.operator_state import LoopSnapshot
 from deploy.runtime.perception_process import CameraConfig
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.process_group import PATIENCE_S, BusAndPolicySettings, ProcessGroup
@@ -41,23 +41,31 @@ from deploy.runtime.target import DetectedTarget, TargetSelector
 log = logging.getLogger(__name__)
 
 PROCESSES, TIMING = "processes.json", "timing.json"
+"""Files in the run folder: process ids, and how each process kept its time."""
 WATCH_S = 0.05
+"""Between looks at requests and processes. Chosen by hand: quick for a person."""
+TERMINAL_HZ = 10
+"""Refresh rate of the terminal, as fast as a person can read it."""
+BAR_WIDTH = 10
+"""Characters of a lever bar from neutral to full."""
+LARGEST_AGE_S = 9.999
+"""Age above which the terminal shows no more digits."""
 
 
 @spec
 class DeploymentLoop(BusAndPolicySettings):
-    """The loop on the machine: listens, advises, records; commands valves only where `commands` says so.
+    """The loop on the machine: listens, advises, records; commands valves only if `commands`.
 
-    Attributes (and those of `Listener`):
+    Attributes (and those of `BusAndPolicySettings`):
         target_s: Age of the borehole from which there is no advice.
         pitch_rad: Wanted pitch of the tool, for policies that ask for one; else `null`.
         commands: Whether the policy's advice is sent to the valves. `false`: nothing is ever sent.
         armed: Whether sending is armed from the beginning; the dead-man must be held all the same.
         record: Whether everything is recorded.
-        seconds: When to stop; `null`: when told to.
+        seconds: Length of the run; `null`: until told to stop.
         show: Whether to show levers and state in the terminal.
         page: The operator's page; `null`: none.
-        camera: What is seen of the boreholes; `null`: there is no camera.
+        camera: Camera beside the loop; `null`: there is none.
     """
 
     target_s: float
@@ -87,7 +95,9 @@ class DeploymentLoop(BusAndPolicySettings):
     def run(
         self, machine: Machine, session: Session, companions: Sequence[CompanionProcess]
     ) -> None:
-        """Runs until the time is over or a person stops it; leaves `processes.json` and `timing.json`.
+        """Run until the time is over or a person stops it.
+
+        Writes `processes.json` and `timing.json`.
 
         Args:
             machine: The machine.
@@ -99,91 +109,82 @@ class DeploymentLoop(BusAndPolicySettings):
             ConfigError: bus description or levers do not fit the machine.
             LinkError: bus or policy process died.
         """
-        self.refuse(machine)
-        memory = LoopMemory.new(
-            machine.num_joints, self.commands, self.camera.num_px if self.camera else 0
-        )
-        children, recorder = (
-            ProcessGroup(memory, self.realtime),
-            self._recorder(memory, machine, session.folder),
-        )
+        self.check_machine(machine)
+        frame_px = self.camera.num_px if self.camera else 0
+        memory = LoopMemory.new(machine.num_joints, self.commands, frame_px)
+        group = ProcessGroup(memory, self.realtime)
+        recorder = self._build_recorder(memory, machine, session.folder)
         try:
-            for companion in companions:
-                children.start(
-                    companion.name, companion.target, companion.arguments, companion.realtime
-                )
-            self._start(children, machine, session)
+            for one in companions:
+                group.start(one.name, one.target, one.arguments, one.realtime)
+            self._start(group, machine, session)
             recorder.refresh()
-            write_json(session.folder / PROCESSES, children.pids | recorder.pids)
-            aim = TargetSelector(self.target.build(), memory.target, memory.holes)
+            write_json(session.folder / PROCESSES, group.pids | recorder.pids)
+            selector = TargetSelector(self.target.build(), memory.target, memory.holes)
+            handler = RequestHandler(memory, recorder, selector, self.armed, self.commands)
             full_rad = find_full_angles_rad(self.guidance.levers or machine.levers)
-            self._watch(
-                children,
-                memory,
-                full_rad,
-                RequestHandler(memory, recorder, aim, self.armed, self.commands),
-            )
+            self._watch(group, memory, full_rad, handler)
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
-            children.end()
+            group.end()
             recorder.end(PATIENCE_S)
             _write_timing_report(memory, session)
             memory.close()
 
-    def _start(self, children: ProcessGroup, machine: Machine, session: Session) -> None:
-        self.listen(children, machine, self.target_s, self.pitch_rad)
+    def _start(self, group: ProcessGroup, machine: Machine, session: Session) -> None:
+        self.start_processes(group, machine, self.target_s, self.pitch_rad)
         if self.page is not None:
-            camera_s = self.camera.stale_s if self.camera else None
-            beside = PageProcessConfig(
-                self.page,
-                machine,
-                self.guidance,
-                session,
-                self.limits.joints_s,
-                self.limits.levers_s,
-                self.target_s,
-                camera_s,
-            )
-            children.start("page", "deploy.page.loop_feed:run", (beside,))
+            config = self.build_page_config(self.page, machine, session)
+            group.start("page", "deploy.page.loop_feed:run", (config,))
         if self.camera is not None:
-            children.start("camera", "deploy.runtime.perception_process:run", (self.camera,))
+            group.start("camera", "deploy.runtime.perception_process:run", (self.camera,))
 
-    def _recorder(self, memory: LoopMemory, machine: Machine, folder: Path) -> RecordingControl:
+    def build_page_config(
+        self, page: PageSettings, machine: Machine, session: Session
+    ) -> PageProcessConfig:
+        """Return the settings of the process that serves `page` beside this loop."""
+        return PageProcessConfig(
+            page=page,
+            machine=machine,
+            guidance=self.guidance,
+            session=session,
+            positions_s=self.limits.joints_s,
+            levers_s=self.limits.levers_s,
+            borehole_s=self.target_s,
+            camera_s=self.camera.stale_s if self.camera else None,
+        )
+
+    def _build_recorder(
+        self, memory: LoopMemory, machine: Machine, folder: Path
+    ) -> RecordingControl:
         facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
+        pictures_hz = self.camera.record_hz if self.camera else 0.0
 
         def start(folder: Path) -> ChildProcess:
-            capture = CaptureConfig(
-                folder, self.dbc, machine, facts, self.camera.record_hz if self.camera else 0.0
-            )
-            return ChildProcess(
-                "log", "deploy.recorder.capture:run", (capture, memory), memory.files
-            )
+            capture = CaptureConfig(folder, self.dbc, machine, facts, pictures_hz)
+            target = "deploy.recorder.capture:run"
+            return ChildProcess("log", target, (capture, memory), memory.files)
 
         recorder = RecordingControl(memory, folder, start)
         recorder.wanted = self.record
         return recorder
 
     def _watch(
-        self,
-        children: ProcessGroup,
-        memory: LoopMemory,
-        full_rad: tuple[float, ...],
-        wanted: RequestHandler,
+        self, group: ProcessGroup, memory: LoopMemory, full_rad: np.ndarray, handler: RequestHandler
     ) -> None:
-        """Shows, does what is wanted and looks after the children until it is time to stop."""
+        """Carry out requests, watch the processes and show the state, until it is time to stop."""
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
         with contextlib.ExitStack() as stack:
-            live = (
-                stack.enter_context(Live(console=Console(stderr=True), refresh_per_second=10))
-                if self.show
-                else None
-            )
+            live = None
+            if self.show:
+                console = Console(stderr=True)
+                live = stack.enter_context(Live(console=console, refresh_per_second=TERMINAL_HZ))
             while end_s is None or time.monotonic() < end_s:
-                wanted.refresh()
-                children.check()
+                handler.refresh()
+                group.check()
                 if live is not None:
-                    live.update(build_table(read_snapshot(memory), full_rad))
+                    live.update(build_table(memory.read_snapshot(), full_rad))
                 time.sleep(WATCH_S)
 
 
@@ -192,7 +193,7 @@ class CompanionProcess:
     """A further process of a bench.
 
     Attributes:
-        name: What it is.
+        name: Of the process.
         target: `module:function`, called as `function(stop, *arguments, memory)`.
         arguments: Its arguments.
         realtime: Real-time priority, where the loop asks for one: a machine is never late; `None`:
@@ -205,30 +206,45 @@ class CompanionProcess:
     realtime: int | None
 
 
+class BenchSpec(Protocol):
+    """A spec in `conf/bench`: stands in for machine and operator on a desk."""
+
+    def companions(self, machine: Machine, session: Session) -> Sequence[CompanionProcess]:
+        """Return the processes to run beside the loop."""
+        ...
+
+
 def _write_timing_report(memory: LoopMemory, session: Session) -> None:
-    """Writes `timing.json`, how each process kept its time, and says it in a line each."""
+    """Write `timing.json` and log a line for each process."""
     reports = [json.loads(text) for text in memory.reports.take()]
     for one in reports:
         log.info(
             "%s: %d cycles of %.0f ms, %d missed, late by %.1f ms (99 %%), %.1f ms at most",
-            one["process"], one["cycles"], 1e3 * one["period_s"], one["missed"], 1e3 * one["late_p99_s"], 1e3 * one["late_max_s"],
-        )  # fmt: skip
-    dropped = sum(pipe.dropped for pipe in memory.logs)
-    write_json(
-        session.folder / TIMING,
-        {"processes": reports, "log_dropped": dropped, "last": read_snapshot(memory).plain()},
-    )
+            one["process"],
+            one["cycles"],
+            1e3 * one["period_s"],
+            one["missed"],
+            1e3 * one["late_p99_s"],
+            1e3 * one["late_max_s"],
+        )
+    last = memory.read_snapshot()
+    report = {"processes": reports, "log_dropped": last.log_dropped, "last": last.to_plain()}
+    write_json(session.folder / TIMING, report)
 
 
-WIDTH = 10
-"""Characters from neutral to full."""
+def build_table(snapshot: LoopSnapshot, full_rad: np.ndarray) -> Table:
+    """Return levers and safety as a table, for a desk without the operator's page.
 
-
-def build_table(view: LoopSnapshot, full_rad: tuple[float, ...]) -> Table:
-    """Returns the view as a table; `full_rad` are the angles of the four axes at full deflection."""
+    Args:
+        snapshot: State and advice.
+        full_rad: Angles of the four axes at full deflection, `(4,)`.
+    """
     grid = Table.grid(padding=(0, 2))
-    own = view.machine.levers if view.machine else None
-    proposed = view.advice.levers.parts(full_rad) if view.advice else None
+    state, advice = snapshot.state, snapshot.advice
+    own = state.levers if state else None
+    proposed = None
+    if advice is not None:
+        proposed = convert_to_positions(advice.lever_rad, full_rad, advice.button_right)
     for name in ("left_theta", "left_psi", "right_theta", "right_psi"):
         grid.add_row(
             name.replace("_", " "),
@@ -236,32 +252,26 @@ def build_table(view: LoopSnapshot, full_rad: tuple[float, ...]) -> Table:
             _draw_bar(getattr(own, name, 0.0), "blue"),
         )
     grid.add_row("right button", _draw_button(proposed, "green"), _draw_button(own, "blue"))
-    advice = "no policy yet" if view.advice is None else view.advice.reason
-    safety = view.safety
-    state = (
-        "bus process silent"
-        if safety is None or not view.alive
-        else f"{safety.state.lower()}, {safety.trip}"
-    )
-    grid.add_row("advice", advice, f"safety: {state}")
-    if view.machine is not None:
-        grid.add_row(
-            "joints",
-            "  ".join(f"{q:+.3f}" for q in view.machine.q),
-            f"{1e3 * min(view.machine.q_age_s, 9.999):.0f} ms old",
-        )
+    reason = "no policy yet" if advice is None else advice.reason.value
+    safety = "bus process silent"
+    if state is not None and snapshot.alive:
+        safety = f"{state.guard.name.lower()}, {state.trip.value}"
+    grid.add_row("advice", reason, f"safety: {safety}")
+    if state is not None:
+        joints = "  ".join(f"{q:+.3f}" for q in state.q)
+        age_s = min(snapshot.t_s - state.q_t_s, LARGEST_AGE_S)
+        grid.add_row("joints", joints, f"{1e3 * age_s:.0f} ms old")
     return grid
 
 
 def _draw_bar(part: float, color: str) -> Text:
-    """Draws -1 … 1 about the middle."""
-    cells, filled = (
-        [" "] * (2 * WIDTH + 1),
-        round(max(-1.0, min(1.0, part if math.isfinite(part) else 0.0)) * WIDTH),
-    )
-    low, high = sorted((WIDTH, WIDTH + filled))
+    """Draw a bar from the middle to `part` of full, in [-1, 1]."""
+    shown = max(-1.0, min(1.0, part)) if math.isfinite(part) else 0.0
+    filled = round(shown * BAR_WIDTH)
+    cells = [" "] * (2 * BAR_WIDTH + 1)
+    low, high = sorted((BAR_WIDTH, BAR_WIDTH + filled))
     cells[low : high + 1] = ["█"] * (high - low + 1)
-    cells[WIDTH] = "│" if filled == 0 else "█"
+    cells[BAR_WIDTH] = "│" if filled == 0 else "█"
     return Text("".join(cells), style=color)
 
 

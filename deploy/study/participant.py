@@ -28,13 +28,12 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
-from deploy.guidance import AXES, LeverGuidance, LeverMap
+from deploy.guidance import AXES, LeverGuidance, LeverMap, find_full_angles_rad
 from deploy.page.settings import LINK
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.supervisor import CompanionProcess
 from deploy.study.simulation import answered
-from deploy.twin.gateway import find_axis_full_rad
 from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
@@ -248,7 +247,7 @@ class _Taking:
             round(self._machine.period_s / remote.period_s),
             CycleTimer(remote.period_s),
             0,
-            find_axis_full_rad(self._machine),
+            find_full_angles_rad(self._machine.levers),
         )
         with wire.open([]) as bus:
             while not stop() and not any(task.done() for task in tasks):
@@ -258,7 +257,7 @@ class _Taking:
                     angles_rad, remote.button_right = self._own.levers(self._given())
                     remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
                 cycle += 1
-                bus.send(remote.frame())
+                bus.send(remote.build_frame())
 
     def _given(self) -> np.ndarray:
         """Returns what the hands give in the coming period, `(J,)`; nothing but in a trial."""

@@ -72,7 +72,7 @@ def page(
     _numbers(found, design, paired_least, sequence_least)
     _errors(found, errors)
     found.add_heading("Rules")
-    found.items(RULES)
+    found.add_list(RULES)
     found.add_heading("Places")
     found.add_table(
         ["hole", "x, m", "y, m", "rim z, m", "radius, m"],

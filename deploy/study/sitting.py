@@ -12,14 +12,13 @@ from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.runtime.supervisor import CompanionProcess, DeploymentLoop
 from deploy.runtime.target import FileTarget
 from deploy.study import folder as folders
 from deploy.study.conductor import Words
 from deploy.study.participant import Participant
-from deploy.study.study_server import Sitters
+from deploy.study.study_server import StudyServerConfig
 from deploy.study.trial import Times
 from deploy.twin.bench import TwinBench
 
@@ -96,15 +95,9 @@ class Sitting:
         loop = replace(
             self.loop, page=None, record=False, show=False, target=FileTarget(path=str(target))
         )
-        limits, operators = (
-            loop.limits,
-            self.bench.operators if isinstance(self.bench, Participant) else {},
-        )
-        room = Sitters(
-            beside=PageProcessConfig(
-                self.page, machine, loop.guidance, session, limits.joints_s, limits.levers_s, loop.target_s,
-                loop.camera.stale_s if loop.camera else None,
-            ),
+        operators = self.bench.operators if isinstance(self.bench, Participant) else {}
+        room = StudyServerConfig(
+            page=loop.build_page_config(self.page, machine, session),
             folder=folder.resolve(),
             participant=participant,
             words=Words(self.consent.version, self.consent.text),

@@ -17,9 +17,10 @@ from typing import Any
 from websockets.asyncio.server import ServerConnection
 
 from brokk_rl.signals import Frame
+from deploy.page.files import read_static_files
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.protocol import DrawReport, OperatorRequest, PageFeed, PageState
-from deploy.page.server import read_static_files
+from deploy.page.server import serve_page
 from deploy.page.settings import LINK
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -38,11 +39,11 @@ HEAD = (
 
 
 @dataclass(frozen=True)
-class Sitters:
-    """What a room is to do.
+class StudyServerConfig:
+    """Settings of the study's server.
 
     Attributes:
-        beside: The page, and how the loop is shown.
+        page: The page, and how the loop is shown.
         folder: The study's.
         participant: Who comes first; `None`: chosen on the page.
         words: What the lab says to participants.
@@ -53,7 +54,7 @@ class Sitters:
         port: Where the twin can be put elsewhere; `None` on a machine.
     """
 
-    beside: PageProcessConfig
+    page: PageProcessConfig
     folder: Path
     participant: str | None
     words: Words
@@ -64,37 +65,37 @@ class Sitters:
     port: int | None
 
 
-def run(stop: Stop, sitters: Sitters, memory: LoopMemory) -> None:
+def run(stop: Stop, config: StudyServerConfig, memory: LoopMemory) -> None:
     """Leads sittings until it is asked to stop.
 
     Raises:
         LinkError: the page's address is taken.
     """
-    beside = sitters.beside
-    stage = LoopStage(memory, beside.machine, sitters.target, sitters.port)
-    seed = beside.session.stream
+    page = config.page
+    stage = LoopStage(memory, page.machine, config.target, config.port)
     conductor = Conductor(
-        sitters.folder,
-        beside.machine,
+        config.folder,
+        page.machine,
         stage,
-        sitters.words,
-        sitters.times,
-        sitters.facts,
-        seed,
-        sitters.operators,
+        config.words,
+        config.times,
+        config.facts,
+        page.session.stream,
+        config.operators,
     )
-    if sitters.participant:
-        conductor.choose(sitters.participant)
-    link = beside.session.folder / LINK
+    if config.participant:
+        conductor.choose(config.participant)
+    link = page.session.folder / LINK
 
-    def tell(address: str) -> None:
+    def announce(address: str) -> None:
         log.info(
             "%s; the link that leads the sitting stands in %s", address.partition("#")[0], link
         )
 
     try:
-        feed = StudyFeed(LoopFeed(beside, memory), conductor)
-        beside.page.serve(stop, beside.machine, feed, beside.session, tell, StudyPages(conductor))
+        feed = StudyFeed(LoopFeed(page, memory), conductor)
+        pages = StudyPages(conductor)
+        serve_page(page.page, stop, page.machine, feed, page.session, announce, pages)
     finally:
         conductor.close()
 
@@ -110,31 +111,31 @@ class StudyFeed:
     def __init__(self, feed: PageFeed, conductor: Conductor) -> None:
         self._feed, self._conductor = feed, conductor
 
-    def news(self) -> int | None:
-        """See `Feed`."""
-        return self._feed.news() if self._conductor.shows_advice else None
+    def read_advice_number(self) -> int | None:
+        """See `PageFeed`."""
+        return self._feed.read_advice_number() if self._conductor.shows_advice else None
 
-    def shown(self) -> PageState:
-        """See `Feed`."""
-        shown = self._feed.shown()
+    def read_state(self) -> PageState:
+        """See `PageFeed`."""
+        state = self._feed.read_state()
         if self._conductor.shows_advice:
-            return replace(shown, guiding=True)
-        return replace(shown, guiding=False, advice=None, path_in_base_m=())
+            return replace(state, guiding=True)
+        return replace(state, guiding=False, advice=None, path_in_base_m=())
 
-    def frame(self, after_s: float) -> Frame | None:
-        """See `Feed`."""
-        return self._feed.frame(after_s)
+    def read_frame(self, after_s: float) -> Frame | None:
+        """See `PageFeed`."""
+        return self._feed.read_frame(after_s)
 
-    def wish(self, wish: OperatorRequest) -> bool:
-        """See `Feed`; `stop` ends the trial too."""
-        if wish.kind != "stop":
+    def submit(self, request: OperatorRequest) -> bool:
+        """See `PageFeed`; `stop` ends the trial too."""
+        if request.kind != "stop":
             return False
         self._conductor.take({"do": "stop_trial"})
         return True
 
-    def drawn(self, drawn: DrawReport) -> None:
-        """See `Feed`."""
-        self._feed.drawn(drawn)
+    def report_drawn(self, report: DrawReport) -> None:
+        """See `PageFeed`."""
+        self._feed.report_drawn(report)
 
 
 class StudyPages:
@@ -157,13 +158,13 @@ class StudyPages:
         }
 
     async def run(self) -> None:
-        """See `Annex`."""
+        """See `PageExtension`."""
         while True:
             self._conductor.tick()
             await asyncio.sleep(TICK_S)
 
     async def talk(self, connection: ServerConnection) -> None:
-        """Sends what is to be shown whenever that changes, and takes what is said; see `Annex`."""
+        """Sends what is to be shown whenever that changes, and takes what is said; see `PageExtension`."""
         speaking = asyncio.create_task(self._speak(connection))
         try:
             async for text in connection:

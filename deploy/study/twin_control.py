@@ -14,10 +14,10 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.policy.policy_process import REASONS, AdviceStatus
 from deploy.recorder import capture_reader
 from deploy.recorder.capture import MCAP
 from deploy.recorder.conversion import CaptureLogReader
+from deploy.runtime.operator_state import AdviceStatus
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.study.design import Hole
 from deploy.twin.faults import request_fault
@@ -98,18 +98,13 @@ class LoopStage:
             self._memory.controls.read(),
         )
         now_s = time.monotonic()
-        fresh = (
-            state is not None
-            and now_s - float(state["q_t_s"]) < FRESH_S
-            and bool(state["q_plausible"])
-        )
+        fresh = state is not None and now_s - state.q_t_s < FRESH_S and state.q_plausible
         advised = AdviceStatus.NO_STATE
-        if advice is not None and now_s - float(advice["t_s"]) < FRESH_S:
-            advised = REASONS[int(advice["reason"])]
-        recording = controls is not None and bool(controls["recording"])
-        return Sight(
-            np.array(state["q"]) if fresh and state is not None else None, advised.value, recording
-        )
+        if advice is not None and now_s - advice.t_s < FRESH_S:
+            advised = advice.reason
+        recording = controls is not None and controls.recording
+        q = np.array(state.q) if fresh and state is not None else None
+        return Sight(q, advised.value, recording)
 
     def prepare(self, hole: Hole, start: np.ndarray) -> None:
         """See `Stage`."""
@@ -125,12 +120,12 @@ class LoopStage:
 
     def record(self, folder: Path | None) -> None:
         """See `Stage`."""
-        wish = (
+        request = (
             {"kind": "record", "value": "off"}
             if folder is None
             else {"kind": "record", "value": "on", "into": str(folder)}
         )
-        self._memory.wishes.put(json.dumps(wish).encode())
+        self._memory.requests.put(json.dumps(request).encode())
 
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
         """See `Stage`."""

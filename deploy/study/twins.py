@@ -27,15 +27,14 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
+from deploy.guard.guard import GuardDecision, GuardState, GuardTrip
 from deploy.guard.limits import GuardLimits
-from deploy.guidance import LeverGuidance, LeverMap
+from deploy.guidance import LeverGuidance, LeverMap, find_full_angles_rad
 from deploy.policy.bundle import PolicyBundle
-from deploy.policy.policy_process import REASONS, AdviceStatus, PolicyAdviser, PolicyProcessConfig
+from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
 from deploy.runtime.receiver import BusReceiver
-from deploy.runtime.shm_layout import build_advice_fields, build_state_fields
 from deploy.study.twin_pool import Crew, cores
 from deploy.twin.faults import FaultPort
-from deploy.twin.gateway import find_axis_full_rad
 from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import CYCLE_S, RunningTwin, Twin
 
@@ -44,7 +43,6 @@ BEGIN_S = 1000.0
 BEFORE_S = 1.0
 """For which everything runs before a trial begins: the policy's history is full then."""
 NO_BUS = CanBus(interface="virtual", channel="none", bitrate=None, port=None)
-VALID = REASONS.index(AdviceStatus.VALID)
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,))])
 
 
@@ -139,13 +137,10 @@ def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray
 
 
 class _Newest:
-    """The newest record, for one process; see `deploy.runtime.shared_memory.Slot`."""
+    """The newest record, for one process; see `deploy.runtime.shared_memory.RecordSlot`."""
 
-    def __init__(self, fields: np.dtype, record: Any = None) -> None:
-        self._fields, self._record = fields, record
-
-    def new(self) -> Any:
-        return np.zeros((), self._fields)
+    def __init__(self, record: Any = None) -> None:
+        self._record = record
 
     def write(self, record: Any) -> None:
         self._record = record
@@ -213,9 +208,9 @@ class _Desk:
         self._remote.deadman = True
         target = np.zeros((), TARGET)
         target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
-        fields = build_state_fields(machine.num_joints), build_advice_fields(machine.num_joints)
-        self._shared = _Shared(
-            _Newest(fields[0]), _Newest(fields[1]), _Newest(TARGET, target), None, _NoLog()
+        self._shared = _Shared(_Newest(), _Newest(), _Newest(target), None, _NoLog())
+        self._silent = GuardDecision(
+            GuardState.SILENT, (0.0,) * machine.num_joints, GuardTrip.NONE, GuardTrip.NONE
         )
         counsel = PolicyProcessConfig(
             machine, ground.policy, ground.guidance, ground.limits.joints_s, 1e9, None
@@ -225,7 +220,7 @@ class _Desk:
             LeverMap(machine.levers, machine),
             LeverMap(ground.guidance.levers or machine.levers, machine),
         )
-        self._full_rad, self._cycles = find_axis_full_rad(machine), 0
+        self._full_rad, self._cycles = find_full_angles_rad(machine.levers), 0
         self._rows: list[tuple[np.ndarray, np.ndarray, np.ndarray, float]] = []
         self._shown = np.zeros(machine.num_joints)
 
@@ -247,11 +242,9 @@ class _Desk:
         angles_rad, self._remote.button_right = self._own.levers(given)
         self._remote.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
         advised = self._shared.advice.read()
-        advice = (
-            np.full(len(given), np.nan)
-            if advised is None or int(advised["reason"]) != VALID
-            else np.array(advised["u"])
-        )
+        advice = np.full(len(given), np.nan)
+        if advised is not None and advised.valid:
+            advice = np.array(advised.u)
         for _ in range(round(self._machine.period_s / CYCLE_S)):
             self._cycle()
         u = (receiver.flow_sum - before[0]) / max(1, receiver.flow_number - before[1])
@@ -262,7 +255,7 @@ class _Desk:
     def _cycle(self) -> None:
         self._now_s += CYCLE_S
         if self._cycles % round(self._remote.period_s / CYCLE_S) == 0:
-            frame = self._remote.frame()
+            frame = self._remote.build_frame()
             self._twin.hear(frame, self._now_s)
             self._receiver.take(frame, self._now_s)
         self._cycles += 1
@@ -273,25 +266,12 @@ class _Desk:
 
     def _advise(self) -> None:
         """Publishes what is known, as the bus process does, and lets the policy speak."""
-        receiver, record, now_s = self._receiver, self._shared.state.new(), self._now_s
-        seen = receiver.seen(now_s, bus_up=True)
-        record["t_s"], record["q"], record["q_t_s"] = (
-            now_s,
-            receiver.q,
-            max(0.0, receiver.q_t_s.min()),
-        )
-        record["q_plausible"], record["trusted"] = seen.joints_plausible, seen.trusted
-        record["flow"], record["flow_sum"], record["flow_number"] = (
-            receiver.flow,
-            receiver.flow_sum,
-            receiver.flow_number,
-        )
-        self._shared.state.write(record)
-        self._adviser.cycle(0, now_s)
+        now_s = self._now_s
+        state = self._receiver.build_state(now_s, bus_up=True, decision=self._silent, missed=0)
+        self._shared.state.write(state)
+        self._adviser.run_cycle(0, now_s)
         advice = self._shared.advice.read()
-        self._shown = self._display.command(
-            np.array(advice["lever_rad"]), bool(advice["button_right"])
-        )
+        self._shown = self._display.command(advice.lever_rad, advice.button_right)
 
     def end(self) -> Recording:
         """Returns the recording, and lets go of the twin: its memory is wanted for nothing any more."""

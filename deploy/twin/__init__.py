@@ -1,1 +1,1 @@
-"""The twin: a process that behaves on the bus as gateway and machine do, with a simulated machine behind it."""
+"""The twin: behaves on the bus as gateway and machine do, with a simulated machine behind it."""

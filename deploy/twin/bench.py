@@ -1,4 +1,4 @@
-"""A desk instead of a machine: the twin, and an operator at its remote who follows the advice as the configured person does."""
+"""A desk instead of a machine: the twin, and a simulated operator at its remote."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 @spec
 class TwinBench:
-    """What stands in for machine and operator.
+    """Twin and operator in place of a machine.
 
     Attributes:
         twin: The twin.
         plant: The simulated machine behind it.
-        operator: Who moves the levers as they are shown; `null`: nobody, the levers stay in
-            neutral.
+        operator: Simulated person who moves the levers as they are shown; `null`: none, the levers
+            stay in neutral.
         guidance: How the levers are shown.
-        assumed: What policies for such an operator assume of them (`advice=person`), for the
-            record; `null` without one.
+        assumed: Assumptions of policies for such an operator (`advice=person`), for the record;
+            `null` without one.
     """
 
     twin: Twin
@@ -42,24 +42,13 @@ class TwinBench:
             )
 
     def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
-        """Returns the processes to run beside the loop."""
-        found = [
-            CompanionProcess(
-                "twin",
-                "deploy.twin.twin:run",
-                (self.twin, machine, self.plant, session),
-                TWIN_PRIORITY,
-            )
-        ]
-        if self.operator is not None:
-            levers = LeverMap(self.guidance.levers or machine.levers, machine)
-            wire, dbc, seed = self.twin.wire, self.twin.dbc, session.stream("operator")
-            found.append(
-                CompanionProcess(
-                    "operator",
-                    "deploy.twin.remote:run_operator",
-                    (wire, dbc, machine, self.operator, levers, seed),
-                    TWIN_PRIORITY,
-                )
-            )
-        return found
+        """Return the processes to run beside the loop."""
+        arguments = (self.twin, machine, self.plant, session)
+        twin = CompanionProcess("twin", "deploy.twin.twin:run", arguments, TWIN_PRIORITY)
+        if self.operator is None:
+            return [twin]
+        levers = LeverMap(self.guidance.levers or machine.levers, machine)
+        wire, dbc, seed = self.twin.wire, self.twin.dbc, session.stream("operator")
+        arguments = (wire, dbc, machine, self.operator, levers, seed)
+        target = "deploy.twin.remote:run_operator"
+        return [twin, CompanionProcess("operator", target, arguments, TWIN_PRIORITY)]

@@ -1,9 +1,9 @@
-"""Faults on request: what can go wrong with messages and machine, switched on over a local port. Off unless a port is configured.
+"""Faults on request, of messages and machine, over a local port. Off unless a port is configured.
 
 A request is one JSON datagram: `{"fault": "drop", "message": "JointPos1", "seconds": 0.2}`.
 `message` names one message, or is left out for all; without `seconds` a fault stays until
 `{"fault": "none"}`. The same port takes `{"place": {"q": [...], "hole_in_base_m": [x, y, z]}}`:
-machine and block are put elsewhere, as somebody does between two trials.
+machine and block are put elsewhere, as between two trials of a study.
 """
 
 from __future__ import annotations
@@ -48,6 +48,16 @@ MACHINE_FAULTS = (
 """Faults of the machine: emergency stop, dead-man or remote let go, a lever moved, another node
 that sends commands, a babbling node, nothing sent at all."""
 KNOWN = ("none", *FRAME_FAULTS, *SIGNAL_FAULTS, *MACHINE_FAULTS)
+FOREVER_S = 1e9
+"""Length of a fault that stays until it is switched off."""
+SHARE_DROPPED = 0.1
+"""Of the messages under `drop_some`."""
+DELAY_S = 0.2
+"""Of messages under `delay`: beyond every limit of the guard."""
+WRONG_CRC, WRONG_ID = 0x5A, 0x10
+"""By which CRC and identifier are XORed; any number but 0 will do."""
+REQUEST_BYTES = 1024
+"""Longest request and answer."""
 
 
 @dataclass
@@ -66,7 +76,7 @@ class ActiveFaults:
     _place: tuple[list[float], list[float]] | None = None
 
     def request(self, text: bytes, now_s: float) -> None:
-        """Takes a request; see the module.
+        """Take a request; see the module.
 
         Raises:
             ConfigError: it is none.
@@ -82,7 +92,7 @@ class ActiveFaults:
             fault, message, seconds = (
                 asked["fault"],
                 asked.get("message", ""),
-                float(asked.get("seconds", 1e9)),
+                float(asked.get("seconds", FOREVER_S)),
             )
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ConfigError(
@@ -97,39 +107,43 @@ class ActiveFaults:
             self._since_s[fault] = now_s
 
     def take_place(self) -> tuple[list[float], list[float]] | None:
-        """Returns where machine and block are to be put, once: joint positions and the centre of the rim."""
+        """Return joint positions and rim to put machine and block to, once; `None` without a request."""
         place, self._place = self._place, None
         return place
 
     def on(self, fault: str, message: str, now_s: float) -> bool:
-        """Says whether a fault is on for a message."""
+        """Return whether a fault is on for a message."""
         return any(self.until_s.get((fault, name), -1.0) > now_s for name in (message, ""))
 
     def since_s(self, fault: str, now_s: float) -> float:
-        """Returns how long ago a fault was asked for."""
+        """Return the time since a fault was requested."""
         return now_s - self._since_s.get(fault, now_s)
 
     def pass_on(self, layout: MessageLayout, frame: CanFrame, now_s: float) -> list[CanFrame]:
-        """Returns what is to be sent now in place of `frame`."""
+        """Return the frames to send now in place of `frame`."""
         name = layout.name
 
         def on(fault: str) -> bool:
             return self.on(fault, name, now_s)
 
         data = bytearray(frame.data)
-        if on("silent") or on("drop") or (on("drop_some") and self._chance.random() < 0.1):
+        if (
+            on("silent")
+            or on("drop")
+            or (on("drop_some") and self._chance.random() < SHARE_DROPPED)
+        ):
             return []
         if on("corrupt"):
             data[self._chance.randrange(len(data))] ^= 1 << self._chance.randrange(8)
         if on("masquerade"):
-            data[layout.crc_byte] ^= 0x5A
+            data[layout.crc_byte] ^= WRONG_CRC
         if on("short"):
             del data[-1]
         frame = CanFrame(
-            frame.frame_id ^ (0x10 if on("wrong_id") else 0), bytes(data), frame.extended
+            frame.frame_id ^ (WRONG_ID if on("wrong_id") else 0), bytes(data), frame.extended
         )
         if on("delay"):
-            self._late.append((now_s + 0.2, frame))
+            self._late.append((now_s + DELAY_S, frame))
             return []
         if on("reorder"):
             held = self._held.pop(name, None)
@@ -140,14 +154,14 @@ class ActiveFaults:
         return [frame, frame] if on("duplicate") else [frame]
 
     def due(self, now_s: float) -> list[CanFrame]:
-        """Returns the frames that were held up until now."""
+        """Return the frames that were held up until now."""
         ripe = [frame for at_s, frame in self._late if at_s <= now_s]
         self._late = [(at_s, frame) for at_s, frame in self._late if at_s > now_s]
         return ripe
 
 
 class FaultPort:
-    """Where requests come in: a datagram socket of this computer only; a context manager.
+    """Datagram socket of this computer for requests; a context manager.
 
     Args:
         port: Its number; `None`: there is none, and no fault.
@@ -161,11 +175,11 @@ class FaultPort:
             self._socket.setblocking(False)
 
     def poll(self, faults: ActiveFaults) -> str | None:
-        """Takes a request that has come in, if any, and answers it; returns its text."""
+        """Answer a request that has come in, if any; return its text."""
         if self._socket is None:
             return None
         try:
-            text, sender = self._socket.recvfrom(1024)
+            text, sender = self._socket.recvfrom(REQUEST_BYTES)
         except BlockingIOError:
             return None
         try:
@@ -185,8 +199,8 @@ class FaultPort:
 
 
 def request_fault(port: int, request: dict[str, object], timeout_s: float = 1.0) -> str:
-    """Sends a request to a twin on this computer and returns its answer."""
+    """Send a request to a twin on this computer; return its answer."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as asking:
         asking.settimeout(timeout_s)
         asking.sendto(json.dumps(request).encode(), ("127.0.0.1", port))
-        return asking.recv(1024).decode()
+        return asking.recv(REQUEST_BYTES).decode()

@@ -1,4 +1,4 @@
-"""What the gateway of a machine must do, as an executable reference: who gets the valves, and when they get nothing.
+"""Executable reference of the gateway's rules: which sender gets the valves, and when none does.
 
     levers moved at a remote that is on   the operator has the valves, whatever else is sent
     valid commands, dead-man held         the PC has them, after three frames with mode idle
@@ -24,15 +24,21 @@ from deploy.guidance import AXES, LeverMap, find_full_angles_rad
 TIMEOUT_S = 0.07
 """Age of the last valid command from which there is none; three cycles and a half, within the 100
 ms that are promised."""
-REMOTE_S, FORGET_S = 0.13, 1.0
+REMOTE_S = 0.13
+"""Age of the remote's last message from which it is lost: six of its periods, and a half."""
+FORGET_S = 1.0
+"""Silence of the PC after which its next command counts as heard anew. Chosen by hand."""
 IDLE_FRAMES = 3
+"""Frames with mode idle before the PC gets the valves: a program that wakes up late begins anew."""
 NEUTRAL = 0.03
+"""Deflection, of full, above which the operator's hand is on a lever. Chosen by hand: below that of
+the guard, so that the gateway always notices first."""
 NOBODY, LEVERS, PC = 0, 1, 2
 """Values of `FlowSource`."""
 
 
 class GatewayState(Enum):
-    """What the gateway says of itself (`GatewayState`)."""
+    """Values of the signal `GatewayState`."""
 
     IDLE = 0
     LEVERS = 1
@@ -61,14 +67,14 @@ class Gateway:
             one.name: ProtectedChannel(one.modulus) for one in (self._command, self._remote)
         }
         self._map = LeverMap(machine.levers, machine)
-        self._axis_full_rad = find_axis_full_rad(machine)
+        self._axis_full_rad = find_full_angles_rad(machine.levers)
         self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0
         self._lever, self._remote_s = np.zeros(len(AXES)), -np.inf
         self._button = self._deadman = self._on = False
         self.estop, self.heard_s = False, np.inf
 
     def take(self, frame: CanFrame, now_s: float) -> None:
-        """Takes in a frame of PC or remote."""
+        """Take in a frame of PC or remote."""
         layout = self._description.by_id.get(frame.frame_id)
         if layout is None or layout.name not in self._channels:
             return
@@ -95,8 +101,8 @@ class Gateway:
         self._u = np.array([values[f"Command_{joint}"] for joint in self._machine.joint_names])
         self._u_s = now_s
 
-    def flow(self, now_s: float) -> tuple[np.ndarray, int, GatewayState]:
-        """Returns what the valves get, `(J,)`, from whom, and the gateway's state."""
+    def decide(self, now_s: float) -> tuple[np.ndarray, int, GatewayState]:
+        """Return the flow of the valves, `(J,)`, its source, and the gateway's state."""
         nothing = np.zeros(self._machine.num_joints)
         remote = self._on and now_s - self._remote_s <= REMOTE_S and self._trusts(self._remote.name)
         if self.estop or not remote:
@@ -104,11 +110,8 @@ class Gateway:
             return nothing, NOBODY, GatewayState.STOPPED
         if np.abs(self._lever).max() > NEUTRAL:
             self._idle = 0
-            return (
-                self._map.command(self._lever * self._axis_full_rad, self._button),
-                LEVERS,
-                GatewayState.LEVERS,
-            )
+            flow = self._map.command(self._lever * self._axis_full_rad, self._button)
+            return flow, LEVERS, GatewayState.LEVERS
         if now_s - self._u_s > TIMEOUT_S or not self._trusts(self._command.name):
             self._idle = 0
             return nothing, NOBODY, GatewayState.TIMEOUT
@@ -126,8 +129,3 @@ class Gateway:
 
     def _trusts(self, name: str) -> bool:
         return self._channels[name].trust is not ChannelTrust.INVALID
-
-
-def find_axis_full_rad(machine: Machine) -> np.ndarray:
-    """Returns the angle of each of the four axes at full deflection, `(4,)`; 1 where no joint hangs on it."""
-    return np.array(find_full_angles_rad(machine.levers))

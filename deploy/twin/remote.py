@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -12,14 +11,16 @@ from brokk_rl.contracts.actuator import Follower
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import LEVER_AXES, BusDescription
-from deploy.guidance import AXES, LeverMap
+from deploy.guidance import AXES, LeverMap, find_full_angles_rad
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.twin.gateway import find_axis_full_rad
+
+STALE_S = 0.5
+"""Age of an advice from which the operator does not follow it. Chosen by hand: a person notices."""
 
 
 class RadioRemote:
-    """Makes the remote's messages.
+    """The remote's side of the bus.
 
     Args:
         description: The bus.
@@ -40,8 +41,8 @@ class RadioRemote:
         self.on = True
         self._counter = 0
 
-    def frame(self, frozen: int | None = None) -> CanFrame:
-        """Returns the next message; `frozen` is a counter that stands still, a fault."""
+    def build_frame(self, frozen: int | None = None) -> CanFrame:
+        """Return the next message; `frozen` is a counter that stands still, a fault."""
         values: dict[str, float] = {
             f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)
         }
@@ -64,40 +65,49 @@ def run_operator(
     seed: int,
     memory: LoopMemory,
 ) -> None:
-    """Runs a simulated operator: reads the outlet as a person reads the page, and moves the levers as `follower` says.
+    """Run a simulated operator, who moves the remote's levers as `follower` follows the advice.
 
-    He lets go of the levers where the advice is stale or none.
+    The operator lets go of the levers where the advice is stale or there is none.
+
+    Args:
+        stop: Returns whether to stop.
+        wire: The bus.
+        dbc: Its description.
+        machine: The machine.
+        follower: The operator.
+        levers: Mapping of the displayed levers.
+        seed: Of the operator.
+        memory: Source of the advice.
     """
-    import torch
+    import torch  # only here: the machine's computer has none
 
     torch.manual_seed(seed)
-    description = BusDescription(dbc, machine)
-    remote, hands = RadioRemote(description), follower.build(machine, 1, torch.device("cpu"))
-    per_period = round(machine.period_s / remote.period_s)
-    full_rad, pace, cycle = find_axis_full_rad(machine), CycleTimer(remote.period_s), 0
+    remote = RadioRemote(BusDescription(dbc, machine))
+    hands = follower.build(machine, 1, torch.device("cpu"))
+    cycles_a_period = round(machine.period_s / remote.period_s)
+    full_rad = find_full_angles_rad(machine.levers)
+    # the hands move the machine's own remote, whatever pattern is displayed
+    own = LeverMap(machine.levers, machine)
     remote.deadman = True
-    own = LeverMap(
-        machine.levers, machine
-    )  # what he moves is the machine's remote, whatever pattern is shown
+    timer, cycle = CycleTimer(remote.period_s), 0
     with wire.open([]) as bus:
         while not stop():
-            pace.wait()
-            pace.begin()
-            if cycle % per_period == 0:
+            timer.wait()
+            timer.begin()
+            if cycle % cycles_a_period == 0:
+                displayed = _read_displayed_command(memory, levers)
+                proposed = torch.as_tensor(displayed, dtype=torch.float32)[None]
                 with torch.inference_mode():
-                    proposed = torch.as_tensor(
-                        _read_displayed_command(memory, levers), dtype=torch.float32
-                    )[None]
                     given = hands.step(proposed)[0].numpy().astype(float)
                 angles_rad, remote.button_right = own.levers(given)
                 remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
             cycle += 1
-            bus.send(remote.frame())
+            bus.send(remote.build_frame())
 
 
 def _read_displayed_command(memory: LoopMemory, levers: LeverMap) -> np.ndarray:
-    """Returns the commands that the shown lever positions stand for."""
-    advice: Any = memory.advice.read()
-    if advice is None or time.monotonic() - float(advice["t_s"]) > 0.5:
+    """Return the commands that the displayed lever positions stand for."""
+    advice = memory.advice.read()
+    if advice is None or time.monotonic() - advice.t_s > STALE_S:
         return np.zeros(len(levers.full_rad))
-    return levers.command(np.array(advice["lever_rad"]), bool(advice["button_right"]))
+    return levers.command(advice.lever_rad, advice.button_right)

@@ -1,8 +1,8 @@
-"""The twin at work: gateway, remote and a simulated machine, in real time, on a bus.
+"""The twin: gateway, remote and a simulated machine, in real time, on a bus.
 
-The machine is simulated at the control rate: what the valves get at the beginning of a period moves
-it through that period, and its positions are sent in between as a faster sensor would see them.
-Without an operator of its own the twin also plays the remote, levers in neutral.
+The machine is simulated at the control rate: the flow of the valves at the beginning of a period
+moves it through that period, and its positions are sent in between as a faster sensor would measure
+them. Without an operator of its own the twin also plays the remote, levers in neutral.
 """
 
 from __future__ import annotations
@@ -29,14 +29,28 @@ from deploy.twin.remote import RadioRemote
 log = logging.getLogger(__name__)
 
 CYCLE_S = 0.01
-PRESS_S, LET_GO_S = 1.0, 0.3
+"""Shortest cycle time of the gateway's messages in the example DBC."""
+PRESS_S = 1.0
+"""Time after the PC is first heard until the operator presses the dead-man. Chosen by hand."""
+LET_GO_S = 0.3
+"""Time for which the operator lets go of it before pressing again. Chosen by hand."""
 HEADER = "gateway.h"
 TWIN_PRIORITY = 45
-"""Below bus and policy: the loop must not look better or worse for the company it has on a desk."""
+"""Of SCHED_FIFO, below bus and policy: the loop must not run better or worse beside a twin."""
 FROZEN = 7
-"""Counter that stands still."""
-FLOOD = 30
-"""Frames a cycle of a babbling node."""
+"""Counter of a message whose counter stands still; any number will do."""
+FLOOD, FLOOD_ID = 30, 0x1FFF0000
+"""Frames a cycle of a babbling node, and their identifier: of lowest priority."""
+LEVER_FAULT = 0.5
+"""Deflection of a lever that the operator moves, of full."""
+JUMP_RAD, DRIFT_RAD_S, OUT_OF_RANGE_RAD = 0.5, 0.05, 3.1
+"""Sizes of the faults of a position; any that no joint could reach will do."""
+SENSOR_RANGE_RAD = 3.2
+"""Largest position that the example DBC's signals hold."""
+OIL_RANGE_C = (-40, 215)
+"""Range of the signal `OilTemperature` in the example DBC."""
+USUAL_OIL_C = 20.0
+"""Temperature of a plant that does not model it."""
 
 
 @spec
@@ -50,10 +64,10 @@ class Twin:
             own.
         deadman: Whether an operator at that remote presses the dead-man, one second after the PC is
             first heard, and holds it.
-        again_s: When that operator, if the valves do not follow the PC, lets go and presses again;
+        again_s: Time after which that operator presses again if the valves do not follow the PC;
             `null`: holds it all the same.
         fault_port: Local port for faults on request; `null`: none.
-        seconds: When to stop; `null`: when told to.
+        seconds: Length of the run; `null`: until told to stop.
         realtime: Whether to ask for real-time priority: a machine is never late.
     """
 
@@ -75,7 +89,9 @@ class Twin:
             raise ConfigError(f"twin.again_s: expected more than 0, or null, got {self.again_s}")
 
     def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
-        """Runs until told to stop, or the time is over; leaves `gateway.h`, the bus for the firmware of a real gateway.
+        """Run until told to stop, or the time is over.
+
+        Writes `gateway.h`, the bus for the firmware of a real gateway.
 
         Raises:
             LinkError: the bus cannot be opened.
@@ -100,49 +116,44 @@ def run(
     session: Session,
     memory: Any = None,
 ) -> None:
-    """Runs a twin as a child process."""
+    """Run a twin as a child process."""
     twin.run(stop, machine, plant, session)
 
 
 class FrameBus(Protocol):
-    """Where a twin's messages go: an open wire, or whatever stands in for one."""
+    """Bus of a twin: an open CAN bus, or a stand-in."""
 
     def recv(self, timeout_s: float) -> CanFrame | None:
-        """Returns the next frame, `None` when none came in time."""
+        """Return the next frame, `None` when none came in time."""
         ...
 
     def send(self, frame: CanFrame) -> None:
-        """Sends a frame."""
+        """Send a frame."""
         ...
 
 
 class RunningTwin:
-    """A twin at work; `run` in real time, or cycle by cycle by whoever keeps the time.
+    """A running twin, in real time by `run`, or cycle by cycle.
 
     Args:
-        twin: What it is.
+        twin: Settings.
         machine: The machine.
         link: The simulated machine.
-        bus: Where its messages go.
-        port: Where faults are asked for.
+        bus: For its messages.
+        port: For requests of faults.
     """
 
     def __init__(
         self, twin: Twin, machine: Machine, link: Link, bus: FrameBus, port: FaultPort
     ) -> None:
-        self._twin, self._machine, self._link, self._bus, self._port = (
-            twin,
-            machine,
-            link,
-            bus,
-            port,
-        )
+        self._twin, self._machine, self._link = twin, machine, link
+        self._bus, self._port = bus, port
         self._description = BusDescription(twin.dbc, machine)
         self._gateway, self._remote = (
             Gateway(self._description, machine),
             RadioRemote(self._description),
         )
-        self._faults, self._pace = ActiveFaults(), CycleTimer(CYCLE_S)
+        self._faults, self._timer = ActiveFaults(), CycleTimer(CYCLE_S)
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
         self._q = self._before = np.asarray(link.read().q, dtype=float)
@@ -155,47 +166,46 @@ class RunningTwin:
         self._own = {remote.frame_id} if twin.remote else set()
 
     def run(self, stop: Stop) -> None:
-        """Runs in real time until told to stop, or until its time is over."""
+        """Run in real time until told to stop, or until its time is over."""
         end_s = np.inf if self._twin.seconds is None else time.monotonic() + self._twin.seconds
         while not stop() and time.monotonic() < end_s:
             try:
-                while (left_s := self._pace.next_s - time.monotonic()) > 0:
+                while (left_s := self._timer.next_s - time.monotonic()) > 0:
                     frame = self._bus.recv(left_s)
                     if frame is not None:
                         self.hear(frame, time.monotonic())
-                self._pace.begin()
+                self._timer.begin()
                 self.cycle(time.monotonic())
             except LinkError as error:
                 log.warning("%s", error)
-                self._pace.wait()
+                self._timer.wait()
 
     def hear(self, frame: CanFrame, now_s: float) -> None:
-        """Takes in a frame of PC or remote, and acts on it if it stops the machine."""
+        """Take in a frame of PC or remote; one that stops the machine takes effect at once."""
         if frame.frame_id not in self._own:
             self._gateway.take(frame, now_s)
-            self._valves(now_s)
+            self._apply_flow(now_s)
 
     def cycle(self, now_s: float) -> None:
-        """Lets `CYCLE_S` go by: valves, motion, messages."""
-        if (asked := self._port.poll(self._faults)) is not None:
-            log.debug("fault: %s", asked)
+        """Let `CYCLE_S` go by: valves, motion, messages."""
+        if (text := self._port.poll(self._faults)) is not None:
+            log.debug("fault: %s", text)
         if (place := self._faults.take_place()) is not None:
             self._place(*place)
         faults, gateway = self._faults, self._gateway
         gateway.estop = faults.on("estop", "", now_s)
         if self._twin.remote:
             self._play_remote(now_s)
-        flow, said = self._valves(now_s)
+        flow, values = self._apply_flow(now_s)
         if now_s - self._period_began_s >= self._machine.period_s - CYCLE_S / 2:
             late = now_s - self._period_began_s > 1.5 * self._machine.period_s
             self._period_began_s = now_s if late else self._period_began_s + self._machine.period_s
             self._before = self._q
             self._link.send(Command(flow))
-            self._q, self._oil_c = (
-                np.asarray(self._link.read().q, dtype=float),
-                _read_oil_c(self._link),
-            )
-        values = self._positions(now_s) | said | {"Stamp": int(1e3 * now_s) % 65536 / 1e3}
+            self._q = np.asarray(self._link.read().q, dtype=float)
+            self._oil_c = _read_oil_c(self._link)
+        # the gateway's clock: 16 bits of milliseconds
+        values |= self._measure_positions(now_s) | {"Stamp": int(1e3 * now_s) % 65536 / 1e3}
         for layout in self._description.sent_by(GATEWAY):
             self._send(layout.name, values, now_s)
         for frame in faults.due(now_s):
@@ -210,40 +220,42 @@ class RunningTwin:
             )
         if faults.on("flood", "", now_s):
             for _ in range(FLOOD):
-                self._bus.send(CanFrame(0x1FFF0000, bytes(8)))
+                self._bus.send(CanFrame(FLOOD_ID, bytes(8)))
 
     def _place(self, q: list[float], hole_in_base_m: list[float]) -> None:
-        """Puts machine and block elsewhere, as between two trials of a study; a plant that cannot be put stays where it is."""
+        """Put machine and block elsewhere, as between two trials of a study, if the plant can."""
         if not hasattr(self._link, "place"):
             log.warning("this simulated machine cannot be put elsewhere; link=site can")
             return
         self._link.place(np.array(q), np.array(hole_in_base_m))  # type: ignore[attr-defined]
         self._q = self._before = np.asarray(self._link.read().q, dtype=float)
 
-    def _valves(self, now_s: float) -> tuple[np.ndarray, dict[str, float]]:
-        """Returns what the valves get, `(J,)`, and what is said of it; that they get nothing any more is said at once."""
+    def _apply_flow(self, now_s: float) -> tuple[np.ndarray, dict[str, float]]:
+        """Return the flow of the valves, `(J,)`, and the signals that report it.
+
+        A flow that falls to zero is reported at once.
+        """
         gateway, before = self._gateway, self._flow
-        self._flow, self._source, state = gateway.flow(now_s)
-        said = {
-            f"Flow_{name}": float(u)
-            for name, u in zip(self._machine.joint_names, self._flow, strict=True)
-        }
-        said |= {
+        self._flow, self._source, state = gateway.decide(now_s)
+        values: dict[str, float] = {
             "FlowSource": self._source,
             "EStop": gateway.estop,
             "ExclusiveSelected": gateway.exclusive_selected,
+            "GatewayState": state.value,
+            "OilTemperature": self._oil_c,
         }
-        said |= {"GatewayState": state.value, "OilTemperature": self._oil_c}
+        for name, u in zip(self._machine.joint_names, self._flow, strict=True):
+            values[f"Flow_{name}"] = float(u)
         if before.any() and not self._flow.any():
             for signal in ("FlowSource", "EStop"):
-                self._send(self._description.message_of(signal), said, now_s, at_once=True)
-        return self._flow, said
+                self._send(self._description.message_of(signal), values, now_s, at_once=True)
+        return self._flow, values
 
     def _play_remote(self, now_s: float) -> None:
         faults, remote = self._faults, self._remote
         layout = self._description.layouts[self._description.message_of("DeadMan")]
-        held = self._held(now_s)
-        released = remote.deadman and not held  # which does not wait for its turn either
+        held = self._holds_deadman(now_s)
+        released = remote.deadman and not held  # a release does not wait for its turn
         if now_s < self._due_s.get(layout.name, now_s) and not released:
             return
         self._due_s[layout.name] = (
@@ -251,18 +263,22 @@ class RunningTwin:
         )
         remote.deadman = held
         remote.on = not faults.on("remote_off", "", now_s)
-        remote.levers = (0.5 if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
-        frame = remote.frame(FROZEN if faults.on("freeze_counter", layout.name, now_s) else None)
+        remote.levers = (LEVER_FAULT if faults.on("lever", "", now_s) else 0.0, 0.0, 0.0, 0.0)
+        frame = remote.build_frame(
+            FROZEN if faults.on("freeze_counter", layout.name, now_s) else None
+        )
         self._gateway.take(frame, now_s)
         for one in faults.pass_on(layout, frame, now_s):
             self._bus.send(one)
 
-    def _held(self, now_s: float) -> bool:
-        """Says whether the operator holds the dead-man; a PC that was not ready when it was pressed waits for it to be let go."""
+    def _holds_deadman(self, now_s: float) -> bool:
+        """Return whether the operator holds the dead-man.
+
+        A PC that was not ready when it was pressed waits for its release; `again_s` provides one.
+        """
         heard = now_s - self._gateway.heard_s > PRESS_S
-        pressed = (
-            self._twin.deadman and heard and not self._faults.on("deadman_released", "", now_s)
-        )
+        released = self._faults.on("deadman_released", "", now_s)
+        pressed = self._twin.deadman and heard and not released
         again_s = self._twin.again_s
         if not pressed or self._source == PC:
             self._grip_s = now_s
@@ -279,16 +295,15 @@ class RunningTwin:
             return
         self._due_s[name] = max(due_s, now_s - layout.period_s) + layout.period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1
-        data = self._description.encode(
-            name, values, FROZEN if self._faults.on("freeze_counter", name, now_s) else counter
-        )
-        for one in self._faults.pass_on(
-            layout, CanFrame(layout.frame_id, data, layout.extended), now_s
-        ):
+        if self._faults.on("freeze_counter", name, now_s):
+            counter = FROZEN
+        data = self._description.encode(name, values, counter)
+        frame = CanFrame(layout.frame_id, data, layout.extended)
+        for one in self._faults.pass_on(layout, frame, now_s):
             self._bus.send(one)
 
-    def _positions(self, now_s: float) -> dict[str, float]:
-        """Returns positions and validities as the sensors say them."""
+    def _measure_positions(self, now_s: float) -> dict[str, float]:
+        """Return positions and validities as the sensors report them, faults included."""
         faults, machine = self._faults, self._machine
         part = min(1.0, max(0.0, (now_s - self._period_began_s) / machine.period_s))
         q = self._before + part * (self._q - self._before)
@@ -299,27 +314,26 @@ class RunningTwin:
             self._stuck = None
         q = q.copy()
         if faults.on("jump", "", now_s):
-            q[0] += 0.5
+            q[0] += JUMP_RAD
         if faults.on("drift", "", now_s):
-            q[0] += 0.05 * faults.since_s("drift", now_s)
+            q[0] += DRIFT_RAD_S * faults.since_s("drift", now_s)
         if faults.on("out_of_range", "", now_s):
-            q[0] = 3.1
+            q[0] = OUT_OF_RANGE_RAD
         if faults.on("sign", "", now_s):
             q[:] = -q
         valid = 0.0 if faults.on("invalid", "", now_s) else 1.0
         names = machine.joint_names
-        values = {
-            f"Position_{name}": float(np.clip(value, -3.2, 3.2))
-            for name, value in zip(names, q, strict=True)
-        }
-        return values | {f"Valid_{name}": valid for name in names}
+        values = {f"Valid_{name}": valid for name in names}
+        clipped = np.clip(q, -SENSOR_RANGE_RAD, SENSOR_RANGE_RAD).tolist()
+        for name, position in zip(names, clipped, strict=True):
+            values[f"Position_{name}"] = position
+        return values
 
 
 def _read_oil_c(link: Link) -> float:
-    """Returns the oil's temperature as the bus can say it, in degrees Celsius."""
+    """Return the oil's temperature in whole degrees Celsius, as the bus carries it."""
     extra = getattr(link, "extra", dict)()
-    return (
-        float(np.clip(np.round(np.asarray(extra["oil_c"]).mean()), -40, 215))
-        if "oil_c" in extra
-        else 20.0
-    )
+    if "oil_c" not in extra:
+        return USUAL_OIL_C
+    oil_c = np.round(np.asarray(extra["oil_c"]).mean())
+    return float(np.clip(oil_c, *OIL_RANGE_C))

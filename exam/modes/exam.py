@@ -407,11 +407,6 @@ class Exam:
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:
     shown = Table("", *tables)
-    row: list[Any]
-    for row in report.build_rows(tables):
-        words, *cells = row
-        shown.add_row(
-            str(words),
-            *(f"{cell.value} ({cell.note})" if cell.note else str(cell.value) for cell in cells),
-        )
+    for label, *cells in report.build_rows(tables):
+        shown.add_row(str(label), *(report.format_cell(cell) for cell in cells))
     Console().print(shown)

@@ -22,7 +22,7 @@ SUPERSAMPLING = 4
 def draw_pattern(
     generator: np.random.Generator, condition: str, width: int = 1024, height: int = 768
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a grey picture `(height, width)` uint8 of a calibration pattern and its ellipses `(C, 5)`.
+    """Return a grey picture `(height, width)` uint8 of a calibration pattern and its ellipses `(C, 5)`.
 
     Args:
         generator: Decides everything.
@@ -50,14 +50,14 @@ def draw_pattern(
                 forms.append(transform_circles(circle, homography))
                 levels.append(ink if k % 2 == 0 else paper)
     ellipses = np.concatenate(forms)
-    table = _table(generator, width, height)
+    table = _draw_table(generator, width, height)
     canvas = cv2.resize(
         table, None, fx=SUPERSAMPLING, fy=SUPERSAMPLING, interpolation=cv2.INTER_LINEAR
     )
     sheet = ((place + 0.5) * SUPERSAMPLING - 0.5).round().astype(np.int32)
     cv2.fillPoly(canvas, [sheet], float(paper))
     for ellipse, level in zip(ellipses, levels, strict=True):
-        _fill(canvas, ellipse, float(level))
+        _fill_ellipse(canvas, ellipse, float(level))
     picture = cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
     lit = picture * draw_light(generator, width, height)
     large = (
@@ -71,7 +71,7 @@ def draw_pattern(
 def degrade(
     picture: np.ndarray, condition: str, generator: np.random.Generator, ellipses: np.ndarray
 ) -> np.ndarray:
-    """Returns a float picture as a camera gives it under a condition, uint8."""
+    """Return a float picture as a camera gives it under a condition, uint8."""
     height, width = picture.shape
     if condition == "stripes":
         x, y = np.meshgrid(np.arange(width), np.arange(height))
@@ -111,7 +111,7 @@ def degrade(
 def draw_negative(
     kind: str, generator: np.random.Generator, width: int = 1024, height: int = 768
 ) -> np.ndarray:
-    """Returns a picture without ellipses; `kind` is one of `NEGATIVES`."""
+    """Return a picture without ellipses; `kind` is one of `NEGATIVES`."""
     if kind == "noise":
         return np.clip(generator.normal(128, 50, (height, width)), 0, 255).astype(np.uint8)
     if kind == "texture":
@@ -143,7 +143,7 @@ def draw_negative(
         for i in range(6):
             for j in range(4):
                 size, turn = generator.uniform(30, 130), generator.uniform(0, 2 * np.pi)
-                shape = _shape(kind) * size
+                shape = _build_shape(kind) * size
                 matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
                 place = shape @ matrix.T + ((i + 0.5) * width / 3, (j + 0.5) * height / 2)
                 cv2.fillPoly(big, [np.round(place * 16).astype(np.int32)], ink, cv2.LINE_AA, 4)
@@ -156,7 +156,7 @@ def draw_negative(
 
 
 def compute_ellipse_overlap(first: np.ndarray, second: np.ndarray) -> float:
-    """Returns intersection over union of two ellipses `(5,)`."""
+    """Return intersection over union of two ellipses `(5,)`."""
     if np.hypot(first[0] - second[0], first[1] - second[1]) > first[2] + second[2]:
         return 0.0
     angles = np.linspace(0, 2 * np.pi, 72, endpoint=False)
@@ -168,7 +168,7 @@ def compute_ellipse_overlap(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def count_matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.8) -> int:
-    """Returns how many ellipses are found, each at most once, with at least this intersection over union."""
+    """Return how many ellipses are found, each at most once, with at least this intersection over union."""
     rows = [np.array([e.x, e.y, e.a, e.b, e.theta_rad]) for e in found]
     pairs = []
     for i, row in enumerate(rows):
@@ -183,12 +183,12 @@ def count_matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.
 
 
 def transform_circles(circle: np.ndarray, homography: np.ndarray) -> np.ndarray:
-    """Returns the ellipses `(C, 5)` that circles, rows like theirs, are after a homography."""
+    """Return the ellipses `(C, 5)` that circles, rows like theirs, are after a homography."""
     back = np.linalg.inv(homography)
     return conic.convert_forms_to_ellipses(back.T @ conic.build_quadratic_forms(circle) @ back)
 
 
-def _fill(canvas: np.ndarray, ellipse: np.ndarray, level: float) -> None:
+def _fill_ellipse(canvas: np.ndarray, ellipse: np.ndarray, level: float) -> None:
     x, y, a, b, theta = ellipse
     place = ((np.array([x, y]) + 0.5) * SUPERSAMPLING - 0.5) * 16
     size = (round(a * SUPERSAMPLING * 16), round(b * SUPERSAMPLING * 16))
@@ -209,7 +209,7 @@ def _fill(canvas: np.ndarray, ellipse: np.ndarray, level: float) -> None:
 def draw_clouds(
     generator: np.random.Generator, width: int, height: int, power: float
 ) -> np.ndarray:
-    """Returns noise whose spectrum falls with frequency, of unit variance."""
+    """Return noise whose spectrum falls with frequency, of unit variance."""
     fy, fx = np.fft.fftfreq(height)[:, None], np.fft.rfftfreq(width)
     spectrum = (
         np.fft.rfft2(generator.normal(size=(height, width)))
@@ -219,7 +219,7 @@ def draw_clouds(
     return ((clouds - clouds.mean()) / clouds.std()).astype(np.float32)
 
 
-def _table(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
+def _draw_table(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
     table = generator.uniform(60, 180) + 12 * draw_clouds(generator, width, height, 1.5)
     for _ in range(int(generator.integers(0, 12))):
         ends = (generator.uniform(0, 1, (2, 2)) * (width, height)).astype(int).tolist()
@@ -228,7 +228,7 @@ def _table(generator: np.random.Generator, width: int, height: int) -> np.ndarra
 
 
 def draw_light(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Returns how bright a lamp from one side makes each place of a picture, `(height, width)`."""
+    """Return how bright a lamp from one side makes each place of a picture, `(height, width)`."""
     slope = generator.uniform(-0.25, 0.25, 2)
     x, y = np.meshgrid(
         np.linspace(-1, 1, width, dtype=np.float32), np.linspace(-1, 1, height, dtype=np.float32)
@@ -236,7 +236,7 @@ def draw_light(generator: np.random.Generator, width: int, height: int) -> np.nd
     return np.clip(0.85 + slope[0] * x + slope[1] * y, 0.3, 1.15)
 
 
-def _shape(kind: str) -> np.ndarray:
+def _build_shape(kind: str) -> np.ndarray:
     if kind == "octagons":
         turn = (np.arange(8) + 0.5) * np.pi / 4
         return np.column_stack([np.cos(turn), np.sin(turn)])

@@ -18,7 +18,7 @@ of the truth."""
 def draw_occluded_ellipses(
     generator: np.random.Generator, style: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a grey picture `(h, w)` uint8 and the ellipses `(C, 5)` of which at least `SEEN` of the rim is seen.
+    """Return a grey picture `(h, w)` uint8 and the ellipses `(C, 5)` of which at least `SEEN` of the rim is seen.
 
     Args:
         generator: Decides everything.
@@ -27,7 +27,7 @@ def draw_occluded_ellipses(
             of each behind a patch of any brightness, plain or grained.
     """
     width, height = (300, 300) if style in ("behind", "outlines") else (800, 600)
-    ellipses = _scattered(
+    ellipses = _scatter_ellipses(
         generator, int(generator.integers(4, 25)), width, height, apart=1.3 if width > 300 else 0.0
     )
     size = (height * SUPERSAMPLING, width * SUPERSAMPLING)
@@ -39,33 +39,35 @@ def draw_occluded_ellipses(
     owner = np.zeros(size, np.int16)  # which ellipse is seen at each place, 0 for none
     if style == "outlines":
         for ellipse in ellipses:
-            _drawn(canvas, ellipse, 0.0, SUPERSAMPLING + 2)
-        return _taken(canvas, generator, width, height), ellipses
+            _draw_ellipse(canvas, ellipse, 0.0, SUPERSAMPLING + 2)
+        return _simulate_camera(canvas, generator, width, height), ellipses
     ink = generator.uniform(5, 80)
     for number, ellipse in enumerate(ellipses, 1):
-        _drawn(canvas, ellipse, float(generator.uniform(0, 255)) if style == "behind" else ink)
-        _drawn(owner, ellipse, number)
+        _draw_ellipse(
+            canvas, ellipse, float(generator.uniform(0, 255)) if style == "behind" else ink
+        )
+        _draw_ellipse(owner, ellipse, number)
     if style != "behind":
         paper = float(canvas[0, 0])
         grain = cv2.resize(
             draw_clouds(generator, width, height, 1.3), size[::-1], interpolation=cv2.INTER_LINEAR
         )
         for number, ellipse in enumerate(ellipses, 1):
-            there = _patch(generator, ellipse, size)
+            there = _draw_patch(generator, ellipse, size)
             if style == "halves":
                 there &= owner == number
             level = paper if style == "halves" else generator.uniform(0, 255)
             rough = 25 * generator.integers(2) if style == "covered" else 0
             canvas[there] = np.clip(level + rough * np.asarray(grain)[there], 0, 255)
             owner[there] = 0
-    picture = _taken(canvas, generator, width, height)
-    return picture, ellipses[_seen(owner, ellipses) >= MIN_VISIBLE]
+    picture = _simulate_camera(canvas, generator, width, height)
+    return picture, ellipses[_compute_visible_shares(owner, ellipses) >= MIN_VISIBLE]
 
 
 def draw_lookalikes(
     generator: np.random.Generator, kind: str, width: int = 800, height: int = 600
 ) -> np.ndarray:
-    """Returns a picture without ellipses, `(height, width)` uint8; `kind` is one of `SHAPES`."""
+    """Return a picture without ellipses, `(height, width)` uint8; `kind` is one of `SHAPES`."""
     if kind == "salt":
         grains = generator.random((height, width))
         return np.where(grains < 0.1, 0, np.where(grains > 0.9, 255, 128)).astype(np.uint8)
@@ -84,31 +86,31 @@ def draw_lookalikes(
         within = np.abs(curve).max(1) < 2 * width
         cv2.polylines(
             canvas,
-            [_fixed(curve[within] + (width / 2, height / 2))],
+            [_to_fixed_point(curve[within] + (width / 2, height / 2))],
             False,
             ink,
             line,
             cv2.LINE_AA,
             4,
         )
-        return _taken(canvas, generator, width, height)
+        return _simulate_camera(canvas, generator, width, height)
     for row in range(3):
         for column in range(4):
             turn = generator.uniform(0, 2 * np.pi)
             matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
             size = generator.uniform(20, 70)
-            outline = _fixed(
-                _shape(generator, kind) @ matrix.T * size
+            outline = _to_fixed_point(
+                _build_shape(generator, kind) @ matrix.T * size
                 + ((column + 0.5) * width / 4, (row + 0.5) * height / 3)
             )
             if generator.random() < 0.3:
                 cv2.polylines(canvas, [outline], True, ink, line, cv2.LINE_AA, 4)
             else:
                 cv2.fillPoly(canvas, [outline], ink, cv2.LINE_AA, 4)
-    return _taken(canvas, generator, width, height)
+    return _simulate_camera(canvas, generator, width, height)
 
 
-def _shape(generator: np.random.Generator, kind: str) -> np.ndarray:
+def _build_shape(generator: np.random.Generator, kind: str) -> np.ndarray:
     if kind == "polygons":
         turn = np.arange(number := int(generator.integers(5, 10))) * 2 * np.pi / number
         return np.column_stack([np.cos(turn), generator.uniform(0.7, 1.0) * np.sin(turn)])
@@ -132,10 +134,10 @@ def _shape(generator: np.random.Generator, kind: str) -> np.ndarray:
     return np.vstack([side, (np.asarray(side) * (-1, 1))[::-1]])
 
 
-def _scattered(
+def _scatter_ellipses(
     generator: np.random.Generator, number: int, width: int, height: int, apart: float
 ) -> np.ndarray:
-    """Returns ellipses anywhere in a picture, each so many times its size from the others, `(C, 5)`."""
+    """Return ellipses anywhere in a picture, each so many times its size from the others, `(C, 5)`."""
     found: list[np.ndarray] = []
     for _ in range(3 * number):
         a = generator.uniform(12, 60)
@@ -148,10 +150,10 @@ def _scattered(
     return np.array(found)
 
 
-def _patch(
+def _draw_patch(
     generator: np.random.Generator, ellipse: np.ndarray, size: tuple[int, int]
 ) -> np.ndarray:
-    """Returns where a patch lies that hides about half of an ellipse, `size` bool."""
+    """Return where a patch lies that hides about half of an ellipse, `size` bool."""
     x, y, a, b, theta = ellipse
     turn = generator.uniform(0, 2 * np.pi)
     along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
@@ -161,13 +163,17 @@ def _patch(
     far = np.array([edge, edge, 1.3 * a, 1.3 * a])
     there = np.zeros(size, np.uint8)
     cv2.fillPoly(
-        there, [_fixed((x, y) + far[:, None] * along + wide[:, None] * across)], 1, cv2.LINE_8, 4
+        there,
+        [_to_fixed_point((x, y) + far[:, None] * along + wide[:, None] * across)],
+        1,
+        cv2.LINE_8,
+        4,
     )
     return there > 0
 
 
-def _seen(owner: np.ndarray, ellipses: np.ndarray) -> np.ndarray:
-    """Returns the part of each rim inside which its own ellipse is seen, `(C,)`."""
+def _compute_visible_shares(owner: np.ndarray, ellipses: np.ndarray) -> np.ndarray:
+    """Return the part of each rim inside which its own ellipse is seen, `(C,)`."""
     inner = ellipses - (0, 0, 0.7, 0.7, 0)
     points, _, length = conic.sample_ellipses(inner, np.arange(180) * (np.pi / 90))
     place = np.rint((points + 0.5) * SUPERSAMPLING - 0.5).astype(int)
@@ -175,9 +181,9 @@ def _seen(owner: np.ndarray, ellipses: np.ndarray) -> np.ndarray:
     return (mine * length).sum(1) / length.sum(1)
 
 
-def _drawn(canvas: np.ndarray, ellipse: np.ndarray, level: float, line: int = -1) -> None:
+def _draw_ellipse(canvas: np.ndarray, ellipse: np.ndarray, level: float, line: int = -1) -> None:
     (x, y), (a, b) = (
-        _fixed(ellipse[:2]).tolist(),
+        _to_fixed_point(ellipse[:2]).tolist(),
         np.round(ellipse[2:4] * SUPERSAMPLING * 16).astype(int).tolist(),
     )
     cv2.ellipse(
@@ -185,12 +191,12 @@ def _drawn(canvas: np.ndarray, ellipse: np.ndarray, level: float, line: int = -1
     )
 
 
-def _fixed(places: np.ndarray) -> np.ndarray:
-    """Returns places of the picture on the supersampled canvas in sixteenths, as OpenCV draws them."""
+def _to_fixed_point(places: np.ndarray) -> np.ndarray:
+    """Return places of the picture on the supersampled canvas in sixteenths, as OpenCV draws them."""
     return np.round(((places + 0.5) * SUPERSAMPLING - 0.5) * 16).astype(np.int32)
 
 
-def _taken(
+def _simulate_camera(
     canvas: np.ndarray, generator: np.random.Generator, width: int, height: int
 ) -> np.ndarray:
     picture = np.asarray(

@@ -23,7 +23,7 @@ SMALLEST_PX = 3.0
 def draw_photograph(
     generator: np.random.Generator, style: str, width: int = 1024, height: int = 768
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a grey picture `(height, width)` uint8, as JPEG leaves it, and its ellipses `(C, 5)`.
+    """Return a grey picture `(height, width)` uint8, as JPEG leaves it, and its ellipses `(C, 5)`.
 
     Args:
         generator: Decides everything.
@@ -34,8 +34,8 @@ def draw_photograph(
     most = (4, 4) if style == "few" else (14, 11)
     num_x, num_y = (int(generator.integers(1 if style == "few" else 4, one)) for one in most)
     radius = generator.uniform(0.15, 0.42)
-    sheet, homography = _sheet(generator, num_x, num_y, width, height)
-    canvas = _clutter(generator, width, height)
+    sheet, homography = _draw_sheet(generator, num_x, num_y, width, height)
+    canvas = _draw_clutter(generator, width, height)
     paper = (
         generator.uniform(170, 245, 3)
         if generator.random() < 0.5
@@ -58,7 +58,7 @@ def draw_photograph(
     for i in range(num_x):
         for j in range(num_y):
             if style == "board" and (i + j) % 2:
-                _square(canvas, homography, i, j, ink)
+                _draw_square(canvas, homography, i, j, ink)
                 continue
             for k, part in enumerate(
                 {"rings": (1.0, 0.6), "targets": (1.0, 0.75, 0.5, 0.25), "coded": (1.0, 0.4)}.get(
@@ -66,10 +66,10 @@ def draw_photograph(
                 )
             ):
                 ellipses.append(
-                    _disc(canvas, homography, i, j, radius * part, paper if k % 2 else ink)
+                    _draw_disc(canvas, homography, i, j, radius * part, paper if k % 2 else ink)
                 )
             if style == "coded":
-                _code(canvas, homography, i, j, radius * 0.7, paper, generator)
+                _draw_code(canvas, homography, i, j, radius * 0.7, paper, generator)
     picture = (
         cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA)
         * draw_light(generator, width, height)[..., None]
@@ -79,13 +79,13 @@ def draw_photograph(
     seen = (
         (b >= SMALLEST_PX) & (x - a > 2) & (x + a < width - 2) & (y - a > 2) & (y + a < height - 2)
     )
-    return _taken(picture, generator), found[seen]
+    return _simulate_camera(picture, generator), found[seen]
 
 
-def _sheet(
+def _draw_sheet(
     generator: np.random.Generator, num_x: int, num_y: int, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the corners of the sheet in the picture, `(4, 2)`, and the homography from the pattern to it."""
+    """Return the corners of the sheet in the picture, `(4, 2)`, and the homography from the pattern to it."""
     corners = np.array([[-1, -1], [num_x, -1], [num_x, num_y], [-1, num_y]], np.float32)
     frame = np.array([[0, 0], [width, 0], [width, height], [0, height]])
     inward = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (width, height)
@@ -93,8 +93,8 @@ def _sheet(
     return sheet, np.asarray(cv2.getPerspectiveTransform(corners, sheet), float)
 
 
-def _clutter(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
-    """Returns a coloured table with lines and scraps on it, supersampled, `(h, w, 3)`."""
+def _draw_clutter(generator: np.random.Generator, width: int, height: int) -> np.ndarray:
+    """Return a coloured table with lines and scraps on it, supersampled, `(h, w, 3)`."""
     table = [
         draw_clouds(generator, width, height, generator.uniform(1.0, 1.8))
         * generator.uniform(5, 35)
@@ -123,11 +123,11 @@ def _clutter(generator: np.random.Generator, width: int, height: int) -> np.ndar
     return canvas
 
 
-def _disc(
+def _draw_disc(
     canvas: np.ndarray, homography: np.ndarray, i: float, j: float, radius: float, color: np.ndarray
 ) -> np.ndarray:
     ellipse = transform_circles(np.array([[i, j, radius, radius, 0.0]]), homography)[0]
-    center, axes = _fixed(ellipse)
+    center, axes = _to_fixed_point(ellipse)
     cv2.ellipse(
         canvas,
         center,
@@ -143,7 +143,7 @@ def _disc(
     return ellipse
 
 
-def _code(
+def _draw_code(
     canvas: np.ndarray,
     homography: np.ndarray,
     i: float,
@@ -152,9 +152,9 @@ def _code(
     color: np.ndarray,
     generator: np.random.Generator,
 ) -> None:
-    """Draws a piece of a ring, as coded targets have; it is no ellipse."""
+    """Draw a piece of a ring, as coded targets have; it is no ellipse."""
     ellipse = transform_circles(np.array([[i, j, radius, radius, 0.0]]), homography)[0]
-    center, axes = _fixed(ellipse)
+    center, axes = _to_fixed_point(ellipse)
     start, width = generator.uniform(0, 360), max(2, int(ellipse[3] * SUPERSAMPLING * 0.25))
     stop = start + generator.uniform(30, 120)
     cv2.ellipse(
@@ -171,7 +171,7 @@ def _code(
     )
 
 
-def _square(
+def _draw_square(
     canvas: np.ndarray, homography: np.ndarray, i: float, j: float, color: np.ndarray
 ) -> None:
     corners = (
@@ -189,15 +189,15 @@ def _square(
     cv2.fillPoly(canvas, [place.round().astype(np.int32)], color.tolist(), cv2.LINE_AA, 4)
 
 
-def _fixed(ellipse: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]]:
-    """Returns centre and axes on the supersampled canvas in sixteenths, as OpenCV draws them."""
+def _to_fixed_point(ellipse: np.ndarray) -> tuple[tuple[int, int], tuple[int, int]]:
+    """Return centre and axes on the supersampled canvas in sixteenths, as OpenCV draws them."""
     x, y = ((ellipse[:2] + 0.5) * SUPERSAMPLING - 0.5) * 16
     a, b = ellipse[2:4] * SUPERSAMPLING * 16
     return (round(x), round(y)), (round(a), round(b))
 
 
-def _taken(picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Returns what a camera makes of a picture: blur, sometimes of motion, noise, JPEG; in grey."""
+def _simulate_camera(picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Return what a camera makes of a picture: blur, sometimes of motion, noise, JPEG; in grey."""
     picture = cv2.GaussianBlur(picture, (0, 0), generator.uniform(0.4, 1.6))
     if generator.random() < 0.2:
         picture = cv2.filter2D(

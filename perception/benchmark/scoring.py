@@ -60,7 +60,7 @@ class FinderScore:
     ms: dict[str, list[float]] = field(default_factory=dict)
 
     def row(self) -> dict[str, float | int | None]:
-        """Returns the figures of a table; `None` for those that there is nothing to say about."""
+        """Return the figures of a table; `None` for those that there is nothing to say about."""
         position, normal = 1000 * np.array(self.position_m), np.degrees(self.normal_rad)
         targets = self.found + self.false + self.fooled
         return {
@@ -70,24 +70,24 @@ class FinderScore:
             "precision": self.found / targets if targets else None,
             "false": self.false,
             "decoys_accepted": self.fooled / self.decoys if self.decoys else None,
-            "position_mm_median": _quantile(position, 50),
-            "position_mm_p95": _quantile(position, 95),
-            "normal_deg_p95": _quantile(normal, 95),
+            "position_mm_median": _compute_percentile(position, 50),
+            "position_mm_p95": _compute_percentile(position, 95),
+            "normal_deg_p95": _compute_percentile(normal, 95),
             "along_inside_1_sigma": _share(self.along_sigmas, 1.0),
             "across_inside_1_sigma": _share(self.across_sigmas, ONE_SIGMA_2D),
             "normal_inside_1_sigma": _share(self.normal_sigmas, ONE_SIGMA_2D),
-            "ms_median": _quantile(np.array(self.ms.get("total", [])), 50),
+            "ms_median": _compute_percentile(np.array(self.ms.get("total", [])), 50),
         }
 
     def noise(self) -> dict[str, float | None]:
-        """Returns the error model for training: what stays the same over an episode, and what one more frame would change.
+        """Return the error model for training: what stays the same over an episode, and what one more frame would change.
 
         A camera that stands still sees the same face with the same matcher: nearly all of the error
         is the episode's. The policy's task draws it as a shift of at most `target_bias_m`, here the
         95th percentile.
         """
         return {
-            "target_bias_m": _quantile(np.array(self.position_m), 95),
+            "target_bias_m": _compute_percentile(np.array(self.position_m), 95),
             "along_std_m": float(np.sqrt(np.mean(np.square(self.along_m))))
             if self.along_m
             else None,
@@ -102,7 +102,7 @@ class FinderScore:
         return self.found == self.true and not (self.refused or self.false or self.fooled)
 
     def __add__(self, other: FinderScore) -> FinderScore:
-        """Returns what was counted by both."""
+        """Return what was counted by both."""
         both: dict[str, Any] = {
             name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "ms"
         }
@@ -115,7 +115,7 @@ class FinderScore:
 def score_frame(
     finder: BoreholeFinder, frame: Frame, truth: dataset.SceneTruth
 ) -> tuple[FinderScore, FrameDetections]:
-    """Returns what was counted on one frame, and what the finder saw in it: nothing where it refused the frame as a whole."""
+    """Return what was counted on one frame, and what the finder saw in it: nothing where it refused the frame as a whole."""
     tally = FinderScore(frames=1)
     start = time.perf_counter()
     try:
@@ -132,7 +132,7 @@ def score_frame(
 def match_holes(
     holes: Sequence[HolePose], truth: dataset.SceneTruth, frame: Frame, tally: FinderScore
 ) -> None:
-    """Adds one frame: each true hole is found by the target nearest to its line of sight, each target finds one at most.
+    """Add one frame: each true hole is found by the target nearest to its line of sight, each target finds one at most.
 
     Holes of which more than half of the rim is hidden, or that leave the picture, need not be
     found; found, they are no mistake.
@@ -143,25 +143,25 @@ def match_holes(
     if in_base and frame.base_from_camera is not None:
         eye = frame.base_from_camera[:3, 3]
     for hole in truth.holes:
-        center, axis = (np.array(v) for v in _in(hole, in_base))
+        center, axis = (np.array(v) for v in _select_frame(hole, in_base))
         due = hole.in_view and hole.hidden <= 0.5
         tally.true += due
-        near = min(left, key=lambda pose: _beside(pose, center, eye), default=None)
-        if near is None or _beside(near, center, eye) > NEAR_M:
+        near = min(left, key=lambda pose: _measure_offset_m(pose, center, eye), default=None)
+        if near is None or _measure_offset_m(near, center, eye) > NEAR_M:
             continue
         left = [pose for pose in left if pose is not near]
         if due:
             tally.found += 1
-            _measure(near, center, axis, eye, tally)
-    discs = [np.array(_in(disc, in_base)[0]) for disc in truth.decoys]
+            _measure_errors(near, center, axis, eye, tally)
+    discs = [np.array(_select_frame(disc, in_base)[0]) for disc in truth.decoys]
     tally.decoys += sum(disc.in_view for disc in truth.decoys)
     for pose in left:
-        fooled = any(_beside(pose, disc, eye) <= NEAR_M for disc in discs)
+        fooled = any(_measure_offset_m(pose, disc, eye) <= NEAR_M for disc in discs)
         tally.fooled += fooled
         tally.false += not fooled
 
 
-def _measure(
+def _measure_errors(
     pose: HolePose, center: np.ndarray, axis: np.ndarray, eye: np.ndarray, tally: FinderScore
 ) -> None:
     ray = (center - eye) / np.linalg.norm(center - eye)
@@ -182,14 +182,16 @@ def _measure(
     tally.normal_sigmas.append(float(np.sqrt(turn @ np.linalg.solve(spread, turn))))
 
 
-def _beside(pose: HolePose, center: np.ndarray, eye: np.ndarray) -> float:
-    """Returns how far from the line of sight to a true centre a found one lies, m."""
+def _measure_offset_m(pose: HolePose, center: np.ndarray, eye: np.ndarray) -> float:
+    """Return how far from the line of sight to a true centre a found one lies, m."""
     ray = (center - eye) / np.linalg.norm(center - eye)
     apart = pose.center_m - center
     return float(np.linalg.norm(apart - (apart @ ray) * ray))
 
 
-def _in(circle: dataset.TrueCircle, in_base: bool) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _select_frame(
+    circle: dataset.TrueCircle, in_base: bool
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return (
         (circle.center_in_base_m, circle.axis_in_base)
         if in_base
@@ -197,7 +199,7 @@ def _in(circle: dataset.TrueCircle, in_base: bool) -> tuple[tuple[float, ...], t
     )
 
 
-def _quantile(values: np.ndarray, percent: float) -> float | None:
+def _compute_percentile(values: np.ndarray, percent: float) -> float | None:
     return float(np.percentile(values, percent)) if len(values) else None
 
 

@@ -1,7 +1,8 @@
-"""A block of concrete in the world as a cuboid with round mouths in one face, and how it looks through a camera."""
+"""A block of concrete as a cuboid with round mouths, its projection, and its placing by clicks."""
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,13 @@ from scipy.spatial.transform import Rotation
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 
-# --- from placing: Where a person says the block is: corners of its drilled face and its mouths,
-# clicked in one frame or touched in the world.
-
 FACES = ((2, 1), (2, -1), (0, 1), (0, -1), (1, 1), (1, -1))
 """Axis and side of each face; the first is the drilled one, at z = 0, whose normal is +z."""
 
 
 @dataclass(frozen=True)
 class Mouth:
-    """The rim of a hole in the drilled face: its centre in the face's coordinates and its radius, m."""
+    """Rim of a hole: its centre in the drilled face's coordinates and its radius, m."""
 
     x_m: float
     y_m: float
@@ -32,7 +30,10 @@ class Mouth:
 
 @dataclass(frozen=True)
 class Cuboid:
-    """A block. Its own coordinates: one corner of the drilled face at the origin, the face along +x and +y, the block towards -z.
+    """A block.
+
+    Its own coordinates: one corner of the drilled face at the origin, the face along +x and +y, the
+    block towards -z.
 
     Attributes:
         rotation: From its coordinates to the world, `(3, 3)`.
@@ -57,15 +58,19 @@ class Cuboid:
         return np.array([self.size_m[0], self.size_m[1], 0.0])
 
     def world(self, points_m: np.ndarray) -> np.ndarray:
-        """Returns points of its own coordinates, `(…, 3)`, in the world."""
+        """Return points of its own coordinates, `(…, 3)`, in the world."""
         return points_m @ self.rotation.T + self.origin_m
 
     def own(self, points_m: np.ndarray) -> np.ndarray:
-        """Returns points of the world, `(…, 3)`, in its own coordinates."""
+        """Return points of the world, `(…, 3)`, in its own coordinates."""
         return (points_m - self.origin_m) @ self.rotation
 
     def moved(self, change: np.ndarray) -> Cuboid:
-        """Returns it turned about its face's middle, shifted, and with another face: `change` is rad (3), m (3), m (2)."""
+        """Return the block turned about its face's middle, shifted, and with another face.
+
+        Args:
+            change: Rotation vector (3, rad), shift (3, m), growth of the face (2, m).
+        """
         middle = self.world(self.high_m * [0.5, 0.5, 0.0])
         turn = Rotation.from_rotvec(change[:3]).as_matrix()
         size_m = self.size_m + np.array([change[6], change[7], 0.0])
@@ -79,29 +84,32 @@ class Cuboid:
         return Cuboid(rotation, origin_m, size_m, mouths)
 
     def edges(self, eye_m: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Returns the edges of faces that can be seen from `eye_m` (world), as end points in its own coordinates."""
+        """Return the edges of the faces that are seen, as end points in its own coordinates.
+
+        Args:
+            eye_m: Where from, world, `(3,)`.
+        """
         eye = self.own(eye_m)
         low, high = self.low_m, self.high_m
-        visible = {
-            face
-            for face in FACES
-            if (eye[face[0]] > high[face[0]] if face[1] > 0 else eye[face[0]] < low[face[0]])
-        }
-        found = []
+        visible = set()
+        for axis, side in FACES:
+            is_visible = eye[axis] > high[axis] if side > 0 else eye[axis] < low[axis]
+            if is_visible:
+                visible.add((axis, side))
+        edges = []
         for axis in range(3):
             one, two = (axis + 1) % 3, (axis + 2) % 3
-            for first in (-1, 1):
-                for second in (-1, 1):
-                    if (one, first) in visible or (two, second) in visible:
-                        begin = np.where(
-                            np.arange(3) == one,
-                            high if first > 0 else low,
-                            high if second > 0 else low,
-                        )
-                        begin, end = begin.copy(), begin.copy()
-                        begin[axis], end[axis] = low[axis], high[axis]
-                        found.append((begin, end))
-        return found
+            for first, second in itertools.product((-1, 1), (-1, 1)):
+                if (one, first) not in visible and (two, second) not in visible:
+                    continue
+                begin = np.empty(3)
+                begin[axis] = low[axis]
+                begin[one] = high[one] if first > 0 else low[one]
+                begin[two] = high[two] if second > 0 else low[two]
+                end = begin.copy()
+                end[axis] = high[axis]
+                edges.append((begin, end))
+        return edges
 
 
 @dataclass(frozen=True)
@@ -120,11 +128,11 @@ class CuboidView:
 
 
 def trace_rays(cuboid: Cuboid, rays: np.ndarray, world_from_camera: np.ndarray) -> CuboidView:
-    """Follows rays until they meet the cuboid.
+    """Follow rays until they meet the cuboid.
 
     Args:
         cuboid: The block.
-        rays: Lines of sight at depth 1 in the camera's frame, `(…, 3)`, see `sight_lines`.
+        rays: Lines of sight at depth 1 in the camera's frame, `(…, 3)`, see `compute_pixel_rays`.
         world_from_camera: Pose of the camera, `(4, 4)`.
     """
     eye = cuboid.own(world_from_camera[:3, 3])
@@ -135,9 +143,8 @@ def trace_rays(cuboid: Cuboid, rays: np.ndarray, world_from_camera: np.ndarray) 
     axis = first.argmax(-1)
     enters, leaves = first.max(-1), np.maximum(low, high).min(-1)
     hit = (enters > 0) & (enters < leaves)
-    positive = (
-        np.take_along_axis(along, axis[..., None], -1)[..., 0] < 0
-    )  # it comes from the positive side
+    # a ray against an axis enters through the face on its positive side
+    positive = np.take_along_axis(along, axis[..., None], -1)[..., 0] < 0
     face = np.full(axis.shape, -1)
     for number, (of, side) in enumerate(FACES):
         face[hit & (axis == of) & (positive == (side > 0))] = number
@@ -151,7 +158,7 @@ def trace_rays(cuboid: Cuboid, rays: np.ndarray, world_from_camera: np.ndarray) 
 
 
 def compute_pixel_rays(frame: Frame, step: int = 1) -> np.ndarray:
-    """Returns the line of sight of every `step`-th pixel at depth 1, `(h, w, 3)`, lens distortion taken out."""
+    """Return the undistorted rays of every `step`-th pixel at depth 1, `(h, w, 3)`."""
     height, width = frame.color.shape[:2]
     columns, rows = np.meshgrid(
         np.arange(0, width, step, dtype=float), np.arange(0, height, step, dtype=float)
@@ -160,7 +167,7 @@ def compute_pixel_rays(frame: Frame, step: int = 1) -> np.ndarray:
 
 
 def compute_rays(frame: Frame, pixels: np.ndarray) -> np.ndarray:
-    """Returns the lines of sight of pixels `(…, 2)` at depth 1, `(…, 3)`."""
+    """Return the lines of sight of pixels `(…, 2)` at depth 1, `(…, 3)`."""
     matrix = np.asarray(frame.camera_matrix, float)
     if frame.distortion is None or not np.any(frame.distortion):
         flat = (pixels - matrix[:2, 2]) / [matrix[0, 0], matrix[1, 1]]
@@ -172,7 +179,7 @@ def compute_rays(frame: Frame, pixels: np.ndarray) -> np.ndarray:
 
 
 def project_points(points_m: np.ndarray, frame: Frame, world_from_camera: np.ndarray) -> np.ndarray:
-    """Returns where points of the world, `(n, 3)`, are seen, `(n, 2)` px; NaN behind the camera."""
+    """Return where points of the world, `(n, 3)`, are seen, `(n, 2)` px; NaN behind the camera."""
     local = (points_m - world_from_camera[:3, 3]) @ world_from_camera[:3, :3]
     ahead = local[:, 2] > 0.05
     pixels = np.full((len(points_m), 2), np.nan)
@@ -187,7 +194,7 @@ def project_points(points_m: np.ndarray, frame: Frame, world_from_camera: np.nda
 
 
 def build_cuboid(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray) -> Cuboid:
-    """Returns the block whose drilled face has three known corners.
+    """Return the block whose drilled face has three known corners.
 
     Args:
         corners_m: A corner and its two neighbours on the face, `(3, 3)`, world.
@@ -208,16 +215,29 @@ def build_cuboid(corners_m: np.ndarray, thickness_m: float, eye_m: np.ndarray) -
 
 
 EXAMPLE = """expected YAML such as
-  frame: "00012"                                  # where it was clicked
-  corners_px: [[512, 300], [840, 310], [505, 560]]  # a corner of the drilled face, then its two neighbours; or corners_m, touched
-  thickness_m: 0.6                                # of the block behind the face
+  frame: "00012"   # where it was clicked
+  # a corner of the drilled face, then its two neighbours; or corners_m, touched
+  corners_px: [[512, 300], [840, 310], [505, 560]]
+  thickness_m: 0.6 # of the block behind the face
   mouths: [{center_px: [660, 420], radius_m: 0.05}]  # or center_m"""
-TRIALS, JUDGES, TRIMS = 400, 800, 3
+# Robust fit of the face's plane; all chosen by hand.
+NUM_TRIALS = 400
+"""Planes through three random pixels; with half of the pixels wrong, all fail once in 10^23."""
+NUM_JUDGES = 800
+"""Random pixels whose median residual scores a trial."""
+NUM_TRIMS = 3
+"""Rounds of fitting and trimming after that."""
+TRIM_SIGMAS = 2.5 * 1.4826
+"""Pixels farther off than 2.5 robust standard deviations are trimmed (1.4826 x the median)."""
+MIN_FACE_PIXELS = 50
+"""Pixels with depth that the plane needs."""
+FACE_SHARE = 0.9
+"""Part of the clicked face that is used, about its middle: clicks are a few pixels off."""
 
 
 @dataclass(frozen=True)
 class BlockPlacing:
-    """What a person has said.
+    """Placing of the block by a person.
 
     Attributes:
         frame: Stem of the frame that was clicked in; `None` where everything was touched.
@@ -234,47 +254,44 @@ class BlockPlacing:
 
 
 def read_placing(path: Path) -> BlockPlacing:
-    """Returns what stands in a file.
+    """Read a placing from YAML.
 
     Raises:
-        ConfigError: it cannot be read, or something is missing; shows how it should look.
+        ConfigError: it cannot be read, or something is missing; shows the expected form.
     """
     try:
-        told = yaml.safe_load(path.read_text())
-        corners = np.asarray(
-            told["corners_px"] if "corners_px" in told else told["corners_m"], float
-        )
+        data = yaml.safe_load(path.read_text())
+        key = "corners_px" if "corners_px" in data else "corners_m"
+        corners = np.asarray(data[key], float)
         mouths = tuple(
-            (_parse_center(one), float(one["radius_m"])) for one in told.get("mouths", ())
+            (_parse_center(one), float(one["radius_m"])) for one in data.get("mouths", ())
         )
-        frame = None if told.get("frame") is None else str(told["frame"])
-        placing = BlockPlacing(frame, corners, float(told["thickness_m"]), mouths)
+        frame = None if data.get("frame") is None else str(data["frame"])
+        placing = BlockPlacing(frame, corners, float(data["thickness_m"]), mouths)
     except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise ConfigError(
             f"label.placing={path}: {type(error).__name__} {error}; {EXAMPLE}"
         ) from error
-    if (
-        corners.shape not in ((3, 2), (3, 3))
-        or placing.thickness_m <= 0
-        or any(radius_m <= 0 for _, radius_m in mouths)
-    ):
+    smallest = min([placing.thickness_m, *(radius_m for _, radius_m in mouths)])
+    if corners.shape not in ((3, 2), (3, 3)) or smallest <= 0:
         raise ConfigError(
-            f"label.placing={path}: corners of shape {corners.shape}, sizes above 0 are needed; {EXAMPLE}"
+            f"label.placing={path}: corners of shape {corners.shape}, sizes above 0 are needed; "
+            f"{EXAMPLE}"
         )
-    if frame is None and any(
-        len(points) == 2 for points in (*corners, *(center for center, _ in mouths))
-    ):
+    has_pixels = corners.shape[1] == 2 or any(len(center) == 2 for center, _ in mouths)
+    if frame is None and has_pixels:
         raise ConfigError(
-            f"label.placing={path}: pixels are given, but not the frame they were clicked in; {EXAMPLE}"
+            f"label.placing={path}: pixels are given, but not the frame they were clicked in; "
+            f"{EXAMPLE}"
         )
     return placing
 
 
 def place_cuboid(placing: BlockPlacing, frame: Frame, world_from_camera: np.ndarray) -> Cuboid:
-    """Returns the block as it was placed, its mouths still missing.
+    """Return the block as it was placed, its mouths still missing.
 
     Args:
-        placing: What a person has said.
+        placing: Corners, thickness, mouths.
         frame: The frame that was clicked in, any frame that shows the face where everything was
             touched.
         world_from_camera: Its camera, `(4, 4)`.
@@ -293,52 +310,54 @@ def place_cuboid(placing: BlockPlacing, frame: Frame, world_from_camera: np.ndar
 def place_mouths(
     cuboid: Cuboid, placing: BlockPlacing, frame: Frame, world_from_camera: np.ndarray
 ) -> Cuboid:
-    """Returns the block with its mouths: where the clicked sight meets the face, or the touched point lies."""
+    """Return the block with its mouths: at touched points, or where clicked rays meet the face."""
     eye = cuboid.own(world_from_camera[:3, 3])
     mouths = []
     for center, radius_m in placing.mouths:
         if len(center) == 2:
-            along = (
-                compute_rays(frame, center[None])[0] @ world_from_camera[:3, :3].T @ cuboid.rotation
-            )
-            at = eye - along * eye[2] / along[2]
+            ray = compute_rays(frame, center[None])[0]
+            along = ray @ world_from_camera[:3, :3].T @ cuboid.rotation
+            point = eye - along * eye[2] / along[2]
         else:
-            at = cuboid.own(center)
-        mouths.append(Mouth(float(at[0]), float(at[1]), radius_m))
+            point = cuboid.own(center)
+        mouths.append(Mouth(float(point[0]), float(point[1]), radius_m))
     return replace(cuboid, mouths=tuple(mouths))
 
 
-def _parse_center(told: dict[str, Any]) -> np.ndarray:
-    center = np.asarray(told["center_px"] if "center_px" in told else told["center_m"], float)
-    if center.shape != ((2,) if "center_px" in told else (3,)):
+def _parse_center(entry: dict[str, Any]) -> np.ndarray:
+    key, size = ("center_px", 2) if "center_px" in entry else ("center_m", 3)
+    center = np.asarray(entry[key], float)
+    if center.shape != (size,):
         raise ValueError(f"a centre of {center.size} numbers")
     return center
 
 
 def _fit_face_plane(frame: Frame, corners_px: np.ndarray) -> np.ndarray:
-    """Returns the face's plane `n / d`, `(3,)`, camera coordinates, from the depth between its clicked corners."""
+    """Return the face's plane `n / d`, `(3,)`, camera coordinates, by depth between its corners."""
     inside = np.zeros(frame.depth_m.shape, np.uint8)
     fourth = corners_px[1] + corners_px[2] - corners_px[0]
     outline = np.stack([corners_px[0], corners_px[1], fourth, corners_px[2]])
-    shrunk = outline.mean(0) + 0.9 * (outline - outline.mean(0))
+    shrunk = outline.mean(0) + FACE_SHARE * (outline - outline.mean(0))
     cv2.fillConvexPoly(inside, np.rint(shrunk).astype(np.int32), 1)
     rows, columns = np.nonzero((inside > 0) & np.isfinite(frame.depth_m))
-    if len(rows) < 50:
+    if len(rows) < MIN_FACE_PIXELS:
         raise FrameError(
-            f"{frame.name}: depth is known at {len(rows)} pixels between the clicked corners, 50 are needed"
+            f"{frame.name}: depth is known at {len(rows)} pixels between the clicked corners, "
+            f"{MIN_FACE_PIXELS} are needed"
         )
-    lines = compute_rays(frame, np.stack([columns, rows], axis=1).astype(float))
+    rays = compute_rays(frame, np.stack([columns, rows], axis=1).astype(float))
     inverse = 1.0 / frame.depth_m[rows, columns].astype(float)
     generator = np.random.default_rng(0)
-    triples = generator.integers(len(rows), size=(TRIALS, 3))
-    triples = triples[np.abs(np.linalg.det(lines[triples])) > 1e-7]
-    trials = np.linalg.solve(lines[triples], inverse[triples][..., None])[..., 0]
-    judge = generator.integers(len(rows), size=JUDGES)
-    # least median of squares (Rousseeuw, 1984): up to half of what lies between the corners may be
-    # an arm, a mouth, a wild match
-    plane = trials[np.median(np.abs(trials @ lines[judge].T - inverse[judge]), axis=1).argmin()]
-    for _ in range(TRIMS):
-        away = np.abs(lines @ plane - inverse)
-        kept = away <= 2.5 * 1.4826 * np.median(away) + 1e-9
-        plane = np.linalg.lstsq(lines[kept], inverse[kept], rcond=None)[0]
+    triples = generator.integers(len(rows), size=(NUM_TRIALS, 3))
+    triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-7]
+    trials = np.linalg.solve(rays[triples], inverse[triples][..., None])[..., 0]
+    judges = generator.integers(len(rows), size=NUM_JUDGES)
+    # least median of squares (Rousseeuw, 1984): up to half of the pixels between the corners may
+    # show an arm, a mouth or a wrong match
+    residuals = np.abs(trials @ rays[judges].T - inverse[judges])
+    plane = trials[np.median(residuals, axis=1).argmin()]
+    for _ in range(NUM_TRIMS):
+        away = np.abs(rays @ plane - inverse)
+        kept = away <= TRIM_SIGMAS * np.median(away) + 1e-9
+        plane = np.linalg.lstsq(rays[kept], inverse[kept], rcond=None)[0]
     return plane

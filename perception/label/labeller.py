@@ -1,14 +1,16 @@
-"""Masks for real footage: the block is placed once, refined over all frames, and projected into each of them.
+"""Masks for real footage: a block, placed once and refined over all frames, is projected into each.
 
-What LabelFusion (Marion et al., 2018) does by reconstruction and alignment of meshes; a cuboid
+LabelFusion (Marion et al., 2018) does the same with reconstructed and aligned meshes; a cuboid
 needs neither.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,12 +22,22 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
-from perception.label import cuboid as label_placing
-from perception.label import refinement
-from perception.label.camera_pose import CameraPose, CameraTracker
-from perception.label.cuboid import Cuboid, compute_pixel_rays, project_points, trace_rays
+from perception.label.camera_pose import CameraPose, CameraTracker, CameraTrackerSpec
+from perception.label.cuboid import (
+    Cuboid,
+    compute_pixel_rays,
+    place_cuboid,
+    place_mouths,
+    project_points,
+    read_placing,
+    trace_rays,
+)
 from perception.label.refinement import (
+    POINTS_PER_MOUTH,
     measure_edge_offsets,
+    prepare_view,
+    refine_cuboid,
+    refine_mouths,
     sample_block_outline,
     sample_mouth_outline,
     smooth_gray,
@@ -33,29 +45,41 @@ from perception.label.refinement import (
 
 FRAMES, OVERLAYS = "frames", "overlays"
 MIN_POINTS = 20
-"""Points of the outline that must be seen to judge a frame by."""
+"""Points of the outline that must be seen to judge a frame by; chosen by hand."""
 LEAST_STEP_M = 0.02
-"""A thing that stands this little before the block, or less, is part of it."""
+"""Something nearer than the block by less than this is part of it; chosen by hand."""
+PIXELS_PER_SPECK = 400
+"""A speck is up to one pixel wide, both ways, per so many pixels of width; chosen by hand."""
 GREEN, ORANGE, RED = (0, 158, 115), (230, 159, 0), (213, 94, 0)
+"""Of the colour-blind-safe palette (Okabe and Ito)."""
 
 log = logging.getLogger(__name__)
 
 
-class CameraSpec(Protocol):
-    """A spec in `conf/perception/camera_pose`."""
+@dataclass(frozen=True)
+class _Footage:
+    """Cameras of all frames.
 
-    def build(self) -> CameraTracker:
-        """Returns a tracker."""
-        ...
+    Attributes:
+        poses: Camera of each frame that can be used, by the frame's name.
+        entries: Entry of `labels.json` for each frame, by its stem.
+        clicked: The frame that was clicked in.
+        clicked_pose: Its camera in the world, `(4, 4)`.
+    """
+
+    poses: dict[str, CameraPose]
+    entries: dict[str, dict[str, Any]]
+    clicked: Frame
+    clicked_pose: np.ndarray
 
 
 @spec
 class BlockLabelling:
-    """Labels a folder of frames of one block that does not move.
+    """Label a folder of frames of one block that does not move.
 
     Attributes:
         source: The frames.
-        camera: How to know where the camera was.
+        camera: Source of the camera's poses.
         placing: YAML file: corners of the drilled face, thickness, mouths; see
             `perception.label.cuboid`.
         noise_per_m: Standard deviation of inverse depth, 1/m.
@@ -68,7 +92,7 @@ class BlockLabelling:
     """
 
     source: FrameSourceSpec
-    camera: CameraSpec
+    camera: CameraTrackerSpec
     placing: str
     noise_per_m: float
     num_sigma: float
@@ -78,62 +102,51 @@ class BlockLabelling:
     min_depth_share: float
 
     def check(self) -> None:
-        if (
-            min(self.noise_per_m, self.num_sigma, self.reach_px, self.max_outline_px) <= 0
-            or self.num_refined < 0
-        ):
+        smallest = min(self.noise_per_m, self.num_sigma, self.reach_px, self.max_outline_px)
+        if smallest <= 0 or self.num_refined < 0:
             raise ConfigError(
-                "label: expected noise_per_m, num_sigma, reach_px and max_outline_px above 0, num_refined of 0 or more"
+                "label: expected noise_per_m, num_sigma, reach_px and max_outline_px above 0, "
+                "num_refined of 0 or more"
             )
         if self.max_outline_px >= self.reach_px / 2:
             raise ConfigError(
-                f"label.max_outline_px: edges that are nowhere near lie {self.reach_px / 2:g} px off on average, half of reach_px; "
-                f"expected less than that, got {self.max_outline_px:g}"
+                f"label.max_outline_px: unrelated edges lie {self.reach_px / 2:g} px off on "
+                f"average, half of reach_px; expected less than that, got {self.max_outline_px:g}"
             )
 
     def label(self, folder: Path) -> dict[str, Any]:
-        """Labels; writes frames with masks, and overlays, into `folder`.
+        """Write frames with masks, and overlays, into `folder`.
 
         Returns:
-            What `labels.json` says: the block, figures of each frame, and which were left out and
-                why.
+            The content of `labels.json`: the block, figures of each frame, and why frames were left
+                out.
 
         Raises:
             ConfigError: the placing cannot be read, or names a frame that is not there.
             FrameError: no frame can be labelled.
         """
-        placing, tracker = label_placing.read_placing(Path(self.placing)), self.camera.build()
-        poses, told, clicked = self._poses(tracker, placing.frame)
-        cuboid = label_placing.place_cuboid(placing, *clicked)
-        before, views = cuboid.world(np.array([cuboid.low_m, cuboid.high_m])), []
+        placing = read_placing(Path(self.placing))
+        footage = self._locate_cameras(self.camera.build(), placing.frame)
+        clicked = footage.clicked, footage.clicked_pose
+        cuboid = place_cuboid(placing, *clicked)
+        corners_m, views = cuboid.world(np.array([cuboid.low_m, cuboid.high_m])), []
         if self.num_refined:
-            names = sorted(poses)
-            chosen = {
-                names[k]
-                for k in np.linspace(0, len(names) - 1, min(self.num_refined, len(names)))
-                .round()
-                .astype(int)
-            }
-            views = [
-                refinement.prepare_view(frame, poses[frame.name].world_from_camera)
-                for frame in self._frames(chosen)
-            ]
-            cuboid = refinement.refine_cuboid(cuboid, views, self.noise_per_m, self.reach_px)
-        shift_m = float(
-            np.linalg.norm(
-                cuboid.world(np.array([cuboid.low_m, cuboid.high_m])) - before, axis=1
-            ).max()
-        )
-        cuboid = label_placing.place_mouths(cuboid, placing, *clicked)
-        cuboid = (
-            refinement.refine_mouths(cuboid, views, self.noise_per_m, self.reach_px)
-            if views
-            else cuboid
-        )
-        self._write(cuboid, poses, told, folder)
-        good = [entry for entry in told.values() if entry["left_out"] is None]
-        if not good:
-            reasons = sorted({str(entry["left_out"]) for entry in told.values()})
+            names = sorted(footage.poses)
+            count = min(self.num_refined, len(names))
+            chosen = np.linspace(0, len(names) - 1, count).round().astype(int)
+            for frame in self._read_frames({names[k] for k in chosen}):
+                views.append(prepare_view(frame, footage.poses[frame.name].world_from_camera))
+            cuboid = refine_cuboid(cuboid, views, self.noise_per_m, self.reach_px)
+        refined_m = cuboid.world(np.array([cuboid.low_m, cuboid.high_m]))
+        shift_m = float(np.linalg.norm(refined_m - corners_m, axis=1).max())
+        cuboid = place_mouths(cuboid, placing, *clicked)
+        if views:
+            cuboid = refine_mouths(cuboid, views, self.noise_per_m, self.reach_px)
+        self._write(cuboid, footage, folder)
+        entries = footage.entries
+        num_labelled = sum(entry["left_out"] is None for entry in entries.values())
+        if not num_labelled:
+            reasons = sorted({str(entry["left_out"]) for entry in entries.values()})
             raise FrameError(f"no frame could be labelled: {'; '.join(reasons[:3])}")
         block = {
             "rotation": cuboid.rotation.tolist(),
@@ -144,11 +157,11 @@ class BlockLabelling:
             "schema": 1,
             "block": block,
             "refined_by_m": shift_m,
-            "num_labelled": len(good),
-            "frames": told,
+            "num_labelled": num_labelled,
+            "frames": entries,
         }
 
-    def _frames(self, names: set[str] | None = None) -> Any:
+    def _read_frames(self, names: set[str] | None = None) -> Iterator[Frame]:
         with self.source.build() as source:
             while True:
                 try:
@@ -161,131 +174,134 @@ class BlockLabelling:
                 if names is None or frame.name in names:
                     yield frame
 
-    def _poses(
-        self, tracker: CameraTracker, clicked_in: str | None
-    ) -> tuple[dict[str, CameraPose], dict[str, dict[str, Any]], tuple[Frame, np.ndarray]]:
-        """Returns the camera of each frame, an entry of `labels.json` for each, and the frame that was clicked in."""
+    def _locate_cameras(self, tracker: CameraTracker, clicked_in: str | None) -> _Footage:
+        """Return the cameras of all frames, and the frame that was clicked in."""
         poses: dict[str, CameraPose] = {}
-        told: dict[str, dict[str, Any]] = {}
+        entries: dict[str, dict[str, Any]] = {}
         clicked = None
-        for frame in self._frames():
-            entry: dict[str, Any] = {
-                "left_out": None,
-                "board_px": None,
-                "outline_px": None,
-                "depth_share": None,
-            }
-            told[Path(frame.name).name] = entry
+        for frame in self._read_frames():
+            stem = Path(frame.name).name
+            entry: dict[str, Any] = dict.fromkeys(
+                ("left_out", "board_px", "outline_px", "depth_share")
+            )
+            entries[stem] = entry
             try:
                 pose = tracker.locate(frame)
             except FrameError as error:
                 entry["left_out"] = str(error)
                 continue
             poses[frame.name], entry["board_px"] = pose, pose.error_px
-            if clicked is None and clicked_in in (None, Path(frame.name).name):
+            if clicked is None and clicked_in in (None, stem):
                 clicked = frame, pose.world_from_camera
         if clicked is None:
-            why = told.get(str(clicked_in), {}).get("left_out")
-            known = ", ".join(list(told)[:5]) or "none"
-            raise ConfigError(
-                f"label.placing: frame '{clicked_in}' cannot be used: {why or f'there is none; frames: {known}, …'}"
-            )
-        return poses, told, clicked
+            why = entries.get(str(clicked_in), {}).get("left_out")
+            if not why:
+                why = f"there is none; frames: {', '.join(list(entries)[:5]) or 'none'}, …"
+            raise ConfigError(f"label.placing: frame '{clicked_in}' cannot be used: {why}")
+        return _Footage(poses, entries, *clicked)
 
-    def _write(
-        self,
-        cuboid: Cuboid,
-        poses: dict[str, CameraPose],
-        told: dict[str, dict[str, Any]],
-        folder: Path,
-    ) -> None:
+    def _write(self, cuboid: Cuboid, footage: _Footage, folder: Path) -> None:
         (folder / OVERLAYS).mkdir(parents=True, exist_ok=True)
+        poses = footage.poses
         with Progress(transient=True) as progress:
             task = progress.add_task("masks", total=len(poses))
-            for frame in self._frames(set(poses)):
+            for frame in self._read_frames(set(poses)):
                 name, pose = Path(frame.name).name, poses[frame.name].world_from_camera
-                found, share = self._masks(cuboid, frame, pose)
-                outline_px = self._outline_px(cuboid, frame, pose)
-                entry = told[name]
-                entry |= {
+                label, share = self._build_label(cuboid, frame, pose)
+                outline_px = self._measure_outline_px(cuboid, frame, pose)
+                reason = self._find_fault(outline_px, share)
+                footage.entries[name] |= {
                     "outline_px": outline_px,
                     "depth_share": share,
-                    "left_out": self._left_out(outline_px, share),
+                    "left_out": reason,
                 }
-                picture = _overlay(cuboid, frame, pose, found, entry["left_out"] is None)
+                picture = _draw_overlay(cuboid, frame, pose, label, reason is None)
                 dataset.write_picture(folder / OVERLAYS / f"{name}.png", picture[..., ::-1])
-                if entry["left_out"] is None:
-                    truth = _truth(cuboid, frame, pose, outline_px or 0.0, self.noise_per_m)
-                    dataset.write_frame(
-                        folder / FRAMES / name, frame.color, None, label=found, truth=truth
-                    )
+                if reason is None:
+                    truth = _build_truth(cuboid, frame, pose, outline_px or 0.0, self.noise_per_m)
+                    stem = folder / FRAMES / name
+                    dataset.write_frame(stem, frame.color, None, label=label, truth=truth)
                 progress.advance(task)
 
-    def _left_out(self, outline_px: float | None, share: float | None) -> str | None:
+    def _find_fault(self, outline_px: float | None, share: float | None) -> str | None:
+        """Return why a frame is left out, `None` where it is not."""
         if outline_px is None:
             return f"fewer than {MIN_POINTS} points of the block's outline are in view"
         if outline_px > self.max_outline_px:
-            return f"the outline is {outline_px:.1f} px off the picture's edges, {self.max_outline_px:g} are allowed"
+            return (
+                f"the outline is {outline_px:.1f} px off the picture's edges, "
+                f"{self.max_outline_px:g} are allowed"
+            )
         if share is not None and share < self.min_depth_share:
-            return f"{share:.0%} of the depth agrees with the block, {self.min_depth_share:.0%} are needed"
+            return (
+                f"{share:.0%} of the depth agrees with the block, {self.min_depth_share:.0%} are "
+                "needed"
+            )
         return None
 
-    def _outline_px(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> float | None:
-        """Returns the mean distance between outline and edges, each point by its steepest edge within reach."""
+    def _measure_outline_px(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> float | None:
+        """Return the mean distance from each outline point to its steepest edge within reach."""
         outline = sample_block_outline(cuboid, frame, pose, self.noise_per_m, self.reach_px)
         if len(outline.points_m) < MIN_POINTS:
             return None
         away = np.abs(measure_edge_offsets(outline, smooth_gray(frame), self.reach_px, np.inf))
         return float(np.nan_to_num(away, nan=self.reach_px).mean())
 
-    def _masks(
+    def _build_label(
         self, cuboid: Cuboid, frame: Frame, pose: np.ndarray
     ) -> tuple[FrameLabel, float | None]:
-        """Returns the masks, and which part of the known depth agrees with the block."""
-        there = trace_rays(cuboid, compute_pixel_rays(frame), pose)
-        block = there.face >= 0
+        """Return the masks, and which part of the known depth agrees with the block."""
+        view = trace_rays(cuboid, compute_pixel_rays(frame), pose)
+        block = view.face >= 0
         with np.errstate(invalid="ignore"):
-            away = frame.depth_m - np.where(block, there.depth_m, np.nan)
-            step = np.maximum(
-                self.num_sigma * self.noise_per_m * np.where(block, there.depth_m, 0.0) ** 2,
-                LEAST_STEP_M,
-            )
-            near, far = away < -step, (away > step) & ~there.mouth
-        known = block & ~there.mouth & np.isfinite(frame.depth_m)
+            away = frame.depth_m - np.where(block, view.depth_m, np.nan)
+            depth_m = np.where(block, view.depth_m, 0.0)
+            step = np.maximum(self.num_sigma * self.noise_per_m * depth_m**2, LEAST_STEP_M)
+            near, far = away < -step, (away > step) & ~view.mouth
+        known = block & ~view.mouth & np.isfinite(frame.depth_m)
         share = float((known & ~near & ~far).sum() / known.sum()) if known.any() else None
-        # single wild matches, and the rim where a matcher smears depth across an edge, are no
-        # things
-        size = max(3, 2 * round(frame.color.shape[1] / 400) + 1)
-        near, far = (
-            cv2.morphologyEx(one.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
-            > 0
-            for one in (near, far)
-        )
+        near, far = _remove_specks(near), _remove_specks(far)
         shown = block & ~near & ~far
-        return FrameLabel(shown, shown & there.mouth, block & near), share
+        return FrameLabel(shown, shown & view.mouth, block & near), share
 
 
-def _truth(
+def _remove_specks(mask: np.ndarray) -> np.ndarray:
+    """Return a mask without single wrong matches and the rim of smeared depth along edges."""
+    side = max(3, 2 * round(mask.shape[1] / PIXELS_PER_SPECK) + 1)
+    opened = cv2.morphologyEx(
+        mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)
+    )
+    return opened > 0
+
+
+def _build_truth(
     cuboid: Cuboid, frame: Frame, pose: np.ndarray, outline_px: float, noise_per_m: float
 ) -> SceneTruth:
-    """Returns the block and its holes as a truth file has them; without a known base the world stands in for it."""
+    """Return the block and its holes as a truth file has them.
+
+    Without a known base the world's frame stands in for it.
+    """
     camera_from_world = np.linalg.inv(pose)
     base = pose if frame.base_from_camera is None else frame.base_from_camera
     rotation = camera_from_world[:3, :3] @ cuboid.rotation
     middle = cuboid.world((cuboid.low_m + cuboid.high_m) / 2.0)
     circles = []
     for number, mouth in enumerate(cuboid.mouths):
-        center = (
-            camera_from_world[:3, :3] @ cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0]))
-            + camera_from_world[:3, 3]
-        )
+        center_in_world = cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0]))
+        center = camera_from_world[:3, :3] @ center_in_world + camera_from_world[:3, 3]
         seen = len(sample_mouth_outline(cuboid, number, frame, pose, noise_per_m, 0.0).points_m)
-        circles.append(
-            TrueCircle(
-                tuple(center.tolist()), tuple(rotation[:, 2].tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
-                tuple((base[:3, :3] @ rotation[:, 2]).tolist()), mouth.radius_m, 0.0, 1.0 - seen / 72, seen > 0,
-            )
-        )  # fmt: skip
+        axis = rotation[:, 2]
+        circle = TrueCircle(
+            center_m=tuple(center.tolist()),
+            axis=tuple(axis.tolist()),
+            center_in_base_m=tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
+            axis_in_base=tuple((base[:3, :3] @ axis).tolist()),
+            radius_m=mouth.radius_m,
+            depth_m=0.0,
+            hidden=1.0 - seen / POINTS_PER_MOUTH,
+            in_view=seen > 0,
+        )
+        circles.append(circle)
     place = {
         "center_m": (camera_from_world[:3, :3] @ middle + camera_from_world[:3, 3]).tolist(),
         "rotation": rotation.tolist(),
@@ -294,10 +310,10 @@ def _truth(
     return SceneTruth("real", {"outline_px": outline_px}, tuple(circles), (), place)
 
 
-def _overlay(
+def _draw_overlay(
     cuboid: Cuboid, frame: Frame, pose: np.ndarray, found: FrameLabel, good: bool
 ) -> np.ndarray:
-    """Returns the frame with block, mouths and what hides them in colour, and the block's edges."""
+    """Return the frame with block, mouths and what hides them in colour, and the block's edges."""
     picture = frame.color.astype(np.float32)
     for mask, colour in ((found.block, GREEN), (found.arm, ORANGE), (found.hole_mask, RED)):
         picture[mask] = 0.6 * picture[mask] + 0.4 * np.array(colour, np.float32)

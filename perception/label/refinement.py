@@ -1,4 +1,7 @@
-"""Outlines in pictures: how far the picture's edges lie from where a shape's outline is thought to be."""
+"""Refinement of a roughly placed block: faces to the depth, outline to the edges of the pictures.
+
+All frames are fitted at once.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +22,31 @@ from perception.label.cuboid import (
     trace_rays,
 )
 
-# --- from refine: Making a roughly placed block fit: its faces to the depth, its outline to the
-# edges of the pictures, over all frames at once.
-
+# All numbers below were chosen by hand.
 POINTS_PER_EDGE = 60
 POINTS_PER_MOUTH = 72
 STEP_PX = 0.5
-SLACK = 2.0
-"""A surface may be nearer by this many times what its outline may be off, for it may be seen at a
-grazing angle."""
+"""Samples across the outline lie this far apart."""
+SMOOTH_PX = 1.0
+"""Standard deviation of the smoothing before edges are sought."""
+GRAZING_FACTOR = 2.0
+"""A surface may be nearer by this many times the outline's error: it may be seen at a slant."""
+OCCLUSION_SIGMAS = 3.0
+"""Something in front of the block is nearer by this many standard deviations of depth."""
+MIN_OCCLUSION_M = 0.03
+"""It is nearer by this at least."""
+MIN_SELF_OCCLUSION_M = 0.01
+"""The block hides its own point if its surface is nearer by this."""
+NUM_ROUNDS = 8
+"""Edges are sought anew in each round, within a reach that shrinks."""
+REACH_END = 0.25
+"""Reach of the last round over that of the first."""
+DEPTH_STEP_PX = 8
+"""Every so many pixels one is compared in depth, both ways."""
+EDGE_SIGMA_PX = 1.0
+"""Standard deviation of an edge's place."""
+ATTRACTION = 0.7
+"""Distance at which an edge counts 1 / e, as a part of the reach: near edges are preferred."""
 
 
 @dataclass(frozen=True)
@@ -36,10 +55,9 @@ class Outline:
 
     Attributes:
         points_m: In the block's own coordinates, `(n, 3)`.
-        seen_px: Where they are projected to, `(n, 2)`.
+        seen_px: Their projections, `(n, 2)`.
         normal: Across the outline, `(n, 2)` unit vectors.
-        darker_inside: The shape is a mouth: `normal` points out of it, and it is darker than what
-            is around it.
+        darker_inside: The shape is a mouth: `normal` points out of it, and it is darker inside.
     """
 
     points_m: np.ndarray
@@ -49,86 +67,76 @@ class Outline:
 
 
 def smooth_gray(frame: Frame) -> np.ndarray:
-    """Returns the frame in grey, slightly smoothed, `(h, w)` float32."""
-    return cv2.GaussianBlur(
-        cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32), (0, 0), 1.0
-    )
+    """Return the frame in grey, slightly smoothed, `(h, w)` float32."""
+    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    return cv2.GaussianBlur(gray, (0, 0), SMOOTH_PX)
 
 
 def sample_block_outline(
     cuboid: Cuboid, frame: Frame, pose: np.ndarray, noise_per_m: float, reach_px: float
 ) -> Outline:
-    """Returns points of the edges of the faces that are seen, those that something hides left out.
+    """Return the visible points on the edges of the faces that are seen.
 
     Args:
         cuboid: The block.
         frame: The frame.
         pose: Its camera in the world, `(4, 4)`.
         noise_per_m: Standard deviation of inverse depth, 1/m.
-        reach_px: How far from the outline edges will be looked for. Points with something before
-            them within that reach are left out, since its edges would be taken for theirs; the
-            block itself may be placed off by as much.
+        reach_px: Distance from the outline within which edges will be sought. Points with something
+            in front of them within that reach are left out, since its edges would be taken for
+            theirs; the block itself may be placed off by as much.
     """
-    part = np.linspace(0.03, 0.97, POINTS_PER_EDGE)[:, None]
-    edges = cuboid.edges(pose[:3, 3])
-    if not edges:
+    part = np.linspace(0.03, 0.97, POINTS_PER_EDGE)[:, None]  # corners belong to no single edge
+    points, along = [], []
+    for begin, end in cuboid.edges(pose[:3, 3]):
+        points.append(begin + part * (end - begin))
+        along.append(np.broadcast_to(end - begin, (POINTS_PER_EDGE, 3)))
+    if not points:
         return Outline(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 2)))
-    points = np.concatenate([begin + part * (end - begin) for begin, end in edges])
-    along = np.concatenate(
-        [np.broadcast_to(end - begin, (POINTS_PER_EDGE, 3)) for begin, end in edges]
-    )
-    return _project_outline(points, along, cuboid, frame, pose, noise_per_m, reach_px)
+    view = cuboid, frame, pose, noise_per_m, reach_px
+    return _project_outline(np.concatenate(points), np.concatenate(along), *view)
 
 
 def sample_mouth_outline(
     cuboid: Cuboid, number: int, frame: Frame, pose: np.ndarray, noise_per_m: float, reach_px: float
 ) -> Outline:
-    """Returns points of the rim of a mouth, empty where its face is not seen."""
+    """Return visible points on the rim of a mouth, none where its face is not seen."""
     mouth = cuboid.mouths[number]
     if cuboid.own(pose[:3, 3])[2] <= 0:
         return Outline(np.zeros((0, 3)), np.zeros((0, 2)), np.zeros((0, 2)))
     angle = np.linspace(0.0, 2.0 * np.pi, POINTS_PER_MOUTH, endpoint=False)
     radial = np.stack([np.cos(angle), np.sin(angle), np.zeros(len(angle))], axis=1)
-    points = np.array([mouth.x_m, mouth.y_m, 0.0]) + mouth.radius_m * radial
-    centre = cuboid.world(np.array([mouth.x_m, mouth.y_m, 0.0]))
-    outline = _project_outline(
-        points,
-        np.stack([-radial[:, 1], radial[:, 0], radial[:, 2]], axis=1),
-        cuboid,
-        frame,
-        pose,
-        noise_per_m,
-        reach_px,
-    )
-    outward = ((outline.seen_px - project_points(centre[None], frame, pose)) * outline.normal).sum(
-        1, keepdims=True
-    )
-    return Outline(
-        outline.points_m, outline.seen_px, outline.normal * np.sign(outward), darker_inside=True
-    )
+    tangent = np.stack([-radial[:, 1], radial[:, 0], radial[:, 2]], axis=1)
+    center_m = np.array([mouth.x_m, mouth.y_m, 0.0])
+    points = center_m + mouth.radius_m * radial
+    outline = _project_outline(points, tangent, cuboid, frame, pose, noise_per_m, reach_px)
+    center_px = project_points(cuboid.world(center_m)[None], frame, pose)
+    outward = ((outline.seen_px - center_px) * outline.normal).sum(1, keepdims=True)
+    normal = outline.normal * np.sign(outward)
+    return Outline(outline.points_m, outline.seen_px, normal, darker_inside=True)
 
 
 def measure_edge_offsets(
     outline: Outline, gray: np.ndarray, reach_px: float, attraction: float
 ) -> np.ndarray:
-    """Returns how far along its normal the steepest edge of the picture lies from each point, `(n,)` px, NaN without one.
+    """Return the distance of the steepest edge along each point's normal, `(n,)` px.
+
+    NaN where there is none.
 
     Args:
         outline: Where to look.
         gray: The picture, `(h, w)` float32.
         reach_px: How far to look.
-        attraction: Distance at which an edge counts for 1 / e of one at the outline, as a part of
-            the reach; infinite: all alike.
+        attraction: Distance at which an edge counts 1 / e of one at the outline, as a part of the
+            reach; infinite: all alike.
     """
     if not len(outline.points_m):
         return np.zeros(0)
     along = np.arange(-reach_px - 1.0, reach_px + 1.0 + STEP_PX / 2, STEP_PX)
     where = (outline.seen_px[:, None] + along[:, None] * outline.normal[:, None]).astype(np.float32)
-    profile = np.asarray(
-        cv2.remap(
-            gray, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-        )
-    )
+    maps = where[..., 0], where[..., 1]
+    profile = cv2.remap(gray, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    profile = np.asarray(profile)
     span = round(2 / STEP_PX)
     slope = profile[:, span:] - profile[:, :-span]
     slope = np.maximum(slope, 0.0) if outline.darker_inside else np.abs(slope)
@@ -148,25 +156,19 @@ def _project_outline(
     noise_per_m: float,
     reach_px: float,
 ) -> Outline:
-    """Returns the points that can be seen, projected, with the normals of the projected line."""
+    """Return the visible points, projected, with the normals of the projected line."""
     height, width = frame.color.shape[:2]
-    here = project_points(cuboid.world(points), frame, pose)
-    there = project_points(
-        cuboid.world(points + 1e-3 * along / np.linalg.norm(along, axis=1, keepdims=True)),
-        frame,
-        pose,
-    )
-    way = there - here
+    pixels = project_points(cuboid.world(points), frame, pose)
+    step = 1e-3 * along / np.linalg.norm(along, axis=1, keepdims=True)
+    way = project_points(cuboid.world(points + step), frame, pose) - pixels
     with np.errstate(invalid="ignore"):
-        normal = np.stack([-way[:, 1], way[:, 0]], axis=1) / np.linalg.norm(
-            way, axis=1, keepdims=True
-        )
-    inside = (
-        np.isfinite(normal).all(1) & (here >= 2).all(1) & (here <= [width - 3, height - 3]).all(1)
-    )
-    points, here, normal = points[inside], here[inside], normal[inside]
-    shown = _find_visible(points, here, cuboid, frame, pose, noise_per_m, reach_px)
-    return Outline(points[shown], here[shown], normal[shown])
+        across = np.stack([-way[:, 1], way[:, 0]], axis=1)
+        normal = across / np.linalg.norm(way, axis=1, keepdims=True)
+    in_picture = (pixels >= 2).all(1) & (pixels <= [width - 3, height - 3]).all(1)
+    inside = np.isfinite(normal).all(1) & in_picture
+    points, pixels, normal = points[inside], pixels[inside], normal[inside]
+    visible = _find_visible(points, pixels, cuboid, frame, pose, noise_per_m, reach_px)
+    return Outline(points[visible], pixels[visible], normal[visible])
 
 
 def _find_visible(
@@ -178,35 +180,22 @@ def _find_visible(
     noise_per_m: float,
     reach_px: float,
 ) -> np.ndarray:
-    """Returns which points neither the block itself nor something before it hides."""
+    """Return which points neither the block itself nor something in front of it hides."""
     depth_m = ((cuboid.world(points) - pose[:3, 3]) @ pose[:3, :3])[:, 2]
-    own = trace_rays(cuboid, compute_rays(frame, pixels), pose).depth_m
+    own_m = trace_rays(cuboid, compute_rays(frame, pixels), pose).depth_m
     rows, columns = np.rint(pixels[:, 1]).astype(int), np.rint(pixels[:, 0]).astype(int)
-    width = 2 * int(reach_px) + 1
-    nearest = cv2.erode(
-        np.where(np.isfinite(frame.depth_m), frame.depth_m, np.float32(1e6)),
-        np.ones((width, width), np.uint8),
-    )
-    slack_m = SLACK * reach_px / frame.camera_matrix[0, 0] * depth_m
-    before = (
-        np.asarray(nearest)[rows, columns]
-        < depth_m - np.maximum(3.0 * noise_per_m * depth_m**2, 0.03) - slack_m
-    )
-    return ~(own < depth_m - 0.01) & ~before
-
-
-ROUNDS = 8
-"""Edges are looked for anew so often, nearer each time."""
-DEPTH_STEP = 8
-"""Every so many pixels one is compared in depth, both ways."""
-EDGE_SIGMA_PX = 1.0
-REACH_END = 0.25
-"""Reach of the last round over that of the first."""
+    side = 2 * int(reach_px) + 1
+    known_m = np.where(np.isfinite(frame.depth_m), frame.depth_m, np.float32(1e6))
+    nearest_m = np.asarray(cv2.erode(known_m, np.ones((side, side), np.uint8)))[rows, columns]
+    slack_m = GRAZING_FACTOR * reach_px / frame.camera_matrix[0, 0] * depth_m
+    noise_m = np.maximum(OCCLUSION_SIGMAS * noise_per_m * depth_m**2, MIN_OCCLUSION_M)
+    is_occluded = nearest_m < depth_m - noise_m - slack_m
+    return ~(own_m < depth_m - MIN_SELF_OCCLUSION_M) & ~is_occluded
 
 
 @dataclass(frozen=True)
 class RefinementView:
-    """One frame to refine by: the frame, where its camera was, and its picture in grey."""
+    """One frame to refine by: the frame, its camera's pose in the world, its picture in grey."""
 
     frame: Frame
     pose: np.ndarray
@@ -214,8 +203,8 @@ class RefinementView:
 
 
 @dataclass(frozen=True)
-class _Edges:
-    """Where the picture has edges along an outline: points of the block, their targets, the normals there."""
+class _EdgeMatches:
+    """Edges along an outline: points of the block, their targets, the normals there."""
 
     points_m: np.ndarray
     target_px: np.ndarray
@@ -223,8 +212,8 @@ class _Edges:
 
 
 @dataclass(frozen=True)
-class _Depths:
-    """Measured points that lie on faces of the block, in the world, with sight and face."""
+class _DepthSamples:
+    """Measured points on faces of the block: inverse depth, ray in the world, face number."""
 
     inverse: np.ndarray
     along: np.ndarray
@@ -232,131 +221,133 @@ class _Depths:
 
 
 def prepare_view(frame: Frame, pose: np.ndarray) -> RefinementView:
-    """Prepares a frame."""
+    """Return a frame ready to refine by."""
     return RefinementView(frame, pose, smooth_gray(frame))
 
 
 def refine_cuboid(
     cuboid: Cuboid, views: Sequence[RefinementView], noise_per_m: float, reach_px: float
 ) -> Cuboid:
-    """Returns the block that fits best.
+    """Return the block that fits best.
 
     Args:
-        cuboid: Where it was placed.
+        cuboid: The block as placed.
         views: Frames to fit to.
         noise_per_m: Standard deviation of inverse depth, 1/m.
-        reach_px: How far from the outline edges are looked for at first.
+        reach_px: Distance from the outline within which edges are sought at first.
     """
-    for number in range(ROUNDS):
-        reach = reach_px * REACH_END ** (number / (ROUNDS - 1))
-        edges = [
-            _edges(
-                sample_block_outline(cuboid, view.frame, view.pose, noise_per_m, reach), view, reach
-            )
-            for view in views
-        ]
-        depths = [_depths(cuboid, view, noise_per_m, reach) for view in views]
+    for number in range(NUM_ROUNDS):
+        reach = _compute_reach_px(reach_px, number)
+        edges, depths = [], []
+        for view in views:
+            outline = sample_block_outline(cuboid, view.frame, view.pose, noise_per_m, reach)
+            edges.append(_match_edges(outline, view, reach))
+            depths.append(_select_depths(cuboid, view, noise_per_m, reach))
 
-        def misfit(
+        def compute_residuals(
             change: np.ndarray,
             now: Cuboid = cuboid,
-            edges: list[_Edges] = edges,
-            depths: list[_Depths] = depths,
+            edges: list[_EdgeMatches] = edges,
+            depths: list[_DepthSamples] = depths,
         ) -> np.ndarray:
             block = now.moved(change)
             parts = []
             for view, edge, depth in zip(views, edges, depths, strict=True):
                 # a point of an edge stays on it when the face grows
-                parts.append(
-                    _across(block, edge.points_m * (block.size_m / now.size_m), edge, view)
-                )
-                parts.append(_out_of_face(block, depth, view) / noise_per_m)
+                points_m = edge.points_m * (block.size_m / now.size_m)
+                parts.append(_compute_edge_residuals(block, points_m, edge, view))
+                parts.append(_compute_depth_residuals(block, depth, view) / noise_per_m)
             return np.concatenate(parts)
 
-        found = least_squares(
-            misfit, np.zeros(8), loss="soft_l1", x_scale=[0.01] * 3 + [0.01] * 5, max_nfev=20
+        fit = least_squares(
+            compute_residuals, np.zeros(8), loss="soft_l1", x_scale=[0.01] * 8, max_nfev=20
         )
-        cuboid = cuboid.moved(found.x)
+        cuboid = cuboid.moved(fit.x)
     return cuboid
 
 
 def refine_mouths(
     cuboid: Cuboid, views: Sequence[RefinementView], noise_per_m: float, reach_px: float
 ) -> Cuboid:
-    """Returns the block with its mouths moved to where the pictures have their rims; arguments as `refined`."""
+    """Return the block with its mouths moved to the edges of the pictures; see `refine_cuboid`."""
     for number in range(len(cuboid.mouths)):
-        cuboid = _with_mouth(cuboid, number, views, noise_per_m, reach_px)
+        cuboid = _refine_mouth(cuboid, number, views, noise_per_m, reach_px)
     return cuboid
 
 
-def _with_mouth(
+def _refine_mouth(
     cuboid: Cuboid,
     number: int,
     views: Sequence[RefinementView],
     noise_per_m: float,
     reach_px: float,
 ) -> Cuboid:
-    """Returns the block with the centre of one mouth moved to where the rim's edges are."""
-    for turn in range(ROUNDS):
-        reach = reach_px * REACH_END ** (turn / (ROUNDS - 1))
-        edges = [
-            _edges(
-                sample_mouth_outline(cuboid, number, view.frame, view.pose, noise_per_m, reach),
-                view,
-                reach,
+    for turn in range(NUM_ROUNDS):
+        reach = _compute_reach_px(reach_px, turn)
+        edges = []
+        for view in views:
+            outline = sample_mouth_outline(
+                cuboid, number, view.frame, view.pose, noise_per_m, reach
             )
-            for view in views
-        ]
+            edges.append(_match_edges(outline, view, reach))
         if not sum(len(edge.points_m) for edge in edges):
             return cuboid
 
-        def misfit(
-            change: np.ndarray, now: Cuboid = cuboid, edges: list[_Edges] = edges
+        def compute_residuals(
+            change: np.ndarray, now: Cuboid = cuboid, edges: list[_EdgeMatches] = edges
         ) -> np.ndarray:
             shift = np.array([change[0], change[1], 0.0])
-            return np.concatenate(
-                [
-                    _across(now, edge.points_m + shift, edge, view)
-                    for view, edge in zip(views, edges, strict=True)
-                ]
-            )
+            parts = []
+            for view, edge in zip(views, edges, strict=True):
+                parts.append(_compute_edge_residuals(now, edge.points_m + shift, edge, view))
+            return np.concatenate(parts)
 
-        found = least_squares(misfit, np.zeros(2), loss="soft_l1", x_scale=0.01, max_nfev=20)
+        fit = least_squares(
+            compute_residuals, np.zeros(2), loss="soft_l1", x_scale=0.01, max_nfev=20
+        )
         mouths = list(cuboid.mouths)
+        mouth = mouths[number]
         mouths[number] = replace(
-            mouths[number],
-            x_m=mouths[number].x_m + float(found.x[0]),
-            y_m=mouths[number].y_m + float(found.x[1]),
+            mouth, x_m=mouth.x_m + float(fit.x[0]), y_m=mouth.y_m + float(fit.x[1])
         )
         cuboid = replace(cuboid, mouths=tuple(mouths))
     return cuboid
 
 
-def _edges(outline: Outline, view: RefinementView, reach_px: float) -> _Edges:
-    offset = measure_edge_offsets(outline, view.gray, reach_px, 0.7)
+def _compute_reach_px(first_px: float, number: int) -> float:
+    """Return the reach of a round: it shrinks geometrically to `REACH_END` of the first."""
+    return first_px * REACH_END ** (number / (NUM_ROUNDS - 1))
+
+
+def _match_edges(outline: Outline, view: RefinementView, reach_px: float) -> _EdgeMatches:
+    offset = measure_edge_offsets(outline, view.gray, reach_px, ATTRACTION)
     found = np.isfinite(offset)
     target = outline.seen_px + np.where(found, offset, 0.0)[:, None] * outline.normal
-    return _Edges(outline.points_m[found], target[found], outline.normal[found])
+    return _EdgeMatches(outline.points_m[found], target[found], outline.normal[found])
 
 
-def _across(block: Cuboid, points_m: np.ndarray, edge: _Edges, view: RefinementView) -> np.ndarray:
-    """Returns how far points of the outline are from their edges, across the outline, in standard deviations."""
+def _compute_edge_residuals(
+    block: Cuboid, points_m: np.ndarray, edge: _EdgeMatches, view: RefinementView
+) -> np.ndarray:
+    """Return distances of outline points from their edges, across the outline, in sigmas."""
     pixels = project_points(block.world(points_m), view.frame, view.pose)
-    return np.nan_to_num(
-        ((pixels - edge.target_px) * edge.normal).sum(1) / EDGE_SIGMA_PX, nan=100.0
-    )
+    across = ((pixels - edge.target_px) * edge.normal).sum(1)
+    return np.nan_to_num(across / EDGE_SIGMA_PX, nan=100.0)  # behind the camera: far off
 
 
-def _depths(cuboid: Cuboid, view: RefinementView, noise_per_m: float, reach_px: float) -> _Depths:
-    """Returns the measured points that lie as near to a face as its placing may be off, and away from the face's border."""
-    rays = compute_pixel_rays(view.frame, DEPTH_STEP)
-    measured = view.frame.depth_m[::DEPTH_STEP, ::DEPTH_STEP]
+def _select_depths(
+    cuboid: Cuboid, view: RefinementView, noise_per_m: float, reach_px: float
+) -> _DepthSamples:
+    """Return the measured points near a face, by the error of its placing, and off its border."""
+    rays = compute_pixel_rays(view.frame, DEPTH_STEP_PX)
+    measured = view.frame.depth_m[::DEPTH_STEP_PX, ::DEPTH_STEP_PX]
     known = np.isfinite(measured)
     rays, measured = rays[known], measured[known].astype(float)
     along = rays @ view.pose[:3, :3].T
     points = cuboid.own(view.pose[:3, 3] + along * measured[:, None])
     slack = np.maximum(
-        reach_px / view.frame.camera_matrix[0, 0] * measured, 3.0 * noise_per_m * measured**2
+        reach_px / view.frame.camera_matrix[0, 0] * measured,
+        OCCLUSION_SIGMAS * noise_per_m * measured**2,
     )
     face, nearest = np.full(len(points), -1), slack.copy()
     eye = cuboid.own(view.pose[:3, 3])
@@ -365,24 +356,25 @@ def _depths(cuboid: Cuboid, view: RefinementView, noise_per_m: float, reach_px: 
         away = np.abs(points[:, axis] - bound)
         others = [k for k in range(3) if k != axis]
         room = np.minimum(points - cuboid.low_m, cuboid.high_m - points)[:, others].min(1)
-        here = (away < nearest) & (room > slack) & (side * (eye[axis] - bound) > 0)
-        face[here], nearest[here] = number, away[here]
+        on_face = (away < nearest) & (room > slack) & (side * (eye[axis] - bound) > 0)
+        face[on_face], nearest[on_face] = number, away[on_face]
     for mouth in cuboid.mouths:
-        within = (
-            np.hypot(points[:, 0] - mouth.x_m, points[:, 1] - mouth.y_m) < mouth.radius_m + slack
-        )
-        face[within & (face == 0)] = -1
-    on = face >= 0
-    return _Depths(1.0 / measured[on], along[on], face[on])
+        distance = np.hypot(points[:, 0] - mouth.x_m, points[:, 1] - mouth.y_m)
+        face[(distance < mouth.radius_m + slack) & (face == 0)] = -1
+    chosen = face >= 0
+    return _DepthSamples(1.0 / measured[chosen], along[chosen], face[chosen])
 
 
-def _out_of_face(block: Cuboid, depth: _Depths, view: RefinementView) -> np.ndarray:
-    """Returns measured minus expected inverse depth on the faces' planes, 1/m."""
+def _compute_depth_residuals(
+    block: Cuboid, depth: _DepthSamples, view: RefinementView
+) -> np.ndarray:
+    """Return measured minus expected inverse depth on the faces' planes, 1/m."""
     eye = block.own(view.pose[:3, 3])
     along = depth.along @ block.rotation
-    out = np.zeros(len(along))
+    residuals = np.zeros(len(along))
     for number, (axis, side) in enumerate(FACES):
-        on = depth.face == number
+        on_face = depth.face == number
         bound = (block.high_m if side > 0 else block.low_m)[axis]
-        out[on] = depth.inverse[on] - along[on, axis] / (bound - eye[axis])
-    return out
+        expected = along[on_face, axis] / (bound - eye[axis])
+        residuals[on_face] = depth.inverse[on_face] - expected
+    return residuals

@@ -1,42 +1,34 @@
-"""`brokk mode=label`: makes masks for real footage of a block, so that the segmenter can be trained on it."""
+"""`brokk mode=label`: makes masks for real footage of a block, to train the segmenter on."""
 
 from __future__ import annotations
 
 import logging
-from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
+from perception.label.labeller import BlockLabelling
 
 log = logging.getLogger(__name__)
 
 
-class Labelling(Protocol):
-    """Makes masks for footage."""
-
-    def label(self, folder: Path) -> dict[str, Any]:
-        """Labels into `folder`; returns what `labels.json` says."""
-        ...
-
-
 @spec
 class Label:
-    """Labels frames of a block that does not move.
+    """Label frames of a block that does not move.
 
     Attributes:
         session: Folder to write into.
-        label: What is labelled, and how.
+        label: Frames, camera poses, placing of the block, and settings.
     """
 
     session: Session
-    label: Labelling
+    label: BlockLabelling
 
     def run(self) -> None:
-        """Writes `frames`, which `mode=train_perception` takes, `overlays` to look at, and `labels.json`.
+        """Write `frames` for `mode=train_perception`, `overlays` to look at, and `labels.json`.
 
         Raises:
             FrameError: no frame can be labelled.

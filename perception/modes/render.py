@@ -1,50 +1,29 @@
-"""`brokk mode=render`: pictures of boreholes that were never drilled, with depth and truth."""
+"""`brokk mode=render`: synthetic stereo pairs of boreholes with depth and truth."""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Protocol
 
-import numpy as np
 from rich.progress import Progress
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
+from perception.render.frame_renderer import FrameRenderer
 
 log = logging.getLogger(__name__)
 
 FOLDER = "frames"
 
 
-class FrameMaker(Protocol):
-    """Makes frames on disk."""
-
-    def prepare(self, folder: Path) -> None:
-        """Writes what all frames of a folder share."""
-        ...
-
-    def has(self, stem: Path) -> bool:
-        """Says whether the frame at `stem` is there, whole."""
-        ...
-
-    def shoot(self, stem: Path, generator: np.random.Generator) -> None:
-        """Writes the frame at `stem`; the generator is the only source of chance.
-
-        Raises:
-            StorageError: a file could not be written.
-        """
-        ...
-
-
 @spec
 class Rendering:
-    """How much to render.
+    """Frames to render.
 
     Attributes:
         count: Number of frames.
-        first: Number of the first one; so several processes share the work.
+        first: Number of the first one, so that several processes can share the work.
     """
 
     count: int
@@ -53,21 +32,22 @@ class Rendering:
     def check(self) -> None:
         if self.count < 1 or self.first < 0:
             raise ConfigError(
-                f"render: expected count of 1 or more and first of 0 or more, got {self.count} and {self.first}"
+                "render: expected count of 1 or more and first of 0 or more, got "
+                f"{self.count} and {self.first}"
             )
 
 
 @spec
 class Render:
-    """Renders stereo pairs of scenes drawn by chance, with depth and truth; the same seed makes the same files."""
+    """Render stereo pairs of random scenes with depth and truth; a seed repeats its files."""
 
     session: Session
     resume: str | None
-    studio: FrameMaker
+    studio: FrameRenderer
     render: Rendering
 
     def run(self) -> None:
-        """Writes `frames/<number>.*` into the run folder; a frame that is there already is left alone.
+        """Write `frames/<number>.*` into the run folder; frames that exist are kept.
 
         Raises:
             ConfigError: `resume` names another folder than `session.out`.
@@ -76,7 +56,8 @@ class Render:
         folder = self.session.folder / FOLDER
         if self.resume is not None and Path(self.resume).resolve() != self.session.folder.resolve():
             raise ConfigError(
-                f"resume={self.resume}: rendering goes on in its own folder; add session.out={self.resume}"
+                f"resume={self.resume}: rendering goes on in its own folder; add "
+                f"session.out={self.resume}"
             )
         self.studio.prepare(folder)
         numbers = range(self.render.first, self.render.first + self.render.count)

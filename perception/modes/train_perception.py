@@ -1,9 +1,9 @@
-"""`brokk mode=train_perception`: fits the segmenter to frames with masks, and says how good it is on frames it has not seen."""
+"""`brokk mode=train_perception`: trains the segmenter and evaluates it on unseen frames."""
 
 from __future__ import annotations
 
 import logging
-from typing import Any, Protocol
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
@@ -11,34 +11,27 @@ from rich.table import Table
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
+from perception.train.trainer import SegmenterTraining
 
 log = logging.getLogger(__name__)
 
 
-class SegmenterFit(Protocol):
-    """Trains a segmenter."""
-
-    def fit(self, session: Session, resume: bool) -> dict[str, Any]:
-        """Trains into the session's folder, going on where it was stopped if `resume`; returns what `training.json` says."""
-        ...
-
-
 @spec
 class TrainPerception:
-    """Trains a segmenter; leaves it as ONNX and safetensors, with its learning curve and samples.
+    """Train a segmenter; leave it as ONNX and safetensors, with its learning curve and samples.
 
     Attributes:
         session: Folder, seed, device.
-        training: What is trained, and how.
+        training: Frames, network and optimiser.
         resume: Run folder of an interrupted training to go on with; the same as `session.out`.
     """
 
     session: Session
-    training: SegmenterFit
+    training: SegmenterTraining
     resume: str | None
 
     def run(self) -> float | None:
-        """Trains, writes `training.json`, shows its figures.
+        """Train, write `training.json`, show its figures.
 
         Returns:
             The overlap (intersection over union) of mouths on unseen frames.
@@ -49,7 +42,8 @@ class TrainPerception:
         """
         if self.resume is not None and self.resume != self.session.out:
             raise ConfigError(
-                f"resume={self.resume}: a training goes on in its own folder; add session.out={self.resume}"
+                f"resume={self.resume}: a training goes on in its own folder; add "
+                f"session.out={self.resume}"
             )
         result = self.training.fit(self.session, self.resume is not None)
         write_json(self.session.folder / "training.json", result)

@@ -23,7 +23,7 @@ _SPACING = 1.3
 
 
 def build_frame(normal: np.ndarray, turn_rad: float) -> np.ndarray:
-    """Returns a rotation whose third column is along `normal`, `(3,)`, turned about it."""
+    """Return a rotation whose third column is along `normal`, `(3,)`, turned about it."""
     normal = normal / np.linalg.norm(normal)
     first = np.cross(
         np.array([0.0, 1.0, 0.0]) if abs(normal[1]) < 0.9 else np.array([1.0, 0.0, 0.0]), normal
@@ -41,7 +41,7 @@ def draw_block(
     turn_rad: float,
     generator: np.random.Generator,
 ) -> DrilledBlock:
-    """Returns a block whose drilled face looks along `normal` and has its first hole, or its middle, at `target`."""
+    """Return a block whose drilled face looks along `normal` and has its first hole, or its middle, at `target`."""
     half = (
         np.array(
             [
@@ -59,18 +59,18 @@ def draw_block(
     radii = [radius] * num_holes + [
         float(generator.uniform(*kind.decoy_radius_m)) for _ in range(num_discs)
     ]
-    places = _scattered(half[:2], radii, edge, generator)
+    places = _scatter_discs(half[:2], radii, edge, generator)
     holes = [
-        _hole(kind, np.array([*place, half[2]]), radius, FRONT, generator)
+        _draw_hole(kind, np.array([*place, half[2]]), radius, FRONT, generator)
         for place in places[:num_holes]
     ]
     for _ in range(int(generator.integers(kind.side_holes[0], kind.side_holes[1] + 1))):
-        holes.append(_side_hole(kind, half, radius, edge, generator))
+        holes.append(_draw_side_hole(kind, half, radius, edge, generator))
     discs = tuple(
         Disc(np.array([*place, half[2]]), size, "paint")
         for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
     )
-    chips = tuple(chip for hole in holes[:num_holes] for chip in _chips(kind, hole, generator))
+    chips = tuple(chip for hole in holes[:num_holes] for chip in _draw_chips(kind, hole, generator))
     rotation = build_frame(normal, turn_rad)
     first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
     pose = SolidPose(rotation, target - rotation @ first)
@@ -84,10 +84,10 @@ def draw_block(
     )
 
 
-def _scattered(
+def _scatter_discs(
     half_m: np.ndarray, radii: list[float], edge_m: float, generator: np.random.Generator
 ) -> list[np.ndarray]:
-    """Returns places on the face for discs of these radii; those that find no room are left out, the first always has it."""
+    """Return places on the face for discs of these radii; those that find no room are left out, the first always has it."""
     found: list[np.ndarray] = []
     for number, radius in enumerate(radii):
         room = np.maximum(half_m - radius - edge_m, 0.0)
@@ -104,7 +104,7 @@ def _scattered(
     return found
 
 
-def _hole(
+def _draw_hole(
     kind: BlockRanges, center: np.ndarray, radius: float, part: int, generator: np.random.Generator
 ) -> DrilledHole:
     lamp = (
@@ -113,10 +113,10 @@ def _hole(
     return DrilledHole(center, radius, float(generator.uniform(*kind.depth_m)), part, lamp)
 
 
-def _side_hole(
+def _draw_side_hole(
     kind: BlockRanges, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator
 ) -> DrilledHole:
-    """Returns a hole in one of the four faces beside the drilled one; shallow, so that it meets no other."""
+    """Return a hole in one of the four faces beside the drilled one; shallow, so that it meets no other."""
     part = int(generator.integers(4))
     axis = part // 2
     center = np.zeros(3)
@@ -130,7 +130,7 @@ def _side_hole(
 def draw_bars(
     kind: BlockRanges, block: DrilledBlock, generator: np.random.Generator
 ) -> list[Solid]:
-    """Returns reinforcing bars, cut bare by some of the holes: cylinders in the concrete, seen through a rim only."""
+    """Return reinforcing bars, cut bare by some of the holes: cylinders in the concrete, seen through a rim only."""
     bars: list[Solid] = []
     for hole in block.holes:
         if hole.part != FRONT or generator.random() >= kind.bar_probability:
@@ -160,8 +160,8 @@ def draw_bars(
     return bars
 
 
-def _chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
-    """Returns pieces broken off a rim: balls whose bowls are centred near it and as wide along the face as `chip_m` says."""
+def _draw_chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
+    """Return pieces broken off a rim: balls whose bowls are centred near it and as wide along the face as `chip_m` says."""
     found = []
     for _ in range(int(generator.integers(kind.chips[0], kind.chips[1] + 1))):
         angle, wide = generator.uniform(-np.pi, np.pi), float(generator.uniform(*kind.chip_m))
@@ -178,13 +178,13 @@ def draw_block_materials(
     discs: tuple[Disc, ...],
     generator: np.random.Generator,
 ) -> tuple[Material, ...]:
-    """Returns the materials of all parts of the block; see `Block`."""
+    """Return the materials of all parts of the block; see `Block`."""
     bright, grain = (
         float(generator.uniform(*kind.brightness)),
         float(generator.uniform(*kind.grain)),
     )
     tint = 1.0 + 0.04 * generator.standard_normal(3)
-    texture, marks = int(generator.integers(NUM_TEXTURES)), _marks(kind, half, generator)
+    texture, marks = int(generator.integers(NUM_TEXTURES)), _paint_marks(kind, half, generator)
 
     def stone(brightness: float, contrast: float, with_marks: bool = False) -> Material:
         red, green, blue = np.clip(brightness * tint, 0.005, 0.95)
@@ -207,8 +207,8 @@ def draw_block_materials(
     return tuple(parts)
 
 
-def _marks(kind: BlockRanges, half: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Paints stains, wet patches, cracks and traces of formwork: relative brightness over the block's faces, `(h, w)` float32."""
+def _paint_marks(kind: BlockRanges, half: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Paint stains, wet patches, cracks and traces of formwork: relative brightness over the block's faces, `(h, w)` float32."""
     size = (2.4 * half[[1, 0]] / MARK_M).astype(int)
     marks = np.ones(tuple(size), np.float32)
     for _ in range(int(generator.integers(kind.stains[0], kind.stains[1] + 1))):

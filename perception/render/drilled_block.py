@@ -56,7 +56,7 @@ class DrilledHole:
         return self.sign * np.eye(3)[self.axis]
 
     def across_m(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns the two coordinates across the axis and the depth below the face of points, `(…, 3)`, of the block."""
+        """Return the two coordinates across the axis and the depth below the face of points, `(…, 3)`, of the block."""
         one, two = (self.axis + 1) % 3, (self.axis + 2) % 3
         away = point - self.center_m.astype(np.float32)
         return away[..., one], away[..., two], -self.sign * away[..., self.axis]
@@ -64,7 +64,7 @@ class DrilledHole:
     def interval(
         self, start: np.ndarray, along: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns where rays, `(M, 3)` each, enter and leave the cavity, and whether they leave through the floor."""
+        """Return where rays, `(M, 3)` each, enter and leave the cavity, and whether they leave through the floor."""
         x, y, depth = self.across_m(start)
         one, two = (self.axis + 1) % 3, (self.axis + 2) % 3
         dx, dy, sink = along[:, one], along[:, two], -self.sign * along[:, self.axis]
@@ -88,7 +88,7 @@ class Chip:
     radius_m: float
 
     def interval(self, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns where rays, `(M, 3)` each, enter and leave the ball."""
+        """Return where rays, `(M, 3)` each, enter and leave the ball."""
         away = start - self.center_m.astype(np.float32)
         a = (along * along).sum(1)
         b = (away * along).sum(1)
@@ -134,7 +134,7 @@ class DrilledBlock:
         return NUM_FACES + 2 * len(self.holes)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Returns where rays meet the block, inside its holes too."""
+        """Return where rays meet the block, inside its holes too."""
         t, part, _ = self.box.hit(origin, direction)
         mouth = np.zeros(len(t), bool)
         struck = np.flatnonzero(np.isfinite(t))
@@ -167,7 +167,7 @@ class DrilledBlock:
         return Hits(t, part, mouth)
 
     def _march(self, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Follows rays from the face through the cavities; returns their further way and the part that ends it, -1 for none."""
+        """Follow rays from the face through the cavities; returns their further way and the part that ends it, -1 for none."""
         way, part = np.zeros(len(start), np.float32), np.full(len(start), -1, np.int16)
         cavities = []
         for number, hole in enumerate(self.holes):
@@ -186,7 +186,7 @@ class DrilledBlock:
         return way, part
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describes faces, breaks, discs, and the insides of the holes, where light falls off with depth."""
+        """Describe faces, breaks, discs, and the insides of the holes, where light falls off with depth."""
         flat = np.where(
             (part >= NUM_FACES) & (part >= self.break_part), FRONT, np.minimum(part, FRONT)
         ).astype(np.int16)
@@ -202,7 +202,9 @@ class DrilledBlock:
                 (part == NUM_FACES + 2 * number) | (part == NUM_FACES + 2 * number + 1)
             )
             if len(rows):
-                inside = _inside(hole, local[rows], part[rows] == NUM_FACES + 2 * number + 1, sun)
+                inside = _describe_inside(
+                    hole, local[rows], part[rows] == NUM_FACES + 2 * number + 1, sun
+                )
                 normal[rows] = inside.normal @ self.pose.rotation.T.astype(np.float32)
                 uv[rows], openness[rows], sunlit[rows] = inside.uv_m, inside.openness, inside.sunlit
         for chip in self.chips:
@@ -214,8 +216,10 @@ class DrilledBlock:
         return Surface(normal, uv, openness, sunlit)
 
 
-def _inside(hole: DrilledHole, point: np.ndarray, floor: np.ndarray, sun: np.ndarray) -> Surface:
-    """Describes the inside of a hole in the block's coordinates.
+def _describe_inside(
+    hole: DrilledHole, point: np.ndarray, floor: np.ndarray, sun: np.ndarray
+) -> Surface:
+    """Describe the inside of a hole in the block's coordinates.
 
     The part of the sky that is seen through the mouth is, for a ring of the wall at depth h, with x
     = h / 2r: (x^2 + 1/2) / sqrt(x^2 + 1) - x, and for the middle of the floor r^2 / (r^2 + h^2)

@@ -67,7 +67,7 @@ class FrameRenderer:
             )
 
     def prepare(self, folder: Path) -> None:
-        """Writes what all frames of a folder share."""
+        """Write what all frames of a folder share."""
         dataset.write_camera(
             folder, self.rig.left.matrix, self.rig.base_from_camera, self.rig.baseline_m
         )
@@ -87,7 +87,7 @@ class FrameRenderer:
         dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
 
     def shot(self, scene: Scene, generator: np.random.Generator) -> RenderedFrame:
-        """Returns the frame of a scene."""
+        """Return the frame of a scene."""
         tracer = Tracer(scene.solids, scene.light, scene.sky)
         left = tracer.view(self.rig.left)
         density = draw_dust(scene.exposure.patchiness, generator)

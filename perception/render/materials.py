@@ -38,7 +38,7 @@ class Material:
     marks: tuple[np.ndarray, float] | None = None
 
     def albedo(self, uv_m: np.ndarray, pixel_m: np.ndarray) -> np.ndarray:
-        """Returns the reflected part of the light, `(M, 3)`.
+        """Return the reflected part of the light, `(M, 3)`.
 
         Args:
             uv_m: Where on the surface, `(M, 2)`.
@@ -46,18 +46,18 @@ class Material:
         """
         uv = uv_m / np.float32(self.texel_m) + np.asarray(self.shift, np.float32)
         level = np.log2(np.maximum(pixel_m / self.texel_m, 1.0))
-        grain = _sampled(_pyramid(self.texture), uv, level)
+        grain = _sample_pyramid(_build_pyramid(self.texture), uv, level)
         bright = np.clip(1.0 + self.contrast * grain, 0.15, 1.9)
         if self.marks is not None:
             picture, size_m = self.marks
             center = uv_m / np.float32(size_m) + np.array(picture.shape[::-1], np.float32) / 2
-            bright = bright * _bilinear(picture, center)
+            bright = bright * _interpolate_bilinear(picture, center)
         return bright[:, None] * np.asarray(self.color, np.float32)
 
 
 @lru_cache(maxsize=NUM_TEXTURES)
-def _pyramid(number: int) -> tuple[np.ndarray, ...]:
-    """Returns a periodic pattern, mean 0 and standard deviation 1, and its reductions by two, down to one texel.
+def _build_pyramid(number: int) -> tuple[np.ndarray, ...]:
+    """Return a periodic pattern, mean 0 and standard deviation 1, and its reductions by two, down to one texel.
 
     The patterns are the same for every scene: a scene differs in where, how strong and in which
     colours they appear.
@@ -95,22 +95,24 @@ def _pyramid(number: int) -> tuple[np.ndarray, ...]:
     return tuple(levels)
 
 
-def _sampled(pyramid: tuple[np.ndarray, ...], uv: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Returns the pattern at `uv`, `(M, 2)` in texels of the finest level, blended between the two levels next to `level`."""
+def _sample_pyramid(
+    pyramid: tuple[np.ndarray, ...], uv: np.ndarray, level: np.ndarray
+) -> np.ndarray:
+    """Return the pattern at `uv`, `(M, 2)` in texels of the finest level, blended between the two levels next to `level`."""
     level = np.minimum(level, len(pyramid) - 1.001)
     total = np.zeros(len(uv), np.float32)
     for number in range(int(level.min()), int(level.max()) + 2):
         weight = 1.0 - np.abs(level - number)
         rows = np.flatnonzero(weight > 0)
         if len(rows):
-            total[rows] += weight[rows] * _bilinear(
+            total[rows] += weight[rows] * _interpolate_bilinear(
                 pyramid[number], (uv[rows] + 0.5) / np.float32(1 << number) - 0.5
             )
     return total
 
 
-def _bilinear(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Returns the periodic picture at `uv`, `(M, 2)` as x and y."""
+def _interpolate_bilinear(picture: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Return the periodic picture at `uv`, `(M, 2)` as x and y."""
     height, width = picture.shape
     size = np.array([width, height], np.float32)
     wrapped = uv - np.floor(uv / size) * size

@@ -49,13 +49,13 @@ class Pinhole:
         )
 
     def project(self, point_m: np.ndarray) -> np.ndarray:
-        """Returns the pixels, `(…, 2)`, of points, `(…, 3)`, in front of the camera."""
+        """Return the pixels, `(…, 2)`, of points, `(…, 3)`, in front of the camera."""
         away = point_m - self.origin_m
         center = self.matrix[:2, 2]
         return self.focal_px * away[..., :2] / away[..., 2:] + center
 
     def rays(self, pixel: np.ndarray) -> np.ndarray:
-        """Returns directions with z = 1, `(M, 3)` float32, through pixels, `(M, 2)`."""
+        """Return directions with z = 1, `(M, 3)` float32, through pixels, `(M, 2)`."""
         flat = (pixel - self.matrix[:2, 2]) / self.focal_px
         return np.concatenate([flat, np.ones((len(flat), 1))], 1).astype(np.float32)
 
@@ -95,7 +95,7 @@ class RenderedView:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _RayEnds:
     """Rays' ends: depth, solid, part, through a rim, in sunlight, `(M,)` each."""
 
     depth_m: np.ndarray
@@ -114,7 +114,7 @@ class _Seen:
 
 
 class Tracer:
-    """Draws solids in a light, from any camera.
+    """Draw solids in a light, from any camera.
 
     Args:
         solids: What there is to see; bars in a block come after it.
@@ -133,7 +133,7 @@ class Tracer:
         ]
 
     def view(self, camera: Pinhole) -> RenderedView:
-        """Returns what `camera` sees."""
+        """Return what `camera` sees."""
         size = (camera.height, camera.width)
         rows = max(1, CHUNK // camera.width)
         columns = np.arange(camera.width, dtype=np.float64)
@@ -142,14 +142,14 @@ class Tracer:
             ys = np.arange(top, min(top + rows, camera.height), dtype=np.float64)
             pixel = np.stack(np.broadcast_arrays(columns[None], ys[:, None]), -1).reshape(-1, 2)
             bands.append(self._shoot(camera, pixel))
-        whole = _Seen(
+        whole = _RayEnds(
             *(
                 np.concatenate([getattr(band, name) for band in bands])
-                for name in _Seen.__dataclass_fields__
+                for name in _RayEnds.__dataclass_fields__
             )
         )
         radiance = whole.radiance
-        edges = np.flatnonzero(_edges(whole.label.reshape(size)).ravel())
+        edges = np.flatnonzero(_find_edges(whole.label.reshape(size)).ravel())
         offsets = (
             np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5
         ) / OVER - 0.5
@@ -171,7 +171,7 @@ class Tracer:
     def first(
         self, origin_m: np.ndarray, direction: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns factor on the direction, solid and part of the first hit of rays, `(M, 3)` float32, from one point."""
+        """Return factor on the direction, solid and part of the first hit of rays, `(M, 3)` float32, from one point."""
         t, solid, part, _ = self._cast(origin_m, direction, None)
         return t, solid, part
 
@@ -182,7 +182,7 @@ class Tracer:
         t, solid = np.full(count, FAR_M, np.float32), np.full(count, NOTHING, np.int16)
         part, mouth = np.zeros(count, np.int16), np.zeros(count, bool)
         for number, thing in enumerate(self.solids):
-            rows = _candidates(thing, camera, direction)
+            rows = _select_rays(thing, camera, direction)
             hits = thing.hit(origin_m, direction if rows is None else direction[rows])
             nearer = np.flatnonzero(hits.t < (t if rows is None else t[rows]))
             if not len(nearer):
@@ -195,7 +195,7 @@ class Tracer:
                 mouth[to] = False
         return t, solid, part, mouth
 
-    def _shoot(self, camera: Pinhole, pixel: np.ndarray) -> _Seen:
+    def _shoot(self, camera: Pinhole, pixel: np.ndarray) -> _RayEnds:
         direction = camera.rays(pixel)
         t, solid, part, mouth = self._cast(camera.origin_m, direction, camera)
         radiance = np.broadcast_to(self.sky, (len(t), 3)).copy()
@@ -207,7 +207,7 @@ class Tracer:
                 radiance[rows], lit[rows] = self._shaded(
                     thing, point[rows], part[rows], direction[rows], t[rows] / camera.focal_px
                 )
-        return _Seen(t, solid, part, mouth, radiance, lit)
+        return _RayEnds(t, solid, part, mouth, radiance, lit)
 
     def _shaded(
         self,
@@ -217,7 +217,7 @@ class Tracer:
         direction: np.ndarray,
         pixel_m: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the radiance of points of one solid, `(M, 3)`, and whether the sun reaches them, `(M,)`."""
+        """Return the radiance of points of one solid, `(M, 3)`, and whether the sun reaches them, `(M,)`."""
         surface = thing.surface(point, part, self.light.to_sun)
         along = np.einsum("ij,ij->i", surface.normal, direction)
         away = np.sign(along)
@@ -252,7 +252,7 @@ class Caster:
         self._low, self._high = corners.min(0).astype(np.float32), corners.max(0).astype(np.float32)
 
     def darken(self, point: np.ndarray, lit: np.ndarray) -> None:
-        """Clears `lit`, `(M,)` bool, at the points, `(M, 3)`, that the solid shades."""
+        """Clear `lit`, `(M,)` bool, at the points, `(M, 3)`, that the solid shades."""
         x, y = point @ self._across[:, 0], point @ self._across[:, 1]
         rows = np.flatnonzero(
             lit
@@ -266,8 +266,8 @@ class Caster:
             lit[rows[np.isfinite(self.solid.hit(point[rows], sun).t)]] = False
 
 
-def _candidates(thing: Solid, camera: Pinhole | None, direction: np.ndarray) -> np.ndarray | None:
-    """Returns the rays that may hit the solid, `None` for all: those within the box around its corners in the picture."""
+def _select_rays(thing: Solid, camera: Pinhole | None, direction: np.ndarray) -> np.ndarray | None:
+    """Return the rays that may hit the solid, `None` for all: those within the box around its corners in the picture."""
     corners = thing.corners_m
     if camera is None or corners is None:
         return None
@@ -280,8 +280,8 @@ def _candidates(thing: Solid, camera: Pinhole | None, direction: np.ndarray) -> 
     return np.flatnonzero((x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]))
 
 
-def _edges(label: np.ndarray) -> np.ndarray:
-    """Returns the pixels next to another label, and their neighbours, `(h, w)` bool."""
+def _find_edges(label: np.ndarray) -> np.ndarray:
+    """Return the pixels next to another label, and their neighbours, `(h, w)` bool."""
     edge = np.zeros(label.shape, np.uint8)
     down, right = label[1:] != label[:-1], label[:, 1:] != label[:, :-1]
     edge[1:] |= down

@@ -224,15 +224,15 @@ class SceneRanges:
 
 
 def draw_uniform(value: Range, generator: np.random.Generator) -> float:
-    """Draws evenly from a range."""
+    """Draw evenly from a range."""
     return float(generator.uniform(*value))
 
 
 def draw_log_uniform(value: Range, generator: np.random.Generator) -> float:
-    """Draws from a range, each factor as likely as any other."""
+    """Draw from a range, each factor as likely as any other."""
     return math.exp(generator.uniform(math.log(value[0]), math.log(value[1])))
 
 
 def draw_integer(value: Count, generator: np.random.Generator) -> int:
-    """Draws a whole number, both ends included."""
+    """Draw a whole number, both ends included."""
     return int(generator.integers(value[0], value[1] + 1))

@@ -33,7 +33,7 @@ _BISECTIONS = 14
 def place_arm(
     rim: np.ndarray, rig: StereoRig, hidden: float, generator: np.random.Generator
 ) -> list[Solid]:
-    """Returns boom, hose and chisel, coming from a random side, that hide the part `hidden` of the rim, `(P, 3)`, from the left."""
+    """Return boom, hose and chisel, coming from a random side, that hide the part `hidden` of the rim, `(P, 3)`, from the left."""
     middle = rim.mean(0)
     ray = middle / np.linalg.norm(middle)
     angle = generator.uniform(-np.pi, np.pi)
@@ -61,7 +61,7 @@ def place_arm(
 def _build_arm(
     start: np.ndarray, ray: np.ndarray, sideways: np.ndarray, generator: np.random.Generator
 ) -> list[Solid]:
-    """Returns the arm with its edge along the line of sight through `start`; it lies on the side that `sideways` points to."""
+    """Return the arm with its edge along the line of sight through `start`; it lies on the side that `sideways` points to."""
     along = np.cross(ray, sideways)
     wide = float(generator.uniform(0.06, 0.16))
     thick = float(generator.uniform(0.05, 0.12))
@@ -108,7 +108,7 @@ def _build_arm(
 
 
 def _shift_solids(parts: list[Solid], shift_m: np.ndarray) -> list[Solid]:
-    """Returns the arm elsewhere."""
+    """Return the arm elsewhere."""
     found: list[Solid] = []
     for part in parts:
         pose = SolidPose(part.pose.rotation, part.pose.center_m + shift_m)  # type: ignore[attr-defined]
@@ -127,7 +127,7 @@ _GREY = 1 / 3
 
 
 def compose_scene(kind: SceneRanges, rig: StereoRig, generator: np.random.Generator) -> Scene:
-    """Returns a scene: first the block before the camera, then the arm, then all the rest; the generator is the only chance."""
+    """Return a scene: first the block before the camera, then the arm, then all the rest; the generator is the only chance."""
     target, normal, turn = _draw_target(kind, rig, generator)
     block, arm = None, []
     if generator.random() < kind.block.present:
@@ -153,7 +153,7 @@ def add_surroundings(
     generator: np.random.Generator,
     ground_m: float | None = None,
 ) -> Scene:
-    """Returns a scene of this kind around a block and an arm that stand already.
+    """Return a scene of this kind around a block and an arm that stand already.
 
     Args:
         kind: Says what else there is, and how it is lit.
@@ -170,13 +170,13 @@ def add_surroundings(
         ground_m = (
             max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
         )
-    solids: list[Solid] = [*_setting(kind, down, ground_m, generator)]
+    solids: list[Solid] = [*_draw_ground_and_backdrop(kind, down, ground_m, generator)]
     if block:
         solids += [block, *draw_bars(kind.block, block, generator)]
     solids += arm
-    solids += _clutter(kind, rig, block, down, ground_m, generator)
-    light = _light(kind, down, target, generator)
-    exposure, level = _exposure(kind, light, normal, target, generator)
+    solids += _draw_clutter(kind, rig, block, down, ground_m, generator)
+    light = _draw_light(kind, down, target, generator)
+    exposure, level = _draw_exposure(kind, light, normal, target, generator)
     sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
     hidden_parts = (
         tuple(compute_hidden_share(solids, block, hole) for hole in block.holes) if block else ()
@@ -198,7 +198,7 @@ def add_surroundings(
 
 
 def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
-    """Returns points on the rim of a hole or disc of the block in camera coordinates, `(NUM_RIM_POINTS, 3)`."""
+    """Return points on the rim of a hole or disc of the block in camera coordinates, `(NUM_RIM_POINTS, 3)`."""
     axis = circle.axis if isinstance(circle, DrilledHole) else 2
     angle = np.linspace(0, 2 * np.pi, NUM_RIM_POINTS, endpoint=False)
     local = np.repeat(circle.center_m[None], NUM_RIM_POINTS, 0)
@@ -210,7 +210,7 @@ def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
 def compute_hidden_share(
     solids: Sequence[Solid], block: DrilledBlock, circle: DrilledHole | Disc
 ) -> float:
-    """Returns the part of the rim of a hole or disc that other solids, or the block itself, hide from the left camera."""
+    """Return the part of the rim of a hole or disc that other solids, or the block itself, hide from the left camera."""
     rim = sample_rim(block, circle)
     outward = block.pose.rotation @ (
         circle.outward if isinstance(circle, DrilledHole) else np.array([0.0, 0.0, 1.0])
@@ -227,7 +227,7 @@ def compute_hidden_share(
 def _draw_target(
     kind: SceneRanges, rig: StereoRig, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Returns the point on the face that is looked at, the face's normal (both `(3,)`), and the turn of the block about it."""
+    """Return the point on the face that is looked at, the face's normal (both `(3,)`), and the turn of the block about it."""
     inner = 1.0 - 2.0 * kind.sight.margin
     size = np.array([rig.width, rig.height])
     pixel = (0.5 + inner * (generator.random(2) - 0.5)) * (size - 1)
@@ -258,7 +258,7 @@ def draw_material(
     tint: float = 0.06,
     texture: int | None = None,
 ) -> Material:
-    """Returns a material of about this brightness, of a random pattern and a slight tint."""
+    """Return a material of about this brightness, of a random pattern and a slight tint."""
     color = brightness * (1.0 + tint * generator.standard_normal(3))
     pattern = int(generator.integers(NUM_TEXTURES)) if texture is None else texture
     shift = tuple(generator.uniform(0, TEXTURE_SIDE, 2))
@@ -272,10 +272,10 @@ def draw_material(
     )
 
 
-def _setting(
+def _draw_ground_and_backdrop(
     kind: SceneRanges, down: np.ndarray, lowest_m: float, generator: np.random.Generator
 ) -> tuple[PlaneSolid, PlaneSolid]:
-    """Returns ground and backdrop."""
+    """Return ground and backdrop."""
     soil = draw_material(
         draw_uniform(kind.around.ground_brightness, generator),
         generator.uniform(0.15, 0.4),
@@ -299,7 +299,7 @@ def _setting(
     return ground, backdrop
 
 
-def _clutter(
+def _draw_clutter(
     kind: SceneRanges,
     rig: StereoRig,
     block: DrilledBlock | None,
@@ -307,7 +307,7 @@ def _clutter(
     lowest_m: float,
     generator: np.random.Generator,
 ) -> list[Solid]:
-    """Returns things on the ground, in the picture, not in front of a rim and not inside the block."""
+    """Return things on the ground, in the picture, not in front of a rim and not inside the block."""
     wanted, found = draw_integer(kind.around.clutter, generator), []
     for _ in range(_CLUTTER_TRIES):
         if len(found) == wanted:
@@ -337,10 +337,10 @@ def _clutter(
     return found
 
 
-def _light(
+def _draw_light(
     kind: SceneRanges, down: np.ndarray, target: np.ndarray, generator: np.random.Generator
 ) -> Light:
-    """Returns sun and sky, and things out of sight that throw shadows on the face."""
+    """Return sun and sky, and things out of sight that throw shadows on the face."""
     elevation, azimuth = (
         draw_uniform(kind.light.elevation_rad, generator),
         generator.uniform(-np.pi, np.pi),
@@ -368,14 +368,14 @@ def _light(
     )
 
 
-def _exposure(
+def _draw_exposure(
     kind: SceneRanges,
     light: Light,
     normal: np.ndarray,
     target: np.ndarray,
     generator: np.random.Generator,
 ) -> tuple[CameraExposure, float]:
-    """Returns how the pictures are taken, and the level of light; the exposure is set for the face as it is lit without dust."""
+    """Return how the pictures are taken, and the level of light; the exposure is set for the face as it is lit without dust."""
     ranges = kind.light
     lit = light.ambient + light.sun * max(0.0, float(normal @ light.to_sun))
     face = lit * float(np.mean(kind.block.brightness))

@@ -58,12 +58,12 @@ class SolidPose:
     center_m: np.ndarray
 
     def local(self, origin: np.ndarray, direction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns rays in the solid's coordinates."""
+        """Return rays in the solid's coordinates."""
         turn = self.rotation.astype(np.float32)
         return ((origin - self.center_m) @ self.rotation).astype(np.float32), direction @ turn
 
     def point(self, local_m: np.ndarray) -> np.ndarray:
-        """Returns a point, `(…, 3)`, of the solid's coordinates in those of the camera."""
+        """Return a point, `(…, 3)`, of the solid's coordinates in those of the camera."""
         return local_m @ self.rotation.T + self.center_m
 
 
@@ -86,11 +86,11 @@ class Solid(Protocol):
         ...
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Returns where rays meet the solid first."""
+        """Return where rays meet the solid first."""
         ...
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describes the surface at the points, `(M, 3)`; `to_sun` is the unit vector to the light."""
+        """Describe the surface at the points, `(M, 3)`; `to_sun` is the unit vector to the light."""
         ...
 
 
@@ -104,7 +104,7 @@ class PlaneSolid:
     corners_m: None = None
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Returns where rays meet the plane, from either side."""
+        """Return where rays meet the plane, from either side."""
         start, along = self.pose.local(origin, direction)
         with np.errstate(divide="ignore", invalid="ignore"):
             t = -start[..., 2] / along[:, 2]
@@ -112,7 +112,7 @@ class PlaneSolid:
         return Hits(t, np.zeros(len(t), np.int16))
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describes the plane; its texture lies along its first two axes."""
+        """Describe the plane; its texture lies along its first two axes."""
         normal = np.broadcast_to(self.pose.rotation[:, 2].astype(np.float32), point.shape)
         return Surface(
             normal,
@@ -137,7 +137,7 @@ class Box:
         return self.pose.point(signs * self.half_m)
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Returns where rays enter the box; rays that start inside miss."""
+        """Return where rays enter the box; rays that start inside miss."""
         start, along = self.pose.local(origin, direction)
         half = self.half_m.astype(np.float32)
         enter = np.full(len(along), -np.inf, np.float32)
@@ -159,7 +159,7 @@ class Box:
         return Hits(t, part)
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describes faces; opposite ones show different places of the texture."""
+        """Describe faces; opposite ones show different places of the texture."""
         local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
             np.float32
         )
@@ -187,7 +187,7 @@ class Cylinder:
         return self.pose.point(signs * [self.radius_m, self.radius_m, self.half_length_m])
 
     def hit(self, origin: np.ndarray, direction: np.ndarray) -> Hits:
-        """Returns where rays enter the cylinder."""
+        """Return where rays enter the cylinder."""
         start, along = self.pose.local(origin, direction)
         across = along[:, 0] ** 2 + along[:, 1] ** 2
         across = np.maximum(across, np.float32(1e-12))
@@ -207,7 +207,7 @@ class Cylinder:
         return Hits(t, (cap > middle - root).astype(np.int16))
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describes side and caps; the texture goes round the side."""
+        """Describe side and caps; the texture goes round the side."""
         local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
             np.float32
         )

@@ -111,7 +111,7 @@ def take_picture(
     density: np.ndarray,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Returns the picture that a camera takes of a view, RGB, `(h, w, 3)` uint8.
+    """Return the picture that a camera takes of a view, RGB, `(h, w, 3)` uint8.
 
     Args:
         radiance: Linear light, `(h, w, 3)` float32.
@@ -154,5 +154,5 @@ def take_picture(
 
 
 def draw_dust(patchiness: float, generator: np.random.Generator) -> np.ndarray:
-    """Returns the density of drifting dust over a picture, `(6, 10)` float32, mean about 1."""
+    """Return the density of drifting dust over a picture, `(6, 10)` float32, mean about 1."""
     return (1.0 + patchiness * generator.standard_normal((6, 10))).astype(np.float32)

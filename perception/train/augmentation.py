@@ -34,7 +34,7 @@ YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.0
 
 
 def recompress_jpeg(pictures: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
-    """Returns RGB pictures in [0, 1], `(B, 3, h, w)`, as files of a quality, `(B, 1, 1, 1)` from 1 to 100, give them back."""
+    """Return RGB pictures in [0, 1], `(B, 3, h, w)`, as files of a quality, `(B, 1, 1, 1)` from 1 to 100, give them back."""
     height, width = pictures.shape[2:]
     percent = torch.where(quality < 50.0, 5000.0 / quality, 200.0 - 2.0 * quality) / 100.0
     tables, matrix, inverse, middle, wave = _build_jpeg_constants(pictures.device)
@@ -77,7 +77,7 @@ class Augmentation(Protocol):
         ...
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns changed pictures; values may leave [0, 1], they are clipped after the last one."""
+        """Return changed pictures; values may leave [0, 1], they are clipped after the last one."""
         ...
 
 
@@ -87,7 +87,7 @@ def apply_augmentations(
     chance: torch.Generator,
     generator: torch.Generator,
 ) -> torch.Tensor:
-    """Returns the pictures after all augmentations in their order, each with its probability, clipped to [0, 1].
+    """Return the pictures after all augmentations in their order, each with its probability, clipped to [0, 1].
 
     `chance`, on the CPU, says which pictures each one changes (whoever asks a graphics card for
     that waits); `generator` says how.
@@ -115,12 +115,18 @@ class Exposure:
     tint: float
 
     def check(self) -> None:
-        _check(self, gain=self.gain)
+        _check_ranges(self, gain=self.gain)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures with another exposure."""
-        gain = _drawn((math.log(self.gain[0]), math.log(self.gain[1])), pictures, generator).exp()
-        return pictures * gain * _drawn((1.0 - self.tint, 1.0 + self.tint), pictures, generator, 3)
+        """Return the pictures with another exposure."""
+        gain = _draw_uniform(
+            (math.log(self.gain[0]), math.log(self.gain[1])), pictures, generator
+        ).exp()
+        return (
+            pictures
+            * gain
+            * _draw_uniform((1.0 - self.tint, 1.0 + self.tint), pictures, generator, 3)
+        )
 
 
 @spec
@@ -136,12 +142,12 @@ class Contrast:
     gain: Range
 
     def check(self) -> None:
-        _check(self, gain=self.gain)
+        _check_ranges(self, gain=self.gain)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures with another contrast."""
+        """Return the pictures with another contrast."""
         mean = pictures.mean((1, 2, 3), keepdim=True)
-        return mean + (pictures - mean) * _drawn(self.gain, pictures, generator)
+        return mean + (pictures - mean) * _draw_uniform(self.gain, pictures, generator)
 
 
 @spec
@@ -157,11 +163,11 @@ class Gamma:
     exponent: Range
 
     def check(self) -> None:
-        _check(self, exponent=self.exponent)
+        _check_ranges(self, exponent=self.exponent)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures with another tone curve."""
-        return pictures.clamp(0.0, 1.0) ** _drawn(self.exponent, pictures, generator)
+        """Return the pictures with another tone curve."""
+        return pictures.clamp(0.0, 1.0) ** _draw_uniform(self.exponent, pictures, generator)
 
 
 @spec
@@ -181,23 +187,23 @@ class Shadow:
     softness: Range
 
     def check(self) -> None:
-        _check(self, width=self.width, softness=self.softness)
+        _check_ranges(self, width=self.width, softness=self.softness)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures with a shadow across them."""
+        """Return the pictures with a shadow across them."""
         height, width = pictures.shape[2:]
-        angle_rad = _drawn((0.0, math.pi), pictures, generator)
-        x, y = (_drawn((0.2, 0.8), pictures, generator) for _ in range(2))
+        angle_rad = _draw_uniform((0.0, math.pi), pictures, generator)
+        x, y = (_draw_uniform((0.2, 0.8), pictures, generator) for _ in range(2))
         across = torch.arange(width, device=pictures.device) / width - x
         down = torch.arange(height, device=pictures.device)[:, None] / width - y * height / width
         half, soft = (
-            _drawn(self.width, pictures, generator) / 2.0,
-            _drawn(self.softness, pictures, generator),
+            _draw_uniform(self.width, pictures, generator) / 2.0,
+            _draw_uniform(self.softness, pictures, generator),
         )
         inside = (
             (half - (across * angle_rad.cos() + down * angle_rad.sin()).abs()) / soft + 0.5
         ).clamp(0.0, 1.0)
-        return pictures * (1.0 - inside * (1.0 - _drawn(self.depth, pictures, generator)))
+        return pictures * (1.0 - inside * (1.0 - _draw_uniform(self.depth, pictures, generator)))
 
 
 @spec
@@ -217,19 +223,21 @@ class Haze:
     unevenness: float
 
     def check(self) -> None:
-        _check(self, transmission=self.transmission, brightness=self.brightness)
+        _check_ranges(self, transmission=self.transmission, brightness=self.brightness)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures through dust."""
-        coarse = _drawn((-self.unevenness, self.unevenness), pictures, generator, 20).reshape(
-            -1, 1, 4, 5
-        )
+        """Return the pictures through dust."""
+        coarse = _draw_uniform(
+            (-self.unevenness, self.unevenness), pictures, generator, 20
+        ).reshape(-1, 1, 4, 5)
         drift = functional.interpolate(
             coarse, pictures.shape[2:], mode="bicubic", align_corners=False
         )
-        through = (_drawn(self.transmission, pictures, generator) + drift).clamp(0.05, 1.0)
-        tint = torch.cat([_drawn((low, 1.0), pictures, generator) for low in (0.95, 0.9, 0.85)], 1)
-        return pictures * through + _drawn(self.brightness, pictures, generator) * tint * (
+        through = (_draw_uniform(self.transmission, pictures, generator) + drift).clamp(0.05, 1.0)
+        tint = torch.cat(
+            [_draw_uniform((low, 1.0), pictures, generator) for low in (0.95, 0.9, 0.85)], 1
+        )
+        return pictures * through + _draw_uniform(self.brightness, pictures, generator) * tint * (
             1.0 - through
         )
 
@@ -247,12 +255,14 @@ class Blur:
     sigma_px: Range
 
     def check(self) -> None:
-        _check(self, sigma_px=self.sigma_px)
+        _check_ranges(self, sigma_px=self.sigma_px)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures out of focus."""
-        kernel = _gaussian(_drawn(self.sigma_px, pictures, generator), self.sigma_px[1])
-        return _filtered(_filtered(pictures, kernel), kernel.transpose(2, 3))
+        """Return the pictures out of focus."""
+        kernel = _build_gaussian_kernels(
+            _draw_uniform(self.sigma_px, pictures, generator), self.sigma_px[1]
+        )
+        return _filter_pictures(_filter_pictures(pictures, kernel), kernel.transpose(2, 3))
 
 
 @spec
@@ -268,13 +278,13 @@ class MotionBlur:
     length_px: Range
 
     def check(self) -> None:
-        _check(self, length_px=self.length_px)
+        _check_ranges(self, length_px=self.length_px)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures smeared along a line; what is shown stays where it was, in the middle of the way."""
+        """Return the pictures smeared along a line; what is shown stays where it was, in the middle of the way."""
         half = math.ceil(self.length_px[1] / 2.0) + 1
         length, angle_rad = (
-            _drawn(one, pictures, generator) for one in (self.length_px, (0.0, math.pi))
+            _draw_uniform(one, pictures, generator) for one in (self.length_px, (0.0, math.pi))
         )
         way = (
             length * torch.linspace(-0.5, 0.5, 8 * half + 1, device=pictures.device)[:, None, None]
@@ -283,7 +293,7 @@ class MotionBlur:
         # each step along the way falls on the four pixels around it
         near = (1.0 - (place - way * angle_rad.cos()).abs()).clamp_min(0.0)
         near = near * (1.0 - (place[:, None] - way * angle_rad.sin()).abs()).clamp_min(0.0)
-        return _filtered(pictures, near.mean(1, keepdim=True))
+        return _filter_pictures(pictures, near.mean(1, keepdim=True))
 
 
 @spec
@@ -303,17 +313,19 @@ class SensorNoise:
     grain_px: Range
 
     def check(self) -> None:
-        _check(self, grain_px=self.grain_px)
+        _check_ranges(self, grain_px=self.grain_px)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures with noise."""
+        """Return the pictures with noise."""
         noise = torch.randn(pictures.shape, device=pictures.device, generator=generator)
-        kernel = _gaussian(_drawn(self.grain_px, pictures, generator), self.grain_px[1])
-        noise = _filtered(_filtered(noise, kernel), kernel.transpose(2, 3)) / kernel.square().sum(
-            (2, 3), keepdim=True
+        kernel = _build_gaussian_kernels(
+            _draw_uniform(self.grain_px, pictures, generator), self.grain_px[1]
         )
+        noise = _filter_pictures(
+            _filter_pictures(noise, kernel), kernel.transpose(2, 3)
+        ) / kernel.square().sum((2, 3), keepdim=True)
         constant, photon = (
-            _drawn(one, pictures, generator) for one in (self.constant, self.photon)
+            _draw_uniform(one, pictures, generator) for one in (self.constant, self.photon)
         )
         return (
             pictures
@@ -334,32 +346,32 @@ class Jpeg:
     quality: Range
 
     def check(self) -> None:
-        _check(self, quality=self.quality)
+        _check_ranges(self, quality=self.quality)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Returns the pictures as a JPEG file gives them back."""
-        return recompress_jpeg(pictures, _drawn(self.quality, pictures, generator))
+        """Return the pictures as a JPEG file gives them back."""
+        return recompress_jpeg(pictures, _draw_uniform(self.quality, pictures, generator))
 
 
-def _drawn(
+def _draw_uniform(
     limits: Range, pictures: torch.Tensor, generator: torch.Generator, count: int = 1
 ) -> torch.Tensor:
-    """Returns evenly drawn numbers, `(B, count, 1, 1)`, for a batch of pictures."""
+    """Return evenly drawn numbers, `(B, count, 1, 1)`, for a batch of pictures."""
     low, high = limits
     drawn = torch.rand((len(pictures), count, 1, 1), device=pictures.device, generator=generator)
     return low + (high - low) * drawn
 
 
-def _gaussian(sigma_px: torch.Tensor, largest_px: float) -> torch.Tensor:
-    """Returns kernels, `(B, 1, 1, k)`, of standard deviations `(B, 1, 1, 1)` up to `largest_px`."""
+def _build_gaussian_kernels(sigma_px: torch.Tensor, largest_px: float) -> torch.Tensor:
+    """Return kernels, `(B, 1, 1, k)`, of standard deviations `(B, 1, 1, 1)` up to `largest_px`."""
     half = max(1, math.ceil(3.0 * largest_px))
     place = torch.arange(-half, half + 1, device=sigma_px.device)
     kernel = (-0.5 * (place / sigma_px.clamp_min(0.05)).square()).exp()
     return kernel / kernel.sum(3, keepdim=True)
 
 
-def _filtered(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
-    """Returns each picture filtered by its own kernel, `(B, 1, k, l)`; what lies beyond a border is like the border."""
+def _filter_pictures(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
+    """Return each picture filtered by its own kernel, `(B, 1, k, l)`; what lies beyond a border is like the border."""
     down, across = kernels.shape[2] // 2, kernels.shape[3] // 2
     wide = functional.pad(pictures, (across, across, down, down), mode="replicate").flatten(0, 1)[
         None
@@ -368,8 +380,8 @@ def _filtered(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
     return functional.conv2d(wide, each, groups=len(each))[0].unflatten(0, pictures.shape[:2])
 
 
-def _check(step: Augmentation, **ranges: Range) -> None:
-    """Raises a `ConfigError` for a probability outside [0, 1] and for ranges that are empty or reach below 0."""
+def _check_ranges(step: Augmentation, **ranges: Range) -> None:
+    """Raise a `ConfigError` for a probability outside [0, 1] and for ranges that are empty or reach below 0."""
     if not 0.0 <= step.probability <= 1.0:
         raise ConfigError(
             f"{type(step).__name__}.probability: expected 0 to 1, got {step.probability}"

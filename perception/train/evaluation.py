@@ -35,7 +35,7 @@ COLOURS = {"block": (0, 114, 178), "mouth": (213, 94, 0)}
 def crop_segmenter_views(
     views: TrainingViews, size_px: tuple[int, int]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Returns what the segmenter would see of each frame, `(F, 2, 3, h, w)` uint8, and what is there, `(F, 2, 2, h, w)` bool."""
+    """Return what the segmenter would see of each frame, `(F, 2, 3, h, w)` uint8, and what is there, `(F, 2, 2, h, w)` bool."""
     width, height = size_px
     full = tuple(views.layers.shape[3:])
     room = (
@@ -60,7 +60,7 @@ def crop_segmenter_views(
 
 @torch.no_grad()
 def predict(network: UNet, pictures: torch.Tensor, device: torch.device) -> torch.Tensor:
-    """Returns the probabilities for pictures `(F, 2, 3, h, w)` uint8, `(F, 2, 2, h, w)`, on the CPU."""
+    """Return the probabilities for pictures `(F, 2, 3, h, w)` uint8, `(F, 2, 2, h, w)`, on the CPU."""
     network.eval()
     flat, found = pictures.flatten(0, 1), []
     for first in range(0, len(flat), BATCH):
@@ -75,7 +75,7 @@ def predict(network: UNet, pictures: torch.Tensor, device: torch.device) -> torc
 def compute_metrics(
     probabilities: torch.Tensor, known: torch.Tensor, conditions: Sequence[str]
 ) -> dict[str, dict[str, Any]]:
-    """Returns figures for each condition, and for all frames under `all`.
+    """Return figures for each condition, and for all frames under `all`.
 
     `block`: intersection over union of the block, seen as a whole. `mouth`: that of mouths, in the
     closer view; both over all
@@ -95,8 +95,8 @@ def compute_metrics(
         index = torch.from_numpy(chosen)
         found, there, false = counts[chosen].sum(0)
         table[name] = {
-            "block": _iou(block[0][index], block[1][index]),
-            "mouth": _iou(mouth[0][index], mouth[1][index]),
+            "block": _compute_iou(block[0][index], block[1][index]),
+            "mouth": _compute_iou(mouth[0][index], mouth[1][index]),
             "found": float(found / there) if there else None,
             "false": float(false / chosen.sum()),
             "frames": int(chosen.sum()),
@@ -104,12 +104,12 @@ def compute_metrics(
     return table
 
 
-def _iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
+def _compute_iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
     return float((said & known).sum() / (said | known).sum()) if known.any() else None
 
 
 def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
-    """Returns how many mouths were found, how many there are, and how many pieces of `said` touch none."""
+    """Return how many mouths were found, how many there are, and how many pieces of `said` touch none."""
     num_said, said_labels = cv2.connectedComponents(said.astype(np.uint8))
     num_known, known_labels = cv2.connectedComponents(known.astype(np.uint8))
     found = 0
@@ -127,7 +127,7 @@ def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
 
 @contextmanager
 def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
-    """Shows how far a training is; yields what says that it is one update farther."""
+    """Show how far a training is; yields what says that it is one update farther."""
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -143,7 +143,7 @@ def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
 def draw_samples(
     path: Path, pictures: torch.Tensor, probabilities: torch.Tensor, known: torch.Tensor
 ) -> None:
-    """Draws some frames in both views: what is there as a thin line, what the network says as colour; writes a PNG."""
+    """Draw some frames in both views: what is there as a thin line, what the network says as colour; writes a PNG."""
     rows = []
     for frame in np.linspace(0, len(pictures) - 1, min(SHOWN, len(pictures))).round().astype(int):
         tiles = []
@@ -168,7 +168,7 @@ def draw_samples(
 
 
 def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
-    """Draws loss and overlaps over the updates; writes a PNG."""
+    """Draw loss and overlaps over the updates; writes a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")

@@ -28,7 +28,7 @@ TOLERANCE = 1e-3
 def build_header(
     network: UNet, size_px: tuple[int, int], facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Returns what stands in a network's files: what it takes and gives, and `facts` about its training, JSON."""
+    """Return what stands in a network's files: what it takes and gives, and `facts` about its training, JSON."""
     return {
         "schema": SCHEMA,
         "channels": list(CHANNELS),
@@ -41,7 +41,7 @@ def build_header(
 
 
 def write_checkpoint(path: Path, network: UNet, header: Mapping[str, Any]) -> None:
-    """Writes a checkpoint in one step.
+    """Write a checkpoint in one step.
 
     Raises:
         StorageError: it could not be written.
@@ -55,7 +55,7 @@ def write_checkpoint(path: Path, network: UNet, header: Mapping[str, Any]) -> No
 def write_onnx(
     path: Path, network: UNet, header: Mapping[str, Any], pictures: torch.Tensor
 ) -> float:
-    """Writes an ONNX file with the header as metadata, and compares it with the network.
+    """Write an ONNX file with the header as metadata, and compares it with the network.
 
     Args:
         path: Where to.
@@ -105,7 +105,7 @@ def write_onnx(
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file in one step.
+    """Write a file in one step.
 
     Raises:
         StorageError: it could not be written; one that was there before is untouched.

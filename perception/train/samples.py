@@ -71,7 +71,7 @@ class Crop:
     def windows(
         self, seen: torch.Tensor, shape: tuple[int, int], generator: torch.Generator
     ) -> torch.Tensor:
-        """Returns random parts of views, `(B, 2, 3)`: maps from a sample's places to the view's.
+        """Return random parts of views, `(B, 2, 3)`: maps from a sample's places to the view's.
 
         Both run from -1 to 1 from border to border, as `torch.nn.functional.affine_grid` wants
         them.
@@ -113,7 +113,7 @@ class TrainingViews:
         return len(self.names)
 
     def part(self, chosen: slice) -> TrainingViews:
-        """Returns the chosen frames."""
+        """Return the chosen frames."""
         return TrainingViews(self.layers[chosen], self.conditions[chosen], self.names[chosen])
 
 
@@ -151,7 +151,7 @@ class Samples:
         self._closer, self._seed, self._device = closer, seed, device
 
     def batch(self, number: int, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns pictures `(count, 3, h, w)` and shares of block and mouth `(count, 2, h, w)` of a batch, float32 in [0, 1]."""
+        """Return pictures `(count, 3, h, w)` and shares of block and mouth `(count, 2, h, w)` of a batch, float32 in [0, 1]."""
         seed = (self._seed * 0x9E3779B97F4A7C15 + number) % 2**63
         chance = torch.Generator().manual_seed(seed)
         frame = torch.randint(len(self._layers), (count,), generator=chance)
@@ -170,7 +170,7 @@ class Samples:
 def cut_windows(
     layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]
 ) -> torch.Tensor:
-    """Returns parts of pictures `(B, C, H, W)` uint8 in the size of a sample, `(B, C, h, w)` float32 in [0, 1].
+    """Return parts of pictures `(B, C, H, W)` uint8 in the size of a sample, `(B, C, h, w)` float32 in [0, 1].
 
     Args:
         layers: Pictures.
@@ -185,7 +185,7 @@ def cut_windows(
 
 
 def list_frames(folders: str | Sequence[str]) -> list[Path]:
-    """Returns the frames with a mask in a folder, or in some, and those below them, as paths without endings, sorted.
+    """Return the frames with a mask in a folder, or in some, and those below them, as paths without endings, sorted.
 
     Raises:
         FrameError: a folder holds none.
@@ -210,7 +210,7 @@ def list_frames(folders: str | Sequence[str]) -> list[Path]:
 def read_views(
     stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: int
 ) -> TrainingViews:
-    """Reads frames, some at a time, and keeps their two views.
+    """Read frames, some at a time, and keeps their two views.
 
     Args:
         stems: Frames, paths without endings.
@@ -223,9 +223,9 @@ def read_views(
     layers = np.empty((len(stems), len(LOOKS), 5, height, width), np.uint8)
 
     def fill(number: int) -> str:
-        picture, known, condition = _frame(stems[number])
+        picture, known, condition = _read_frame(stems[number])
         generator = np.random.default_rng((seed, number))
-        for look, window in enumerate(_looks(known, (width, height), margin, generator)):
+        for look, window in enumerate(_choose_windows(known, (width, height), margin, generator)):
             layers[number, look, :3] = window.take(picture, (width, height)).transpose(2, 0, 1)
             layers[number, look, 3:] = window.take(known, (width, height)).transpose(2, 0, 1)
         return condition
@@ -243,8 +243,8 @@ def read_views(
     )
 
 
-def _frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """Returns picture `(H, W, 3)`, shares `(H, W, 2)` and condition of one frame."""
+def _read_frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return picture `(H, W, 3)`, shares `(H, W, 2)` and condition of one frame."""
     path = Path(f"{stem}{dataset.COLOR}")
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR) if path.is_file() else None
     if picture is None:
@@ -261,10 +261,10 @@ def _frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), known, condition
 
 
-def _looks(
+def _choose_windows(
     known: np.ndarray, size_px: tuple[int, int], margin: float, generator: np.random.Generator
 ) -> list[Window]:
-    """Returns the windows of both views of a frame."""
+    """Return the windows of both views of a frame."""
     first = cover_picture(known.shape, size_px)
     box = bound_block(known[..., 0] / 255.0, THRESHOLD, SMALLEST_PIECE)
     if box is None:

@@ -99,7 +99,7 @@ class SegmenterTraining:
             raise ConfigError("training: expected average, rate and max_seconds above 0")
 
     def fit(self, session: Session, resume: bool) -> dict[str, Any]:
-        """Trains; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
+        """Train; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
 
         Returns:
             What `training.json` says: `conditions` (see `training_report.judged`), `best_update`,
@@ -167,7 +167,7 @@ class _Training:
         return self._finish(pictures, known)
 
     def _begun(self) -> UNet:
-        """Returns the network as the training begins with it."""
+        """Return the network as the training begins with it."""
         network, settings = UNet(self._settings.widths), self._settings
         if settings.start is not None:
             first, _ = read_checkpoint(find_weights(settings.start))
@@ -211,7 +211,7 @@ class _Training:
 
     @torch.no_grad()
     def _remember(self, part: float) -> None:
-        """Moves the mean network by a part of the way to the one under training."""
+        """Move the mean network by a part of the way to the one under training."""
         now = self._network.state_dict()
         moving = [name for name, value in now.items() if value.is_floating_point()]
         # all at once: a graphics card takes longer to be told of each of a hundred small tensors
@@ -221,7 +221,7 @@ class _Training:
         )
 
     def _spent(self) -> float:
-        """Returns which part of the training is over, by updates or by seconds, in [0, 1]."""
+        """Return which part of the training is over, by updates or by seconds, in [0, 1]."""
         in_time = self._seconds / (self._settings.max_seconds or math.inf)
         return min(1.0, max(self._update / self._settings.updates, in_time))
 
@@ -292,7 +292,7 @@ class _Training:
         }
 
     def _identity(self) -> dict[str, str]:
-        """Returns what must be the same for a training to go on."""
+        """Return what must be the same for a training to go on."""
         same = {name: value for name, value in vars(self._settings).items() if name not in FREE}
         data = hashlib.sha256()
         for views in (self._train, self._unseen):

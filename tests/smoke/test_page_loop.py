@@ -20,7 +20,7 @@ from websockets.asyncio.client import connect
 
 from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
 
-FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).frame(0, 0.0)
+FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 0.0)
 TOKEN = "correct horse battery staple"
 
 

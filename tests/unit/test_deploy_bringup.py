@@ -72,7 +72,7 @@ def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -
             part, remote.button_right = t_s % 4.8, t_s >= 4.8
             pushed = (0.6 if part < 2.0 else -0.6) if 1.0 < part < 1.6 or 3.4 < part < 4.0 else 0.0
             remote.levers = (0.0, 0.0, pushed, 0.0) if remote.button_right else (pushed,) * 4
-            bus.send(remote.frame())
+            bus.send(remote.build_frame())
 
 
 @pytest.mark.slow

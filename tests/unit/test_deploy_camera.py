@@ -18,7 +18,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
-from deploy.page.loop_feed import GIVEN, LoopFeed, PageProcessConfig
+from deploy.page.loop_feed import UNNAMED, LoopFeed, PageProcessConfig
 from deploy.page.protocol import OperatorRequest
 from deploy.page.scene import locate_borehole
 from deploy.recorder import capture_reader
@@ -30,7 +30,7 @@ from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import DetectedTarget, FileTarget, GivenTarget, TargetSelector
 
 MACHINE = option("machine", "brokk170")
-FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).frame(0, 12.0)
+FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 12.0)
 PIXELS = 640 * 360
 
 
@@ -190,22 +190,22 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     )  # type: ignore[arg-type,return-value]
     center_m = np.array(TARGETS[1].center_in_base_m)
     point = OperatorRequest("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
-    assert not feed.wish(point), "there is no picture yet"
+    assert not feed.submit(point), "there is no picture yet"
     assert exchange.frame is not None
     perception_process._publish_frame(exchange.frame, FRAME, PIXELS, time.monotonic())
-    assert feed.wish(point)
+    assert feed.submit(point)
     wanted.refresh()
     assert np.linalg.norm(np.array(aimed(exchange)) - center_m) < 0.012
-    shown = feed.shown()
-    assert [(one.name, one.chosen) for one in shown.targets] == [(GIVEN, True)]
+    shown = feed.read_state()
+    assert [(one.name, one.chosen) for one in shown.targets] == [(UNNAMED, True)]
     assert next(one for one in shown.streams if one.name == "camera").age_s is not None
     show(exchange, pose(2.95, -0.4), pose(2.25, 0.41))
     wanted.refresh()
-    assert [(one.name, one.chosen) for one in feed.shown().targets] == [
+    assert [(one.name, one.chosen) for one in feed.read_state().targets] == [
         ("1", False),
         ("2", True),
     ], "perception knows it by now"
-    assert feed.wish(OperatorRequest("target", "1")) and not feed.wish(
+    assert feed.submit(OperatorRequest("target", "1")) and not feed.submit(
         OperatorRequest("target", "9")
     )
     wanted.refresh()
@@ -244,7 +244,7 @@ def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recor
     source: Any = Blinking()
     perception_process.run(lambda: False, camera(source), exchange)
     assert exchange.frame is not None and exchange.frame.number == 2
-    said = [json.loads(data[1:]) for data in exchange.sight_log.take()]
+    said = [json.loads(data[1:]) for data in exchange.vision_log.take()]
     assert [one["topic"] for one in said] == ["holes"] * 2 and said[1]["holes"][0][
         "center_in_base_m"
     ] == [2.6, 0.0, 0.75]

@@ -73,11 +73,11 @@ def test_what_must_stop_the_machine_stops_it_in_time_and_for_good(
     stage.get_going()
     stage.fault(fault, message)
     assert stage.stops_within_s() <= limit_s + 0.011  # the twin takes a fault up in its next cycle
-    safety = stage.view.safety
+    state = stage.view.state
     assert (
-        safety is not None
-        and (safety.state == "LATCHED" or fault == "deadman_released")
-        and not any(safety.sent)
+        state is not None
+        and (state.guard.name == "LATCHED" or fault == "deadman_released")
+        and not any(state.sent)
     )
     stage.fault("none")
     stage.go(0.3)
@@ -113,8 +113,8 @@ def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero(
     stage.fault(fault, message)
     stage.go(0.5)
     seen = stage.view
-    assert seen.safety is not None and seen.safety.plausible
-    assert stage.moves or seen.safety.state in ("LATCHED", "SILENT")
+    assert seen.state is not None and seen.state.q_plausible
+    assert stage.moves or seen.state.guard.name in ("LATCHED", "SILENT")
     assert mode != "listen" or not stage.air.sent
 
 
@@ -124,9 +124,9 @@ def test_the_operators_lever_always_wins(stages: dict[str, Stage], mode: str) ->
     stage.get_going()
     stage.fault("lever")
     stage.go(0.1)
-    safety = stage.view.safety
-    assert stage.twin._flow[3] > 0.4 and safety is not None and not any(safety.sent)
-    assert safety.state == ("SILENT" if mode == "listen" else "LATCHED")
+    state = stage.view.state
+    assert stage.twin._flow[3] > 0.4 and state is not None and not any(state.sent)
+    assert state.guard.name == ("SILENT" if mode == "listen" else "LATCHED")
 
 
 @pytest.mark.parametrize("mode", COMMANDING)
@@ -142,8 +142,8 @@ def test_a_process_that_stood_still_moves_nothing_when_it_wakes_up(
         "the gateway waits for nobody"
     )
     stage.go(0.5)
-    safety = stage.view.safety
-    assert not stage.moves and safety is not None and safety.state in ("LATCHED", "READY")
+    state = stage.view.state
+    assert not stage.moves and state is not None and state.guard.name in ("LATCHED", "READY")
 
 
 @pytest.mark.parametrize("mode", COMMANDING)
@@ -152,11 +152,11 @@ def test_a_bus_that_goes_down_is_zero_and_begins_anew(stages: dict[str, Stage], 
     stage.get_going()
     stage.air.broken = True
     assert stage.stops_within_s() <= 0.1
-    safety = stage.view.safety
-    assert safety is not None and not safety.bus_up and safety.state == "LATCHED"
+    state = stage.view.state
+    assert state is not None and not state.bus_up and state.guard.name == "LATCHED"
     stage.air.broken = False
     stage.go(0.6)
-    assert not stage.moves and stage.view.safety is not None and stage.view.safety.bus_up
+    assert not stage.moves and stage.view.state is not None and stage.view.state.bus_up
 
 
 def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(
@@ -171,7 +171,7 @@ def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(
         for name, value in change.items():
             setattr(stage, name, value)
         assert stage.stops_within_s() <= limit_s
-        assert stage.view.safety is not None and stage.view.safety.state == "LATCHED"
+        assert stage.view.state is not None and stage.view.state.guard.name == "LATCHED"
 
 
 @pytest.mark.parametrize("mode", COMMANDING)
@@ -234,8 +234,8 @@ def test_a_dead_man_pressed_before_there_was_advice_has_to_be_pressed_again(
     stage = Stage(machine, "auto", tmp_path, again_s)
     late, stage.adviser = stage.adviser, None
     stage.go(3.0)
-    safety = stage.view.safety
-    assert safety is not None and safety.state == "LATCHED" and not stage.moves
+    state = stage.view.state
+    assert state is not None and state.guard.name == "LATCHED" and not stage.moves
     stage.adviser = late
     stage.go(6.0, lambda: stage.moves)
     assert stage.moves == (again_s is not None)

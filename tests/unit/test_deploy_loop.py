@@ -23,16 +23,11 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from deploy.guidance import AXES, LeverDisplay, LeverMap
 from deploy.policy.bundle import PolicyBundle
-from deploy.policy.policy_process import (
-    AdviceStatus,
-    PolicyAdviser,
-    PolicyHistory,
-    PolicyProcessConfig,
-)
-from deploy.runtime.operator_state import read_snapshot
+from deploy.policy.policy_process import PolicyAdviser, PolicyHistory, PolicyProcessConfig
+from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.process import CycleTimer
-from deploy.runtime.shared_memory import Pipe, Slot
-from deploy.runtime.shm_layout import LoopMemory, build_state_fields
+from deploy.runtime.shared_memory import Pipe, RecordLayout, Slot
+from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import FileTarget
 
 SHIPPED = "tasks:policies/borehole_insertion"
@@ -94,17 +89,23 @@ def test_a_deadline_that_was_missed_is_skipped_and_counted(monkeypatch: pytest.M
     )
 
 
-def state(machine: Machine, number: int, flow: float, q: float, now_s: float = 0.0) -> Any:
-    record = np.zeros((), build_state_fields(machine.num_joints))
-    record["t_s"] = record["q_t_s"] = now_s
-    record["q"], record["flow_number"], record["flow_sum"], record["flow"] = (
-        q,
-        number,
-        flow * number,
-        flow,
+def state(
+    machine: Machine, number: int, flow: float, q: float, now_s: float = 0.0, **changes: Any
+) -> OperatorState:
+    each = np.ones(machine.num_joints)
+    blank = RecordLayout(OperatorState, machine.num_joints).new()
+    found = replace(
+        blank,
+        t_s=now_s,
+        q_t_s=now_s,
+        q=q * each,
+        flow_number=number,
+        flow_sum=flow * number * each,
+        flow=flow * each,
+        q_plausible=True,
+        trusted=True,
     )
-    record["q_plausible"] = record["trusted"] = True
-    return record
+    return replace(found, **changes)
 
 
 def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does(
@@ -115,9 +116,8 @@ def test_the_ring_holds_positions_and_mean_flows_of_each_period_as_training_does
         assert not ring.full
         ring.sample(state(machine, 10 + 2 * k, 0.0, float(k)), missed=0)
     assert ring.full and ring.q[:, 0].tolist() == list(range(13))
-    record = state(machine, 40, 0.0, 13.0)
-    record["flow_sum"] = 0.9  # since number 34 six messages, 0.9 in all
-    ring.sample(record, missed=0)
+    # since number 34 six messages, 0.9 in all
+    ring.sample(state(machine, 40, 0.0, 13.0, flow_sum=np.full(5, 0.9)), missed=0)
     assert ring.u[-1].tolist() == pytest.approx([0.15] * 5) and ring.q[-1, 0] == 13.0
 
 
@@ -297,28 +297,27 @@ def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(
     adviser: PolicyAdviser, machine: Machine
 ) -> None:
     memory, now_s, found = adviser._memory, 1000.0, []
-    assert adviser.cycle(0, now_s) is AdviceStatus.NO_STATE
+    assert adviser.run_cycle(0, now_s) is AdviceStatus.NO_STATE
     for k in range(30):
         now_s += machine.period_s
-        record = state(machine, 10 + k, 0.0, 0.0, now_s)
-        record["q"] = machine.home
-        memory.state.write(record)
+        home = state(machine, 10 + k, 0.0, 0.0, now_s)
+        memory.state.write(replace(home, q=machine.home))
         if k == 15:
             target = memory.target.new()
             target["t_s"], target["center_in_base_m"] = now_s, (2.6, 0.0, 0.75)
             memory.target.write(target)
-        found.append(adviser.cycle(0, now_s))
+        found.append(adviser.run_cycle(0, now_s))
     assert (
         found[:12] == [AdviceStatus.WARMING_UP] * 12
         and found[12:15] == [AdviceStatus.NO_TARGET] * 3
         and set(found[15:]) == {AdviceStatus.VALID}
     )
-    shown = read_snapshot(memory)
-    assert shown.advice is not None and shown.advice.valid and any(shown.advice.command)
-    assert adviser.cycle(0, now_s + 0.16) is AdviceStatus.STALE
+    shown = memory.read_snapshot()
+    assert shown.advice is not None and shown.advice.valid and any(shown.advice.u)
+    assert adviser.run_cycle(0, now_s + 0.16) is AdviceStatus.STALE
     advice = memory.advice.read()
-    assert advice is not None and not advice["u"].any() and memory.request is None
-    json.dumps(read_snapshot(memory).plain(), allow_nan=False)
+    assert advice is not None and not advice.u.any() and memory.request is None
+    json.dumps(memory.read_snapshot().to_plain(), allow_nan=False)
 
 
 @pytest.mark.parametrize(
@@ -331,11 +330,8 @@ def test_advice_comes_when_history_and_borehole_are_there_and_goes_with_them(
 def test_positions_that_are_not_to_be_believed_give_no_advice(
     adviser: PolicyAdviser, machine: Machine, change: dict[str, bool], reason: AdviceStatus
 ) -> None:
-    record = state(machine, 1, 0.0, 0.0, 1000.0)
-    for name, value in change.items():
-        record[name] = value
-    adviser._memory.state.write(record)
-    assert adviser.cycle(0, 1000.0) is reason
+    adviser._memory.state.write(state(machine, 1, 0.0, 0.0, 1000.0, **change))
+    assert adviser.run_cycle(0, 1000.0) is reason
 
 
 def test_an_answer_that_makes_no_sense_is_not_shown(
@@ -354,10 +350,10 @@ def test_an_answer_that_makes_no_sense_is_not_shown(
         for _ in range(14):
             now_s += machine.period_s
             memory.state.write(state(machine, int(now_s * 100), 0.0, 0.0, now_s))
-            reason = adviser.cycle(0, now_s)
+            reason = adviser.run_cycle(0, now_s)
         assert reason is AdviceStatus.REJECTED
         advice = memory.advice.read()
-        assert advice is not None and not advice["u"].any()
+        assert advice is not None and not advice.u.any()
 
 
 def test_a_borehole_file_is_read_when_it_changes_and_its_faults_are_named(tmp_path: Path) -> None:

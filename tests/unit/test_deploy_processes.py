@@ -13,7 +13,7 @@ from composed import option
 from desk import COMMAND, Desk
 
 from brokk_rl.machine import Machine
-from deploy.runtime.operator_state import read_snapshot
+from deploy.guard.guard import GuardState
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 SLACK = 3.0 if os.environ.get("CI") or os.cpu_count() == 2 else 1.0
@@ -24,7 +24,8 @@ the benchmark's."""
 @pytest.fixture(scope="module")
 def desk(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Desk]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(Path(__file__).parents[1]))
+        folders = [str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH", "")]
+        patch.setenv("PYTHONPATH", os.pathsep.join(folders))
         with Desk(machine, option("guard", "default"), tmp_path_factory.mktemp("desk")) as made:
             for name in ("twin", "bus", "commander"):
                 made.start(name)
@@ -72,15 +73,15 @@ def test_a_fault_stops_the_machine_in_time(
     found_s = _stopped(desk, fault, since_s)
     desk.fault("none")
     assert found_s <= limit_s + 0.02 * SLACK
-    safety = read_snapshot(desk.memory).safety
-    assert safety is not None and safety.state in ("LATCHED", "READY")
+    state = desk.memory.state.read()
+    assert state is not None and state.guard in (GuardState.LATCHED, GuardState.READY)
 
 
 def _stopped(desk: Desk, fault: str, since_s: float) -> float:
     if fault == "silent":  # the gateway says nothing either: what the guard sends decides
         while time.monotonic() < since_s + 1.0:
-            safety = read_snapshot(desk.memory).safety
-            if safety is not None and not any(safety.sent):
+            state = desk.memory.state.read()
+            if state is not None and not any(state.sent):
                 return time.monotonic() - since_s
             time.sleep(0.001)
     return desk.still_after(since_s, 0.6).flow_s
@@ -97,7 +98,7 @@ def test_the_operators_lever_always_wins(desk: Desk) -> None:
         for _, values in heard
     )
     state = desk.memory.state.read()
-    assert state is not None and not state["sent"].any()
+    assert state is not None and not state.sent.any()
 
 
 @pytest.mark.parametrize("fault", ["drop_some", "duplicate"])
@@ -108,8 +109,8 @@ def test_what_a_bus_does_now_and_then_is_borne_or_ends_in_zero_but_is_never_used
     desk.fault(fault, "JointPos1", 0.5)
     time.sleep(0.5)
     state = desk.memory.state.read()
-    assert state is not None and (state["lost"] > 0 or state["refused"] > 0)
-    assert bool(state["q_plausible"])
+    assert state is not None and (state.lost > 0 or state.refused > 0)
+    assert bool(state.q_plausible)
 
 
 @pytest.mark.parametrize(("name", "number"), [("commander", signal.SIGKILL), ("commander", signal.SIGSTOP), ("bus", signal.SIGSTOP),
@@ -131,6 +132,10 @@ def test_a_process_that_dies_or_hangs_stops_the_machine(desk: Desk, name: str, n
 
 def test_what_is_shown_says_who_has_the_valves(desk: Desk) -> None:
     desk.set_moving()
-    safety = read_snapshot(desk.memory).safety
-    assert safety is not None and safety.state == "ACTIVE" and safety.commands
-    assert [round(abs(u), 3) for u in safety.sent] == [round(abs(u), 3) for u in COMMAND]
+    state = desk.memory.state.read()
+    assert (
+        state is not None
+        and state.guard is GuardState.ACTIVE
+        and desk.memory.read_snapshot().commands
+    )
+    assert [round(abs(u), 3) for u in state.sent] == [round(abs(u), 3) for u in COMMAND]

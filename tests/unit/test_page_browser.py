@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import LEVERS, SHOWN, TOKEN, Scripted, chromium, served
+from browser import SHOWN, STATE, TOKEN, Scripted, change_state, chromium, lever, served
 from PIL import Image
 
 from brokk_rl.signals import Frame
+from deploy.guard.guard import GuardState, GuardTrip
 from deploy.page.protocol import OperatorRequest, SourceAge
 
 SIZE = {"width": 1280, "height": 800}
@@ -99,10 +100,7 @@ def test_levers_are_drawn_where_they_are_and_should_be(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:
     page = opened(port)
-    feed.now = replace(
-        feed.now,
-        own=replace(LEVERS, left_theta=0.5, left_psi=-0.25, right_theta=-1.0, right_psi=1.0),
-    )
+    feed.now = replace(feed.now, state=replace(STATE, lever=lever(0.5, -0.25, -1.0, 1.0)))
     feed.advise(2, left_theta=-0.75, left_psi=1.0, right_theta=0.1, right_psi=-0.6)
     eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
     found = drawn(page)
@@ -117,7 +115,7 @@ def test_pixels_are_green_where_the_lever_should_be_and_blue_where_it_is(
 ) -> None:
     page = opened(port)
     own, advised = (0.8, -0.5), (-0.4, 0.6)  # psi, theta
-    feed.now = replace(feed.now, own=replace(LEVERS, left_psi=own[0], left_theta=own[1]))
+    feed.now = change_state(feed.now, lever=lever(left_psi=own[0], left_theta=own[1]))
     feed.advise(2, left_psi=advised[0], left_theta=advised[1])
     eventually(lambda: drawn(page)["left advised"] != (0.0, 0.0))
     box = page.locator("#left").bounding_box()
@@ -203,7 +201,7 @@ def test_together_within_the_tolerance_is_said_by_more_than_colour(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:
     page = opened(port)
-    feed.now = replace(feed.now, own=replace(LEVERS, left_psi=0.45, right_psi=0.3))
+    feed.now = change_state(feed.now, lever=lever(left_psi=0.45, right_psi=0.3))
     feed.advise(2, left_psi=0.5, right_psi=0.5)
     page.wait_for_selector("#left.together")
     assert (
@@ -226,9 +224,9 @@ def test_the_page_comes_back_after_the_server_was_away(
         page.wait_for_selector("body:not(.lost)")
         eventually(lambda: drawn(page)["left advised"] == pytest.approx((0.9, 0.0), abs=1e-3))
         eventually(
-            lambda: page.keyboard.press("g") or feed.wishes
+            lambda: page.keyboard.press("g") or feed.requests
         )  # until then it says that it has no connection
-        assert set(feed.wishes) == {OperatorRequest("start", "")}
+        assert set(feed.requests) == {OperatorRequest("start", "")}
 
 
 def test_safety_and_connection_are_told_apart_in_words(
@@ -236,14 +234,11 @@ def test_safety_and_connection_are_told_apart_in_words(
 ) -> None:
     page = opened(port)
     assert page.locator("#safety.good").inner_text() == "Listens only"
-    assert SHOWN.safety is not None
-    feed.now = replace(
-        SHOWN,
-        safety=replace(SHOWN.safety, commands=True, state="LATCHED", trip="messages corrupted"),
-    )
+    latched = change_state(SHOWN, guard=GuardState.LATCHED, trip=GuardTrip.CHANNEL_INVALID)
+    feed.now = replace(latched, commands=True)
     page.wait_for_selector("#safety.bad")
     assert page.locator("#safety").inner_text() == "LATCHED – messages corrupted"
-    feed.now = replace(SHOWN, safety=replace(SHOWN.safety, estop=True, trip="emergency stop"))
+    feed.now = change_state(SHOWN, estop=True, trip=GuardTrip.ESTOP)
     until(page, "document.getElementById('safety').textContent.includes('EMERGENCY STOP')")
     page.wait_for_selector("#deadman.careful")
     feed.now = replace(SHOWN, alive=False)
@@ -277,14 +272,14 @@ def test_everything_is_done_by_keys_and_by_gloves(
         ("2", OperatorRequest("target", "B")),
     ):
         page.keyboard.press(key)
-        eventually(lambda wish=wish: feed.wishes[-1:] == [wish])
+        eventually(lambda wish=wish: feed.requests[-1:] == [wish])
     for name, wish in (
         ("#start", OperatorRequest("start", "")),
         ("#stop", OperatorRequest("stop", "")),
         ("#record", OperatorRequest("record", "on")),
     ):
         page.click(name)
-        eventually(lambda wish=wish: feed.wishes[-1] == wish)
+        eventually(lambda wish=wish: feed.requests[-1] == wish)
     for button in page.locator("button").all():
         box = button.bounding_box()
         assert min(box["width"], box["height"]) >= 15 / 25.4 * 96, (
@@ -307,21 +302,20 @@ def test_everything_is_done_by_keys_and_by_gloves(
 def test_without_dead_man_or_token_nothing_is_done_and_the_page_says_why(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:
-    assert SHOWN.safety is not None
-    feed.now = replace(SHOWN, safety=replace(SHOWN.safety, deadman=False))
+    feed.now = change_state(SHOWN, deadman=False)
     page = opened(port)
     page.click("#start")
     until(page, "document.getElementById('answer').textContent === 'Refused: hold the dead-man'")
-    assert feed.wishes == []
+    assert feed.requests == []
     page.click("#stop")
-    eventually(lambda: feed.wishes == [OperatorRequest("stop", "")])
+    eventually(lambda: feed.requests == [OperatorRequest("stop", "")])
     feed.now = SHOWN
     for token in ("wrong", None):
         stranger = opened(port, token=token)
         stranger.click("#stop")
         until(stranger, "document.getElementById('answer').textContent.startsWith('No access')")
     time.sleep(0.2)
-    assert len(feed.wishes) == 1
+    assert len(feed.requests) == 1
 
 
 def test_the_token_leaves_the_address_bar(port: int, opened: Callable[..., Any]) -> None:
@@ -383,8 +377,8 @@ def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
     until(page, "!document.getElementById('camera').hidden")
     box = page.locator("#picture").bounding_box()
     page.locator("#picture").click(position={"x": 0.25 * box["width"], "y": 0.6 * box["height"]})
-    eventually(lambda: bool(feed.wishes))
-    wish = feed.wishes[-1]
+    eventually(lambda: bool(feed.requests))
+    wish = feed.requests[-1]
     assert wish.kind == "point" and [
         float(part) for part in wish.value.split(",")
     ] == pytest.approx([0.25, 0.6], abs=0.01)

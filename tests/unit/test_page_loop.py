@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from composed import option
 
@@ -17,8 +18,7 @@ from deploy.guard.guard import GuardState
 from deploy.guidance import LeverPositions
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.protocol import DrawReport, OperatorRequest
-from deploy.policy.policy_process import REASONS, AdviceStatus
-from deploy.runtime.bus_process import TEXT, TRIPS
+from deploy.runtime.bus_process import TEXT
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
@@ -53,38 +53,41 @@ def feed(memory: LoopMemory, tmp_path: Path) -> LoopFeed:
 
 def say(memory: LoopMemory, **changes: Any) -> None:
     """Publishes a state in which all is well, with `changes`."""
-    record, now_s = memory.state.new(), time.monotonic()
-    record["t_s"] = record["q_t_s"] = record["levers_t_s"] = now_s
-    record["q"], record["lever"] = MACHINE.home, [0.1, -0.2, 0.3, -0.4]
-    record["q_plausible"] = record["trusted"] = record["alone"] = record["bus_up"] = record[
-        "deadman"
-    ] = True
-    record["guard"], record["trip"] = GuardState.SILENT.value, TRIPS.index(TRIPS[0])
-    for name, value in changes.items():
-        record[name] = value
-    memory.state.write(record)
+    now_s = time.monotonic()
+    state = replace(
+        memory.state.new(),
+        t_s=now_s,
+        q_t_s=now_s,
+        levers_t_s=now_s,
+        q=MACHINE.home,
+        lever=np.array([0.1, -0.2, 0.3, -0.4]),
+        q_plausible=True,
+        trusted=True,
+        alone=True,
+        bus_up=True,
+        deadman=True,
+        guard=GuardState.SILENT,
+    )
+    memory.state.write(replace(state, **changes))
 
 
-def advise(memory: LoopMemory, reason: AdviceStatus = AdviceStatus.VALID, **changes: Any) -> None:
-    record = memory.advice.new()
-    record["t_s"], record["number"], record["reason"] = time.monotonic(), 5, REASONS.index(reason)
-    for name, value in changes.items():
-        record[name] = value
-    memory.advice.write(record)
+def advise(memory: LoopMemory, **changes: Any) -> None:
+    advice = replace(memory.advice.new(), t_s=time.monotonic(), number=5)
+    memory.advice.write(replace(advice, **changes))
 
 
 def test_before_anything_came_everything_is_missing(feed: LoopFeed) -> None:
-    shown = feed.shown()
+    shown = feed.read_state()
     assert not shown.alive and shown.advice is None and shown.own is None and shown.q is None
     assert all(stream.stale for stream in shown.streams)
     assert not shown.deadman
-    assert json.dumps(shown.plain())
+    assert json.dumps(shown.to_plain())
 
 
 def test_levers_are_parts_of_full(memory: LoopMemory, feed: LoopFeed) -> None:
     say(memory)
     advise(memory, lever_rad=[FULL_RAD, -FULL_RAD / 2, 0.0, FULL_RAD / 4])
-    shown = feed.shown()
+    shown = feed.read_state()
     assert shown.own == LeverPositions(0.1, -0.2, 0.3, -0.4, False)
     assert shown.advice is not None
     assert shown.advice.levers == LeverPositions(1.0, -0.5, 0.0, 0.25, False)
@@ -98,13 +101,13 @@ def test_the_button_is_announced_while_the_levers_go_through_neutral(
     say(memory)
     wants_q2 = [0.0, 0.7, 0.0, 0.0, 0.0]
     advise(memory, u=wants_q2, lever_rad=[0.3, 0.0, 0.0, 0.0])
-    advice = feed.shown().advice
+    advice = feed.read_state().advice
     assert advice is not None and advice.button_due_s == pytest.approx(0.3 / 2.0)  # at 2 rad/s
     advise(memory, u=wants_q2, lever_rad=[0.0, 0.0, 0.1, 0.0], button_right=True)
-    advice = feed.shown().advice
+    advice = feed.read_state().advice
     assert advice is not None and advice.button_due_s == 0.0
     advise(memory, u=[0.3, 0.0, 0.0, 0.0, 0.0])
-    advice = feed.shown().advice
+    advice = feed.read_state().advice
     assert advice is not None and advice.button_due_s is None
 
 
@@ -115,13 +118,13 @@ def test_old_things_are_old(memory: LoopMemory, feed: LoopFeed) -> None:
     target = memory.target.new()
     target["t_s"], target["center_in_base_m"] = now_s - 700.0, [2.6, 0.0, 0.75]
     memory.target.write(target)
-    assert {stream.name for stream in feed.shown().streams if stream.stale} == {
+    assert {stream.name for stream in feed.read_state().streams if stream.stale} == {
         "positions",
         "levers",
         "advice",
         "borehole",
     }
-    assert not feed.shown().deadman, "a dead-man of which nothing was heard is not held"
+    assert not feed.read_state().deadman, "a dead-man of which nothing was heard is not held"
 
 
 def test_the_borehole_and_the_way_to_it(memory: LoopMemory, feed: LoopFeed) -> None:
@@ -133,19 +136,19 @@ def test_the_borehole_and_the_way_to_it(memory: LoopMemory, feed: LoopFeed) -> N
         0.003,
     )
     memory.target.write(target)
-    shown = feed.shown()
+    shown = feed.read_state()
     assert shown.targets[0].center_in_base_m == (2.6, 0.0, 0.75) and shown.targets[0].std_m == 0.003
     assert shown.path_in_base_m[-1] == pytest.approx((2.6, 0.0, 0.65))
-    assert feed.wish(OperatorRequest("target", shown.targets[0].name))
-    assert not feed.wish(OperatorRequest("target", "another"))
-    feed.wish(OperatorRequest("stop", ""))
-    stopped = feed.shown()
+    assert feed.submit(OperatorRequest("target", shown.targets[0].name))
+    assert not feed.submit(OperatorRequest("target", "another"))
+    feed.submit(OperatorRequest("stop", ""))
+    stopped = feed.read_state()
     assert not stopped.guiding and stopped.path_in_base_m == ()
 
 
 def test_what_was_wished_and_drawn_is_recorded(memory: LoopMemory, feed: LoopFeed) -> None:
-    feed.drawn(DrawReport(7, 12.5, 0.002, 1))
-    feed.wish(OperatorRequest("record", "on"))
+    feed.report_drawn(DrawReport(7, 12.5, 0.002, 1))
+    feed.submit(OperatorRequest("record", "on"))
     said = [json.loads(data.removeprefix(TEXT)) for data in memory.page_log.take()]
     assert [one["topic"] for one in said] == ["drawn", "wish"]
     assert (said[0]["advice"], said[0]["at_s"]) == (7, 12.5)
@@ -193,24 +196,24 @@ def controls(memory: LoopMemory) -> Any:
 def test_start_arms_and_stop_disarms(memory: LoopMemory, feed: LoopFeed, tmp_path: Path) -> None:
     supervisor, _ = wanted(memory, tmp_path)
     supervisor.refresh()
-    assert not controls(memory)["armed"]
+    assert not controls(memory).armed
     for kind, armed in (("start", True), ("stop", False), ("start", True)):
-        feed.wish(OperatorRequest(kind, ""))
+        feed.submit(OperatorRequest(kind, ""))
         supervisor.refresh()
-        assert controls(memory)["armed"] == armed
-    feed.wish(OperatorRequest("start", ""))
-    feed.wish(OperatorRequest("stop", ""))
+        assert controls(memory).armed == armed
+    feed.submit(OperatorRequest("start", ""))
+    feed.submit(OperatorRequest("stop", ""))
     supervisor.refresh()
-    assert not controls(memory)["armed"], "the last word counts"
+    assert not controls(memory).armed, "the last word counts"
 
 
 def test_nothing_is_armed_where_nothing_is_ever_sent(
     memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
     supervisor, _ = wanted(memory, tmp_path, commands=False)
-    feed.wish(OperatorRequest("start", ""))
+    feed.submit(OperatorRequest("start", ""))
     supervisor.refresh()
-    assert not controls(memory)["armed"]
+    assert not controls(memory).armed
 
 
 def test_recordings_begin_and_end_one_at_a_time(
@@ -220,34 +223,34 @@ def test_recordings_begin_and_end_one_at_a_time(
     memory.bus_log.put(b"old")
     supervisor.refresh()
     assert memory.bus_log.waiting == 0, "what nobody records does not pile up"
-    feed.wish(OperatorRequest("record", "on"))
+    feed.submit(OperatorRequest("record", "on"))
     supervisor.refresh()
     assert [one.folder for one in started] == [tmp_path]
-    assert feed.shown().recording.on
-    feed.wish(OperatorRequest("record", "off"))
-    feed.wish(OperatorRequest("record", "on"))
-    feed.wish(OperatorRequest("record", "off"))
+    assert feed.read_state().recording.on
+    feed.submit(OperatorRequest("record", "off"))
+    feed.submit(OperatorRequest("record", "on"))
+    feed.submit(OperatorRequest("record", "off"))
     supervisor.refresh()
-    assert started[0].asked and not feed.shown().recording.on
-    feed.wish(OperatorRequest("record", "on"))
+    assert started[0].asked and not feed.read_state().recording.on
+    feed.submit(OperatorRequest("record", "on"))
     supervisor.refresh()
     assert len(started) == 1, "the first still writes its last words"
     started[0].code = 0
     supervisor.refresh()
     assert [one.folder for one in started] == [tmp_path, tmp_path / "recording_2"]
-    assert feed.shown().recording.on
+    assert feed.read_state().recording.on
 
 
 def test_a_log_that_died_is_not_started_again_in_secret(
     memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
     supervisor, started = wanted(memory, tmp_path)
-    feed.wish(OperatorRequest("record", "on"))
+    feed.submit(OperatorRequest("record", "on"))
     supervisor.refresh()
     started[0].code = -9
     supervisor.refresh()
     supervisor.refresh()
-    assert len(started) == 1 and not feed.shown().recording.on
+    assert len(started) == 1 and not feed.read_state().recording.on
 
 
 def test_other_lever_patterns_have_their_own_full_angles(
@@ -264,5 +267,5 @@ def test_other_lever_patterns_have_their_own_full_angles(
     )
     say(memory)
     advise(memory, lever_rad=[0.25, 0.0, 0.0, 0.0])
-    advice = feed.shown().advice
+    advice = feed.read_state().advice
     assert advice is not None and advice.levers.left_theta == pytest.approx(0.5)

@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from browser import SHOWN, TOKEN
+from browser import SHOWN, TOKEN, change_state
 from composed import option
 from hypothesis import given
 from hypothesis import strategies as st
@@ -22,10 +22,10 @@ from brokk_rl.signals import Frame
 from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
 from deploy.page.demo import DemoMachine
+from deploy.page.files import load_files
 from deploy.page.protocol import OperatorRequest, SourceAge
 from deploy.page.scene import plan_approach
-from deploy.page.server import SendWindow, load_files
-from deploy.page.settings import build_link
+from deploy.page.server import SendWindow, build_link
 
 MINE = access.list_own_hosts("127.0.0.1", 8170, ())
 
@@ -104,11 +104,10 @@ def test_a_wish_that_is_not_quite_one_is_none(found: dict[str, object]) -> None:
 
 
 def test_without_the_dead_man_only_stop_goes_through() -> None:
-    assert SHOWN.safety is not None
-    released = replace(SHOWN, safety=replace(SHOWN.safety, deadman=False))
-    stopped = replace(SHOWN, safety=replace(SHOWN.safety, estop=True))
+    released = change_state(SHOWN, deadman=False)
+    stopped = change_state(SHOWN, estop=True)
     old = replace(SHOWN, streams=(SourceAge("levers", 0.2, 0.15),))
-    dead, unknown = replace(SHOWN, alive=False), replace(SHOWN, safety=None)
+    dead, unknown = replace(SHOWN, alive=False), replace(SHOWN, state=None)
     for shown in (released, stopped, old, dead, unknown):
         for wish in (
             OperatorRequest("start", ""),
@@ -191,10 +190,10 @@ def test_draw_times_are_right_within_half_the_round_trip(
     ahead_s: float, out_s: float, back_s: float, drawing_s: float
 ) -> None:
     clock = PageClock()
-    clock.sent(1, 7, 100.0)
+    clock.note_sent(1, 7, 100.0)
     came_s = 100.0 + out_s
     times = [1000 * (t_s + ahead_s) for t_s in (came_s, came_s + drawing_s, came_s + drawing_s)]
-    said = clock.heard(json.dumps([1, *times]), came_s + drawing_s + back_s)
+    said = clock.read_acknowledgement(json.dumps([1, *times]), came_s + drawing_s + back_s)
     assert said is not None and said.advice == 7
     assert math.isclose(clock.round_trip_s, out_s + back_s, abs_tol=1e-6)
     assert abs(said.drawn_s - (came_s + drawing_s)) <= clock.round_trip_s / 2 + 1e-6
@@ -204,8 +203,8 @@ def test_an_advice_becomes_visible_once() -> None:
     clock = PageClock()
     seen = []
     for number, advice in enumerate([5, 5, 6, None, 6]):
-        clock.sent(number, advice, float(number))
-        said = clock.heard(json.dumps([number, 0, 1, 1]), number + 0.01)
+        clock.note_sent(number, advice, float(number))
+        said = clock.read_acknowledgement(json.dumps([number, 0, 1, 1]), number + 0.01)
         assert said is not None
         seen.append(said.advice)
     assert seen == [5, None, 6, None, 6]
@@ -226,18 +225,18 @@ def test_an_advice_becomes_visible_once() -> None:
 )
 def test_nonsense_about_draw_times_is_noticed(text: str) -> None:
     clock = PageClock()
-    clock.sent(1, None, 0.0)
-    assert clock.heard(text, 1.0) is None
+    clock.note_sent(1, None, 0.0)
+    assert clock.read_acknowledgement(text, 1.0) is None
 
 
 def test_a_page_has_no_more_undrawn_messages_than_the_limit() -> None:
-    room = SendWindow(2)
-    room.sent(1)
-    assert room._free.is_set()
-    room.sent(2)
-    assert not room._free.is_set()
-    room.drawn(2)  # drawn the newest: the one before is of no use either
-    assert room._free.is_set()
+    window = SendWindow(2)
+    window.note_sent(1)
+    assert window._free.is_set()
+    window.note_sent(2)
+    assert not window._free.is_set()
+    window.note_drawn(2)  # drawn the newest: the one before is of no use either
+    assert window._free.is_set()
 
 
 def test_the_way_leads_over_the_rim_and_then_down_the_axis() -> None:
@@ -259,7 +258,7 @@ def test_the_demo_keeps_to_the_machine() -> None:
     before, speeds = None, []
     for k in range(600):
         now_s[0] = 0.05 * k
-        shown = feed.shown()
+        shown = feed.read_state()
         assert shown.q is not None and shown.advice is not None
         q = np.array(shown.q)
         assert (q >= machine.lower).all() and (q <= machine.upper).all()
@@ -285,7 +284,7 @@ def test_the_link_carries_the_token_where_browsers_keep_it_to_themselves() -> No
     page = option("page", "local")
     address = build_link(page, 8170, TOKEN)
     assert address.index("#") < address.index(TOKEN)
-    assert TOKEN not in json.dumps(page.setup(option("machine", "brokk170")))
+    assert TOKEN not in json.dumps(page.describe_setup(option("machine", "brokk170")))
 
 
 @pytest.mark.parametrize(
@@ -306,7 +305,7 @@ def test_both_languages_say_everything() -> None:
     }
     assert keys["en"] <= keys["de"]
     from deploy.guard.guard import GuardTrip
-    from deploy.policy.policy_process import AdviceStatus
+    from deploy.runtime.operator_state import AdviceStatus
 
     said = {one.value for one in (*GuardTrip, *AdviceStatus)} - {"valid"}
     assert said - {key for key in said if f'"{key}":' in german or f" {key}:" in german} == set()

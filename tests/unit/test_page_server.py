@@ -65,16 +65,16 @@ def test_strangers_are_refused(feed: Scripted, port: int) -> None:
         {"refused": "malformed", "kind": ""},
     ]
     assert talk(port, "/elsewhere", ["x"]) == 404
-    assert feed.wishes == []
+    assert feed.requests == []
 
 
 def test_the_feed_is_asked_for_everything_no_faster_than_the_page_is_fed() -> None:
     class Counted(Scripted):
         asked = 0
 
-        def shown(self) -> PageState:
+        def read_state(self) -> PageState:
             self.asked += 1
-            return super().shown()
+            return super().read_state()
 
     feed = Counted()
     with served(feed):

@@ -250,6 +250,6 @@ def test_a_small_block_is_not_enlarged_beyond_what_its_frame_shows(
 ) -> None:
     known = np.zeros((270, 480, 2), np.uint8)
     known[50 : 50 + side_px, 60 : 60 + side_px, 0] = 255
-    _, closer = samples._looks(known, (480, 288), 0.15, np.random.default_rng(0))
+    _, closer = samples._choose_windows(known, (480, 288), 0.15, np.random.default_rng(0))
     assert closer.width == pytest.approx(width_px, abs=2)
     assert closer.left + closer.width / 2 == pytest.approx(60 + side_px / 2, abs=2)

@@ -240,16 +240,20 @@ def test_advice_leaves_the_loop_in_guided_trials_alone(tmp_path: Path, arm: Arm)
     agreed(lead)
     while lead.view()["kind"] == "trial":
         condition = lead.view()["condition"]
-        assert feed.shown().advice is None and feed.shown().path_in_base_m == ()
+        assert feed.read_state().advice is None and feed.read_state().path_in_base_m == ()
         lead.take({"do": "begin"})
         arm.later(lead, 2.0)
-        assert (feed.shown().advice is not None) == feed.shown().guiding == (condition == "guided")
         assert (
-            not feed.wish(OperatorRequest("record", "off"))
-            and not feed.wish(OperatorRequest("start", ""))
-            and inner.wishes == []
+            (feed.read_state().advice is not None)
+            == feed.read_state().guiding
+            == (condition == "guided")
         )
-        assert feed.wish(OperatorRequest("stop", "")) and not lead.running
+        assert (
+            not feed.submit(OperatorRequest("record", "off"))
+            and not feed.submit(OperatorRequest("start", ""))
+            and inner.requests == []
+        )
+        assert feed.submit(OperatorRequest("stop", "")) and not lead.running
         arm.later(lead, 1.0)
         saved(lead, arm)
         lead.take({"do": "next"})
