@@ -181,7 +181,8 @@ def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it
         (replace(faint, deeper=0.0, contrast=3.0), 1.0, True),
     ):
         assert (
-            estimator._check_appearance(inside, parallax, masks, pose_row(ellipse), ellipse, True) is None
+            estimator._check_appearance(inside, parallax, masks, pose_row(ellipse), ellipse, True)
+            is None
         ) == passes
 
 
@@ -306,7 +307,9 @@ def test_edges_beside_what_hides_the_rest_of_a_rim_do_not_draw_its_circle() -> N
 
 def test_the_mouth_channel_is_believed(estimator) -> None:
     frame, masks, ellipse = drawn()
-    refused = estimator.estimate(frame, replace(masks, hole_mask=np.zeros_like(masks.block)), ellipse)
+    refused = estimator.estimate(
+        frame, replace(masks, hole_mask=np.zeros_like(masks.block)), ellipse
+    )
     assert isinstance(refused, Rejection) and refused.reason == "mouth probability inside"
 
 
