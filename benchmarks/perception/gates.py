@@ -51,7 +51,6 @@ NUM_RESAMPLES = 400
 STEP = 0.2
 """Part by which each number is moved, both ways."""
 OFF = {
-    "noise": 0.0,
     "coverage": 0.01,
     "gap": 1.0,
     "rms_px": 1e3,
@@ -59,11 +58,9 @@ OFF = {
     "wave_rad": 1e3,
     "angle_rms_rad": 1e3,
     "purity": 0.0,
-    "departure": 1.0,
     "evidence": 0.0,
     "score": 0.0,
     "smallest_px": 0.0,
-    "flattest": 0.0,
     "prior_flattest": 0.0,
 }
 """Value of each gate's number that lets everything pass."""
@@ -152,8 +149,6 @@ def list_variants(settings: Any) -> Iterator[tuple[str, EllipseDetector, Callabl
         value = getattr(settings, field.name)
         for name, factor in (("-20 %", 1.0 - STEP), ("+20 %", 1.0 + STEP)):
             moved = value * factor
-            if field.name == "percentile":  # of what is left above it
-                moved = 100.0 - (100.0 - value) / factor
             if isinstance(value, int):
                 moved = max(round(moved), 6)
             if moved != value:

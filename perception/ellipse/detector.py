@@ -27,14 +27,10 @@ class ContourArcs:
 
     Attributes:
         sigma_px: Blur before the gradient.
-        percentile: Percentile of the gradient's magnitude that is the upper threshold of edges.
-        noise: Least upper threshold in standard deviations of noise.
-        low: Lower threshold as a part of the upper one.
         arc_tolerance_px: Tolerance of the polygon that finds corners and bends.
         corner_rad: Turn of that polygon at which an arc ends.
         arc_points: Least number of points of an arc.
         reach_px: Least reach of an ellipse: how far from it its edge points may lie.
-        reach_relative: Reach per px of the geometric mean semi-axis.
         angle_rad: Largest angle between the gradient at a supporting point and the ellipse's
             normal.
         coverage: Least part of the circumference with support.
@@ -49,27 +45,20 @@ class ContourArcs:
         angle_rms_rad: Largest standard deviation of the support's angles; less for a part.
         angle_rms_small: Addition to it, over the geometric mean semi-axis in px.
         purity: Least part of the supporting edges, corner to corner, that lies on the ellipse.
-        departure: Largest part of the circumference beside which supporting edges run on (spirals,
-            hearts).
         evidence: Least decimal exponent of the odds against accidental support.
         score: Least score at full coverage; it falls with the coverage, half of it at one half.
-        prior_slack: Factor on the limits of distance, angle and departure, and divisor of purity,
-            where the size is known. The known size excludes most of the shapes that these limits
-            are for, and rims are chipped.
+        prior_slack: Factor on the limits of distance and angle, and divisor of purity, where the
+            size is known: it excludes most shapes that they are for, and rims are chipped.
         smallest_px: Least minor semi-axis.
-        flattest: Least ratio of the semi-axes.
-        prior_flattest: The same where the size is known: then the tilt of the face is limited.
+        prior_flattest: Least ratio of the semi-axes where the size is known: the tilt of the face
+            is limited then.
     """
 
     sigma_px: float
-    percentile: float
-    noise: float
-    low: float
     arc_tolerance_px: float
     corner_rad: float
     arc_points: int
     reach_px: float
-    reach_relative: float
     angle_rad: float
     coverage: float
     gap: float
@@ -81,20 +70,15 @@ class ContourArcs:
     angle_rms_rad: float
     angle_rms_small: float
     purity: float
-    departure: float
     evidence: float
     score: float
     prior_slack: float
     smallest_px: float
-    flattest: float
     prior_flattest: float
 
     def check(self) -> None:
-        if not 0 < self.percentile < 100 or not 0 < self.low <= 1 or self.sigma_px <= 0:
-            raise ConfigError(
-                "perception.ellipse: expected 0 < percentile < 100, 0 < low <= 1 and sigma_px > 0, "
-                f"got {self.percentile}, {self.low} and {self.sigma_px}"
-            )
+        if self.sigma_px <= 0:
+            raise ConfigError(f"perception.ellipse: expected sigma_px > 0, got {self.sigma_px}")
         if not 0 < self.coverage <= 1 or self.arc_points < 6:
             raise ConfigError(
                 "perception.ellipse: expected 0 < coverage <= 1 and arc_points >= 6, got "
@@ -106,9 +90,15 @@ class ContourArcs:
         return ArcDetector(self)
 
 
+# A change of these by 20 % changes no count of the benchmark (benchmarks/perception/gates.json).
+PERCENTILE, NOISE, LOW = 85.0, 4.0, 0.4
+"""Upper threshold of edges: percentile of the gradient, and least value in standard deviations of
+noise; lower threshold as a part of the upper one."""
+REACH_RELATIVE = 0.03
+"""Reach of an ellipse per px of its geometric mean semi-axis."""
+FLATTEST = 0.18
+"""Least ratio of the semi-axes where the size is unknown."""
 # Chosen by hand, unless a comment says otherwise.
-NUM_SEEDS = 28
-"""Points that stand for an arc, or a group of arcs, in its first fit."""
 NO_ELLIPSES = np.empty((0, 5))
 SMALLEST_PICTURE_PX = 8
 """Smallest side of a picture that can hold an ellipse with its edges."""
@@ -119,8 +109,6 @@ FAINT, SMALL_PX = 0.12, 6.0
 size. Faint stains are round all over."""
 ROUNDING_PX = 2
 """Addition to the reach within which the nearest edge is looked up, for rounding to pixels."""
-PIECE = 0.6
-"""Part of an arc that may be an ellipse's where not all of it is."""
 SAME_AREA = 0.6
 """Least ratio of areas of the two edges of one thin line."""
 LEAST_ARC, HALFWAY = 0.2, 0.3
@@ -138,25 +126,6 @@ SHARED = 0.4
 """Part of its support that an ellipse may share with better ones."""
 SEARCH_SLACK = 1.5
 """Factor on the size limits before refinement."""
-
-
-@dataclass(frozen=True)
-class JudgedEllipses:
-    """Accepted candidates, `C` of them.
-
-    Attributes:
-        candidates: Ellipses and polarity.
-        support: Number of the edge point at each place, `(C, NUM_SAMPLES)`, -1 for none.
-        rms_px: Root mean square distance of the support, `(C,)`.
-        coverage: Part of the circumference with support, `(C,)`.
-        score: Confidence, `(C,)`.
-    """
-
-    candidates: EllipseCandidates
-    support: np.ndarray
-    rms_px: np.ndarray
-    coverage: np.ndarray
-    score: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -232,7 +201,7 @@ class ArcDetector:
         where = None if roi is None else roi[top:bottom, left:right]
         near_px = int(np.ceil(self._limit_reach(limits.highest_px))) + ROUNDING_PX
         edges = ellipse_edges.detect_edges(
-            part, where, s.sigma_px, s.percentile, s.noise, s.low, s.arc_points, near_px
+            part, where, s.sigma_px, PERCENTILE, NOISE, LOW, s.arc_points, near_px
         )
         if not len(edges.points):
             return []
@@ -271,8 +240,7 @@ class ArcDetector:
         )
         rounds_px = ROUGH_PX if limits.lowest_px > 0 else PRECISE_PX
         refined = self._refine(first, edges, rounds_px)
-        chosen = self._choose(self._judge(refined, edges, limits), edges)
-        return sorted(chosen, key=lambda one: -one.score)
+        return sorted(self._judge(refined, edges, limits), key=lambda one: -one.score)
 
     def _collect_seeds(self, edges: Edges, limits: SizePrior) -> tuple[np.ndarray, np.ndarray]:
         """Return seed points `(C, NUM_SEEDS)` of spans, arcs and groups, and their lengths `(C,)`."""
@@ -283,9 +251,11 @@ class ArcDetector:
         parts = parts.reshape(-1, 2)
         groups = [arcs[group] for group in ellipse_edges.group_arcs(arcs, edges, (4, 3, 2))]
         if limits.lowest_px == 0:
-            parts = np.concatenate([parts, _split_arcs(arcs, self.settings.arc_points)])
+            parts = np.concatenate(
+                [parts, ellipse_edges.split_arcs(arcs, self.settings.arc_points)]
+            )
         kinds = (spans[:, None], parts[:, None], *groups)
-        seeds = np.concatenate([_select_seed_points(some) for some in kinds])
+        seeds = np.concatenate([ellipse_edges.select_seed_points(some) for some in kinds])
         lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
         return seeds, lengths
 
@@ -343,13 +313,12 @@ class ArcDetector:
 
     def _judge(
         self, candidates: EllipseCandidates, edges: Edges, limits: SizePrior
-    ) -> JudgedEllipses:
-        """Return the candidates with enough support of the right kind."""
+    ) -> list[FoundEllipse]:
+        """Return the candidates with enough support of the right kind, each rim once."""
         sized = self._is_sized(candidates.ellipses, limits, 1.0)
         candidates = candidates[sized & _is_centre_inside(candidates.ellipses, edges)]
         if not len(candidates.ellipses):
-            empty = np.empty(0)
-            return JudgedEllipses(candidates, np.empty((0, NUM_SAMPLES), int), empty, empty, empty)
+            return []
         s, slack = self.settings, self._choose_slack(limits)
         fit = self._measure_fit(candidates, edges, slack)
         good = self._has_good_shape(fit, edges, slack)
@@ -363,8 +332,7 @@ class ArcDetector:
         # A whole ellipse must fit well to count; of half of one its limits are nearly enough.
         share = np.maximum(np.clip(3 * fit.coverage - 1.5, 0.0, 1.0), 0.9 * fit.coverage)
         good &= score * slack**2 >= s.score * share
-        fit = fit[good]
-        return JudgedEllipses(fit.candidates, fit.support, fit.rms_px, fit.coverage, score[good])
+        return self._choose(fit[good], score[good], edges)
 
     def _measure_fit(self, candidates: EllipseCandidates, edges: Edges, slack: float) -> _Fit:
         """Return how well the edges around the candidates fit, with the limits of that."""
@@ -434,18 +402,15 @@ class ArcDetector:
             good[good] &= occluded[good] | ~ellipse_support.find_inward_outlines(
                 candidates[good], edges, support[good], length[good]
             )
-        departure = ellipse_support.measure_departure(
-            candidates, edges, support, length, self._reach(candidates.ellipses)
-        )
-        return good & (occluded | (departure <= s.departure * slack))
+        return good
 
-    def _choose(self, judged: JudgedEllipses, edges: Edges) -> list[FoundEllipse]:
+    def _choose(self, fit: _Fit, score: np.ndarray, edges: Edges) -> list[FoundEllipse]:
         """Return the candidates that share little support with better ones."""
         claimed = np.zeros(len(edges.points), bool)
         found: list[FoundEllipse] = []
-        for k in np.argsort(-judged.score, kind="stable"):
-            own = judged.support[k][judged.support[k] >= 0]
-            candidate = judged.candidates[k : k + 1]
+        for k in np.argsort(-score, kind="stable"):
+            own = fit.support[k][fit.support[k] >= 0]
+            candidate = fit.candidates[k : k + 1]
             row = candidate.ellipses[0]
             if claimed[own].mean() > SHARED or _is_other_side_of_line(row, found):
                 continue
@@ -455,7 +420,7 @@ class ArcDetector:
             angles = np.arange(number) * (2 * np.pi / number)
             dense = self._gather(candidate, edges, angles)[0][0]
             claimed[dense[dense >= 0]] = True
-            found.append(FoundEllipse(row, judged.rms_px[k], judged.coverage[k], judged.score[k]))
+            found.append(FoundEllipse(row, fit.rms_px[k], fit.coverage[k], score[k]))
         return found
 
     def _gather(
@@ -483,7 +448,7 @@ class ArcDetector:
             )
 
     def _choose_flattest(self, limits: SizePrior) -> float:
-        return self.settings.prior_flattest if limits.lowest_px > 0 else self.settings.flattest
+        return self.settings.prior_flattest if limits.lowest_px > 0 else FLATTEST
 
     def _choose_slack(self, limits: SizePrior) -> float:
         return self.settings.prior_slack if limits.lowest_px > 0 else 1.0
@@ -504,8 +469,8 @@ class ArcDetector:
 
     def _limit_reach(self, size_px: np.ndarray | float) -> np.ndarray:
         """Return the reach of ellipses of a geometric mean semi-axis, px."""
-        s = self.settings
-        return np.clip(s.reach_relative * size_px, s.reach_px, 4.0 * s.reach_px)
+        least_px = self.settings.reach_px
+        return np.clip(REACH_RELATIVE * size_px, least_px, 4.0 * least_px)
 
 
 def _measure_wholeness(coverage: np.ndarray) -> np.ndarray:
@@ -532,28 +497,3 @@ def _is_other_side_of_line(row: np.ndarray, others: list[FoundEllipse]) -> bool:
         if is_near and min(areas) > SAME_AREA * max(areas):
             return True
     return False
-
-
-def _split_arcs(arcs: np.ndarray, least: int) -> np.ndarray:
-    """Return first, middle and last piece of each arc, of `least` points or more.
-
-    The ends of an arc may belong to something else.
-    """
-    start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
-    part = np.maximum((PIECE * length).astype(int), least)
-    is_long = length > part + 2
-    start, part, left = start[is_long], part[is_long], (length - part)[is_long]
-    pieces = []
-    for shift in (0 * part, left // 2, left):
-        pieces.append(np.column_stack([start + shift, start + shift + part]))
-    return np.concatenate(pieces)
-
-
-def _select_seed_points(groups: np.ndarray) -> np.ndarray:
-    """Return evenly spread points of each group of spans `(C, G, 2)`, `(C, NUM_SEEDS)`."""
-    ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
-    place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]
-    number = (place[..., None] >= ends[:, None]).sum(-1)
-    rows = np.arange(len(groups))[:, None]
-    before = np.concatenate([np.zeros((len(ends), 1), int), ends], 1)[rows, number]
-    return (groups[rows, number, 0] + place - before).astype(int)

@@ -332,6 +332,10 @@ def _make_empty_edges(shape: tuple) -> Edges:
     )
 
 
+NUM_SEEDS = 28
+"""Points that stand for an arc, or a group of arcs, in its first fit."""
+PIECE = 0.6
+"""Part of an arc that may be an ellipse's where not all of it is."""
 INSET = 3
 """Points at the ends of an arc that are left out: the blur bends them. Chosen by hand."""
 NEAREST = 16
@@ -365,6 +369,31 @@ def group_arcs(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[n
         key = groups @ (len(arcs) ** np.arange(number)[::-1])
         found.append(groups[np.unique(key, return_index=True)[1]])
     return found
+
+
+def split_arcs(arcs: np.ndarray, least: int) -> np.ndarray:
+    """Return first, middle and last piece of each arc, of `least` points or more.
+
+    The ends of an arc may belong to something else.
+    """
+    start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
+    part = np.maximum((PIECE * length).astype(int), least)
+    is_long = length > part + 2
+    start, part, left = start[is_long], part[is_long], (length - part)[is_long]
+    pieces = []
+    for shift in (0 * part, left // 2, left):
+        pieces.append(np.column_stack([start + shift, start + shift + part]))
+    return np.concatenate(pieces)
+
+
+def select_seed_points(groups: np.ndarray) -> np.ndarray:
+    """Return evenly spread points of each group of spans `(C, G, 2)`, `(C, NUM_SEEDS)`."""
+    ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
+    place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]
+    number = (place[..., None] >= ends[:, None]).sum(-1)
+    rows = np.arange(len(groups))[:, None]
+    before = np.concatenate([np.zeros((len(ends), 1), int), ends], 1)[rows, number]
+    return (groups[rows, number, 0] + place - before).astype(int)
 
 
 def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:

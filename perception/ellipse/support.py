@@ -86,45 +86,6 @@ def measure_purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.
     return np.minimum((each * ds * there).sum(1) / np.maximum((ds * there).sum(1), 1e-9), 1.0)
 
 
-def measure_departure(
-    candidates: EllipseCandidates,
-    edges: Edges,
-    support: np.ndarray,
-    length: np.ndarray,
-    reach_px: np.ndarray,
-) -> np.ndarray:
-    """Return the unsupported part of each circumference beside which a supporting edge runs on.
-
-    Only up to a corner: there the edge of an occluder may begin.
-    """
-    e = candidates.ellipses
-    if not len(e):
-        return np.empty(0)
-    points, outward, _ = conic.sample_ellipses(e, ANGLES)
-    number = len(edges.run_length) + 1
-    rows = np.repeat(np.arange(len(e)), NUM_SAMPLES).reshape(support.shape)
-    mine = np.unique(
-        (rows * number + edges.run[support])[(support >= 0) & (edges.run[support] >= 0)]
-    )
-    reach, wide = reach_px[:, None], np.clip(0.3 * np.sqrt(e[:, 2] * e[:, 3]), 3.0, 12.0)[:, None]
-    beside = np.zeros(support.shape, bool)
-    for part in (-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0):
-        found = edges.at(points + (part * wide)[..., None] * outward)
-        off = np.abs(conic.sum_products(edges.points[found] - points, outward))
-        along = conic.sum_products(edges.directions[found], outward) * candidates.polarity[:, None]
-        hit = (
-            (found >= 0)
-            & (edges.run[found] >= 0)
-            & (along > 0.85)
-            & (off > reach)
-            & (off <= wide)
-            & (support < 0)
-            & ~beside
-        )
-        beside[hit] = np.isin((rows * number + edges.run[found])[hit], mine)
-    return (length * beside).sum(1) / length.sum(1)
-
-
 def measure_waviness(
     candidates: EllipseCandidates, edges: Edges, support: np.ndarray, off: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
