@@ -11,9 +11,10 @@ from brokk_rl.report import Cell, Report, Tone
 from diagnosis import plots
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 from diagnosis.error_growth import READINGS
+from diagnosis.probes import CLEAR_Z
 
 GOOD_CLOSED = 0.5
-"""A closed part of the gap from which the news are good."""
+"""Closed share of the gap from which the headline is good news; chosen by hand."""
 
 
 def write_headline(answer: Answer) -> tuple[str, Tone]:
@@ -176,229 +177,180 @@ def _format_percent_range(value: Estimate) -> str:
 
 
 REPORT_FILE = "report.html"
-TONES: dict[str, Tone] = {"bad": "bad", "warn": "warn", "note": "plain"}
+SEVERITIES = {"bad": "severe", "warn": "check it", "note": "good to know"}
 MAX_LISTED = 8
-"""Regimes, probes and rivals that are listed; the rest stands in details."""
+"""Most rows of a list; the rest is folded. Chosen by hand: a screen."""
 
 
 def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
-    """Write `report.html` into `folder`.
-
-    Parts of the answer that a diagnosis left out are left out here as well.
+    """Write `report.html` into `folder`; parts that the answer lacks are left out.
 
     Raises:
         StorageError: it could not be written.
     """
     answer, more = outcome.answer, outcome.answer.more
     text, tone = write_headline(answer)
-    page = Report(f"What the simulator of {machine.name} lacks", text, tone)
+    page = Report(f"Missing effects in the simulator of {machine.name}", text, tone)
     if figure := plots.draw_gap_bars(answer):
         page.add_picture(
             figure,
-            "Error over free runs of 5 s on recordings that no effect was fitted to: before, after, and the floor.",
+            "Error of free runs of 5 s on recordings that no effect was fitted to: before, after, "
+            "and the floor.",
         )
     for remark in more.get("sanity", []):
         if remark["severity"] == "bad":
             page.add_text(_describe_remark(remark), "bad")
-    _add_effects(page, outcome, machine)
-    _add_where(page, outcome, machine)
-    _add_paths(page, outcome, machine)
-    _add_growth(page, outcome, machine)
+    units = {joint.name: joint.unit for joint in machine.joints}
+    _add_effects(page, answer)
+    _add_errors_by_joint(page, answer, units)
+    _add_residual_model(page, more)
+    _add_where(page, outcome, machine, units)
+    page.add_heading("Measured and simulated")
+    page.add_picture(
+        plots.draw_paths(outcome, machine),
+        "Joints with the largest gaps. The simulator gets the recorded commands (grey, below) and "
+        "starts anew every 5 s (thin lines). Black: measured; red: simulated as it was; blue: "
+        "simulated with the effects.",
+    )
+    _add_growth(page, outcome, machine, units)
     _add_evidence(page, more)
     _add_stages(page, more)
-    _add_next_experiment(page, outcome)
+    _add_next_experiment(page, answer)
     _add_sanity(page, more)
-    _add_details(page, more)
+    _add_all_parts(page, more)
     page.write(folder / REPORT_FILE)
 
 
-def _add_effects(page: Report, outcome: Outcome, machine: Machine) -> None:
-    answer = outcome.answer
+def _add_effects(page: Report, answer: Answer) -> None:
     page.add_heading("Effects")
-    if not answer.selected:
-        page.add_text(
-            {
-                "none": "Nothing that could be told from chance.",
-                "unknown": "Nothing that the library of effects knows.",
-            }.get(answer.verdict, "")
-        )
+    if answer.verdict == "none":
+        page.add_text("No effect that exceeds chance.")
+    elif answer.verdict == "unknown":
+        page.add_text("No effect of the library explains the gap.")
     rows = []
     for one in answer.selected:
-        closed, interval = format_estimate(one.gap_closed, 100.0, ".0f")
-        name = Cell(
-            name_effect(one.effect),
-            f"or {', '.join(name_effect(name) for name in one.same_as)}" if one.same_as else "",
-        )
-        first = True
-        for number, by_joint in one.parameters.items():
-            for joint, value in by_joint.items():
-                size, range_ = format_estimate(value)
-                head = (
-                    [
-                        name,
-                        ", ".join(one.joints) or "machine",
-                        f"{one.probability:.2f}",
-                        Cell(closed, interval),
-                    ]
-                    if first
-                    else [""] * 4
-                )
-                rows.append([*head, f"{number} {joint}", Cell(size, range_)])
-                first = False
-        if first:
-            rows.append(
-                [
-                    name,
-                    ", ".join(one.joints) or "machine",
-                    f"{one.probability:.2f}",
-                    Cell(closed, interval),
-                    "",
-                    None,
-                ]
-            )
+        rows += _list_effect_rows(one)
     if rows:
-        columns = ["effect", "joints", "probability", "closes, %", "number", "value"]
         page.add_table(
-            columns,
+            ["effect", "joints", "probability", "closes, %", "parameter", "value"],
             rows,
-            "With 95 % intervals. 'Closes' is the effect's part of what all of them close together (Shapley value).",
+            "With 95 % intervals. 'Closes' is the effect's share of the closed gap (Shapley value).",
         )
     for one in answer.selected:
-        if text := describe_class(one):
-            page.add_text(text, "warn")
-    if text := describe_remainder(answer):
-        page.add_text(text)
+        page.add_text(describe_class(one), "warn")
+    page.add_text(describe_remainder(answer))
     if answer.reason and answer.verdict == "none":
         page.add_text(f"{answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}.")
-    if (foretold := answer.more.get("predicted_closed")) and answer.gap and answer.gap.closed:
+    predicted = answer.more.get("predicted_closed")
+    if predicted and answer.gap and answer.gap.closed:
         page.add_text(
-            f"Foretold, by the parts of the recordings that sizes were fitted to: {100 * foretold['mean']:.0f} % closed. "
-            f"Achieved, on parts that they were not fitted to: {100 * answer.gap.closed.mean:.0f} %."
+            f"Predicted on the parts of the recordings that sizes were fitted to: "
+            f"{100 * predicted['mean']:.0f} % closed. Achieved on the other parts: "
+            f"{100 * answer.gap.closed.mean:.0f} %."
         )
-    _add_errors_by_joint(page, outcome, machine)
-    for key, saying in (("undecided", "Left undecided"), ("remainder", "Remainder")):
-        if isinstance(found := answer.more.get(key), str):
-            page.add_text(f"{saying}: {found}")
-
-    if isinstance(left := answer.more.get("remainder"), Mapping) and left:
-        rows = [
-            [
-                joint,
-                one.get("clue"),
-                *(
-                    None if one.get(key) is None else f"{one[key]:.1f}"
-                    for key in ("earned", "null")
-                ),
-            ]
-            for joint, one in left.items()
-        ]
-        caption = "From what a flexible model still predicts the error that is left, log likelihood, and what it earns by chance"
-        page.add_table(["joint", "best from", "earned", "by chance"], rows, caption)
 
 
-def _add_errors_by_joint(page: Report, outcome: Outcome, machine: Machine) -> None:
-    """Report errors before and after joint by joint, and on recordings apart."""
-    gap, unseen = outcome.answer.gap, outcome.answer.more.get("unseen")
-    if not outcome.answer.selected or gap is None or not gap.joints:
+def _list_effect_rows(one: Selected) -> list[list[str | Cell | None]]:
+    """Return a row for each parameter of an effect; only the first names the effect."""
+    others = f"or {', '.join(name_effect(name) for name in one.same_as)}" if one.same_as else ""
+    head: list[str | Cell | None] = [
+        Cell(name_effect(one.effect), others),
+        ", ".join(one.joints) or "machine",
+        f"{one.probability:.2f}",
+        Cell(*format_estimate(one.gap_closed, 100.0, ".0f")),
+    ]
+    rows: list[list[str | Cell | None]] = []
+    for parameter, by_joint in one.parameters.items():
+        for joint, value in by_joint.items():
+            rows.append([*head, f"{parameter} {joint}", Cell(*format_estimate(value))])
+            head = [""] * len(head)
+    return rows or [[*head, "", None]]
+
+
+def _add_errors_by_joint(page: Report, answer: Answer, units: Mapping[str, str]) -> None:
+    """Add errors before and after the effects by joint, on unseen recordings too."""
+    gap, unseen = answer.gap, answer.more.get("unseen")
+    if not answer.selected or gap is None or not gap.joints:
         return
-    units = {joint.name: joint.unit for joint in machine.joints}
     rows = []
     for name, one in gap.joints.items():
-        floor = None if one.floor is None else f"{1e3 * one.floor:.1f}"
-        row = [
-            f"{name} [m{units[name]}]",
-            f"{1e3 * one.before:.1f}",
-            f"{1e3 * one.after:.1f}",
-            floor,
-            f"{100 * one.share:.0f}",
-        ]
+        row = [f"{name} [m{units[name]}]", _scale(one.before), _scale(one.after)]
+        row += [_scale(one.floor), f"{100 * one.share:.0f}"]
         if unseen:
-            apart = unseen["joints"][name]
-            row += [
-                f"{1e3 * apart['before']:.1f}",
-                f"{1e3 * apart['after']:.1f}",
-                f"{100 * apart['share']:.0f}",
-            ]
+            other = unseen["joints"][name]
+            row += [_scale(other["before"]), _scale(other["after"]), f"{100 * other['share']:.0f}"]
         rows.append(row)
     columns = ["joint", "before", "after", "floor", "% less"]
-    caption = "Root mean square error of free runs of 5 s on parts of the recordings that sizes were not fitted to"
+    caption = "Root mean square error of free runs of 5 s, on parts that sizes were not fitted to"
     if unseen:
         columns += ["unseen: before", "after", "% less"]
-        caption += f"; unseen: {unseen['recordings']} recordings ({unseen['seconds']:.0f} s) that nothing was fitted to"
+        caption += f"; unseen: {unseen['recordings']} further recordings"
+        caption += f" ({unseen['seconds']:.0f} s)"
     page.add_table(columns, rows, caption)
 
 
-def _add_where(page: Report, outcome: Outcome, machine: Machine) -> None:
+def _add_residual_model(page: Report, more: Mapping[str, Any]) -> None:
+    """Add how well a flexible model predicts the remaining error."""
+    left = more.get("remainder")
+    for key, label in (("undecided", "Undecided"), ("remainder", "Remainder")):
+        if isinstance(found := more.get(key), str):
+            page.add_text(f"{label}: {found}")
+    if not isinstance(left, Mapping) or not left:
+        return
+    rows = []
+    for joint, one in left.items():
+        gains = [None if one.get(key) is None else f"{one[key]:.1f}" for key in ("earned", "null")]
+        rows.append([joint, one.get("clue"), *gains])
+    page.add_table(
+        ["joint", "best input", "gain", "gain by chance"],
+        rows,
+        "Gain of a flexible model on the remaining error, log likelihood",
+    )
+
+
+def _add_where(page: Report, outcome: Outcome, machine: Machine, units: Mapping[str, str]) -> None:
     location = outcome.answer.more.get("location")
     if not location:
         return
-    page.add_heading("Where the gap lies")
+    page.add_heading("Location of the gap")
     page.add_picture(
         plots.draw_gap_map(outcome.answer, outcome.before, machine),
-        "Left: where the gap arises; all cells together are 100 %. An error counts where it came in. "
+        "Left: share of the gap, all cells together are 100 %; an error counts at its origin. "
         "Right: error of free runs of 5 s along the recordings.",
     )
     rows = []
     for name, joint in location["joints"].items():
-        unit = machine.joints[machine.joint_names.index(name)].unit
-        cells = [
-            f"{1e3 * joint['rmse']:.1f}",
-            f"{1e3 * joint['floor']:.1f}",
-            f"{100 * joint['error']:.0f}",
-        ]
-        rows.append(
-            [
-                f"{name} [m{unit}]",
-                *cells,
-                Cell(f"{100 * joint['gap']:.0f}", "beyond chance" if joint["is_sure"] else ""),
-            ]
-        )
-    page.add_table(
-        ["joint", "error", "floor", "% of the error", "% of the gap"],
-        rows,
-        "Root mean square error of free runs of 5 s",
-    )
+        sure = "beyond chance" if joint["is_sure"] else ""
+        row = [f"{name} [m{units[name]}]", _scale(joint["rmse"]), _scale(joint["floor"])]
+        rows.append([*row, f"{100 * joint['error']:.0f}", Cell(f"{100 * joint['gap']:.0f}", sure)])
+    columns = ["joint", "error", "floor", "% of the error", "% of the gap"]
+    page.add_table(columns, rows, "Root mean square error of free runs of 5 s")
     if not location["has_gap"]:
-        page.add_text(
-            "No joint exceeds its floor beyond what chance explains; shares of the gap are those of chance, then.",
-            "warn",
-        )
+        page.add_text("No joint exceeds its floor beyond chance; the shares are noise.", "warn")
     if location["blocks"]:
         page.add_text(
-            f"Tested by exchanging {location['blocks']} between field and reference, with at most 5 % false discoveries."
+            f"Permutation test: {location['blocks']} change sides between field and reference; "
+            "false discovery rate of 5 %."
         )
 
 
-def _add_paths(page: Report, outcome: Outcome, machine: Machine) -> None:
-    page.add_heading("Measured and simulated")
-    caption = (
-        "Joints with the largest gaps. The simulator is given the recorded commands (grey, below) and begins "
-        "anew every 5 s (thin lines). Black: measured; orange: simulated as it was; blue: with the effects that were found."
-    )
-    page.add_picture(plots.draw_paths(outcome, machine), caption)
-
-
-def _add_growth(page: Report, outcome: Outcome, machine: Machine) -> None:
+def _add_growth(page: Report, outcome: Outcome, machine: Machine, units: Mapping[str, str]) -> None:
     location = outcome.answer.more.get("location")
     if not location:
         return
-    page.add_heading("How the error grows")
+    page.add_heading("Growth of the error")
     page.add_picture(
         plots.draw_growth(outcome, machine),
-        "Error over the time of a free run; what exceeds the floor tells its kind.",
+        "Error over the time of a free run; its slope beyond the floor suggests the kind of cause.",
     )
     rows = []
     for name, growth in location["growth"].items():
-        unit = machine.joints[machine.joint_names.index(name)].unit
         errors = [f"{1e3 * value:.2f}" for value in growth["rmse"]]
-        whole = "–" if growth["whole_run"] is None else f"{1e3 * growth['whole_run']:.0f}"
-        rows.append([f"{name} [m{unit}]", *errors, whole, READINGS[growth["reading"]]])
+        whole = None if growth["whole_run"] is None else f"{1e3 * growth['whole_run']:.0f}"
+        rows.append([f"{name} [m{units[name]}]", *errors, whole, READINGS[growth["reading"]]])
     horizons = [f"{value:g} s" for value in next(iter(location["growth"].values()))["horizon_s"]]
-    page.add_table(
-        ["joint", *horizons, "whole run", "reading"],
-        rows,
-        "Root mean square error at the end of free runs",
-    )
+    columns = ["joint", *horizons, "whole run", "kind"]
+    page.add_table(columns, rows, "Root mean square error at the end of free runs")
 
 
 def _add_evidence(page: Report, more: Mapping[str, Any]) -> None:
@@ -407,19 +359,17 @@ def _add_evidence(page: Report, more: Mapping[str, Any]) -> None:
     if figure or probes:
         page.add_heading("Why these effects and not others")
     if figure:
-        page.add_picture(
-            figure, "What each rival earns on recordings that it was not fitted to; blue: chosen."
-        )
-    if probes:
-        page.add_text(
-            "What the simulator's errors look like, by families of effects that leave such traces (compared with the reference):"
-        )
-        clear = [
-            probe["text"] + f" – as {name_effect(probe['effect'])} does"
-            for probe in probes
-            if abs(probe["z"]) > 4.0
-        ]
-        page.add_list(clear[:MAX_LISTED] or ["no trace stands out"])
+        page.add_picture(figure, "Gain of each rival on held-out recordings; blue: chosen.")
+    if not probes:
+        return
+    page.add_text(
+        "Traces in the residual, compared with the reference, and the effects behind them:"
+    )
+    texts = []
+    for probe in probes:
+        if abs(probe["z"]) > CLEAR_Z:
+            texts.append(f"{probe['text']} – as {name_effect(probe['effect'])} does")
+    page.add_list(texts[:MAX_LISTED] or ["no trace stands out"])
 
 
 def _add_stages(page: Report, more: Mapping[str, Any]) -> None:
@@ -430,47 +380,35 @@ def _add_stages(page: Report, more: Mapping[str, Any]) -> None:
     if budget:
         page.add_picture(
             plots.draw_tip_budget(budget),
-            "Red steps: how the joints' errors add up to the error of the tip over free runs of 5 s (as squares; one that "
-            "works against the others goes down). Then the error of the tip before, after, the floor, and other stages.",
+            "Red steps: how the errors of the joints add up to the error of the tip over free runs "
+            "of 5 s (as squares; one against the others goes down). Then the error of the tip "
+            "before, after, the floor, and other stages.",
         )
         names = [name for name in ("before", "after", "floor") if budget[name]]
-        rows = [
-            [
-                joint,
-                *(f"{budget[name]['joint_rms_mm'][joint]:.1f}" for name in names),
-                f"{100 * part:.0f}",
-            ]
-            for joint, part in budget["before"]["joint_part"].items()
-        ]
+        rows = []
+        for joint, part in budget["before"]["joint_part"].items():
+            alone = [f"{budget[name]['joint_rms_mm'][joint]:.1f}" for name in names]
+            rows.append([joint, *alone, f"{100 * part:.0f}"])
         rows.append(["tip", *(f"{budget[name]['tip_rms_mm']:.1f}" for name in names), "100"])
-        page.add_table(
-            ["", *(f"{name}, mm" for name in names), "% before"],
-            rows,
-            "What each joint's error alone moves the tool by, RMS",
-        )
-    rows = [
-        [
-            stage["stage"],
-            None if stage["part"] is None else f"{100 * stage['part']:.0f}",
-            None if stage["rms_m"] is None else f"{1e3 * stage['rms_m']:.1f}",
-            stage["text"],
-        ]
-        for stage in stages
-    ]
+        columns = ["", *(f"{name}, mm" for name in names), "% before"]
+        page.add_table(columns, rows, "Displacement of the tool by the error of each joint, RMS")
+    rows = []
+    for stage in stages:
+        part = None if stage["part"] is None else f"{100 * stage['part']:.0f}"
+        rows.append([stage["stage"], part, _scale(stage["rms_m"]), stage["text"]])
     page.add_table(["stage", "% of the joints' gap", "at the tool, mm", "why"], rows)
 
 
-def _add_next_experiment(page: Report, outcome: Outcome) -> None:
-    following = outcome.answer.next_experiment
+def _add_next_experiment(page: Report, answer: Answer) -> None:
+    following = answer.next_experiment
     if following is None:
         return
     page.add_heading("Next experiment")
-    between = (
-        f" It separates {join_words([name_effect(name) for name in following.separates])}."
-        if following.separates
-        else ""
-    )
-    page.add_text(f"{following.why}{between}".strip())
+    text = following.why
+    if following.separates:
+        names = join_words([name_effect(name) for name in following.separates])
+        text += f" It separates {names}."
+    page.add_text(text.strip())
     page.add_code(following.excitation)
 
 
@@ -481,60 +419,56 @@ def _add_sanity(page: Report, more: Mapping[str, Any]) -> None:
     page.add_heading("Can the recordings be trusted?")
     if not remarks:
         page.add_text(
-            "Nothing was found against them: clocks, lost frames, interlocks, sensors, exclusive joints.",
-            "good",
+            "No finding about clocks, lost frames, interlocks, sensors or exclusive joints.", "good"
         )
         return
-    rows = [
-        [
-            Cell(
-                remark["name"],
-                {"bad": "grave", "warn": "look at it", "note": "good to know"}[remark["severity"]],
-            ),
-            remark["joint"] or "all",
-            Cell(
-                remark["recording"],
-                f"{remark['from_s']:.1f} to {remark['to_s']:.1f} s, {remark['count']} ×",
-            ),
-            Cell(remark["amount"], f"{remark['meaning']}. To do: {remark['advice']}"),
-        ]
-        for remark in remarks
-    ]
-    page.add_table(["what", "joint", "where", "how much, and what it means"], rows[:MAX_LISTED])
+    columns, rows = ["finding", "joint", "place", "amount and meaning"], []
+    for remark in remarks:
+        place = f"{remark['from_s']:.1f} to {remark['to_s']:.1f} s, {remark['count']} ×"
+        meaning = f"{remark['meaning']}. To do: {remark['advice']}"
+        rows.append(
+            [
+                Cell(remark["name"], SEVERITIES[remark["severity"]]),
+                remark["joint"] or "all",
+                Cell(remark["recording"], place),
+                Cell(remark["amount"], meaning),
+            ]
+        )
+    page.add_table(columns, rows[:MAX_LISTED])
     if len(rows) > MAX_LISTED:
         with page.add_details(f"{len(rows) - MAX_LISTED} more"):
-            page.add_table(
-                ["what", "joint", "where", "how much, and what it means"], rows[MAX_LISTED:]
-            )
+            page.add_table(columns, rows[MAX_LISTED:])
 
 
-def _add_details(page: Report, more: Mapping[str, Any]) -> None:
+def _add_all_parts(page: Report, more: Mapping[str, Any]) -> None:
     location = more.get("location")
     if not location:
         return
     page.add_heading("All parts of the gap")
     for name, parts in location["parts"].items():
+        rows = []
+        for part in parts:
+            if part["time"] <= 0:
+                continue
+            p = None
+            if part["p"] is not None:
+                p = Cell(f"{part['p']:.4f}", "beyond chance" if part["is_sure"] else "")
+            shares = [f"{100 * part[key]:.1f}" for key in ("time", "error", "gap")]
+            rows.append([part["joint"], part["category"], *shares, p])
         with page.add_details(f"by {name}"):
-            rows = [
-                [
-                    part["joint"],
-                    part["category"],
-                    *(f"{100 * part[key]:.1f}" for key in ("time", "error", "gap")),
-                    None
-                    if part["p"] is None
-                    else Cell(f"{part['p']:.4f}", "beyond chance" if part["is_sure"] else ""),
-                ]
-                for part in parts
-                if part["time"] > 0
-            ]
-            caption = "Each column of the error and the gap adds up to 100; p: how probable so much would be by chance."
             page.add_table(
                 ["joint", name, "% of the time", "% of the error", "% of the gap", "p"],
                 rows,
-                caption,
+                "Error and gap add up to 100; p: probability of so large an error by chance.",
             )
+
+
+def _scale(value: float | None) -> str | None:
+    """Return an error in rad or m as text in mrad or mm."""
+    return None if value is None else f"{1e3 * value:.1f}"
 
 
 def _describe_remark(remark: Mapping[str, Any]) -> str:
     joint = f" ({remark['joint']})" if remark["joint"] else ""
-    return f"{remark['name']}{joint} in {remark['recording']}: {remark['amount']}. {remark['meaning']}; {remark['advice']}."
+    place = f"{remark['name']}{joint} in {remark['recording']}"
+    return f"{place}: {remark['amount']}. {remark['meaning']}; {remark['advice']}."

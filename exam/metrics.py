@@ -18,7 +18,7 @@ from brokk_rl.intervals import CONFIDENCE, compute_wilson_interval
 from exam.score import QUIET_KINDS, CaseScore, Claim
 
 NUM_DRAWS = 1000
-"""Bootstrap draws; the ends of an interval move by about 1 % of its width between seeds."""
+"""Bootstrap draws; the usual number for 95 % intervals."""
 NUM_BINS = 10
 """Bins of the reliability diagram and of the expected calibration error; the usual number."""
 SIZES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.01)

@@ -54,7 +54,7 @@ class CommandBus:
 
 
 TRACKER_M = 0.0015
-"""Standard deviation of the measured tool point, m; chosen by hand for a laser tracker outdoors."""
+"""Standard deviation of the measured tool point, m; chosen by hand."""
 TRACKER_RAD = 0.001
 """Standard deviation of its measured pitch, rad; chosen by hand."""
 

@@ -12,8 +12,7 @@ from house import rules
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("brokk_rl", "conf", *rules.ROOMS, *rules.EXTENSIONS)
 LONG: dict[str, str] = {
-    "diagnosis.report": "sentences, tables and figures of one report",
-    "brokk_rl.contracts.vision": "the seams between the parts of perception stand in one place",
+    "brokk_rl.contracts.vision": "the seams between the parts of perception stand in one place"
 }
 """Modules of over 500 lines, and why."""
 
