@@ -60,7 +60,7 @@ class GuidanceEffect:
     paired_ci95: Interval | None = None
     paired_dz: float | None = None
     paired_dz_ci95: Interval | None = None
-    estimate_hodges_lehmann: float | None = None
+    hodges_lehmann: float | None = None
     hodges_lehmann_ci95: Interval | None = None
     paired_p: float | None = None
     wilcoxon_p: float | None = None

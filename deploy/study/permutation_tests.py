@@ -77,8 +77,9 @@ def compute_sequence_p(period_difference: np.ndarray, guided_first: np.ndarray) 
     """Return the two-sided p of guidance with the period in the model.
 
     `period_difference`, `(…, P)`, is the first period minus the second. The statistic is the
-    difference of the two sequences' means. Practice shifts both alike and cancels. The permutation counterpart of Hills and Armitage, Br. J. Clin.
-    Pharmacol. 8 (1979) 7-20, equation for the treatment effect.
+    difference of the two sequences' means. Practice shifts both alike and cancels. The permutation
+    counterpart of Hills and Armitage, Br. J. Clin. Pharmacol. 8 (1979) 7-20, equation for the
+    treatment effect.
     """
     first = np.asarray(guided_first, bool)
     num, num_first = len(first), int(first.sum())
