@@ -14,7 +14,7 @@ import torch
 from composed import option
 
 from actuators.effects.command import DeadBand
-from actuators.effects.composition import Affected
+from actuators.effects.composition import ActuatorWithEffects
 from actuators.effects.speed import Compliance, FlowGain
 from actuators.models.lag import FirstOrderLag
 from brokk_rl import record
@@ -65,7 +65,7 @@ def driven(
 ) -> list[Recording]:
     """Returns recordings of the plant with effects under levels and rests, its speed wandering by a percent or two."""
     random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
-    model = Affected(actuator=PLANT, effects=effects).build(machine, count, CPU)
+    model = ActuatorWithEffects(actuator=PLANT, effects=effects).build(machine, count, CPU)
     shape = (count, machine.num_history, machine.num_joints)
     history = History(q=torch.zeros(shape), u=torch.zeros(shape))
     history.reset(

@@ -13,7 +13,7 @@ import torch
 from composed import option
 
 from actuators.effects.command import DeadBand, Saturation
-from actuators.effects.composition import Affected
+from actuators.effects.composition import ActuatorWithEffects
 from actuators.models.lag import FirstOrderLag
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -109,7 +109,7 @@ def driven(machine: Machine, seed: int, dead_band: float = 0.35, gentle: bool = 
         "saturation": Saturation(joints="all", level=0.7),
     }
     model, random = (
-        Affected(actuator=LINEAR, effects=effects).build(machine, 1, CPU),
+        ActuatorWithEffects(actuator=LINEAR, effects=effects).build(machine, 1, CPU),
         np.random.default_rng(seed),
     )
     history = History(
