@@ -1,9 +1,9 @@
-"""A person at the levers, who follows what the policy proposes: late, sluggishly, imprecisely, and a few levers at a time.
+"""Model of a human at the levers who follows the policy's proposals imperfectly.
 
 One control period, for a proposal `p` that is shown during it:
 
-    attention    looks at the display every `attention_s` and goes on with what was seen last
-    reaction     what was seen acts `delay_s` later; within the period where it changes, to the
+    attention    looks at the display every `attention_s` and keeps the last proposal seen
+    reaction     a seen proposal acts `delay_s` later; within the period where it changes, to the
     fraction choice       an exclusive joint or the others, whichever is asked for more; of those
     the `joints_at_once` largest, and a lever
                  once taken is kept for `grip_s`: nobody changes hands twenty times a second
@@ -13,7 +13,7 @@ One control period, for a proposal `p` that is shown during it:
 The command of a period is the lever's mean over it, as a logger of 20 Hz would have it. Delay and
 lag are the usual range of compensatory tracking (McRuer et al., AFFDL-TR-65-15, 1965: 0.1 to 0.4 s
 and 0.1 to 0.2 s), intermittent attention is that of Loram et al. (J. Physiol. 589, 2011), tremor in
-proportion to what is done that of Harris and Wolpert (Nature 394, 1998).
+proportion to the deflection that of Harris and Wolpert (Nature 394, 1998).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ Range = float | tuple[float, float]
 
 @spec
 class HumanFollower:
-    """A person at the levers: reaction delay, lag of the hand, dead zone, wrong amplitude, few levers at once.
+    """A person at the levers: reaction delay, hand lag, dead zone, gain error, few levers at once.
 
     Each number may be a range `[low, high]`, drawn per environment at each reset: another person.
 
@@ -85,12 +85,12 @@ class HumanFollower:
             )
 
     def levers(self, num_joints: int) -> tuple[int, int]:
-        """Returns the smallest and largest number of levers moved at once, on a machine of `num_joints`."""
+        """Return the smallest and largest number of levers moved at once."""
         number = num_joints if self.joints_at_once is None else self.joints_at_once
         return number if isinstance(number, tuple) else (number, number)
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> HumanFollowerModel:
-        """Returns `num_envs` persons; see `brokk_rl.contracts.actuator.Follower`.
+        """Return `num_envs` persons; see `brokk_rl.contracts.actuator.Follower`.
 
         Raises:
             ConfigError: A number is out of bounds, a range upside down, or a joint unknown.
@@ -99,10 +99,10 @@ class HumanFollower:
 
 
 class HumanFollowerModel:
-    """Persons at work; fulfils `brokk_rl.contracts.actuator.FollowerModel`.
+    """Persons at the levers; fulfils `brokk_rl.contracts.actuator.FollowerModel`.
 
     Attributes:
-        state: What each person has seen and holds, who it is, and where its draws stand.
+        state: Proposals seen, levers held, personal parameters and draw counters.
     """
 
     def __init__(
@@ -140,7 +140,7 @@ class HumanFollowerModel:
         self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Puts a new person at the levers in the environments of `mask`, `(N,)` bool: hands off, about to look."""
+        """Put a new person at the levers in the environments of `mask`, `(N,)` bool."""
         self._ranges.redraw(mask)
         self.state["seen"].masked_fill_(mask[:, None, None], 0.0)
         self.state["hand"].masked_fill_(mask[:, None], 0.0)
@@ -151,7 +151,7 @@ class HumanFollowerModel:
         )
 
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns the command given during the coming period, `(N, J)`, where `proposed`, `(N, J)`, is shown."""
+        """Return the given command, `(N, J)`, while `proposed`, `(N, J)`, is shown."""
         value, state = self._ranges.value, self.state
         self._look(proposed)
         delay = (value["delay_s"] / self._period_s).expand_as(proposed)
@@ -170,7 +170,7 @@ class HumanFollowerModel:
         return open_valve(deflection.clamp(-1.0, 1.0), value["dead_zone"], value["dead_zone"])
 
     def _look(self, proposed: torch.Tensor) -> None:
-        """Appends what the person goes by from now on: the proposal where it is time to look, else what was seen before."""
+        """Append the proposal where it is time to look, else the one seen before."""
         seen, since = self.state["seen"], self.state["since_look"]
         between = self._ranges.value["attention_s"] / self._period_s
         looks = since >= between - 1e-4
@@ -182,7 +182,7 @@ class HumanFollowerModel:
         seen[:, -1] = newest
 
     def _held(self, asked: torch.Tensor) -> torch.Tensor:
-        """Returns which levers the person holds, `(N, J)` bool, where `asked`, `(N, J)`, has come through."""
+        """Return the levers that the person holds, `(N, J)` bool, for requests `asked`, `(N, J)`."""
         # of what is asked for equally, not at all for example, the lever that is in the hand
         priority = asked.abs() + 1e-6 * self.state["hand"].abs()
         alone = torch.where(self._exclusive, priority, 0.0).amax(1)
@@ -200,7 +200,7 @@ class HumanFollowerModel:
     def _reach(
         self, hand: torch.Tensor, target: torch.Tensor, part: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Returns where the hand is after `part` of a period on its way to `target`, and what that adds to the period's mean."""
+        """Return the hand after `part` of a period toward `target`, and its share of the mean."""
         lag = self._ranges.value["lag_s"] / self._period_s
         left = torch.exp(-part / lag.clamp(min=1e-9))
         moved = (hand - target) * left

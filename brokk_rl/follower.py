@@ -1,4 +1,4 @@
-"""Nobody between policy and machine: what is proposed is given.
+"""The neutral follower: the given command equals the proposed command.
 
 On the machine a person reads the proposed lever positions and moves the levers, late and
 imperfectly; such a follower is one of `conf/follower`. This is the neutral one, of which every
@@ -22,26 +22,28 @@ class NoFollower:
     label: ClassVar = "nobody"
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> NoFollowerModel:
-        """Returns the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""
+        """Return the follower that changes nothing; see `brokk_rl.contracts.actuator.Follower`."""
         return NoFollowerModel()
 
 
 class NoFollowerModel:
-    """Gives what is proposed."""
+    """Gives the proposed command."""
 
     def __init__(self) -> None:
         self.state: dict[str, torch.Tensor] = {}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Has no memory."""
+        """Have no memory."""
 
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns `proposed`, `(N, J)`."""
+        """Return `proposed`, `(N, J)`."""
         return proposed
 
 
 def select_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
-    """Returns which levers are moved, `(N, J)` bool: the `most`, a number or `(N, 1)`, of highest `priority`, `(N, J)`.
+    """Return the levers that are moved, `(N, J)` bool: the `most` of highest `priority`.
+
+    `priority` is `(N, J)`, `most` a number or `(N, 1)`.
 
     Of equals the first.
     """

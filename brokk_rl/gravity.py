@@ -1,4 +1,4 @@
-"""The weight that each joint carries, from the machine's masses and geometry; batched, in torch, without the simulator."""
+"""Gravity load on each joint, from masses and geometry; batched, in torch."""
 
 import torch
 
@@ -33,7 +33,7 @@ class Gravity:
         self._eye = torch.eye(3, device=device)
 
     def load(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns the force with which gravity pushes each joint in its positive direction, shape of `q` `(N, J)`, Nm or N."""
+        """Return the gravity load in the positive direction at `q`, `(N, J)`, Nm or N."""
         angle = (q * self._hinge)[..., None, None]
         turn = (
             self._eye + angle.sin() * self._cross + (1.0 - angle.cos()) * self._cross_twice

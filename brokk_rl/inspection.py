@@ -1,6 +1,6 @@
-"""What is in a recording before any physics: rates, ranges, noise, and stretches that no model of the machine could explain.
+"""Inspection of a recording: rates, ranges, noise, and stretches that no model could explain.
 
-Axes: `T` time, `J` joints. Recordings may be broken: what is missing is NaN and takes no part.
+Axes: `T` time, `J` joints. Recordings may be broken: missing values are NaN and take no part.
 """
 
 import warnings
@@ -71,7 +71,7 @@ class InspectionThresholds:
 
 @dataclass(frozen=True)
 class RecordingFinding:
-    """A stretch of a recording that wants an explanation.
+    """A stretch of a recording that needs an explanation.
 
     Attributes:
         kind: One of `KINDS`.
@@ -80,7 +80,7 @@ class RecordingFinding:
         num_rows: Rows on end.
         t_s: Time of the first row.
         duration_s: From the first row to the last.
-        text: What is there, with its size.
+        text: Description with its size.
     """
 
     kind: Kind
@@ -94,7 +94,7 @@ class RecordingFinding:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What one recording holds.
+    """Contents of one recording.
 
     Attributes:
         timing: Rate and jitter of the file.
@@ -110,7 +110,7 @@ class Inspection:
 def inspect_recording(
     recording: Recording, machine: Machine, thresholds: InspectionThresholds
 ) -> Inspection:
-    """Returns what is in a recording of `machine`."""
+    """Return the contents of a recording of `machine`."""
     with warnings.catch_warnings(), np.errstate(invalid="ignore", divide="ignore"):
         warnings.simplefilter("ignore", RuntimeWarning)  # of columns that are all NaN
         look = _RecordingScan(recording, machine, thresholds)
@@ -128,7 +128,7 @@ def inspect_recording(
 
 
 class _RecordingScan:
-    """One look at a recording: what the findings have in common."""
+    """Scan of one recording: the quantities that all findings use."""
 
     def __init__(
         self, recording: Recording, machine: Machine, thresholds: InspectionThresholds
@@ -159,7 +159,7 @@ class _RecordingScan:
         )
 
     def timing(self) -> dict[str, float | None]:
-        """Returns duration, rate and jitter."""
+        """Return duration, rate and jitter."""
         period_s = np.diff(self._t_s)
         period_s = period_s[np.isfinite(period_s)]
         if not len(period_s):
@@ -180,7 +180,7 @@ class _RecordingScan:
         }
 
     def joints(self) -> dict[str, dict[str, float | None]]:
-        """Returns the figures of each joint."""
+        """Return the figures of each joint."""
         size, found = np.abs(self._u), {}
         margin = self._limits.at_limit * self._travel
         at_limit = (self._q < self._machine.lower + margin) | (
@@ -201,7 +201,7 @@ class _RecordingScan:
         return found
 
     def no_motion(self) -> list[RecordingFinding]:
-        """Finds commands that should move a joint and do not, away from the stop that they lead to."""
+        """Find commands that should move a joint away from a stop and do not."""
         found, margin = [], self._limits.at_limit * self._travel
         for j, name in enumerate(self._machine.joint_names):
             for sign in (1, -1):
@@ -225,7 +225,7 @@ class _RecordingScan:
         return found
 
     def no_command(self) -> list[RecordingFinding]:
-        """Finds stretches without command over which a joint goes elsewhere."""
+        """Find stretches without command over which a joint goes elsewhere."""
         found = []
         for j, (name, unit) in enumerate(self._units()):
             for row, count in find_stretches(self._idle[:, j]):
@@ -240,7 +240,7 @@ class _RecordingScan:
         return found
 
     def frozen(self) -> list[RecordingFinding]:
-        """Finds equal samples amid motion, and at rest where the sensor is otherwise never still."""
+        """Find equal samples amid motion, and at rest where the sensor is otherwise never still."""
         found = []
         for j, (name, unit) in enumerate(self._units()):
             equal = np.append(False, np.diff(self._q[:, j]) == 0)
@@ -265,7 +265,7 @@ class _RecordingScan:
         return found
 
     def repeated(self) -> list[RecordingFinding]:
-        """Finds rows that repeat all positions of the row before although a joint moves visibly within a period."""
+        """Find rows that repeat the row before although a joint moves visibly."""
         same = np.append(False, (np.diff(self._q, axis=0) == 0).all(1))
         seen = (np.abs(self._v) * self._period_s > self._visible).any(1)
         return [
@@ -274,7 +274,7 @@ class _RecordingScan:
         ]
 
     def beyond(self) -> list[RecordingFinding]:
-        """Finds positions outside the limits, by more than the sensor's own noise and step."""
+        """Find positions outside the limits, by more than the sensor's own noise and step."""
         found = []
         for j, (name, unit) in enumerate(self._units()):
             over = np.fmax(
@@ -294,7 +294,7 @@ class _RecordingScan:
         return found
 
     def exclusive(self) -> list[RecordingFinding]:
-        """Finds commands to an exclusive joint together with others."""
+        """Find commands to an exclusive joint together with others."""
         commanded, mask = np.abs(self._u) > self._limits.commanded, self._machine.is_exclusive
         found = []
         for j in np.flatnonzero(mask):
@@ -318,7 +318,10 @@ class _RecordingScan:
         return [(joint.name, joint.unit) for joint in self._machine.joints]
 
     def _speed(self, ahead: int, behind: int) -> np.ndarray:
-        """Returns the mean speed from `behind` rows before to `ahead` rows after each row, `(T, J)`; NaN near the ends."""
+        """Return mean speeds from `behind` rows before to `ahead` after, `(T, J)`.
+
+        NaN near the ends.
+        """
         speed, span = np.full(self._q.shape, np.nan), ahead + behind
         if len(self._q) > span:
             change = (self._q[span:] - self._q[:-span]) / (self._t_s[span:] - self._t_s[:-span])[
@@ -328,13 +331,16 @@ class _RecordingScan:
         return speed
 
     def _noise_of(self, joint: int) -> float:
-        """Returns the standard deviation of the sensor at rest; white noise is in each of two samples that are subtracted."""
+        """Return the standard deviation of the sensor at rest.
+
+        A difference of two samples holds the noise twice.
+        """
         change = np.diff(self._q[:, joint])[self._idle[1:, joint] & ~self._is_moving[1:, joint]]
         return float(np.nanstd(change) / np.sqrt(2.0)) if len(change) > 20 else np.nan
 
 
 def _find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
-    """Returns where `condition`, `(T,)`, has held for more than `num_rows` rows on end."""
+    """Return where `condition`, `(T,)`, has held for more than `num_rows` rows on end."""
     held = np.zeros(len(condition), dtype=bool)
     for row, count in find_stretches(condition):
         held[row + num_rows : row + count] = True
@@ -342,7 +348,7 @@ def _find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
 
 
 def _estimate_step(q: np.ndarray) -> float:
-    """Returns the step of a coarse sensor from the values that it repeats, NaN where it repeats too few to tell."""
+    """Return the step of a coarse sensor from repeated values, NaN if they are few."""
     values, counts = np.unique(q[np.isfinite(q)], return_counts=True)
     codes = values[counts >= CODE_REPEATS]
     if len(codes) < 10 or counts[counts >= CODE_REPEATS].sum() < 0.3 * len(q):
@@ -351,5 +357,5 @@ def _estimate_step(q: np.ndarray) -> float:
 
 
 def _to_json_number(value: Any) -> float | None:
-    """Returns a number as JSON knows it, `None` for NaN."""
+    """Return a number as JSON knows it, `None` for NaN."""
     return float(value) if np.isfinite(value) else None

@@ -1,6 +1,6 @@
-"""Free runs: an actuator model is given the recorded commands and its own predictions, never the recorded positions.
+"""Free runs: a model gets recorded commands and its own predictions, no recorded positions.
 
-One-step errors hardly separate models (a machine at 20 Hz moves little in a step); what counts is
+One-step errors hardly separate models (a machine at 20 Hz moves little in a step); the measure is
 where a free run ends up.
 Axes: `W` windows, `K` steps, `J` joints, `L` samples before the free run, of which `H` are the
 first history.
@@ -29,7 +29,7 @@ the recorded one is moving."""
 
 @dataclass(frozen=True)
 class FreeRunWindows:
-    """Windows of recordings for free runs; where the recording ends within a window, positions are NaN from there on.
+    """Windows of recordings for free runs; positions are NaN after the end of a recording.
 
     Attributes:
         u: Commands, shape `(W, L - 1 + K, J)`: those before, then those of the `K` steps to come;
@@ -48,18 +48,18 @@ class FreeRunWindows:
 
     @property
     def measured(self) -> np.ndarray:
-        """Measured positions after each step, shape `(W, K, J)`, NaN after the end of the recording."""
+        """Measured positions after each step, `(W, K, J)`, NaN after the recording's end."""
         return self.q[:, self.num_before :]
 
 
 def find_longest_horizon_s(recordings: Sequence[Recording], machine: Machine) -> float:
-    """Returns the longest free run that fits into one of the recordings, s; not above 0 where none does."""
+    """Return the longest free run that fits into a recording, s; 0 or less if none."""
     longest = max((recording.num_samples for recording in recordings), default=0)
     return (longest - count_samples_before(machine)) * machine.period_s
 
 
 def count_samples_before(machine: Machine) -> int:
-    """Returns the number of samples before a free run, `L`."""
+    """Return the number of samples before a free run, `L`."""
     return machine.num_history + round(WARM_UP_S / machine.period_s)
 
 
@@ -70,7 +70,7 @@ def cut_windows(
     stride_s: float,
     shortest_s: float | None = None,
 ) -> FreeRunWindows:
-    """Cuts recordings into windows of `horizon_s` after what comes before, one every `stride_s`.
+    """Cut recordings into windows of `horizon_s` after their warm-up, one every `stride_s`.
 
     Args:
         recordings: Where from.
@@ -105,7 +105,7 @@ def cut_windows(
 
 
 def join_windows(cuts: Sequence[FreeRunWindows]) -> FreeRunWindows:
-    """Returns the windows of several cuts of the same shape as one, in their order."""
+    """Return the windows of several cuts of the same shape as one, in their order."""
     u, q, run = (np.concatenate([getattr(cut, name) for cut in cuts]) for name in ("u", "q", "run"))
     return FreeRunWindows(u, q, run, cuts[0].num_history, cuts[0].num_before)
 
@@ -113,7 +113,7 @@ def join_windows(cuts: Sequence[FreeRunWindows]) -> FreeRunWindows:
 def roll_out(
     actuator: Actuator, machine: Machine, cut: FreeRunWindows, device: torch.device
 ) -> np.ndarray:
-    """Returns the positions of free runs through all windows at once, shape `(W, K, J)`.
+    """Return the positions of free runs through all windows at once, shape `(W, K, J)`.
 
     Raises:
         BrokkError: the model ran into NaN.

@@ -29,10 +29,10 @@ COMMAND_TOLERANCE = 1e-6
 
 @dataclass(frozen=True)
 class Breach:
-    """A place where a recording breaks a rule.
+    """A place where a recording breaks a rule of the format.
 
     Attributes:
-        text: What was expected and what is there.
+        text: The expected and the found content.
         column: Column concerned, `None` where it is the file as a whole.
         row: First row concerned, `None` where it is the column or the file as a whole.
         num_rows: Number of rows on end that break the same rule.
@@ -50,7 +50,7 @@ class Breach:
 
 
 def check_metadata(metadata: Mapping[str, str], machine: str) -> Iterator[Breach]:
-    """Yields what is wrong with the metadata (without the prefix `brokk.`) of a recording made on the machine of that name."""
+    """Yield the breaches in the metadata of a recording of machine `machine`."""
     for key in ("schema", "machine", "rate_hz"):
         if key not in metadata:
             yield Breach(
@@ -67,7 +67,7 @@ def check_metadata(metadata: Mapping[str, str], machine: str) -> Iterator[Breach
 
 
 def parse_rate_hz(metadata: Mapping[str, str]) -> float | None:
-    """Returns the stated rate, `None` where there is none or none that makes sense."""
+    """Return the stated rate, `None` where there is none or none that makes sense."""
     try:
         rate = float(metadata.get("rate_hz", ""))
     except ValueError:
@@ -76,7 +76,7 @@ def parse_rate_hz(metadata: Mapping[str, str]) -> float | None:
 
 
 def check_names(required: Sequence[str], present: Sequence[str]) -> Iterator[Breach]:
-    """Yields the columns that are missing."""
+    """Yield the columns that are missing."""
     for name in required:
         if name not in present:
             yield Breach(f"column '{name}' is missing; {list_choices(name, present)}", name)
@@ -85,7 +85,7 @@ def check_names(required: Sequence[str], present: Sequence[str]) -> Iterator[Bre
 def check_columns(
     columns: Mapping[str, np.ndarray], required: Sequence[str], stated_hz: float
 ) -> Iterator[Breach]:
-    """Yields what is wrong with the numbers.
+    """Yield the breaches in the numbers.
 
     In an optional column NaN means "not measured"; everywhere else it is a breach.
 
@@ -131,7 +131,7 @@ def _check_time(t_s: np.ndarray, stated_hz: float) -> Iterator[Breach]:
 
 
 def find_stretches(condition: np.ndarray) -> list[tuple[int, int]]:
-    """Returns first row and length of each stretch of rows on end where `condition`, `(T,)`, holds."""
+    """Return first row and length of each stretch of rows where `condition`, `(T,)`, holds."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], condition, [False]]).astype(np.int8)))
     return [(int(begin), int(end - begin)) for begin, end in edges.reshape(-1, 2)]
 
@@ -167,7 +167,7 @@ class Recording:
 
     @property
     def run(self) -> str:
-        """The run of the machine that this is a part of: a long run is cut into files, and a log split where it has gaps."""
+        """The machine's run that this is a part of: runs are cut into files and at gaps."""
         return self.metadata.get("run") or (self.path.stem if self.path else "")
 
     @property
@@ -182,17 +182,17 @@ class Recording:
 
 
 def name_command_column(joint: str) -> str:
-    """Returns the name of the column with the command of `joint`."""
+    """Return the name of the column with the command of `joint`."""
     return f"u_{joint}"
 
 
 def name_position_column(joint: str, unit: str) -> str:
-    """Returns the name of the column with the position of `joint`, in `unit` (`rad` or `m`)."""
+    """Return the name of the column with the position of `joint`, in `unit` (`rad` or `m`)."""
     return f"q_{joint}_{unit}"
 
 
 def write_recording(recording: Recording, path: Path) -> None:
-    """Writes `recording` to `path`: under a temporary name first, so that `path` is either whole or absent.
+    """Write `recording` to `path`, which is then either whole or absent.
 
     Raises:
         RecordingError: the recording breaks a rule of the format.
@@ -230,7 +230,7 @@ def write_recording(recording: Recording, path: Path) -> None:
 
 
 def read_recording(path: Path, machine: Machine) -> Recording:
-    """Reads the recording at `path`, made on `machine`.
+    """Read the recording at `path`, made on `machine`.
 
     Raises:
         RecordingError: the file is missing or truncated, was made on another machine, lacks a
@@ -243,10 +243,10 @@ def read_recording(path: Path, machine: Machine) -> Recording:
 
 
 def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, list[Breach]]:
-    """Reads what can be read of the recording at `path`.
+    """Read as much as possible of the recording at `path`.
 
     Returns:
-        The recording, with NaN in place of what is missing and the machine's rate where none is
+        The recording, with NaN for missing values and the machine's rate where none is
         stated, `None` where nothing can be read; and every place where it breaks a rule of the
         format.
     """
@@ -308,7 +308,7 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
 
 
 def read_recordings(patterns: str | Sequence[str], machine: Machine) -> list[Recording]:
-    """Reads all recordings that match a glob or any of several, in order of their names.
+    """Read all recordings that match a glob or any of several, in order of their names.
 
     Raises:
         RecordingError: nothing matches, or one of them cannot be used.
@@ -317,7 +317,7 @@ def read_recordings(patterns: str | Sequence[str], machine: Machine) -> list[Rec
 
 
 def find_files(patterns: str | Sequence[str], what: str) -> list[Path]:
-    """Returns the files that match a glob or any of several, in order of their names; `what` they are goes into the message.
+    """Return the files that match one or several globs, sorted; `what` names them in messages.
 
     Raises:
         RecordingError: nothing matches.
@@ -330,7 +330,9 @@ def find_files(patterns: str | Sequence[str], what: str) -> list[Path]:
 
 
 def check_recording(recording: Recording, where: str) -> None:
-    """Raises a `RecordingError` that names file (`where`), row (from 0) and column when `recording` breaks a rule of the format.
+    """Raise a `RecordingError` where `recording` breaks a rule of the format.
+
+    The message names file (`where`), row (from 0) and column.
 
     In an optional column NaN means "not measured"; everywhere else it is refused.
     """
@@ -350,17 +352,17 @@ def check_recording(recording: Recording, where: str) -> None:
 
 
 def format_now() -> str:
-    """Returns the present time as `brokk.created` wants it."""
+    """Return the present time as `brokk.created` wants it."""
     return datetime.now().astimezone().isoformat(timespec="milliseconds")
 
 
 def add_seconds(created: str, elapsed_s: float) -> str:
-    """Returns the time `elapsed_s` after `created`, both as `brokk.created` wants them."""
+    """Return the time `elapsed_s` after `created`, both as `brokk.created` wants them."""
     return (datetime.fromisoformat(created) + timedelta(seconds=elapsed_s)).isoformat(
         timespec="milliseconds"
     )
 
 
 def format_fingerprint(machine: Machine) -> str:
-    """Returns the machine's fingerprint as `brokk.fingerprint` holds it: JSON."""
+    """Return the machine's fingerprint as `brokk.fingerprint` holds it: JSON."""
     return json.dumps(machine.fingerprint())

@@ -1,4 +1,4 @@
-"""Splits of recordings into sets to fit to, to stop by and to judge by: whole runs only, and each joint commanded in every set.
+"""Splits of recordings into training, validation and test sets by whole runs.
 
 Windows of one run are not independent (same oil, same operator, same load), so a run that is split
 makes any model look good.
@@ -20,7 +20,7 @@ COMMANDED = 0.02
 
 
 def group_by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
-    """Returns the recordings of each run, by a name that is the run's alone.
+    """Return the recordings of each run, by a name that is the run's alone.
 
     Two collections may give their runs the same names; the seed tells them apart. A recording that
     does not say which run it is a part of is one by itself.
@@ -37,7 +37,7 @@ def group_by_run(recordings: Sequence[Recording]) -> dict[str, list[Recording]]:
 
 
 def measure_commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
-    """Returns for how long each joint is commanded in all recordings together, s, shape `(J,)`."""
+    """Return for how long each joint is commanded in all recordings together, s, shape `(J,)`."""
     return np.sum(
         [(np.abs(recording.u) > COMMANDED).sum(0) / recording.rate_hz for recording in recordings],
         0,
@@ -47,7 +47,7 @@ def measure_commanded_s(recordings: Sequence[Recording]) -> np.ndarray:
 def split_runs(
     runs: Mapping[str, Sequence[Recording]], shares: Mapping[str, float]
 ) -> dict[str, list[str]]:
-    """Distributes runs over sets such that each joint is commanded in each set for about its share of the time.
+    """Distribute runs over sets so that each joint's commanded time follows the shares.
 
     The joint that is commanded in the fewest runs comes first; its longest run goes to the set that
     lacks it, or else to the one
@@ -94,7 +94,10 @@ def split_runs(
 def check_commanded(
     runs: Mapping[str, Sequence[Recording]], machine: Machine, needed: int, why: str
 ) -> None:
-    """Raises a `RecordingError` that names a joint commanded in fewer than `needed` runs, and what to record; `why`: for what."""
+    """Raise a `RecordingError` for a joint commanded in fewer than `needed` runs.
+
+    `why` says for which purpose; the message advises on recordings.
+    """
     moving = {name: measure_commanded_s(recordings) > 0 for name, recordings in runs.items()}
     minutes = (
         sum(recording.duration_s for recordings in runs.values() for recording in recordings) / 60.0

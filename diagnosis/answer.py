@@ -22,7 +22,7 @@ from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 
 
 @dataclass(frozen=True)
@@ -378,9 +378,9 @@ class Outcome:
     """
 
     answer: Answer
-    before: FreeRuns
-    after: FreeRuns | None
-    floor: FreeRuns | None
+    before: WindowedRuns
+    after: WindowedRuns | None
+    floor: WindowedRuns | None
 
     def save(self, folder: Path) -> None:
         """Write `diagnosis.json` and `diagnosis.npz`, each in one step.
@@ -429,7 +429,7 @@ def load_outcome(folder: Path, machine: Machine) -> Outcome:
     )
 
 
-def _pack_runs(name: str, runs: FreeRuns) -> dict[str, Any]:
+def _pack_runs(name: str, runs: WindowedRuns) -> dict[str, Any]:
     arrays: dict[str, Any] = {
         f"{name}.source": runs.source, f"{name}.row": runs.row, f"{name}.simulated": runs.simulated.astype(np.float32),
         f"{name}.titles": np.array([r.path.stem if r.path else r.run for r in runs.recordings]),
@@ -441,7 +441,7 @@ def _pack_runs(name: str, runs: FreeRuns) -> dict[str, Any]:
     return arrays
 
 
-def _unpack_runs(name: str, arrays: Any, machine: Machine) -> FreeRuns | None:
+def _unpack_runs(name: str, arrays: Any, machine: Machine) -> WindowedRuns | None:
     if f"{name}.row" not in arrays:
         return None
     empty = Recording(
@@ -458,7 +458,7 @@ def _unpack_runs(name: str, arrays: Any, machine: Machine) -> FreeRuns | None:
         )
         for number, (title, begun, rate_hz) in enumerate(zip(titles, created, rates, strict=True))
     ]  # fmt: skip
-    return FreeRuns(
+    return WindowedRuns(
         recordings,
         arrays[f"{name}.source"],
         arrays[f"{name}.row"],

@@ -25,49 +25,61 @@ from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import residual_model, residuals
-from diagnosis.case import HORIZON_S, Case, parts, running_s
-from diagnosis.effect_library import Candidates, Kind, Values
-from diagnosis.free_runs import FreeRuns
-from diagnosis.refine import thinned
-from diagnosis.residuals import ErrorCovariance, Evidence, Ray, rays, robust_loss, robust_weight
-from diagnosis.responses import FELT, SHAPES, Shape, plain
-from diagnosis.search import Table
+from diagnosis import residual_model
+from diagnosis.case import HORIZON_S, GapCase, estimate_running_s, split_recordings
+from diagnosis.effect_library import EffectSimulator, EffectType, EffectValues
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.refine import drop_windows
+from diagnosis.residuals import (
+    ErrorCovariance,
+    ParameterRay,
+    Residuals,
+    build_rays,
+    compute_loss,
+    fit_noise,
+    weigh_residuals,
+)
+from diagnosis.responses import MIN_RESPONSE, SHAPE_FACTORS, Response, fit_faults
+from diagnosis.search import SubsetTable
 
 log = logging.getLogger(__name__)
 
 
-STEPS = 3
-SECONDS = 0.004
+TUNING_STEPS = 3
+TIME_STEP_S = 0.004
 """Finite difference of a time; numbers without a unit: `PART`."""
-PART = 0.01
-FREE = 4.0
+NUMBER_STEP = 0.01
+TUNING_PRIOR = 4.0
 """Prior: numbers are off by so many finite differences."""
 
 
-def changes(parts: Sequence[Evidence]) -> dict[str, np.ndarray]:
-    """Returns by how much the simulator's numbers should change, by name, each `(J,)`; empty where they cannot be set."""
-    first = parts[0].candidates
+def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
+    """Return by how much the simulator's numbers should change, by name, each `(J,)`; empty where they cannot be set."""
+    first = parts[0].simulator
     model: Any = first.base.build(first.machine, 1, torch.device("cpu"))
     if not (own := getattr(model, "parameters", None)):
         return {}
     names = list(own)
     start = np.stack([own[name][0].numpy().astype(float) for name in names])  # (P, J)
-    size = np.array([SECONDS if name.endswith("_s") else PART for name in names])[:, None]
+    size = np.array([TIME_STEP_S if name.endswith("_s") else NUMBER_STEP for name in names])[
+        :, None
+    ]
     reach = first.machine.num_history * first.machine.period_s - 2.0 * first.machine.period_s
     most = np.where(np.array([name.endswith("_s") for name in names])[:, None], reach, np.inf)
     now, best, lowest = start.copy(), start.copy(), np.full(start.shape[1], np.inf)
-    for _ in range(STEPS + 1):
-        errors, slopes = _linear(parts, names, now, size)
-        total = robust_loss(errors, 1) + 0.5 * np.square((now - start) / size / FREE).sum(0)
+    for _ in range(TUNING_STEPS + 1):
+        errors, slopes = _linearise_parameters(parts, names, now, size)
+        total = compute_loss(errors, 1) + 0.5 * np.square((now - start) / size / TUNING_PRIOR).sum(
+            0
+        )
         better = total < lowest
         best, lowest = np.where(better, now, best), np.minimum(total, lowest)
         step = np.zeros_like(now)
         for j in range(now.shape[1]):
-            weighted = slopes[j] * robust_weight(errors[j])
-            normal = weighted @ slopes[j].T + np.eye(len(names)) / FREE**2
+            weighted = slopes[j] * weigh_residuals(errors[j])
+            normal = weighted @ slopes[j].T + np.eye(len(names)) / TUNING_PRIOR**2
             step[:, j] = np.linalg.solve(
-                normal, weighted @ errors[j] - (now - start)[:, j] / size[:, 0] / FREE**2
+                normal, weighted @ errors[j] - (now - start)[:, j] / size[:, 0] / TUNING_PRIOR**2
             )
         now = np.clip(
             np.where(better, now + step * size, (now + best) / 2),
@@ -79,36 +91,30 @@ def changes(parts: Sequence[Evidence]) -> dict[str, np.ndarray]:
     }
 
 
-def changed(actuator: Actuator, by: dict[str, np.ndarray], machine: Machine) -> Actuator:
-    """Returns `actuator` with its numbers changed."""
+def apply_changes(actuator: Actuator, by: dict[str, np.ndarray], machine: Machine) -> Actuator:
+    """Return `actuator` with its numbers changed."""
     model: Any = actuator.build(machine, 1, torch.device("cpu"))
-    tables: Any = {
-        name: dict(
-            zip(
-                machine.joint_names,
-                (model.parameters[name][0].numpy() + row).clip(0.0).tolist(),
-                strict=True,
-            )
-        )
-        for name, row in by.items()
-    }
+    tables: Any = {}
+    for name, row in by.items():
+        values = (model.parameters[name][0].numpy() + row).clip(0.0).tolist()
+        tables[name] = dict(zip(machine.joint_names, values, strict=True))
     return dataclasses.replace(actuator, **tables)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
 
-def _linear(
-    parts: Sequence[Evidence], names: list[str], now: np.ndarray, size: np.ndarray
+def _linearise_parameters(
+    parts: Sequence[Residuals], names: list[str], now: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns errors over the noise of all parts, `(J, E)`, and what a finite difference of each number takes off, `(J, P, E)`."""
+    """Return errors over the noise of all parts, `(J, E)`, and what a finite difference of each number takes off, `(J, P, E)`."""
     count = len(names)
     varied = np.repeat(now[None], count + 1, 0)  # (P + 1, P, J)
     for p in range(count):
         varied[p + 1, p] += size[p]
     errors, slopes = [], []
     for part in parts:
-        paths = part.candidates.paths(
+        paths = part.simulator.simulate(
             [], count + 1, {name: varied[:, p] for p, name in enumerate(names)}
         )
-        z = part.whitened(part.error_of(paths))
+        z = part.whiten(part.compute_error(paths))
         errors.append(z[:, 0])
         slopes.append(z[:, :1] - z[:, 1:])
     return np.concatenate(errors, 1), np.concatenate(slopes, 2)
@@ -116,12 +122,12 @@ def _linear(
 
 FOLDS = 4
 """Times that a part of the reference is left out."""
-TOGETHER = 3
+COVARIANCE_WINDOWS = 3
 """Windows in a row on which the noise is fitted."""
 
 
 @dataclass(frozen=True)
-class Held:
+class SimulatorComparison:
     """A simulator held against recordings.
 
     Attributes:
@@ -132,23 +138,23 @@ class Held:
     """
 
     recordings: Sequence[Recording]
-    evidence: Evidence
+    residuals: Residuals
     source: np.ndarray
     row: np.ndarray
 
-    def with_base(self, actuator: Actuator) -> Held:
-        """Returns another simulator held against the same recordings; its noise is still to be found."""
-        evidence = self.evidence
-        candidates = replace(evidence.candidates, base=actuator)
-        return replace(self, evidence=Evidence(candidates, None, evidence.claims))
+    def with_base(self, actuator: Actuator) -> SimulatorComparison:
+        """Return another simulator held against the same recordings; its noise is still to be found."""
+        residuals = self.residuals
+        simulator = replace(residuals.simulator, base=actuator)
+        return replace(self, residuals=Residuals(simulator, None, residuals.valid_mask))
 
-    def runs(self, paths: np.ndarray) -> FreeRuns:
-        """Returns free runs `(W, K, J)` beside their recordings."""
-        return FreeRuns(self.recordings, self.source, self.row, paths.astype(float))
+    def runs(self, paths: np.ndarray) -> WindowedRuns:
+        """Return free runs `(W, K, J)` beside their recordings."""
+        return WindowedRuns(self.recordings, self.source, self.row, paths.astype(float))
 
 
 @dataclass(frozen=True)
-class Base:
+class Baseline:
     """The simulator, and its errors.
 
     Attributes:
@@ -161,17 +167,19 @@ class Base:
     """
 
     actuator: Actuator
-    field: Held
-    nulls: Sequence[Held]
+    field: SimulatorComparison
+    left_out: Sequence[SimulatorComparison]
     is_flexible: bool = False
 
 
-Begun = Sequence[tuple[Recording, float]]
+StartedRecordings = Sequence[tuple[Recording, float]]
 """Recordings, and how long the machine had been running when each began, s."""
 
 
-def held(actuator: Actuator, begun: Begun, machine: Machine, seed: int) -> Held:
-    """Returns `actuator` held against all whole windows of recordings."""
+def compare_simulator(
+    actuator: Actuator, begun: StartedRecordings, machine: Machine, seed: int
+) -> SimulatorComparison:
+    """Return `actuator` held against all whole windows of recordings."""
     before, steps = open_loop.count_samples_before(machine), round(HORIZON_S / machine.period_s)
     cuts, source, row, running = [], [], [], []
     for number, (recording, begun_s) in enumerate(begun):
@@ -188,25 +196,21 @@ def held(actuator: Actuator, begun: Begun, machine: Machine, seed: int) -> Held:
             f"too little data: no recording is long enough for a free run of {HORIZON_S:g} s"
         )
     windows = open_loop.join_windows(cuts)
-    claims = np.ones((len(windows.q), machine.num_joints), dtype=bool)
-    candidates = Candidates(actuator, machine, windows, np.array(running), seed)
-    return Held(
-        [recording for recording, _ in begun],
-        Evidence(candidates, None, claims),
-        np.array(source),
-        np.array(row),
-    )
+    valid_mask = np.ones((len(windows.q), machine.num_joints), dtype=bool)
+    simulator = EffectSimulator(actuator, machine, windows, np.array(running), seed)
+    recordings, residuals = [one for one, _ in begun], Residuals(simulator, None, valid_mask)
+    return SimulatorComparison(recordings, residuals, np.array(source), np.array(row))
 
 
-def fitted(
-    case: Case,
+def fit_baseline(
+    case: GapCase,
     fit: ActuatorFit,
     folder: Path,
     seed: int,
     device: torch.device,
-    refined: Callable[[Base], Base] = lambda base: base,
-) -> Base:
-    """Returns a simulator fitted to the reference, and fits that leave a part of it out.
+    refined: Callable[[Baseline], Baseline] = lambda base: base,
+) -> Baseline:
+    """Return a simulator fitted to the reference, and fits that leave a part of it out.
 
     A fit that knows how to `refit` is fitted anew to each rest, all others once to two thirds: the
     price of a fit that takes long. `refined` may change the simulator before what it gets wrong is
@@ -216,70 +220,78 @@ def fitted(
         RecordingError: too little reference.
     """
     machine = case.machine
-    reference = parts(case.reference)
+    reference = split_recordings(case.reference)
     if len(reference) < 2:
         raise RecordingError(
             f"too little data: the reference lasts {sum(r.duration_s for r in case.reference):.0f} s; a simulator that is "
             "judged on recordings it was not fitted to needs several minutes"
         )
-    actuator, nulls = _crosswise(case.reference, reference, fit, machine, folder, seed, device)
-    field = held(actuator, _begun(case.field), machine, seed)
-    if tuned := changes([one.evidence for one in nulls]):
-        actuator = changed(actuator, tuned, machine)
-        nulls = _noised(
-            [one.with_base(changed(one.evidence.candidates.base, tuned, machine)) for one in nulls],
-            machine,
-        )
+    actuator, left_out = _cross_validate(
+        case.reference, reference, fit, machine, folder, seed, device
+    )
+    field = compare_simulator(actuator, _list_started(case.field), machine, seed)
+    if tuned := tune_parameters([one.residuals for one in left_out]):
+        actuator = apply_changes(actuator, tuned, machine)
+        changed = [apply_changes(one.residuals.simulator.base, tuned, machine) for one in left_out]
+        left_out = [one.with_base(base) for one, base in zip(left_out, changed, strict=True)]
+        left_out = _set_covariances(left_out, machine)
         field = field.with_base(actuator)
-    field = replace(field, evidence=replace(field.evidence, claims=_known(case, field)))
-    return learned(refined(Base(actuator, field, nulls)), machine)
-
-
-def learned(base: Base, machine: Machine) -> Base:
-    """Returns the same simulator, with what it gets wrong on the reference taken off, and the noise of what is left."""
-    biases, of_field = residual_model.learned(
-        [one.evidence for one in base.nulls], base.field.evidence
-    )
-    nulls = [
-        replace(one, evidence=replace(one.evidence, bias=bias))
-        for one, bias in zip(base.nulls, biases, strict=True)
-    ]
-    nulls = _noised(nulls, machine)
-    widths = residual_model.widths([one.evidence for one in nulls])
-    nulls = [replace(one, evidence=replace(one.evidence, widths=widths)) for one in nulls]
     field = replace(
-        base.field.evidence, noise=nulls[0].evidence.noise, bias=of_field, widths=widths
+        field, residuals=replace(field.residuals, valid_mask=_find_known_windows(case, field))
     )
-    return replace(base, field=replace(base.field, evidence=field), nulls=nulls)
+    return learn_errors(refined(Baseline(actuator, field, left_out)), machine)
 
 
-def given(
-    case: Case, actuator: Actuator, fit: ActuatorFit, folder: Path, seed: int, device: torch.device
-) -> Base:
-    """Returns a configured simulator held against the field, and flexible models of the field that leave a part of it out.
+def learn_errors(base: Baseline, machine: Machine) -> Baseline:
+    """Return the same simulator, with what it gets wrong on the reference taken off, and the noise of what is left."""
+    biases, of_field = residual_model.learn_discrepancy(
+        [one.residuals for one in base.left_out], base.field.residuals
+    )
+    left_out = [
+        replace(one, residuals=replace(one.residuals, bias=bias))
+        for one, bias in zip(base.left_out, biases, strict=True)
+    ]
+    left_out = _set_covariances(left_out, machine)
+    widths = residual_model.estimate_fault_scales([one.residuals for one in left_out])
+    left_out = [replace(one, residuals=replace(one.residuals, widths=widths)) for one in left_out]
+    field = replace(
+        base.field.residuals, noise=left_out[0].residuals.noise, bias=of_field, widths=widths
+    )
+    return replace(base, field=replace(base.field, residuals=field), left_out=left_out)
+
+
+def accept_simulator(
+    case: GapCase,
+    actuator: Actuator,
+    fit: ActuatorFit,
+    folder: Path,
+    seed: int,
+    device: torch.device,
+) -> Baseline:
+    """Return a configured simulator held against the field, and flexible models of the field that leave a part of it out.
 
     There is no reference that would tell how a machine errs that lacks nothing: what `fit` does not
     explain of recordings that it was not fitted to takes its place, as noise, price and floor.
     Where it cannot be fitted the noise is that of the simulator.
     """
     machine = case.machine
-    field = held(actuator, _begun(case.field), machine, seed)
-    pieces, nulls = parts(case.field), []
+    field = compare_simulator(actuator, _list_started(case.field), machine, seed)
+    pieces, left_out = split_recordings(case.field), []
     try:
         if len(pieces) > 1 and not case.doubts():
-            nulls = _crosswise(case.field, pieces, fit, machine, folder, seed, device)[1]
+            left_out = _cross_validate(case.field, pieces, fit, machine, folder, seed, device)[1]
     except RecordingError as error:
         log.warning("no floor: a flexible model cannot be fitted to the field (%s)", error)
-    known = nulls[0].evidence.noise if nulls else noises([field], machine)
-    return Base(
+    known = left_out[0].residuals.noise if left_out else fit_covariances([field], machine)
+    return Baseline(
         actuator,
-        replace(field, evidence=replace(field.evidence, noise=known)),
-        nulls,
-        is_flexible=bool(nulls),
+        replace(field, residuals=replace(field.residuals, noise=known)),
+        left_out,
+        is_flexible=bool(left_out),
     )
 
 
-def _crosswise(
+def _cross_validate(
     recordings: Sequence[Recording],
     pieces: Sequence[Recording],
     fit: ActuatorFit,
@@ -287,60 +299,64 @@ def _crosswise(
     folder: Path,
     seed: int,
     device: torch.device,
-) -> tuple[Actuator, list[Held]]:
-    """Returns a fit, and fits that left out a part of the recordings' `pieces`, each held against that part, their noise known."""
-    begun = _begun(pieces)
+) -> tuple[Actuator, list[SimulatorComparison]]:
+    """Return a fit, and fits that left out a part of the recordings' `pieces`, each held against that part, their noise known."""
+    begun = _list_started(pieces)
     fold = (
         np.arange(len(pieces)) % FOLDS
     )  # in turns: what is left out is of the same making as what is fitted to
     refit: Any = getattr(fit, "refit", None)
-    nulls = []
+    left_out = []
     if refit:
         actuator = fit.fit(machine, recordings, [], folder, seed, device)
         for part in np.unique(fold):
             rest = [r for r, f in zip(pieces, fold, strict=True) if f != part]
             left = [one for one, f in zip(begun, fold, strict=True) if f == part]
-            nulls.append(held(refit(actuator, machine, rest), left, machine, seed))
+            left_out.append(compare_simulator(refit(actuator, machine, rest), left, machine, seed))
     else:
         last = fold == fold.max()
         rest = [r for r, out in zip(pieces, last, strict=True) if not out]
         actuator = fit.fit(machine, rest[: max(1, len(rest) - 1)], rest[-1:], folder, seed, device)
         left = [one for one, out in zip(begun, last, strict=True) if out]
-        nulls.append(held(actuator, left, machine, seed))
-    return actuator, _noised(nulls, machine)
+        left_out.append(compare_simulator(actuator, left, machine, seed))
+    return actuator, _set_covariances(left_out, machine)
 
 
-def _noised(nulls: Sequence[Held], machine: Machine) -> list[Held]:
-    known = noises(nulls, machine)
-    return [replace(one, evidence=replace(one.evidence, noise=known)) for one in nulls]
+def _set_covariances(
+    left_out: Sequence[SimulatorComparison], machine: Machine
+) -> list[SimulatorComparison]:
+    known = fit_covariances(left_out, machine)
+    return [replace(one, residuals=replace(one.residuals, noise=known)) for one in left_out]
 
 
-def _begun(recordings: Sequence[Recording]) -> Begun:
-    return list(zip(recordings, running_s(recordings), strict=True))
+def _list_started(recordings: Sequence[Recording]) -> StartedRecordings:
+    return list(zip(recordings, estimate_running_s(recordings), strict=True))
 
 
-def noises(nulls: Sequence[Held], machine: Machine) -> list[ErrorCovariance]:
-    """Returns the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
+def fit_covariances(
+    left_out: Sequence[SimulatorComparison], machine: Machine
+) -> list[ErrorCovariance]:
+    """Return the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
     found = []
     for j in range(machine.num_joints):
         error, way = (
-            [_rows(getattr(one.evidence, name)[..., j]) for one in nulls]
-            for name in ("error", "way")
+            [_join_windows(getattr(one.residuals, name)[..., j]) for one in left_out]
+            for name in ("error", "increments")
         )
-        found.append(residuals.fit_noise(np.concatenate(error), np.concatenate(way)))
+        found.append(fit_noise(np.concatenate(error), np.concatenate(way)))
     return found
 
 
-def _rows(values: np.ndarray) -> np.ndarray:
-    """Returns increments `(W, I)` with several windows in a row, `(W / TOGETHER, TOGETHER I)`."""
-    together = min(TOGETHER, len(values))
+def _join_windows(values: np.ndarray) -> np.ndarray:
+    """Return increments `(W, I)` with several windows in a row, `(W / TOGETHER, TOGETHER I)`."""
+    together = min(COVARIANCE_WINDOWS, len(values))
     return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
 
 
-def _known(case: Case, field: Held) -> np.ndarray:
-    """Returns which field windows stay within the poses and commands that the reference visited, `(W, J)` bool."""
+def _find_known_windows(case: GapCase, field: SimulatorComparison) -> np.ndarray:
+    """Return which field windows stay within the poses and commands that the reference visited, `(W, J)` bool."""
     q, u = (np.concatenate([getattr(r, name) for r in case.reference]) for name in ("q", "u"))
-    cut, travel = field.evidence.candidates.cut, case.machine.upper - case.machine.lower
+    cut, travel = field.residuals.simulator.cut, case.machine.upper - case.machine.lower
     low, high = q.min(0) - 0.03 * travel, q.max(0) + 0.03 * travel
     outside = (cut.q < low) | (cut.q > high)
     most = np.abs(u).max(0) + 0.05
@@ -348,19 +364,21 @@ def _known(case: Case, field: Held) -> np.ndarray:
     return (outside.mean(1) < 0.1) & (beyond.mean(1) < 0.1)
 
 
-SIZES = (0.12, 0.3, 0.45, 0.6, 1.0)
-SURE = 6.0
+REFERENCE_SIZES = (0.12, 0.3, 0.45, 0.6, 1.0)
+SURE_GAIN = 6.0
 """Log of a Bayes factor, all parts together, from which an effect is there."""
-AGREEING = 0.75
+AGREEING_SHARE = 0.75
 """Share of the parts in which it must pay."""
-EACH = 3
+REFERENCE_WINDOWS = 3
 """This is looked for on one of so many stretches of each part."""
 
-Ways = Mapping[str, Sequence[Ray]]
+RaysByTrial = Mapping[str, Sequence[ParameterRay]]
 
 
-def refined(base: Base, kinds: Sequence[Kind], machine: Machine) -> Base:
-    """Returns the simulator with the effects around it that the reference shows.
+def add_reference_effects(
+    base: Baseline, kinds: Sequence[EffectType], machine: Machine
+) -> Baseline:
+    """Return the simulator with the effects around it that the reference shows.
 
     Args:
         base: A simulator, and fits that left out parts of the reference, their noise known, before
@@ -368,80 +386,89 @@ def refined(base: Base, kinds: Sequence[Kind], machine: Machine) -> Base:
         kinds: The library.
         machine: The machine.
     """
-    ways = {key: way for kind in kinds if _can_be_there(kind) for key, way in _ways(kind).items()}
-    if len(base.nulls) < 2 or base.is_flexible:
+    ways = {
+        key: way for kind in kinds if _is_one_sided(kind) for key, way in _list_trials(kind).items()
+    }
+    if len(base.left_out) < 2 or base.is_flexible:
         return base
-    found = _there([thinned(one.evidence, EACH) for one in base.nulls], ways, machine.joint_names)
-    return _around(base, found, machine) if found else base
-
-
-def _can_be_there(kind: Kind) -> bool:
-    """Says whether free runs show the effect on a joint by itself, and only one way: what goes both ways a fit has settled."""
-    ways = (
-        []
-        if kind.target.stochastic or kind.target.side not in ("speed", "command")
-        else rays(kind, SIZES)
+    found = _find_effects(
+        [drop_windows(one.residuals, REFERENCE_WINDOWS) for one in base.left_out],
+        ways,
+        machine.joint_names,
     )
-    return bool(ways) and all(ray.sizes.min() >= 0.0 for ray in ways)
+    return _wrap_simulator(base, found, machine) if found else base
 
 
-def _ways(kind: Kind) -> dict[str, list[Ray]]:
-    """Returns the ways in which an effect can grow, by a name for each of its shapes."""
-    trials: list[dict[str, float]] = [
-        {},
-        *({number: part} for number in kind.shaping for part in SHAPES),
-    ]
+def _is_one_sided(kind: EffectType) -> bool:
+    """Return True where free runs show the effect on a joint alone, and sizes have one sign only.
+
+    Sizes of both signs have been settled by the fit of the simulator.
+    """
+    if kind.target.stochastic or kind.target.side not in ("speed", "command"):
+        return False
+    rays = build_rays(kind, REFERENCE_SIZES)
+    return bool(rays) and all(ray.sizes.min() >= 0.0 for ray in rays)
+
+
+def _list_trials(kind: EffectType) -> dict[str, list[ParameterRay]]:
+    """Return the ways in which an effect can grow, by a name for each of its shapes."""
+    trials: list[dict[str, float]] = [{}]
+    trials += [{number: part} for number in kind.shaping for part in SHAPE_FACTORS]
     found = {}
     for place, trial in enumerate(trials):
         shape = {name: np.full(kind.num_joints, part) for name, part in trial.items()}
-        found[f"{kind.name} {place}"] = [replace(ray, shape=shape) for ray in rays(kind, SIZES)]
+        found[f"{kind.name} {place}"] = [
+            replace(ray, shape=shape) for ray in build_rays(kind, REFERENCE_SIZES)
+        ]
     return found
 
 
-def _there(
-    parts: Sequence[Evidence], ways: Ways, joint_names: Sequence[str]
-) -> list[tuple[Kind, Values]]:
-    """Returns the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
+def _find_effects(
+    parts: Sequence[Residuals], ways: RaysByTrial, joint_names: Sequence[str]
+) -> list[tuple[EffectType, EffectValues]]:
+    """Return the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
     responses = {
         key: [[part.response(ray) for ray in way] for part in parts] for key, way in ways.items()
     }
     of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
-    found: dict[str, tuple[Kind, dict[str, np.ndarray]]] = {}
+    found: dict[str, tuple[EffectType, dict[str, np.ndarray]]] = {}
     for j in range(parts[0].z.shape[0]):
-        joint = plain(
+        joint = fit_faults(
             np.concatenate([part.z[j] for part in parts]),
             np.concatenate([part.faults[j] for part in parts], 1),
         )
-        shapes: dict[str, list[Shape]] = {}
+        shapes: dict[str, list[Response]] = {}
         for key, way in ways.items():
             changes = [
                 np.concatenate([one[k][j] for one in responses[key]], 1) for k in range(len(way))
             ]
-            if max(np.abs(change).max() for change in changes) >= FELT:
+            if max(np.abs(change).max() for change in changes) >= MIN_RESPONSE:
                 shapes[key] = [
-                    Shape(ray.sizes, change) for ray, change in zip(way, changes, strict=True)
+                    Response(ray.sizes, change) for ray, change in zip(way, changes, strict=True)
                 ]
-        table = Table(joint, shapes, of_part)
+        table = SubsetTable(joint, shapes, of_part)
         scored = {key: table.score(frozenset({key})) for key in shapes}
         best = max(scored, key=lambda key: scored[key].total, default=None)
         if (
             best is None
-            or scored[best].total < SURE
-            or np.mean(np.bincount(of_part, scored[best].gain) > 0) < AGREEING
+            or scored[best].total < SURE_GAIN
+            or np.mean(np.bincount(of_part, scored[best].gain) > 0) < AGREEING_SHARE
         ):
             continue
         kind = ways[best][0].kind
         log.info("the reference shows %s on %s already", kind.name, joint_names[j])
         _, values = found.setdefault(
-            kind.name, (kind, _values(kind, ways[best], np.zeros(len(ways[best]))))
+            kind.name, (kind, _expand_values(kind, ways[best], np.zeros(len(ways[best]))))
         )
-        for name, value in _values(kind, ways[best], scored[best].sizes[best]).items():
+        for name, value in _expand_values(kind, ways[best], scored[best].sizes[best]).items():
             values[name][:, j] = value[:, j]
     return list(found.values())
 
 
-def _values(kind: Kind, ways: Sequence[Ray], sizes: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the numbers of an effect at sizes along its rays, the same on all joints, each `(1, J)`."""
+def _expand_values(
+    kind: EffectType, ways: Sequence[ParameterRay], sizes: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the numbers of an effect at sizes along its rays, the same on all joints, each `(1, J)`."""
     found = {
         name: np.full((1, kind.num_joints), kind.numbers[name].typical) for name in kind.shaping
     }
@@ -452,15 +479,18 @@ def _values(kind: Kind, ways: Sequence[Ray], sizes: np.ndarray) -> dict[str, np.
     }
 
 
-def _around(base: Base, effects: Sequence[tuple[Kind, Values]], machine: Machine) -> Base:
-    """Returns the simulator with effects around it, and the noise of what it errs by then."""
+def _wrap_simulator(
+    base: Baseline, effects: Sequence[tuple[EffectType, EffectValues]], machine: Machine
+) -> Baseline:
+    """Return the simulator with effects around it, and the noise of what it errs by then."""
 
-    def around(one: Held) -> Held:
-        candidates = one.evidence.candidates
-        fixed = replace(candidates, fixed=[*candidates.fixed, *effects])
-        return replace(one, evidence=Evidence(fixed, one.evidence.noise, one.evidence.claims))
+    def around(one: SimulatorComparison) -> SimulatorComparison:
+        simulator = one.residuals.simulator
+        fixed = replace(simulator, fixed=[*simulator.fixed, *effects])
+        return replace(
+            one, residuals=Residuals(fixed, one.residuals.noise, one.residuals.valid_mask)
+        )
 
-    nulls = [around(one) for one in base.nulls]
-    known = noises(nulls, machine)
-    nulls = [replace(one, evidence=replace(one.evidence, noise=known)) for one in nulls]
-    return replace(base, field=around(base.field), nulls=nulls)
+    left_out = [around(one) for one in base.left_out]
+    left_out = _set_covariances(left_out, machine)
+    return replace(base, field=around(base.field), left_out=left_out)

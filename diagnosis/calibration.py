@@ -16,29 +16,29 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.spec import spec
-from diagnosis.detection import Findings
+from diagnosis.detection import DetectionResult
 from diagnosis.residual_model import CLUES, CURVE, FORMS, LATER, STARTS, TIME
 
-OUTSIDE = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
-RIGHT = ("constant", "margin", "adds", "size", "names", "outside")
-NONE = ("constant", "nearest", "outside")
+OUTSIDE_SIGNS = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
+EFFECT_SIGNS = ("constant", "margin", "adds", "size", "names", "outside")
+NONE_SIGNS = ("constant", "nearest", "outside")
 STAGES = ("timing", "actuation", "sensing", "kinematics", "perception")
-BY_CHANCE = 1.5
+REFERENCE_FACTOR = 1.5
 """Times that a clue must earn what it earns on the reference before it counts."""
-NATS = 10.0
+LITTLE_NATS = 10.0
 """Evidence below is little."""
-MUCH = 50.0
+MUCH_NATS = 50.0
 """What effects explain is much beyond: then a part that they leave says less, as no form is exactly
 that of the library."""
-MOST = 100.0
+CLUE_NATS = 100.0
 """The same of a clue's evidence."""
-TELLING = {STARTS: 50.0, CURVE: 1000.0, TIME: 1000.0, LATER: 1000.0}
+OWN_CLUE_NATS = {STARTS: 50.0, CURVE: 1000.0, TIME: 1000.0, LATER: 1000.0}
 """The same of single clues: real forms differ most in starts and stops, little in their curve, and
 not with the running time."""
 
 
 @spec
-class Certainty:
+class ProbabilityModel:
     """Weights of signs, and how far forms of effects differ.
 
     Attributes:
@@ -58,7 +58,12 @@ class Certainty:
     temperature: float
 
     def check(self) -> None:
-        known = {"outside": OUTSIDE, "right": RIGHT, "none": NONE, "form": STAGES}
+        known = {
+            "outside": OUTSIDE_SIGNS,
+            "right": EFFECT_SIGNS,
+            "none": NONE_SIGNS,
+            "form": STAGES,
+        }
         for name, signs in known.items():
             for sign in getattr(self, name):
                 if sign not in signs:
@@ -73,31 +78,35 @@ class Certainty:
             raise ConfigError("certainty: expected form of 0 or more and temperature above 0")
 
 
-def chance(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
-    """Returns the probability that goes with signs."""
-    return float(1.0 / (1.0 + np.exp(-odds(weights, signs))))
+def compute_probability(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
+    """Return the probability that goes with signs."""
+    return float(1.0 / (1.0 + np.exp(-compute_log_odds(weights, signs))))
 
 
-def odds(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
-    """Returns the logarithm of the odds, within what answers can tell."""
+def compute_log_odds(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
+    """Return the logarithm of the odds, within what answers can tell."""
     return float(np.clip(sum(weights[name] * value for name, value in signs.items()), -6.0, 6.0))
 
 
-def predicted(findings: Findings) -> np.ndarray:
-    """Returns what clues earn on what is left, beyond what they may on the reference, `(clues, J)`."""
-    return np.maximum(findings.left - BY_CHANCE * findings.left_null, 0.0)
+def subtract_reference_clues(result: DetectionResult) -> np.ndarray:
+    """Return what clues earn on what is left, beyond what they may on the reference, `(clues, J)`."""
+    return np.maximum(result.clue_gains - REFERENCE_FACTOR * result.reference_clue_gains, 0.0)
 
 
-def outside(findings: Findings) -> dict[str, float]:
-    """Returns the signs that something is there which no effect of the library is."""
-    stages, left = {one.kind.stage for one in findings.others}, predicted(findings)
-    subsets = zip(findings.tables, findings.chosen.subsets, strict=True)
+def collect_outside_signs(result: DetectionResult) -> dict[str, float]:
+    """Return the signs that something is there which no effect of the library is."""
+    stages, left = {one.kind.stage for one in result.detected}, subtract_reference_clues(result)
+    subsets = zip(result.tables, result.chosen.subsets, strict=True)
     gained = np.array([table.score(subset).total if subset else 0.0 for table, subset in subsets])
-    explained = 1.0 + float(np.log1p(gained.sum() / MUCH))
+    explained = 1.0 + float(np.log1p(gained.sum() / MUCH_NATS))
     late = "timing" in stages  # frames that come late scatter errors, whatever else is there
     seen = bool(stages & {"kinematics", "sensing"})
     clues = {
-        name: float(np.log1p((row / (1.0 + gained / TELLING.get(name, MOST))).max() / NATS))
+        name: float(
+            np.log1p(
+                (row / (1.0 + gained / OWN_CLUE_NATS.get(name, CLUE_NATS))).max() / LITTLE_NATS
+            )
+        )
         for name, row in zip(
             CLUES, left, strict=False
         )  # the curve has not always been a clue of its own
@@ -107,18 +116,20 @@ def outside(findings: Findings) -> dict[str, float]:
         "clue": max((value for name, value in clues.items() if name not in FORMS), default=0.0),
         "form": clues[STARTS],
         "curve": clues.get(CURVE, 0.0),
-        "scatter": 0.0 if late else _log(findings.scatter) / explained,
-        "strays": _log(findings.strays) / explained,
-        "tool": 0.0 if seen else _log(np.array(findings.tool_left)),
+        "scatter": 0.0 if late else _log_excess(result.scatter) / explained,
+        "strays": _log_excess(result.strays) / explained,
+        "tool": 0.0 if seen else _log_excess(np.array(result.tool_left)),
     }
 
 
-def _log(ratios: np.ndarray) -> float:
+def _log_excess(ratios: np.ndarray) -> float:
     return float(np.log(np.maximum(ratios, 1.0)).max())
 
 
-def right(margin: float, adds: float, size: float, names: int, outside: float) -> dict[str, float]:
-    """Returns the signs that an effect is rightly named.
+def collect_effect_signs(
+    margin: float, adds: float, size: float, names: int, outside: float
+) -> dict[str, float]:
+    """Return the signs that an effect is rightly named.
 
     Args:
         margin: By how much more it is worth than nothing in its place, and than any other effect.
@@ -129,7 +140,7 @@ def right(margin: float, adds: float, size: float, names: int, outside: float) -
     """
     return {
         "constant": 1.0,
-        "margin": float(np.arcsinh(margin / NATS)),
+        "margin": float(np.arcsinh(margin / LITTLE_NATS)),
         "adds": float(np.log(np.clip(adds, 0.01, 1.0))),
         "size": float(np.log(np.clip(size, 0.05, 3.0))),
         "names": names - 1.0,
@@ -137,18 +148,22 @@ def right(margin: float, adds: float, size: float, names: int, outside: float) -
     }
 
 
-def none(nearest: float, outside: float) -> dict[str, float]:
-    """Returns the signs that there is nothing to find.
+def collect_none_signs(nearest: float, outside: float) -> dict[str, float]:
+    """Return the signs that there is nothing to find.
 
     Args:
         nearest: What the best effect is worth; it was not enough.
         outside: Logarithm of the odds that the cause lies outside.
     """
-    return {"constant": 1.0, "nearest": float(np.arcsinh(nearest / NATS)), "outside": outside}
+    return {
+        "constant": 1.0,
+        "nearest": float(np.arcsinh(nearest / LITTLE_NATS)),
+        "outside": outside,
+    }
 
 
-def widened(ends: np.ndarray, form: float) -> np.ndarray:
-    """Returns low end, value and high end of a size `(3, …)` with the error of its form added to both sides."""
+def widen_interval(ends: np.ndarray, form: float) -> np.ndarray:
+    """Return low end, value and high end of a size `(3, …)` with the error of its form added to both sides."""
     low, value, high = ends
     more = 1.96 * form * np.abs(value)
     return np.stack(

@@ -17,18 +17,18 @@ from brokk_rl.record import Recording
 from brokk_rl.split import COMMANDED
 
 HORIZON_S = 5.0
-LEAST_S = 60.0
+MIN_TOTAL_S = 60.0
 """Field recordings that are shorter in all say nothing that holds beyond them."""
-MOVED = 0.01
+MIN_TRAVEL_SHARE = 0.01
 """A joint that moved less, of its travel, in all field recordings shows nothing."""
-PART_S = 150.0
+MAX_PART_S = 150.0
 """Longest part of a recording that stays together when some are left out."""
 PAUSE_S = 4.0 * 3600.0
 """After so long without a recording the machine has been off."""
 
 
 @dataclass(frozen=True)
-class Case:
+class GapCase:
     """What a diagnosis is given.
 
     Attributes:
@@ -45,12 +45,12 @@ class Case:
     unseen: Sequence[Recording] = ()
 
     def doubts(self) -> list[str]:
-        """Returns reasons why these recordings cannot tell anything, in words for people; none where they can."""
+        """Return reasons why these recordings cannot tell anything, in words for people; none where they can."""
         found = []
         total_s = sum(recording.duration_s for recording in self.field)
-        if total_s < LEAST_S:
+        if total_s < MIN_TOTAL_S:
             found.append(
-                f"the field recordings last {total_s:.0f} s in all; {LEAST_S:.0f} s or more are needed"
+                f"the field recordings last {total_s:.0f} s in all; {MIN_TOTAL_S:.0f} s or more are needed"
             )
         if open_loop.find_longest_horizon_s(self.field, self.machine) < HORIZON_S:
             found.append(f"no field recording is long enough for a free run of {HORIZON_S:g} s")
@@ -66,13 +66,13 @@ class Case:
         return found
 
     def resting(self) -> np.ndarray:
-        """Returns which joints are never commanded in the field recordings, `(J,)` bool."""
+        """Return which joints are never commanded in the field recordings, `(J,)` bool."""
         commanded = np.abs(np.concatenate([recording.u for recording in self.field])) > COMMANDED
         return np.logical_not(np.any(commanded, axis=0))
 
 
-def load(folder: Path, machine: Machine) -> Case:
-    """Reads a gap case: `reference/*.parquet` and `field/*.parquet`.
+def load_case(folder: Path, machine: Machine) -> GapCase:
+    """Read a gap case: `reference/*.parquet` and `field/*.parquet`.
 
     Raises:
         RecordingError: a part is missing, or a recording cannot be used (another machine, NaN,
@@ -90,11 +90,13 @@ def load(folder: Path, machine: Machine) -> Case:
                 f"{folder}: no {name}/*.parquet; a case has both"
                 + (f" ({why})" if name == "reference" else "")
             )
-    return Case(machine, *(recorded(str(part / "*.parquet"), machine) for part in parts.values()))
+    return GapCase(
+        machine, *(read_recordings(str(part / "*.parquet"), machine) for part in parts.values())
+    )
 
 
-def recorded(where: str | tuple[str, ...], machine: Machine) -> list[Recording]:
-    """Reads recordings of the machine.
+def read_recordings(where: str | tuple[str, ...], machine: Machine) -> list[Recording]:
+    """Read recordings of the machine.
 
     Raises:
         RecordingError: there are none, or one cannot be used (another machine, NaN, gaps, …).
@@ -107,15 +109,15 @@ def recorded(where: str | tuple[str, ...], machine: Machine) -> list[Recording]:
 
 
 def _check_stamp(stamp: str, recording: Recording, machine: Machine) -> None:
-    """Raises a `RecordingError` when a recording was made on a machine with other joints, limits or control rate."""
+    """Raise a `RecordingError` when a recording was made on a machine with other joints, limits or control rate."""
     try:
         machine.check_fingerprint(json.loads(stamp), str(recording.path))
     except (CheckpointError, ValueError) as error:
         raise RecordingError(f"{recording.path}: {error}") from error
 
 
-def running_s(recordings: Sequence[Recording]) -> list[float]:
-    """Returns how long the machine had been running at the beginning of each recording, as far as their dates tell."""
+def estimate_running_s(recordings: Sequence[Recording]) -> list[float]:
+    """Return how long the machine had been running at the beginning of each recording, as far as their dates tell."""
     dates = [recording.metadata.get("created") for recording in recordings]
     if not all(dates):
         return [0.0] * len(recordings)
@@ -129,11 +131,11 @@ def running_s(recordings: Sequence[Recording]) -> list[float]:
     return found.tolist()
 
 
-def parts(recordings: Sequence[Recording]) -> list[Recording]:
-    """Returns the recordings, those longer than `PART_S` cut into equal parts, each part a run by itself."""
+def split_recordings(recordings: Sequence[Recording]) -> list[Recording]:
+    """Return the recordings, those longer than `PART_S` cut into equal parts, each part a run by itself."""
     found = []
     for number, recording in enumerate(recordings):
-        count = max(1, round(recording.duration_s / PART_S))
+        count = max(1, round(recording.duration_s / MAX_PART_S))
         for part, rows in enumerate(np.array_split(np.arange(recording.num_samples), count)):
             rows = slice(rows[0], rows[-1] + 1)
             extra = {name: values[rows] for name, values in recording.extra.items()}

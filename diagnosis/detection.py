@@ -21,30 +21,44 @@ from diagnosis import (
     sensors,
     timing,
 )
-from diagnosis.baseline import Base
-from diagnosis.case import Case
-from diagnosis.effect_library import Found, Kind
-from diagnosis.refine import Repair, repair
-from diagnosis.residuals import Evidence, Ray
-from diagnosis.responses import SMALL, Shape, add, plain_joints, rays_of
-from diagnosis.search import MOST, Chosen, Nulls, Price, Table, bind_shared_sizes, choose
+from diagnosis.baseline import Baseline
+from diagnosis.case import GapCase
+from diagnosis.effect_library import DetectedEffect, EffectType
+from diagnosis.refine import FittedSet, fit_set
+from diagnosis.residuals import ParameterRay, Residuals
+from diagnosis.responses import (
+    REFERENCE_GRID,
+    Response,
+    add_responses,
+    choose_rays,
+    fit_joint_faults,
+)
+from diagnosis.search import (
+    MAX_EFFECTS,
+    EffectSet,
+    PenaltyFunction,
+    ReferenceScores,
+    SubsetTable,
+    bind_shared_sizes,
+    choose_set,
+)
 
 log = logging.getLogger(__name__)
 
-SCATTERED = 1.3
+SCATTER_LIMIT = 1.3
 """Mean square error over that of the reference from which what effects earn is taken down."""
-CUT = 25.0
+MAX_SQUARE = 25.0
 """Squares of errors over the noise count no more than this in what scatters."""
-FEW = 2
+TIMING_REFERENCES = 2
 """Parts of the reference that tell how delays scatter."""
-TURNS = 2
+MAX_REFITS = 2
 """Times that effects are simulated around what was found, where adding up is far off."""
-Tell = Callable[[str, float], None]
+ProgressCallback = Callable[[str, float], None]
 """Is told what is being done and how much of the whole is done."""
 
 
 @spec
-class Prices:
+class Penalties:
     """What an effect must earn, in units of log likelihood on recordings that it was not fitted to.
 
     Attributes:
@@ -67,7 +81,7 @@ class Prices:
 
 
 @dataclass
-class Findings:
+class DetectionResult:
     """What the search found.
 
     Attributes:
@@ -77,8 +91,8 @@ class Findings:
         price: What a subset of effects costs on a joint.
         chosen: The set.
         repair: Its simulation; `None` for the empty set.
-        others: Effects that sensors, frames and tool points show.
-        left: What each of `remainder.CLUES` earns on what is left, `(clues, J)`.
+        detected: Effects that sensors, frames and tool points show.
+        clue_gains: What each of `remainder.CLUES` earns on what is left, `(clues, J)`.
         left_null: The same on reference recordings, the most of any part, at the length of the
             field, `(clues, J)`.
         scatter: Mean square of what is left over that of the reference, by joint, `(J,)`.
@@ -87,15 +101,15 @@ class Findings:
         tool_left: Error of measured tool points that is left over that of the reference.
     """
 
-    evidence: Evidence
-    tables: list[Table]
-    rays: dict[str, list[Ray]]
-    price: Price
-    chosen: Chosen
-    repair: Repair | None
-    others: list[Found]
-    left: np.ndarray
-    left_null: np.ndarray
+    residuals: Residuals
+    tables: list[SubsetTable]
+    rays: dict[str, list[ParameterRay]]
+    price: PenaltyFunction
+    chosen: EffectSet
+    fitted: FittedSet | None
+    detected: list[DetectedEffect]
+    clue_gains: np.ndarray
+    reference_clue_gains: np.ndarray
     scatter: np.ndarray
     strays: np.ndarray
     tool_left: float
@@ -103,11 +117,11 @@ class Findings:
     @property
     def names(self) -> set[str]:
         """All effects that were found."""
-        return {*self.chosen.names, *(one.kind.name for one in self.others)}
+        return {*self.chosen.names, *(one.kind.name for one in self.detected)}
 
 
 @dataclass
-class Search:
+class EffectSearch:
     """The search for effects.
 
     Attributes:
@@ -118,201 +132,233 @@ class Search:
         tell: Is told what is being done.
     """
 
-    case: Case
-    base: Base
-    kinds: Sequence[Kind]
-    prices: Prices
-    tell: Tell
+    case: GapCase
+    base: Baseline
+    kinds: Sequence[EffectType]
+    penalties: Penalties
+    tell: ProgressCallback
 
-    def run(self) -> Findings:
-        """Returns what is found."""
-        prices, nulls = self.prices, [one.evidence for one in self.base.nulls]
+    def run(self) -> DetectionResult:
+        """Return what is found."""
+        penalties, left_out = self.penalties, [one.residuals for one in self.base.left_out]
         self.tell("sensors", 0.32)
-        on_sensors = sensors.find_sensor_effects(self.case, self.kinds, prices.joint, prices.name)
-        on_tool = geometry.find_geometry_errors(self.case, self.kinds, prices.joint, prices.name)
-        evidence = _adjusted(self.base.field.evidence, self.case, [*on_sensors, *on_tool.found])
-        grown, shapes = self._simulated(
-            evidence, geometry.is_tracked(self.case.field, self.case.machine)
+        on_sensors = sensors.find_sensor_effects(
+            self.case, self.kinds, penalties.joint, penalties.name
         )
-        small = {name: rays_of(ways[0].kind, SMALL) for name, ways in grown.items()}
-        known = Nulls(
-            nulls,
-            self.base.field.evidence.z.shape[1],
+        on_tool = geometry.find_geometry_errors(
+            self.case, self.kinds, penalties.joint, penalties.name
+        )
+        residuals = _adjust_residuals(
+            self.base.field.residuals, self.case, [*on_sensors, *on_tool.found]
+        )
+        grown, shapes = self._simulated(
+            residuals, geometry.is_tracked(self.case.field, self.case.machine)
+        )
+        small = {name: choose_rays(ways[0].kind, REFERENCE_GRID) for name, ways in grown.items()}
+        known = ReferenceScores(
+            left_out,
+            self.base.field.residuals.z.shape[1],
             small,
             grown,
-            plain_joints(evidence),
+            fit_joint_faults(residuals),
             shapes,
             self.shared,
         )
 
         def price(j: int, subset: frozenset[str]) -> float:
-            known_there = max(prices.reference * known.earned(j, subset), known.repeated(j, subset))
-            return prices.joint * len(subset - self.shared) + known_there
+            known_there = max(
+                penalties.reference * known.earned(j, subset), known.repeated(j, subset)
+            )
+            return penalties.joint * len(subset - self.shared) + known_there
 
         scatter = np.ones(self.case.machine.num_joints)
-        tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter)
+        tables, chosen, fitted = self._round(residuals, grown, shapes, price, scatter)
         wide = None
-        if repaired and nonadditive_refit.is_needed(evidence, repaired, _promised(tables, chosen)):
-            wide, tables, chosen, repaired = self._around(evidence, grown, chosen, repaired, price)
+        if fitted and nonadditive_refit.is_needed(residuals, fitted, _sum_scores(tables, chosen)):
+            wide, tables, chosen, fitted = self._around(residuals, grown, chosen, fitted, price)
             grown = wide[1]
         self.tell("frames", 0.8)
-        after = repaired.after if repaired else evidence.base
-        changes, error = timing.Changes(evidence), evidence.error_of(after)
-        late = timing.search(changes, error, nulls[:FEW], self.kinds, prices.joint, prices.name)
+        after = fitted.after if fitted else residuals.base
+        changes, error = timing.CommandChanges(residuals), residuals.compute_error(after)
+        late = timing.detect_timing_effect(
+            changes,
+            error,
+            left_out[:TIMING_REFERENCES],
+            self.kinds,
+            penalties.joint,
+            penalties.name,
+        )
         if late:  # from here on errors scatter after each change of a command
-            chancy = replace(evidence, late=changes.spread(error))
+            chancy = replace(residuals, late=changes.spread(error))
             shapes = [
                 {
-                    name: [replace(s, change=chancy.rewhitened(evidence, s.change, j)) for s in own]
+                    name: [replace(s, change=chancy.rewhiten(residuals, s.change, j)) for s in own]
                     for name, own in mine.items()
                 }
                 for j, mine in enumerate(shapes)
             ]
-            evidence = chancy
-        scatter = np.maximum(1.0, self._scatter(evidence.whitened(error[None])[:, 0]))
-        for _ in range(2 if late else int(scatter.max() > SCATTERED)):
+            residuals = chancy
+        scatter = np.maximum(1.0, self._scatter(residuals.whiten(error[None])[:, 0]))
+        for _ in range(2 if late else int(scatter.max() > SCATTER_LIMIT)):
             if (
                 late
             ):  # what delays change depends on when commands act, and so on what else delays them
-                evidence = timing.expected(evidence, late, repaired.effects() if repaired else [])
+                residuals = timing.add_mean_delay(
+                    residuals, late, fitted.effects() if fitted else []
+                )
                 wide = (
-                    nonadditive_refit.simulated(evidence, grown, repaired)
-                    if wide and repaired
+                    nonadditive_refit.simulate_beside(residuals, grown, fitted)
+                    if wide and fitted
                     else None
                 )
             z, grown, shapes = wide or (None, grown, shapes)
-            tables, chosen, repaired = self._round(evidence, grown, shapes, price, scatter, z)
+            tables, chosen, fitted = self._round(residuals, grown, shapes, price, scatter, z)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
-        beside = residual_model.repaired(evidence, repaired)
-        left, left_null = self._left(beside)
-        return Findings(
-            evidence, tables, grown, price, chosen, repaired, others, left, left_null,
+        beside = residual_model.apply_fitted_set(residuals, fitted)
+        left, reference_clue_gains = self._left(beside)
+        return DetectionResult(
+            residuals, tables, grown, price, chosen, fitted, others, left, reference_clue_gains,
             self._scatter(beside.z), self._strays(beside), on_tool.left,
         )  # fmt: skip
 
     @property
     def shared(self) -> frozenset[str]:
         """Effects with one cause for all joints."""
-        return effect_library.shared(self.kinds)
+        return effect_library.list_shared_effects(self.kinds)
 
     def _simulated(
-        self, evidence: Evidence, tracked: bool
-    ) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
-        """Returns the rays of each effect that free runs can show, and what it does to each joint."""
-        grown: dict[str, list[Ray]] = {}
-        shapes: list[dict[str, list[Shape]]] = [{} for _ in range(evidence.way.shape[2])]
+        self, residuals: Residuals, tracked: bool
+    ) -> tuple[dict[str, list[ParameterRay]], list[dict[str, list[Response]]]]:
+        """Return the rays of each effect that free runs can show, and what it does to each joint."""
+        grown: dict[str, list[ParameterRay]] = {}
+        shapes: list[dict[str, list[Response]]] = [{} for _ in range(residuals.increments.shape[2])]
         for number, kind in enumerate(self.kinds):
             measured = kind.target.side == "measurement" and (tracked or not kind.target.smooth)
             if kind.target.stochastic or kind.target.side == "kinematics" or measured:
                 continue
             self.tell(f"simulating {kind.name}", 0.35 + 0.2 * number / len(self.kinds))
-            grown[kind.name] = add(shapes, kind.name, rays_of(kind), evidence)
+            grown[kind.name] = add_responses(shapes, kind.name, choose_rays(kind), residuals)
         return grown, shapes
 
     def _round(
         self,
-        evidence: Evidence,
-        grown: Mapping[str, list[Ray]],
-        shapes: Sequence[Mapping[str, list[Shape]]],
-        price: Price,
+        residuals: Residuals,
+        grown: Mapping[str, list[ParameterRay]],
+        shapes: Sequence[Mapping[str, list[Response]]],
+        price: PenaltyFunction,
         scatter: np.ndarray,
         z: np.ndarray | None = None,
-    ) -> tuple[list[Table], Chosen, Repair | None]:
-        """Searches sets where errors scatter more than the noise says: they are worth less by as much; `z`: errors to explain."""
-        tables = self._tables(evidence, grown, shapes, scatter, z)
+    ) -> tuple[list[SubsetTable], EffectSet, FittedSet | None]:
+        """Search sets where errors scatter more than the noise says: they are worth less by as much; `z`: errors to explain."""
+        tables = self._tables(residuals, grown, shapes, scatter, z)
         self.tell("the same on the reference", 0.7)
-        prices = self.prices
-        chosen = choose(
-            tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint
+        penalties = self.penalties
+        chosen = choose_set(
+            tables,
+            price,
+            penalties.name,
+            penalties.share,
+            self.shared,
+            penalties.partial,
+            penalties.joint,
         )
         if z is None and (common := chosen.names & self.shared):
             grown, shapes = bind_shared_sizes(common, tables, grown, shapes)
-            tables = self._tables(evidence, grown, shapes, scatter, z)
-            chosen = choose(
-                tables, price, prices.name, prices.share, self.shared, prices.partial, prices.joint
+            tables = self._tables(residuals, grown, shapes, scatter, z)
+            chosen = choose_set(
+                tables,
+                price,
+                penalties.name,
+                penalties.share,
+                self.shared,
+                penalties.partial,
+                penalties.joint,
             )
-        repaired = self._repaired(evidence, grown, tables, chosen)
+        fitted = self._repaired(residuals, grown, tables, chosen)
         if (
-            repaired
-            and (kept := refine.kept(evidence, chosen, repaired, price, scatter, self.shared))
+            fitted
+            and (kept := refine.prune_set(residuals, chosen, fitted, price, scatter, self.shared))
             != chosen.subsets
         ):
-            chosen = Chosen(kept, chosen.worth)
-            repaired = self._repaired(evidence, grown, tables, chosen)
-        return tables, chosen, repaired
+            chosen = EffectSet(kept, chosen.net_gain)
+            fitted = self._repaired(residuals, grown, tables, chosen)
+        return tables, chosen, fitted
 
     def _repaired(
         self,
-        evidence: Evidence,
-        grown: Mapping[str, list[Ray]],
-        tables: Sequence[Table],
-        chosen: Chosen,
-    ) -> Repair | None:
+        residuals: Residuals,
+        grown: Mapping[str, list[ParameterRay]],
+        tables: Sequence[SubsetTable],
+        chosen: EffectSet,
+    ) -> FittedSet | None:
         start = [
             table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)
         ]
-        return repair(evidence, chosen.subsets, grown, start) if chosen.names else None
+        return fit_set(residuals, chosen.subsets, grown, start) if chosen.names else None
 
     def _tables(
         self,
-        evidence: Evidence,
-        grown: Mapping[str, list[Ray]],
-        shapes: Sequence[Mapping[str, list[Shape]]],
+        residuals: Residuals,
+        grown: Mapping[str, list[ParameterRay]],
+        shapes: Sequence[Mapping[str, list[Response]]],
         scatter: np.ndarray,
         z: np.ndarray | None,
-    ) -> list[Table]:
-        """Returns what sets earn on each joint."""
-        tables, flat = [], {name: self.prices.joint * (name not in self.shared) for name in grown}
+    ) -> list[SubsetTable]:
+        """Return what sets earn on each joint."""
+        tables, flat = (
+            [],
+            {name: self.penalties.joint * (name not in self.shared) for name in grown},
+        )
         for j, (mine, joint) in enumerate(
-            zip(shapes, plain_joints(evidence, scatter, z), strict=True)
+            zip(shapes, fit_joint_faults(residuals, scatter, z), strict=True)
         ):
             self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
             by = 1.0 / np.sqrt(scatter[j])
             scaled = {
-                name: [Shape(shape.sizes, shape.change * by) for shape in own]
+                name: [Response(shape.sizes, shape.change * by) for shape in own]
                 for name, own in mine.items()
             }
-            tables.append(Table(joint, scaled, evidence.block))
-            tables[-1].explore(flat, 3 if z is None else MOST)
+            tables.append(SubsetTable(joint, scaled, residuals.block))
+            tables[-1].explore(flat, 3 if z is None else MAX_EFFECTS)
         return tables
 
     def _around(
         self,
-        evidence: Evidence,
-        grown: Mapping[str, list[Ray]],
-        chosen: Chosen,
-        repaired: Repair,
-        price: Price,
-    ) -> tuple[nonadditive_refit.Around, list[Table], Chosen, Repair | None]:
-        """Goes on from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
-        tried, scatter = [repaired], np.ones(self.case.machine.num_joints)
-        wide = nonadditive_refit.simulated(evidence, grown, repaired)
-        for turn in range(TURNS):
+        residuals: Residuals,
+        grown: Mapping[str, list[ParameterRay]],
+        chosen: EffectSet,
+        fitted: FittedSet,
+        price: PenaltyFunction,
+    ) -> tuple[nonadditive_refit.WideResponses, list[SubsetTable], EffectSet, FittedSet | None]:
+        """Continue from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
+        tried, scatter = [fitted], np.ones(self.case.machine.num_joints)
+        wide = nonadditive_refit.simulate_beside(residuals, grown, fitted)
+        for turn in range(MAX_REFITS):
             self.tell("simulating around what was found", 0.72 + 0.04 * turn)
             before = chosen
-            tables, chosen, now = self._round(evidence, *wide[1:], price, scatter, wide[0])
+            tables, chosen, now = self._round(residuals, *wide[1:], price, scatter, wide[0])
             tried += [now] if now else []
-            more = now and nonadditive_refit.grown(
-                evidence, wide[1], tables, chosen, now, self.prices.joint
+            more = now and nonadditive_refit.add_effect(
+                residuals, wide[1], tables, chosen, now, self.penalties.joint
             )
             tried += [more] if more else []
             if now is None or (more is None and chosen.subsets == before.subsets):
                 break
-            wide = nonadditive_refit.simulated(evidence, grown, more or now)
-        best = nonadditive_refit.best(evidence, wide[1], tried, price)
+            wide = nonadditive_refit.simulate_beside(residuals, grown, more or now)
+        best = nonadditive_refit.combine_best(residuals, wide[1], tried, price)
         if best is None:
-            return wide, tables, Chosen((frozenset(),) * len(tables), 0.0), None
+            return wide, tables, EffectSet((frozenset(),) * len(tables), 0.0), None
         for drops in (True, False):
             wide, subsets = (
-                nonadditive_refit.simulated(evidence, grown, best),
-                refine.subsets_of(best),
+                nonadditive_refit.simulate_beside(residuals, grown, best),
+                refine.list_subsets(best),
             )
-            tables = self._tables(evidence, *wide[1:], scatter, wide[0])
-            paying = nonadditive_refit.paying(tables, subsets, price, self.prices.name)
+            tables = self._tables(residuals, *wide[1:], scatter, wide[0])
+            paying = nonadditive_refit.drop_unneeded(tables, subsets, price, self.penalties.name)
             if not drops or paying == subsets or not any(paying):
                 break
-            best = refine.without(evidence, wide[1], best, paying)
+            best = refine.drop_effects(residuals, wide[1], best, paying)
         worth = sum(
             table.score(s).total - price(j, s)
             for j, (table, s) in enumerate(zip(tables, subsets, strict=True))
@@ -321,53 +367,60 @@ class Search:
         return (
             wide,
             tables,
-            Chosen(subsets, worth - self.prices.name * len(frozenset().union(*subsets))),
+            EffectSet(subsets, worth - self.penalties.name * len(frozenset().union(*subsets))),
             best,
         )
 
     def _scatter(self, z: np.ndarray) -> np.ndarray:
-        """Returns the mean square of errors over the noise `(J, E)` over that of the reference, outliers cut, `(J,)`."""
-        nulls = [one.evidence.z for one in self.base.nulls]
+        """Return the mean square of errors over the noise `(J, E)` over that of the reference, outliers cut, `(J,)`."""
+        left_out = [one.residuals.z for one in self.base.left_out]
         usual = (
-            np.mean(np.minimum(np.concatenate(nulls, 1) ** 2, CUT), 1) if nulls else np.ones(len(z))
+            np.mean(np.minimum(np.concatenate(left_out, 1) ** 2, MAX_SQUARE), 1)
+            if left_out
+            else np.ones(len(z))
         )
-        return np.mean(np.minimum(z**2, CUT), 1) / usual
+        return np.mean(np.minimum(z**2, MAX_SQUARE), 1) / usual
 
-    def _left(self, beside: Evidence) -> tuple[np.ndarray, np.ndarray]:
-        """Returns what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
-        nulls = [one.evidence for one in self.base.nulls]
+    def _left(self, beside: Residuals) -> tuple[np.ndarray, np.ndarray]:
+        """Return what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
+        left_out = [one.residuals for one in self.base.left_out]
         earned, on_nulls = (
-            residual_model.predictable(beside, beside.z),
-            [residual_model.predictable(one, one.z) for one in nulls],
+            residual_model.score_clues(beside, beside.z),
+            [residual_model.score_clues(one, one.z) for one in left_out],
         )
-        return earned, residual_model.beyond(
-            earned, on_nulls, [beside.z.shape[1] / one.z.shape[1] for one in nulls]
+        return earned, residual_model.scale_reference_gains(
+            earned, on_nulls, [beside.z.shape[1] / one.z.shape[1] for one in left_out]
         )
 
-    def _strays(self, beside: Evidence) -> np.ndarray:
-        own = residual_model.strayed(beside, beside.error)
-        nulls = [
-            residual_model.strayed(one.evidence, one.evidence.error) for one in self.base.nulls
+    def _strays(self, beside: Residuals) -> np.ndarray:
+        own = residual_model.measure_straying(beside, beside.error)
+        left_out = [
+            residual_model.measure_straying(one.residuals, one.residuals.error)
+            for one in self.base.left_out
         ]
-        return np.sqrt(own / np.maximum(np.mean(nulls, 0), 1e-9)) if nulls else np.ones_like(own)
+        return (
+            np.sqrt(own / np.maximum(np.mean(left_out, 0), 1e-9)) if left_out else np.ones_like(own)
+        )
 
 
-def _promised(tables: Sequence[Table], chosen: Chosen) -> float:
+def _sum_scores(tables: Sequence[SubsetTable], chosen: EffectSet) -> float:
     return sum(
         table.score(subset).total for table, subset in zip(tables, chosen.subsets, strict=True)
     )
 
 
-def _adjusted(evidence: Evidence, case: Case, found: Sequence[Found]) -> Evidence:
-    """Returns the evidence where encoders err as was found, and where sensors that scatter more say less."""
+def _adjust_residuals(
+    residuals: Residuals, case: GapCase, found: Sequence[DetectedEffect]
+) -> Residuals:
+    """Return the evidence where encoders err as was found, and where sensors that scatter more say less."""
     steady = [
         (one.kind, one.values())
         for one in found
         if one.kind.target.side == "measurement" and _is_steady(one.kind)
     ]
-    evidence = replace(
-        evidence,
-        candidates=replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]),
+    residuals = replace(
+        residuals,
+        simulator=replace(residuals.simulator, fixed=[*residuals.simulator.fixed, *steady]),
     )
     rough = [
         one.joints
@@ -375,16 +428,17 @@ def _adjusted(evidence: Evidence, case: Case, found: Sequence[Found]) -> Evidenc
         if one.kind.target.side == "measurement" and not _is_steady(one.kind)
     ]
     if not rough:
-        return evidence
-    assert evidence.noise is not None, "noise is known by now"
+        return residuals
+    assert residuals.noise is not None, "noise is known by now"
     reading = sensors.measure_excess_scatter(case.field, case.reference, case.machine) * np.any(
         rough, 0
     )
     noise = [
-        replace(one, reading=float(more)) for one, more in zip(evidence.noise, reading, strict=True)
+        replace(one, reading=float(more))
+        for one, more in zip(residuals.noise, reading, strict=True)
     ]
-    return replace(evidence, noise=noise)
+    return replace(residuals, noise=noise)
 
 
-def _is_steady(kind: Kind) -> bool:
+def _is_steady(kind: EffectType) -> bool:
     return kind.target.smooth and not kind.target.stochastic

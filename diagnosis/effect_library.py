@@ -29,12 +29,12 @@ from diagnosis.answer import Estimate
 
 log = logging.getLogger(__name__)
 
-ORDER = {"joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
+SIDE_ORDER = {"joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
 """From the machine outwards; delays of a command lie outside of what the valve makes of it."""
 
 
 @dataclass(frozen=True, eq=False)
-class Kind:
+class EffectType:
     """An effect of the registry.
 
     Attributes:
@@ -60,7 +60,7 @@ class Kind:
     @property
     def order(self) -> tuple[int, int]:
         """Place from the machine outwards."""
-        return ORDER.get(self.target.side, 3), int(self.target.stage == "timing")
+        return SIDE_ORDER.get(self.target.side, 3), int(self.target.stage == "timing")
 
     @property
     def running(self) -> str | None:
@@ -98,21 +98,21 @@ class Kind:
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
     ) -> Any:
-        """Returns `model` with the effect around it, at its neutral value; numbers are written into `parameters`."""
+        """Return `model` with the effect around it, at its neutral value; numbers are written into `parameters`."""
         return self.neutral.wrap(model, machine, num_envs, device)
 
     def size(self, name: str) -> float:
-        """Returns typical less neutral value: the natural unit of a number. One without a neutral value: its typical value."""
+        """Return typical less neutral value: the natural unit of a number. One without a neutral value: its typical value."""
         number = self.numbers[name]
         return number.typical - (number.none or 0.0)
 
     def clipped(self, name: str, value: np.ndarray) -> np.ndarray:
-        """Returns `value` within the bounds of number `name`."""
+        """Return `value` within the bounds of number `name`."""
         return np.clip(value, *self.numbers[name].bounds)
 
 
-def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[Kind]:
-    """Returns the effects of the registry that can be simulated on `machine`, or of these `names`.
+def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[EffectType]:
+    """Return the effects of the registry that can be simulated on `machine`, or of these `names`.
 
     Raises:
         ConfigError: a name is unknown, or an effect cannot be imported.
@@ -130,7 +130,7 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[K
                 f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}"
             ) from error
         if hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
-            found[option.name] = Kind(option.name, target, machine.num_joints)
+            found[option.name] = EffectType(option.name, target, machine.num_joints)
     for name in names or ():
         if name not in found:
             raise ConfigError(
@@ -139,31 +139,31 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[K
     usable = []
     for kind in (found[name] for name in names or found):
         try:
-            _try(kind, machine)
+            _check_simulable(kind, machine)
             usable.append(kind)
         except ConfigError as error:
             log.info("%s is left out: %s", kind.name, error)
     return usable
 
 
-def shared(kinds: Iterable[Kind]) -> frozenset[str]:
-    """Returns the effects with one cause for all joints."""
+def list_shared_effects(kinds: Iterable[EffectType]) -> frozenset[str]:
+    """Return the effects with one cause for all joints."""
     return frozenset(kind.name for kind in kinds if getattr(kind.target, "shared", False))
 
 
-def _try(kind: Kind, machine: Machine) -> None:
-    """Raises a `ConfigError` when the effect needs what is not known of the machine."""
+def _check_simulable(kind: EffectType, machine: Machine) -> None:
+    """Raise a `ConfigError` when the effect needs what is not known of the machine."""
     device = torch.device("cpu")
     rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(
         1, machine.num_history, -1
     )
-    model = kind.wrap(Still(), machine, 1, device)
+    model = kind.wrap(StationaryModel(), machine, 1, device)
     with torch.inference_mode():
         model.step(History(q=rest.clone(), u=torch.zeros_like(rest)))
         model.misplacement(rest[:, -1]) if kind.target.side == "kinematics" else None
 
 
-class Still:
+class StationaryModel:
     """A machine that does not move."""
 
     @property
@@ -175,34 +175,34 @@ class Still:
         """Nothing to forget."""
 
     def step(self, history: Any) -> torch.Tensor:
-        """Returns the positions as they are."""
+        """Return the positions as they are."""
         return history.q[:, -1]
 
 
 @dataclass(frozen=True)
-class Found:
+class DetectedEffect:
     """An effect with its numbers.
 
     Attributes:
         kind: The effect.
         joints: Which joints have it, `(J,)` bool.
         parameters: By name and joint, or `machine`.
-        worth: What it earns in log likelihood less its price.
+        net_gain: What it earns in log likelihood less its price.
         gain: What it earns.
         closed: Share of what the statistic shows that the effect explains.
         rivals: What other effects would earn in its place, by name.
     """
 
-    kind: Kind
+    kind: EffectType
     joints: np.ndarray
     parameters: Mapping[str, Mapping[str, Estimate]]
-    worth: float
+    net_gain: float
     gain: float
     closed: float
     rivals: Mapping[str, float]
 
     def values(self, count: int = 1) -> dict[str, np.ndarray]:
-        """Returns the numbers of `count` candidates that all have the effect, each `(C, J)` or `(C, 1)`."""
+        """Return the numbers of `count` candidates that all have the effect, each `(C, J)` or `(C, 1)`."""
         found = {}
         for name, estimates in self.parameters.items():
             if "machine" in estimates:
@@ -214,8 +214,8 @@ class Found:
         return found
 
 
-def fit_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float, float, float]:
-    """Returns the most likely size and the ends of its 95 % interval from log likelihoods at rising `sizes`."""
+def estimate_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float, float, float]:
+    """Return the most likely size and the ends of its 95 % interval from log likelihoods at rising `sizes`."""
     fine = np.interp(np.linspace(0, len(sizes) - 1, 401), np.arange(len(sizes)), np.log(sizes))
     curve = np.interp(fine, np.log(sizes), likelihood)
     best = int(np.argmax(likelihood))
@@ -229,15 +229,15 @@ def fit_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float, floa
     return float(np.exp(fine[int(np.argmax(curve))])), float(inside.min()), float(inside.max())
 
 
-ROWS = 1536
+BATCH_ROWS = 1536
 """Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
 
-Values = Mapping[str, np.ndarray]
+EffectValues = Mapping[str, np.ndarray]
 """Numbers of an effect by name, each `(C, J)`, or `(C, 1)` for one that joints do not have."""
 
 
 @dataclass(frozen=True)
-class Candidates:
+class EffectSimulator:
     """Free runs of one base through one cut, as a function of effects.
 
     Attributes:
@@ -254,15 +254,15 @@ class Candidates:
     cut: FreeRunWindows
     running_s: np.ndarray
     seed: int
-    fixed: Sequence[tuple[Kind, Values]] = ()
+    fixed: Sequence[tuple[EffectType, EffectValues]] = ()
 
-    def paths(
+    def simulate(
         self,
-        effects: Sequence[tuple[Kind, Values]],
+        effects: Sequence[tuple[EffectType, EffectValues]],
         count: int = 1,
-        own: Values = MappingProxyType({}),
+        own: EffectValues = MappingProxyType({}),
     ) -> np.ndarray:
-        """Returns measured positions of free runs, `(C, W, K, J)`.
+        """Return measured positions of free runs, `(C, W, K, J)`.
 
         Args:
             effects: Effects with the numbers of each candidate.
@@ -279,8 +279,8 @@ class Candidates:
         effects = sorted([*effects, *fixed], key=lambda one: one[0].order)
         windows = len(self.cut.q)
         found = np.empty((count * windows, *self.cut.measured.shape[1:]), dtype=np.float32)
-        for start in range(0, len(found), ROWS):
-            rows = np.arange(start, min(start + ROWS, len(found)))
+        for start in range(0, len(found), BATCH_ROWS):
+            rows = np.arange(start, min(start + BATCH_ROWS, len(found)))
             found[rows] = self._run(effects, own, rows // windows, rows % windows)
         if not np.isfinite(found).all():
             names = ", ".join(kind.name for kind, _ in effects) or "no effect"
@@ -291,12 +291,12 @@ class Candidates:
 
     def _run(
         self,
-        effects: Sequence[tuple[Kind, Values]],
-        own: Values,
+        effects: Sequence[tuple[EffectType, EffectValues]],
+        own: EffectValues,
         candidate: np.ndarray,
         window: np.ndarray,
     ) -> np.ndarray:
-        """Returns one free run a row, `(N, K, J)`."""
+        """Return one free run a row, `(N, K, J)`."""
         cut, count, device = self.cut, len(window), torch.device("cpu")
         size, before = cut.num_history, cut.num_before
         with torch.random.fork_rng(devices=[]):

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.machine import Machine
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 
 HORIZONS_S = (0.05, 0.5, 2.0, 5.0)
 READINGS = {
@@ -66,7 +66,7 @@ class ErrorGrowth:
 
 
 def measure_growth(
-    runs: FreeRuns, reference: FreeRuns | None, machine: Machine, whole: FreeRuns | None
+    runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine, whole: WindowedRuns | None
 ) -> dict[str, ErrorGrowth]:
     """Return the growth of each joint's error."""
     steps = runs.simulated.shape[1]
@@ -101,7 +101,7 @@ def measure_growth(
     return found
 
 
-def compute_rmse_curve(runs: FreeRuns) -> np.ndarray:
+def compute_rmse_curve(runs: WindowedRuns) -> np.ndarray:
     """Return the root mean square error after each step, `(K, J)`; NaN without any window."""
     given = np.isfinite(runs.error)
     with np.errstate(invalid="ignore"):

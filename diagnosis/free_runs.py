@@ -23,7 +23,7 @@ from brokk_rl.record import Recording
 
 
 @dataclass(frozen=True)
-class FreeRuns:
+class WindowedRuns:
     """Free runs, each begun at what was measured.
 
     Attributes:
@@ -45,7 +45,7 @@ class FreeRuns:
         return len(self.row)
 
     def cut(self, values: Sequence[np.ndarray]) -> np.ndarray:
-        """Returns the part of each recording's values, `(T, …)`, that lies in each window, `(W, K, …)`; NaN after the end."""
+        """Return the part of each recording's values, `(T, …)`, that lies in each window, `(W, K, …)`; NaN after the end."""
         steps = self.simulated.shape[1]
         found = np.full((self.num_windows, steps, *values[0].shape[1:]), np.nan)
         for window, (source, row) in enumerate(zip(self.source, self.row, strict=True)):
@@ -77,14 +77,14 @@ class FreeRuns:
         )  # fmt: skip
 
 
-def free_runs(
+def simulate_free_runs(
     actuator: Actuator,
     recordings: Sequence[Recording],
     machine: Machine,
     horizon_s: float,
     device: torch.device,
-) -> FreeRuns:
-    """Runs a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
+) -> WindowedRuns:
+    """Run a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
 
     Raises:
         RecordingError: no recording is long enough.
@@ -103,4 +103,4 @@ def free_runs(
             f"too little data: a free run needs recordings of more than {before * machine.period_s:g} s"
         )
     simulated = open_loop.roll_out(actuator, machine, open_loop.join_windows(cuts), device)
-    return FreeRuns(recordings, np.array(source), np.array(row), simulated.astype(float))
+    return WindowedRuns(recordings, np.array(source), np.array(row), simulated.astype(float))

@@ -20,65 +20,71 @@ from brokk_rl import open_loop
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate, Gap, JointClosed
-from diagnosis.baseline import Base
-from diagnosis.case import HORIZON_S, running_s
-from diagnosis.detection import Findings
-from diagnosis.refine import refitted, simulate
+from diagnosis.baseline import Baseline
+from diagnosis.case import HORIZON_S, estimate_running_s
+from diagnosis.detection import DetectionResult
+from diagnosis.refine import simulate_refit, simulate_sizes
 
-DRAWS = 1000
-BLOCK = 4
+NUM_DRAWS = 1000
+BLOCK_WINDOWS = 4
 """Windows in a row that are drawn together: poses and oil change slowly."""
-SIGNIFICANT = 1.1
+MIN_GAP_RATIO = 1.1
 """Error over floor below which there is no gap whose share could be told."""
 
 
-def unit_of(machine: Machine) -> str:
-    """Returns the unit of errors of all joints together: that of the joints, or `travel`, the joint's, where they differ."""
+def choose_unit(machine: Machine) -> str:
+    """Return the unit of errors of all joints together: that of the joints, or `travel`, the joint's, where they differ."""
     units = {joint.unit for joint in machine.joints}
     return units.pop() if len(units) == 1 else "travel"
 
 
-def squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -> np.ndarray:
-    """Returns the mean square error of each window, all joints together, `(W,)`, in the square of `unit_of`."""
-    size = machine.upper - machine.lower if unit_of(machine) == "travel" else 1.0
+def compute_squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -> np.ndarray:
+    """Return the mean square error of each window, all joints together, `(W,)`, in the square of `unit_of`."""
+    size = machine.upper - machine.lower if choose_unit(machine) == "travel" else 1.0
     return np.square((paths - measured) / size).mean((1, 2))
 
 
-def draws(
+def draw_windows(
     field: int, floor: int, generator: np.random.Generator
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns windows of field and floor in bootstraps over blocks, as many as each has."""
-    return [(_draw(field, generator), _draw(floor, generator)) for _ in range(DRAWS)]
+    """Return windows of field and floor in bootstraps over blocks, as many as each has."""
+    return [
+        (_draw_blocks(field, generator), _draw_blocks(floor, generator)) for _ in range(NUM_DRAWS)
+    ]
 
 
-def shares(
+def compute_shares(
     before: np.ndarray,
     after: np.ndarray,
     floor: np.ndarray,
     drawn: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> np.ndarray:
-    """Returns the share of the gap that is closed, then the same of each draw, `(1 + B,)`."""
-    found = [_share(rmse(before), rmse(after), rmse(floor))]
+    """Return the share of the gap that is closed, then the same of each draw, `(1 + B,)`."""
+    found = [_compute_share(compute_rmse(before), compute_rmse(after), compute_rmse(floor))]
     return np.array(
-        found + [_share(rmse(before[f]), rmse(after[f]), rmse(floor[g])) for f, g in drawn]
+        found
+        + [
+            _compute_share(compute_rmse(before[f]), compute_rmse(after[f]), compute_rmse(floor[g]))
+            for f, g in drawn
+        ]
     )
 
 
-def estimate(values: np.ndarray) -> Estimate:
-    """Returns the first of values `(1 + B,)` with the 95 % interval of the others."""
+def summarise_draws(values: np.ndarray) -> Estimate:
+    """Return the first of values `(1 + B,)` with the 95 % interval of the others."""
     low, high = np.nanquantile(values[1:], [0.025, 0.975])
     return Estimate(float(values[0]), (float(min(low, values[0])), float(max(high, values[0]))))
 
 
-def rmse(square: np.ndarray) -> float:
-    """Returns the root of the mean over windows."""
+def compute_rmse(square: np.ndarray) -> float:
+    """Return the root of the mean over windows."""
     return float(np.sqrt(square.mean()))
 
 
-def closed(
+def estimate_closed(
     before: np.ndarray, after: np.ndarray, floor: np.ndarray, generator: np.random.Generator
 ) -> Estimate | None:
-    """Returns the share of the gap that is closed, with the interval of a bootstrap over blocks of windows.
+    """Return the share of the gap that is closed, with the interval of a bootstrap over blocks of windows.
 
     Args:
         before: Mean square errors of field windows, `(W,)`.
@@ -86,13 +92,17 @@ def closed(
         floor: Of reference windows.
         generator: Draws the blocks.
     """
-    if rmse(before) < SIGNIFICANT * rmse(floor):
+    if compute_rmse(before) < MIN_GAP_RATIO * compute_rmse(floor):
         return None
-    return estimate(shares(before, after, floor, draws(len(before), len(floor), generator)))
+    return summarise_draws(
+        compute_shares(before, after, floor, draw_windows(len(before), len(floor), generator))
+    )
 
 
-def shapley(names: Sequence[str], closed_by: Callable[[frozenset[str]], Any]) -> dict[str, Any]:
-    """Returns what each effect closes, a number or an array of them: the mean over all orders of adding them."""
+def compute_shapley(
+    names: Sequence[str], closed_by: Callable[[frozenset[str]], Any]
+) -> dict[str, Any]:
+    """Return what each effect closes, a number or an array of them: the mean over all orders of adding them."""
     count, found = len(names), dict.fromkeys(names, 0.0)
     value = {
         frozenset(s): closed_by(frozenset(s))
@@ -107,25 +117,27 @@ def shapley(names: Sequence[str], closed_by: Callable[[frozenset[str]], Any]) ->
     return found
 
 
-def _share(before: float, after: float, floor: float) -> float:
+def _compute_share(before: float, after: float, floor: float) -> float:
     floor = min(
         floor, after
     )  # no repair is better than the floor: where it is, the floor was measured on harder recordings
     return float((before - after) / max(before - floor, 0.02 * before + 1e-12))
 
 
-def _draw(count: int, generator: np.random.Generator) -> np.ndarray:
-    starts = generator.integers(0, max(1, count - BLOCK + 1), size=-(-count // BLOCK))
-    return np.concatenate([np.arange(start, min(start + BLOCK, count)) for start in starts])
+def _draw_blocks(count: int, generator: np.random.Generator) -> np.ndarray:
+    starts = generator.integers(
+        0, max(1, count - BLOCK_WINDOWS + 1), size=-(-count // BLOCK_WINDOWS)
+    )
+    return np.concatenate([np.arange(start, min(start + BLOCK_WINDOWS, count)) for start in starts])
 
 
-BEYOND = 1.25
+MIN_EXCESS_RATIO = 1.25
 """So many times the floor is more than what the simulator errs by anyway, where it exceeds the
 floor for sure."""
 
 
 @dataclass(frozen=True, eq=False)
-class Reach:
+class GapClosure:
     """Errors before, after and at the floor.
 
     Attributes:
@@ -136,7 +148,7 @@ class Reach:
         generator: Draws the bootstraps.
     """
 
-    base: Base
+    base: Baseline
     machine: Machine
     after: np.ndarray
     own: np.ndarray | None
@@ -145,27 +157,27 @@ class Reach:
     @cached_property
     def before(self) -> np.ndarray:
         """Mean square errors of the simulator as it was, `(W,)`."""
-        evidence = self.base.field.evidence
-        return squares(evidence.base, self._measured, self.machine)
+        residuals = self.base.field.residuals
+        return compute_squares(residuals.base, self._measured, self.machine)
 
     @cached_property
     def floor(self) -> np.ndarray | None:
         """Mean square errors at the floor, by window; `None` where it is unknown."""
-        if not self.base.nulls:
+        if not self.base.left_out:
             return None
-        parts = [one.evidence for one in self.base.nulls]
+        parts = [one.residuals for one in self.base.left_out]
         return np.concatenate(
-            [squares(one.base, one.candidates.cut.measured, self.machine) for one in parts]
+            [compute_squares(one.base, one.simulator.cut.measured, self.machine) for one in parts]
         )
 
     @cached_property
     def draws(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Windows of each bootstrap, the same for all shares."""
-        return draws(len(self.before), len(self._floor), self.generator)
+        return draw_windows(len(self.before), len(self._floor), self.generator)
 
     @property
     def _measured(self) -> np.ndarray:
-        return self.base.field.evidence.candidates.cut.measured
+        return self.base.field.residuals.simulator.cut.measured
 
     @property
     def _floor(self) -> np.ndarray:
@@ -173,87 +185,106 @@ class Reach:
         return np.zeros(1) if self.floor is None else self.floor
 
     def shares(self, paths: np.ndarray) -> np.ndarray:
-        """Returns the share of the gap that free runs close, then the same of each draw, `(1 + B,)`."""
-        return shares(
-            self.before, squares(paths, self._measured, self.machine), self._floor, self.draws
+        """Return the share of the gap that free runs close, then the same of each draw, `(1 + B,)`."""
+        return compute_shares(
+            self.before,
+            compute_squares(paths, self._measured, self.machine),
+            self._floor,
+            self.draws,
         )
 
     @cached_property
     def has_gap(self) -> bool:
         """Whether there is a floor, and errors that exceed it."""
-        return self.floor is not None and rmse(self.before) >= SIGNIFICANT * rmse(self.floor)
+        return self.floor is not None and compute_rmse(self.before) >= MIN_GAP_RATIO * compute_rmse(
+            self.floor
+        )
 
     def gap(self) -> Gap:
-        """Returns the errors, all joints together and joint by joint."""
-        left = squares(self.after, self._measured, self.machine)
-        closed = estimate(self.shares(self.after)) if self.has_gap else None
-        floor = None if self.floor is None else rmse(self.floor)
+        """Return the errors, all joints together and joint by joint."""
+        left = compute_squares(self.after, self._measured, self.machine)
+        closed = summarise_draws(self.shares(self.after)) if self.has_gap else None
+        floor = None if self.floor is None else compute_rmse(self.floor)
         of = "" if floor is None else "flexible model" if self.base.is_flexible else "reference"
         return Gap(
-            rmse(self.before), rmse(left), floor, closed, unit_of(self.machine), of, self._joints()
+            compute_rmse(self.before),
+            compute_rmse(left),
+            floor,
+            closed,
+            choose_unit(self.machine),
+            of,
+            self._joints(),
         )
 
     def foretold(self) -> Estimate | None:
-        """Returns the share that should be closed, as the parts that were fitted to say; `None` without a gap or a fit."""
-        return estimate(self.shares(self.own)) if self.has_gap and self.own is not None else None
+        """Return the share that should be closed, as the parts that were fitted to say; `None` without a gap or a fit."""
+        return (
+            summarise_draws(self.shares(self.own))
+            if self.has_gap and self.own is not None
+            else None
+        )
 
-    def by_effect(self, findings: Findings, names: Sequence[str]) -> dict[str, Estimate]:
-        """Returns what each chosen effect closes, its Shapley value; without a floor of the whole error."""
-        values = shapley(names, lambda some: self.shares(self._with(findings, some)))
-        return {name: estimate(value) for name, value in values.items()}
+    def by_effect(self, result: DetectionResult, names: Sequence[str]) -> dict[str, Estimate]:
+        """Return what each chosen effect closes, its Shapley value; without a floor of the whole error."""
+        values = compute_shapley(names, lambda some: self.shares(self._with(result, some)))
+        return {name: summarise_draws(value) for name, value in values.items()}
 
     def beyond(self) -> list[str]:
-        """Returns the joints whose error after repair exceeds the floor for sure."""
+        """Return the joints whose error after repair exceeds the floor for sure."""
         if self.floor is None:
             return []
         left = np.square(self.after - self._measured).mean(1)  # (W, J)
-        parts = [one.evidence for one in self.base.nulls]
+        parts = [one.residuals for one in self.base.left_out]
         floor = np.concatenate(
-            [np.square(one.base - one.candidates.cut.measured).mean(1) for one in parts]
+            [np.square(one.base - one.simulator.cut.measured).mean(1) for one in parts]
         )
         drawn = [
             np.sqrt(left[f].mean(0) / np.maximum(floor[g].mean(0), 1e-18)) for f, g in self.draws
         ]
         ratio = np.sqrt(left.mean(0) / np.maximum(floor.mean(0), 1e-18))
-        beyond = (ratio > BEYOND) & (np.quantile(drawn, 0.025, axis=0) > 1.0)
+        beyond = (ratio > MIN_EXCESS_RATIO) & (np.quantile(drawn, 0.025, axis=0) > 1.0)
         return [
             name
             for name, is_beyond in zip(self.machine.joint_names, beyond, strict=True)
             if is_beyond
         ]
 
-    def _with(self, findings: Findings, names: frozenset[str]) -> np.ndarray:
-        """Returns free runs with some of the chosen effects, their sizes fitted anew."""
+    def _with(self, result: DetectionResult, names: frozenset[str]) -> np.ndarray:
+        """Return free runs with some of the chosen effects, their sizes fitted anew."""
         if not names:
-            return self.base.field.evidence.base
-        if names == findings.chosen.names:
+            return self.base.field.residuals.base
+        if names == result.chosen.names:
             return self.after
-        subsets = [subset & names for subset in findings.chosen.subsets]
-        start = [table.score(s).sizes for table, s in zip(findings.tables, subsets, strict=True)]
-        return refitted(findings.evidence, subsets, findings.rays, start)
+        subsets = [subset & names for subset in result.chosen.subsets]
+        start = [table.score(s).sizes for table, s in zip(result.tables, subsets, strict=True)]
+        return simulate_refit(result.residuals, subsets, result.rays, start)
 
     def _joints(self) -> dict[str, JointClosed]:
-        evidence = self.base.field.evidence
+        residuals = self.base.field.residuals
         before, after = (
-            _by_joint([paths], [self._measured]) for paths in (evidence.base, self.after)
+            _compute_joint_rmse([paths], [self._measured]) for paths in (residuals.base, self.after)
         )
-        parts = [one.evidence for one in self.base.nulls]
+        parts = [one.residuals for one in self.base.left_out]
         floor = (
-            _by_joint([one.base for one in parts], [one.candidates.cut.measured for one in parts])
+            _compute_joint_rmse(
+                [one.base for one in parts], [one.simulator.cut.measured for one in parts]
+            )
             if parts
             else None
         )
-        return _closed(self.machine, before, after, floor)
+        return _describe_joints(self.machine, before, after, floor)
 
 
-def apart(findings: Findings, recordings: Sequence[Recording], machine: Machine) -> dict[str, Any]:
-    """Returns how far the effects carry on recordings that nothing was fitted to, as plain JSON data.
+def evaluate_unseen(
+    result: DetectionResult, recordings: Sequence[Recording], machine: Machine
+) -> dict[str, Any]:
+    """Return how far the effects carry on recordings that nothing was fitted to, as plain JSON data.
 
     Raises:
         RecordingError: no recording is long enough.
     """
-    assert findings.repair is not None, "there is something to carry"
-    begun = running_s(recordings)
+    assert result.fitted is not None, "there is something to carry"
+    begun = estimate_running_s(recordings)
     cuts = [
         open_loop.cut_windows([one], machine, HORIZON_S, HORIZON_S)
         for one in recordings
@@ -266,11 +297,13 @@ def apart(findings: Findings, recordings: Sequence[Recording], machine: Machine)
         else open_loop.cut_windows(recordings, machine, HORIZON_S, HORIZON_S)
     )
     running_at = np.repeat(running, [len(one.q) for one in cuts])
-    candidates = replace(findings.evidence.candidates, cut=cut, running_s=running_at)
-    none = simulate(candidates, findings.repair.rays, 0.0 * findings.repair.sizes[None])[0]
-    paths = simulate(candidates, findings.repair.rays, findings.repair.sizes[None])[0]
-    before, after = (_by_joint([one], [cut.measured]) for one in (none, paths))
-    joints = {name: vars(one) for name, one in _closed(machine, before, after, None).items()}
+    simulator = replace(result.residuals.simulator, cut=cut, running_s=running_at)
+    none = simulate_sizes(simulator, result.fitted.rays, 0.0 * result.fitted.sizes[None])[0]
+    paths = simulate_sizes(simulator, result.fitted.rays, result.fitted.sizes[None])[0]
+    before, after = (_compute_joint_rmse([one], [cut.measured]) for one in (none, paths))
+    joints = {
+        name: vars(one) for name, one in _describe_joints(machine, before, after, None).items()
+    }
     return {"seconds": HORIZON_S * len(cut.q), "recordings": len(cuts), "joints": joints}
 
 
@@ -278,15 +311,15 @@ def _is_long(recording: Recording, machine: Machine) -> bool:
     return open_loop.find_longest_horizon_s([recording], machine) >= HORIZON_S
 
 
-def _by_joint(paths: Sequence[np.ndarray], measured: Sequence[np.ndarray]) -> np.ndarray:
-    """Returns the root mean square error of each joint, `(J,)`."""
+def _compute_joint_rmse(paths: Sequence[np.ndarray], measured: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the root mean square error of each joint, `(J,)`."""
     squares = np.concatenate(
         [np.square(one - other).mean(1) for one, other in zip(paths, measured, strict=True)]
     )
     return np.sqrt(squares.mean(0))
 
 
-def _closed(
+def _describe_joints(
     machine: Machine, before: np.ndarray, after: np.ndarray, floor: np.ndarray | None
 ) -> dict[str, JointClosed]:
     found = {}
@@ -294,7 +327,7 @@ def _closed(
         least = None if floor is None else float(floor[j])
         above = (
             None
-            if least is None or before[j] < SIGNIFICANT * least
+            if least is None or before[j] < MIN_GAP_RATIO * least
             else (before[j] - after[j]) / (before[j] - least)
         )
         share = float(1.0 - after[j] / max(before[j], 1e-12))

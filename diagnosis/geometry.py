@@ -20,8 +20,8 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
-from diagnosis.case import Case
-from diagnosis.effect_library import Found, Kind, Still
+from diagnosis.case import GapCase
+from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel
 
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 MIN_SAMPLES = 100
@@ -149,7 +149,7 @@ class SetFit:
 class _GeometryError:
     """One error: an effect on one joint or of the whole machine; `columns` `(D, P)` per unit."""
 
-    kind: Kind
+    kind: EffectType
     joint: int | None
     names: tuple[str, ...]
     columns: np.ndarray
@@ -177,12 +177,12 @@ class GeometryFindings:
             measured.
     """
 
-    found: Sequence[Found]
+    found: Sequence[DetectedEffect]
     left: float
 
 
 def find_geometry_errors(
-    case: Case, kinds: Sequence[Kind], price: float, name_price: float
+    case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
 ) -> GeometryFindings:
     """Return the errors of geometry and encoders that the measured tool points show."""
     field, reference, machine = case.field, case.reference, case.machine
@@ -269,7 +269,7 @@ def _describe_effect(
     fits: Mapping[tuple[int, ...], SetFit],
     worth: Mapping[tuple[int, ...], float],
     machine: Machine,
-) -> Found:
+) -> DetectedEffect:
     gain, values, covariance = fits[best].gain, fits[best].sizes, fits[best].covariance
     deviation, parameters, mask, place = (
         np.sqrt(np.diag(covariance)),
@@ -302,11 +302,11 @@ def _describe_effect(
         value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
     )
     closed = float(np.clip(own / max(gain, 1e-9), 0.0, 1.0))
-    return Found(kind, mask, parameters, worth[best] - without, own, closed, rivals)
+    return DetectedEffect(kind, mask, parameters, worth[best] - without, own, closed, rivals)
 
 
 def _list_errors(
-    kinds: Sequence[Kind], q: np.ndarray, ways: np.ndarray, machine: Machine
+    kinds: Sequence[EffectType], q: np.ndarray, ways: np.ndarray, machine: Machine
 ) -> list[_GeometryError]:
     """Return the errors that move the tool point at all, other than along the ways that it goes."""
     plain, found = _compute_tool_points(None, {}, q, machine), []
@@ -333,7 +333,7 @@ def _list_errors(
 
 
 def _shift_from_neutral(
-    kind: Kind, name: str, joint: int | None, by: float, machine: Machine
+    kind: EffectType, name: str, joint: int | None, by: float, machine: Machine
 ) -> np.ndarray:
     """Return a parameter `by` above neutral on one joint or on all, `(J,)` or `(1,)`."""
     value = np.full(
@@ -439,14 +439,14 @@ def _is_measured(recording: Recording) -> bool:
 
 
 def _compute_tool_points(
-    kind: Kind | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
+    kind: EffectType | None, values: Mapping[str, np.ndarray], q: np.ndarray, machine: Machine
 ) -> np.ndarray:
     """Return where the tool point is at measured positions, with an effect or none, `(S, 3)`."""
     at, device = torch.as_tensor(q, dtype=torch.float32), torch.device("cpu")
     kinematics = Kinematics(machine, device)
     if kind is None:
         return kinematics.pose(at).tip_in_base_m.numpy().astype(float)
-    model = kind.wrap(Still(), machine, len(q), device)
+    model = kind.wrap(StationaryModel(), machine, len(q), device)
     for name, value in values.items():
         model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
     true = model.truth(at)

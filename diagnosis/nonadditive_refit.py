@@ -15,127 +15,146 @@ from dataclasses import replace
 import numpy as np
 
 from diagnosis.refine import (
-    Repair,
-    known_sizes,
+    FittedSet,
+    drop_windows,
+    list_subsets,
+    look_up_sizes,
     refit_from,
-    searched,
-    simulate,
-    subsets_of,
-    thinned,
+    search_sizes,
+    simulate_sizes,
 )
-from diagnosis.residuals import GRID, Evidence, Ray, rays, robust_loss, to_increments
-from diagnosis.responses import FELT, Shape
-from diagnosis.search import Chosen, Price, Table
+from diagnosis.residuals import (
+    SIZE_GRID,
+    ParameterRay,
+    Residuals,
+    build_rays,
+    compute_loss,
+    to_increments,
+)
+from diagnosis.responses import MIN_RESPONSE, Response
+from diagnosis.search import EffectSet, PenaltyFunction, SubsetTable
 
-WIDE = tuple(sorted({*GRID, 4.0, 5.5, 7.5, 10.0, 14.0}))
+WIDE_GRID = tuple(sorted({*SIZE_GRID, 4.0, 5.5, 7.5, 10.0, 14.0}))
 """Sizes, over the typical one, at which effects are simulated; numbers keep their bounds."""
 
-ROUGH = 0.7
+MIN_ADDITIVE_SHARE = 0.7
 """A set that earns less than so much of what adding up promised does not add up."""
 
-LARGE = 2.6
+LARGE_SIZE = 2.6
 """Sizes over the typical one from which adding up is not trusted."""
 
-ADDED_TRIED = 6
+MAX_ADDITIONS = 6
 """Effects that are tried beside a set by fitting all sizes together."""
 
-ADDED_THINNING = 4
+ADDITION_WINDOWS = 4
 """They are tried on one of so many parts of the recordings."""
 
-Shapes = list[dict[str, list[Shape]]]
+Shapes = list[dict[str, list[Response]]]
 
-Around = tuple[np.ndarray, dict[str, list[Ray]], Shapes]
+WideResponses = tuple[np.ndarray, dict[str, list[ParameterRay]], Shapes]
 """The errors that are to be explained `(J, E)`, the rays of each effect, and what they do to each
 joint."""
 
 
-def is_needed(evidence: Evidence, repaired: Repair, promised: float) -> bool:
-    """Says whether effects hardly add up: sizes are far beyond the typical, and some hide others, or earn far less than `promised`.
+def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
+    """Return True where the responses of the set do not add up.
 
+    Sizes are then far beyond the typical ones, and an effect hides others or gains far less than
+    `promised`.
     What acts on the command hides what else does: nothing shows within a dead band. A speed that is
     far off hides nothing.
     """
     far = [
         ray
-        for ray, sizes in zip(repaired.rays, repaired.sizes, strict=True)
-        if np.abs(sizes).max() > LARGE
+        for ray, sizes in zip(fitted.rays, fitted.sizes, strict=True)
+        if np.abs(sizes).max() > LARGE_SIZE
     ]
     hides = any(ray.kind.target.side == "command" for ray in far)
     return hides or (
-        bool(far) and float(robust_loss(evidence.z) - robust_loss(repaired.z)) < ROUGH * promised
+        bool(far)
+        and float(compute_loss(residuals.z) - compute_loss(fitted.z))
+        < MIN_ADDITIVE_SHARE * promised
     )
 
 
-def simulated(evidence: Evidence, grown: Mapping[str, Sequence[Ray]], repaired: Repair) -> Around:
-    """Returns what effects do in the company of a set."""
-    joints = evidence.way.shape[2]
+def simulate_beside(
+    residuals: Residuals, grown: Mapping[str, Sequence[ParameterRay]], fitted: FittedSet
+) -> WideResponses:
+    """Return what effects do in the company of a set."""
+    joints = residuals.increments.shape[2]
     shapes: Shapes = [{} for _ in range(joints)]
-    left = evidence.whitened(
-        evidence.error_of(simulate(evidence.candidates, repaired.rays, repaired.sizes[None]))
+    left = residuals.whiten(
+        residuals.compute_error(
+            simulate_sizes(residuals.simulator, fitted.rays, fitted.sizes[None])
+        )
     )[:, 0]
-    wide: dict[str, list[Ray]] = {}
-    mine = {(ray.kind.name, ray.name): place for place, ray in enumerate(repaired.rays)}
+    wide: dict[str, list[ParameterRay]] = {}
+    mine = {(ray.kind.name, ray.name): place for place, ray in enumerate(fitted.rays)}
     for name, ways in grown.items():
         grid = sorted(
-            {*WIDE, *ways[0].sizes[ways[0].sizes > 0.0].tolist()}
+            {*WIDE_GRID, *ways[0].sizes[ways[0].sizes > 0.0].tolist()}
         )  # as close as they were before
-        wide[name] = [replace(ray, shape=ways[0].shape) for ray in rays(ways[0].kind, grid)]
-        responses = [_response(evidence, ray, wide[name], repaired) for ray in wide[name]]
+        wide[name] = [replace(ray, shape=ways[0].shape) for ray in build_rays(ways[0].kind, grid)]
+        responses = [_simulate_response(residuals, ray, wide[name], fitted) for ray in wide[name]]
         for j in range(joints):
-            if max(np.abs(response[j]).max() for response in responses) >= FELT:
+            if max(np.abs(response[j]).max() for response in responses) >= MIN_RESPONSE:
                 shapes[j][name] = [
-                    Shape(ray.sizes, response[j])
+                    Response(ray.sizes, response[j])
                     for ray, response in zip(wide[name], responses, strict=True)
                 ]
         for ray, response in zip(wide[name], responses, strict=True):
             place = mine.get((name, ray.name))
             for j in range(joints) if place is not None else ():
-                left[j] += Shape(ray.sizes, response[j]).at(float(repaired.sizes[place, j]))[0]
+                left[j] += Response(ray.sizes, response[j]).at(float(fitted.sizes[place, j]))[0]
     return left, wide, shapes
 
 
-def _response(evidence: Evidence, ray: Ray, ways: Sequence[Ray], repaired: Repair) -> np.ndarray:
-    """Returns what a ray changes at each of its sizes, in the company of the set, over the noise, `(J, C, E)`."""
-    has = any(one.kind.name == ray.kind.name for one in repaired.rays)
-    company = [*repaired.rays, *([] if has else ways)]
+def _simulate_response(
+    residuals: Residuals, ray: ParameterRay, ways: Sequence[ParameterRay], fitted: FittedSet
+) -> np.ndarray:
+    """Return what a ray changes at each of its sizes, in the company of the set, over the noise, `(J, C, E)`."""
+    has = any(one.kind.name == ray.kind.name for one in fitted.rays)
+    company = [*fitted.rays, *([] if has else ways)]
     place = next(
         k
         for k, one in enumerate(company)
         if one.kind.name == ray.kind.name and one.name == ray.name
     )
-    sizes = np.zeros((len(ray.sizes), len(company), repaired.sizes.shape[1]))
-    sizes[:, : len(repaired.rays)] = repaired.sizes
+    sizes = np.zeros((len(ray.sizes), len(company), fitted.sizes.shape[1]))
+    sizes[:, : len(fitted.rays)] = fitted.sizes
     sizes[:, place] = ray.sizes[:, None]
-    ends = to_increments(simulate(evidence.candidates, company, sizes), evidence.start)
-    return evidence.whitened(ends - ends[np.flatnonzero(ray.sizes == 0.0)[0]])
+    ends = to_increments(simulate_sizes(residuals.simulator, company, sizes), residuals.start)
+    return residuals.whiten(ends - ends[np.flatnonzero(ray.sizes == 0.0)[0]])
 
 
-def grown(
-    evidence: Evidence,
-    ways: Mapping[str, Sequence[Ray]],
-    tables: Sequence[Table],
-    chosen: Chosen,
-    repaired: Repair,
+def add_effect(
+    residuals: Residuals,
+    ways: Mapping[str, Sequence[ParameterRay]],
+    tables: Sequence[SubsetTable],
+    chosen: EffectSet,
+    fitted: FittedSet,
     price: float,
-) -> Repair | None:
-    """Returns the set with one more effect, on the joints where it pays, all sizes fitted together; `None` where none pays.
+) -> FittedSet | None:
+    """Return the set with one more effect, on the joints where it pays, all sizes fitted together; `None` where none pays.
 
     A saturation pays only when dead band and speed move along with it: adding up does not show
     that, a joint fit does. `price` is that of a joint with an effect, in the part of the recordings
     on which this is tried.
     """
-    part = thinned(evidence, ADDED_THINNING)
-    least = _losses(part, repaired.rays, repaired.sizes)
+    part = drop_windows(residuals, ADDITION_WINDOWS)
+    least = _compute_losses(part, fitted.rays, fitted.sizes)
     found, most = None, 0.0
-    for name in _promising(tables, chosen, ways):
+    for name in _rank_additions(tables, chosen, ways):
         subsets = [
             s | {name} if s and name in t.shapes else s
             for t, s in zip(tables, chosen.subsets, strict=True)
         ]
         rays_ = [ray for one in sorted(frozenset().union(*subsets)) for ray in ways[one]]
         mask = np.array([[ray.kind.name in subset for subset in subsets] for ray in rays_])
-        sizes = searched(part, rays_, mask, known_sizes(rays_, repaired), np.random.default_rng(0))
-        gain = least - _losses(part, rays_, sizes)
+        sizes = search_sizes(
+            part, rays_, mask, look_up_sizes(rays_, fitted), np.random.default_rng(0)
+        )
+        gain = least - _compute_losses(part, rays_, sizes)
         new = np.array(
             [name in s and name not in old for s, old in zip(subsets, chosen.subsets, strict=True)]
         )
@@ -144,45 +163,51 @@ def grown(
             kept = [
                 s if p else old for s, p, old in zip(subsets, pays, chosen.subsets, strict=True)
             ]
-            start = np.where(pays, sizes, known_sizes(rays_, repaired))
+            start = np.where(pays, sizes, look_up_sizes(rays_, fitted))
             found, most = (kept, rays_, start), worth
-    return refit_from(evidence, ways, *found) if found else None
+    return refit_from(residuals, ways, *found) if found else None
 
 
-def best(
-    evidence: Evidence, ways: Mapping[str, Sequence[Ray]], tried: Sequence[Repair], price: Price
-) -> Repair | None:
-    """Returns the repair that takes for each joint the best of those `tried`, none where errors of free runs only grow by it.
+def combine_best(
+    residuals: Residuals,
+    ways: Mapping[str, Sequence[ParameterRay]],
+    tried: Sequence[FittedSet],
+    price: PenaltyFunction,
+) -> FittedSet | None:
+    """Return the repair that takes for each joint the best of those `tried`, none where errors of free runs only grow by it.
 
     `price` is what a set costs on a joint. `None` where no joint is left.
     """
-    measured = evidence.candidates.cut.measured
+    measured = residuals.simulator.cut.measured
     squares = [
         np.square(paths - measured).mean((0, 1))
-        for paths in (evidence.base, *(one.after for one in tried))
+        for paths in (residuals.base, *(one.after for one in tried))
     ]
     subsets, rays_ = (
         [],
         list({(ray.kind.name, ray.name): ray for one in tried for ray in one.rays}.values()),
     )
-    start = np.zeros((len(rays_), evidence.way.shape[2]))
-    for j in range(evidence.way.shape[2]):
-        own = [subsets_of(one)[j] for one in tried]
+    start = np.zeros((len(rays_), residuals.increments.shape[2]))
+    for j in range(residuals.increments.shape[2]):
+        own = [list_subsets(one)[j] for one in tried]
         cost = [
-            float(robust_loss(one.z[j])) + (price(j, s) if s else 0.0)
+            float(compute_loss(one.z[j])) + (price(j, s) if s else 0.0)
             for one, s in zip(tried, own, strict=True)
         ]
         closing = [k for k in np.argsort(cost) if squares[k + 1][j] < squares[0][j]]
         subsets.append(own[closing[0]] if closing else frozenset())
         if closing:
-            start[:, j] = known_sizes(rays_, tried[closing[0]])[:, j]
-    return refit_from(evidence, ways, subsets, rays_, start) if any(subsets) else None
+            start[:, j] = look_up_sizes(rays_, tried[closing[0]])[:, j]
+    return refit_from(residuals, ways, subsets, rays_, start) if any(subsets) else None
 
 
-def paying(
-    tables: Sequence[Table], subsets: Sequence[frozenset[str]], price: Price, name_price: float
+def drop_unneeded(
+    tables: Sequence[SubsetTable],
+    subsets: Sequence[frozenset[str]],
+    price: PenaltyFunction,
+    name_price: float,
 ) -> tuple[frozenset[str], ...]:
-    """Returns the sets without effects that add less than they cost, dropped one by one: of two that are alike one stays."""
+    """Return the sets without effects that add less than they cost, dropped one by one: of two that are alike one stays."""
     while names := frozenset().union(*subsets):
         own = dict.fromkeys(names, -name_price)
         for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
@@ -196,16 +221,18 @@ def paying(
     return tuple(subsets)
 
 
-def _losses(evidence: Evidence, rays_: Sequence[Ray], sizes: np.ndarray) -> np.ndarray:
-    """Returns the loss of each joint at sizes `(R, J)`, `(J,)`."""
-    paths = simulate(evidence.candidates, rays_, sizes[None])
-    return robust_loss(evidence.whitened(evidence.error_of(paths))[:, 0], 1)
+def _compute_losses(
+    residuals: Residuals, rays_: Sequence[ParameterRay], sizes: np.ndarray
+) -> np.ndarray:
+    """Return the loss of each joint at sizes `(R, J)`, `(J,)`."""
+    paths = simulate_sizes(residuals.simulator, rays_, sizes[None])
+    return compute_loss(residuals.whiten(residuals.compute_error(paths))[:, 0], 1)
 
 
-def _promising(
-    tables: Sequence[Table], chosen: Chosen, ways: Mapping[str, Sequence[Ray]]
+def _rank_additions(
+    tables: Sequence[SubsetTable], chosen: EffectSet, ways: Mapping[str, Sequence[ParameterRay]]
 ) -> list[str]:
-    """Returns effects that some joint with a set lacks: those on the command, which hide behind each other, then what adds most."""
+    """Return effects that some joint with a set lacks: those on the command, which hide behind each other, then what adds most."""
     found: dict[str, float] = {}
     for table, subset in zip(tables, chosen.subsets, strict=True):
         own = table.score(subset).total
@@ -213,4 +240,4 @@ def _promising(
             found[name] = found.get(name, 0.0) + max(0.0, table.score(subset | {name}).total - own)
     return sorted(
         found, key=lambda name: (ways[name][0].kind.target.side != "command", -found[name])
-    )[:ADDED_TRIED]
+    )[:MAX_ADDITIONS]

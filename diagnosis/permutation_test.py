@@ -14,7 +14,7 @@ from math import comb
 import numpy as np
 from scipy.stats import false_discovery_control
 
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 
 MIN_PERMUTATIONS = 1000
 """Least number of ways to distribute recordings over two sides: with fewer, no cell of some forty
@@ -42,7 +42,7 @@ class ExchangeBlocks:
     unit: str
 
 
-def assign_blocks(field: FreeRuns, reference: FreeRuns) -> ExchangeBlocks:
+def assign_blocks(field: WindowedRuns, reference: WindowedRuns) -> ExchangeBlocks:
     """Return recordings as blocks, or parts of them where recordings are too few."""
     sides = [np.unique(side.source, return_inverse=True)[1] for side in (field, reference)]
     few = comb(len(set(sides[0])) + len(set(sides[1])), len(set(sides[0]))) < MIN_PERMUTATIONS
@@ -54,7 +54,7 @@ def assign_blocks(field: FreeRuns, reference: FreeRuns) -> ExchangeBlocks:
     )
 
 
-def number_parts(runs: FreeRuns) -> np.ndarray:
+def number_parts(runs: WindowedRuns) -> np.ndarray:
     """Return the number of the part of `PART_S` of a recording that each window lies in, `(W,)`."""
     begin_s = np.array(
         [

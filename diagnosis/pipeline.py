@@ -16,18 +16,18 @@ from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
 from diagnosis import calibration, decision, detection, next_experiment
 from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
-from diagnosis.baseline import Base
-from diagnosis.calibration import Certainty
-from diagnosis.case import Case
-from diagnosis.detection import Findings, Prices, Tell
-from diagnosis.effect_library import Kind
-from diagnosis.free_runs import FreeRuns
-from diagnosis.gap import Reach, apart
-from diagnosis.refine import Repair
+from diagnosis.baseline import Baseline
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.case import GapCase
+from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
+from diagnosis.effect_library import EffectType
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.gap import GapClosure, evaluate_unseen
+from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
 from diagnosis.stages import examine_gap
 
-NEAR = 0.6
+RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
 DECIDED_BY = {
     frozenset(
@@ -41,7 +41,7 @@ DECIDED_BY = {
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class DiagnosisPipeline:
     """What a diagnosis works with.
 
     Attributes:
@@ -55,42 +55,41 @@ class Diagnosis:
         generator: Draws bootstraps, permutations and excitations.
     """
 
-    case: Case
-    base: Base
-    kinds: Sequence[Kind]
-    prices: Prices
-    calibration: Certainty
+    case: GapCase
+    base: Baseline
+    kinds: Sequence[EffectType]
+    penalties: Penalties
+    calibration: ProbabilityModel
     thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
     generator: np.random.Generator
 
-    def run(self, tell: Tell) -> Outcome:
-        """Returns the outcome; `tell` is told what is being done and how much of the whole is done."""
+    def run(self, tell: ProgressCallback) -> Outcome:
+        """Return the outcome; `tell` is told what is being done and how much of the whole is done."""
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
-        search = detection.Search(self.case, self.base, self.kinds, self.prices, tell)
+        search = detection.EffectSearch(self.case, self.base, self.kinds, self.penalties, tell)
         return self._outcome(search.run())
 
-    def _outcome(self, findings: Findings) -> Outcome:
-        weighed = decision.record_weights(findings, self.prices)
-        findings = decision.likely(findings, self.prices, self.certainty)
-        field, evidence = self.base.field, findings.evidence
-        before, floor = field.runs(field.evidence.base), self._floor()
-        unknown = decision.is_unknown(findings, self.prices, self.certainty)
-        repaired = None if unknown else findings.repair
-        found = [] if unknown else findings.others
-        mean = 0.0 if evidence.mean is None else evidence.mean
-        paths = (
-            repaired.after if repaired else evidence.base + mean if found else field.evidence.base
-        )
-        reach = Reach(
-            self.base, self.case.machine, paths, repaired and repaired.own, self.generator
+    def _outcome(self, result: DetectionResult) -> Outcome:
+        weighed = decision.record_weights(result, self.penalties)
+        result = decision.drop_unlikely_effects(result, self.penalties, self.calibration)
+        field, residuals = self.base.field, result.residuals
+        before, floor = field.runs(field.residuals.base), self._floor()
+        unknown = decision.is_unknown(result, self.penalties, self.calibration)
+        fitted = None if unknown else result.fitted
+        found = [] if unknown else result.detected
+        mean = 0.0 if residuals.mean is None else residuals.mean
+        paths = fitted.after if fitted else residuals.base + mean if found else field.residuals.base
+        reach = GapClosure(
+            self.base, self.case.machine, paths, fitted and fitted.own, self.generator
         )
         foretold = reach.foretold()
         selected = [
-            decision.other(findings, one, self.certainty, self.case.machine) for one in found
+            decision.describe_detected_effect(result, one, self.calibration, self.case.machine)
+            for one in found
         ]
-        selected += self._selected(findings, reach) if repaired else []
+        selected += self._selected(result, reach) if fitted else []
         selected.sort(key=lambda one: -one.probability)
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
@@ -98,38 +97,40 @@ class Diagnosis:
         seen = examine_gap(
             before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
         )
-        remainder = self._remainder(findings, reach) if selected else None
-        chance = decision.unknown_chance(findings, self.prices, self.certainty)
+        remainder = self._remainder(result, reach) if selected else None
+        chance = decision.compute_unknown_probability(result, self.penalties, self.calibration)
         answer = Answer(
             verdict=told,
             selected=tuple(selected),
             ranking=tuple(
-                decision.ranking(findings, selected, self.prices, self.certainty, machine, chance)
+                decision.rank_hypotheses(
+                    result, selected, self.penalties, self.calibration, machine, chance
+                )
             ),
             where=seen.where(),
             gap=reach.gap(),
-            next_experiment=self._next(findings, selected),
-            reason=self._reason(told, findings, selected, remainder),
+            next_experiment=self._next(result, selected),
+            reason=self._reason(told, result, selected, remainder),
             more=seen.more()
-            | self._more(findings, weighed, foretold)
+            | self._more(result, weighed, foretold)
             | {"unknown_remainder": remainder}
-            | self._unseen(findings, repaired),
+            | self._unseen(result, fitted),
         )
         return Outcome(answer, before, after, floor)
 
-    def _selected(self, findings: Findings, reach: Reach) -> list[Selected]:
+    def _selected(self, result: DetectionResult, reach: GapClosure) -> list[Selected]:
         kinds = {kind.name: kind for kind in self.kinds}
-        chosen = decision.chosen_kinds(findings, kinds)
-        shares = reach.by_effect(findings, [kind.name for kind in chosen])
-        assert findings.repair is not None, "what is selected has been simulated"
+        chosen = decision.rank_chosen_effects(result, kinds)
+        shares = reach.by_effect(result, [kind.name for kind in chosen])
+        assert result.fitted is not None, "what is selected has been simulated"
         found = []
         for kind in chosen:
-            swaps = decision.rivals(findings, kind.name)
-            like = decision.same_as(swaps, decision.own_gain(findings, kind.name))
-            signs = decision.named_signs(
-                findings, self.prices, self.certainty, kind.name, swaps, like
+            swaps = decision.rank_substitutions(result, kind.name)
+            like = decision.list_equivalents(swaps, decision.compute_own_gain(result, kind.name))
+            signs = decision.read_chosen_signs(
+                result, self.penalties, self.calibration, kind.name, swaps, like
             )
-            joints = findings.repair.joints_of(kind)
+            joints = result.fitted.joints_of(kind)
             decided = next(
                 (how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)),
                 None,
@@ -142,9 +143,9 @@ class Diagnosis:
                         for name, has in zip(self.case.machine.joint_names, joints, strict=True)
                         if has
                     ),
-                    probability=calibration.chance(self.certainty.right, signs),
-                    parameters=decision.numbers(
-                        findings, kind, self.case.machine, self.certainty.form[kind.stage]
+                    probability=calibration.compute_probability(self.calibration.right, signs),
+                    parameters=decision.estimate_numbers(
+                        result, kind, self.case.machine, self.calibration.form[kind.stage]
                     ),
                     gap_closed=shares[kind.name],
                     same_as=like,
@@ -153,9 +154,9 @@ class Diagnosis:
             )
         return sorted(found, key=lambda one: -one.probability)
 
-    def _remainder(self, findings: Findings, reach: Reach) -> dict[str, Any] | None:
-        """Returns what is left beside the effects that were named and has no name; `None` where that is nothing."""
-        predictable = decision.unexplained(findings)
+    def _remainder(self, result: DetectionResult, reach: GapClosure) -> dict[str, Any] | None:
+        """Return what is left beside the effects that were named and has no name; `None` where that is nothing."""
+        predictable = decision.find_unexplained_joints(result)
         names = self.case.machine.joint_names
         beyond = reach.beyond()
         joints = [
@@ -168,42 +169,44 @@ class Diagnosis:
         over = f"the error of {', '.join(beyond)} exceeds the floor" if beyond else ""
         return {"joints": joints, "reason": "; ".join(filter(None, (why, over)))}
 
-    def _unseen(self, findings: Findings, repaired: Repair | None) -> dict[str, Any]:
-        """Returns how far the effects carry on recordings apart."""
-        if not self.case.unseen or repaired is None:
+    def _unseen(self, result: DetectionResult, fitted: FittedSet | None) -> dict[str, Any]:
+        """Return how far the effects carry on recordings apart."""
+        if not self.case.unseen or fitted is None:
             return {}
-        return {"unseen": apart(findings, self.case.unseen, self.case.machine)}
+        return {"unseen": evaluate_unseen(result, self.case.unseen, self.case.machine)}
 
-    def _next(self, findings: Findings, selected: Sequence[Selected]) -> NextExperiment | None:
-        """Returns the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
+    def _next(self, result: DetectionResult, selected: Sequence[Selected]) -> NextExperiment | None:
+        """Return the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
         kinds, rivals = {kind.name: kind for kind in self.kinds}, []
         undecided = next((one for one in selected if one.same_as), None)
         for one in selected:
             swaps = (
                 []
-                if one.effect not in findings.chosen.names
-                else decision.rivals(findings, one.effect)
+                if one.effect not in result.chosen.names
+                else decision.rank_substitutions(result, one.effect)
             )
-            near = {swap.name: max(0.0, swap.share) for swap in swaps[:3] if swap.share > NEAR}
+            near = {
+                swap.name: max(0.0, swap.share) for swap in swaps[:3] if swap.share > RIVAL_SHARE
+            }
             if near and (undecided is None or one is undecided):
                 rivals = [
-                    next_experiment.Rival(
+                    next_experiment.RivalEffect(
                         kinds[one.effect],
-                        decision.values(findings, one.effect, one.effect),
+                        decision.look_up_values(result, one.effect, one.effect),
                         one.probability,
                     )
                 ]
                 rivals += [
-                    next_experiment.Rival(
+                    next_experiment.RivalEffect(
                         kinds[name],
-                        decision.values(findings, one.effect, name),
+                        decision.look_up_values(result, one.effect, name),
                         share * one.probability,
                     )
                     for name, share in near.items()
                 ]
                 break
-        noises = self.base.field.evidence.noise or []
-        found = next_experiment.best(
+        noises = self.base.field.residuals.noise or []
+        found = next_experiment.choose_experiment(
             self.base.actuator, noises, rivals, self.excitations, self.case.machine, self.generator
         )
         if found is None and undecided and undecided.decided_by:
@@ -214,16 +217,16 @@ class Diagnosis:
             )
         return found
 
-    def _floor(self) -> FreeRuns | None:
-        if not self.base.nulls:
+    def _floor(self) -> WindowedRuns | None:
+        if not self.base.left_out:
             return None
         recordings, source, row, paths = [], [], [], []
-        for one in self.base.nulls:
+        for one in self.base.left_out:
             source.append(one.source + len(recordings))
             recordings += one.recordings
             row.append(one.row)
-            paths.append(one.evidence.base)
-        return FreeRuns(
+            paths.append(one.residuals.base)
+        return WindowedRuns(
             recordings,
             np.concatenate(source),
             np.concatenate(row),
@@ -234,7 +237,7 @@ class Diagnosis:
         return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
 
     def _more(
-        self, findings: Findings, weighed: Mapping[str, Any], foretold: Estimate | None
+        self, result: DetectionResult, weighed: Mapping[str, Any], foretold: Estimate | None
     ) -> dict[str, Any]:
         names = self.case.machine.joint_names
         rivals = [
@@ -242,11 +245,11 @@ class Diagnosis:
                 "name": f"{name} on {joint}",
                 "effect": name,
                 "joints": [joint],
-                "score": table.scored[subset].total,
-                "selected": name in findings.chosen.subsets[j],
+                "score": table.scores[subset].total,
+                "selected": name in result.chosen.subsets[j],
             }
-            for j, (joint, table) in enumerate(zip(names, findings.tables, strict=True))
-            for subset in table.scored
+            for j, (joint, table) in enumerate(zip(names, result.tables, strict=True))
+            for subset in table.scores
             if len(subset) == 1 and (name := next(iter(subset)))
         ]
         rivals = sorted(rivals, key=lambda row: -row["score"])[:40]
@@ -259,7 +262,11 @@ class Diagnosis:
                 "scatter": float(c),
             }
             for name, a, b, c in zip(
-                names, findings.left.T, findings.left_null.T, findings.scatter, strict=True
+                names,
+                result.clue_gains.T,
+                result.reference_clue_gains.T,
+                result.scatter,
+                strict=True,
             )
             for best in [int(np.argmax(a - b))]
         }
@@ -272,7 +279,7 @@ class Diagnosis:
         return {
             "evidence": {
                 "rivals": rivals,
-                "threshold": self.prices.name + self.prices.joint,
+                "threshold": self.penalties.name + self.penalties.joint,
                 "null": null,
                 "unit": "log likelihood",
             },
@@ -284,7 +291,7 @@ class Diagnosis:
     def _reason(
         self,
         told: str,
-        findings: Findings,
+        result: DetectionResult,
         selected: Sequence[Selected],
         remainder: Mapping[str, Any] | None,
     ) -> str:
@@ -296,13 +303,13 @@ class Diagnosis:
                 f"; an unknown remainder on {', '.join(remainder['joints'])}" if remainder else ""
             )
         if told == "unknown":
-            joints = np.flatnonzero(decision.unexplained(findings))
+            joints = np.flatnonzero(decision.find_unexplained_joints(result))
             where = ", ".join(self.case.machine.joint_names[j] for j in joints) or "some joints"
-            best = calibration.predicted(findings).max(1)
+            best = calibration.subtract_reference_clues(result).max(1)
             clues = [
                 clue
                 for clue, earned in zip(CLUES, best, strict=True)
-                if earned > max(decision.LEFT, 0.5 * best.max())
+                if earned > max(decision.MIN_CLUE_NATS, 0.5 * best.max())
             ]
             if not clues:
                 return f"the gap of {where} is real, and no effect of the library explains it"
@@ -310,10 +317,12 @@ class Diagnosis:
         return "no effect earns more on the field recordings than it would by chance"
 
     def _cannot_tell(self, why: str) -> Outcome:
-        """Returns the answer of recordings that cannot tell anything."""
+        """Return the answer of recordings that cannot tell anything."""
         field = self.base.field
-        runs, floor = field.runs(field.evidence.base), self._floor()
-        known = Reach(self.base, self.case.machine, field.evidence.base, None, self.generator).gap()
+        runs, floor = field.runs(field.residuals.base), self._floor()
+        known = GapClosure(
+            self.base, self.case.machine, field.residuals.base, None, self.generator
+        ).gap()
         known = replace(known, closed=None)
         answer = Answer(
             verdict="unknown", selected=(), ranking=(Ranked("unknown", (), 1.0),), where=Where({}, (), None), gap=known,
@@ -325,8 +334,8 @@ class Diagnosis:
 EFFECTS_FILE = "effects.yaml"
 
 
-def write_effects(answer: Answer, kinds: Sequence[Kind], path: Path) -> None:
-    """Writes the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
+def write_effects(answer: Answer, kinds: Sequence[EffectType], path: Path) -> None:
+    """Write the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
 
     Raises:
         StorageError: it could not be written.
@@ -340,7 +349,7 @@ def write_effects(answer: Answer, kinds: Sequence[Kind], path: Path) -> None:
     ]
     text = (
         yaml.safe_dump(
-            {one.effect: _node(one, by_name[one.effect]) for one in chosen}, sort_keys=False
+            {one.effect: _build_node(one, by_name[one.effect]) for one in chosen}, sort_keys=False
         )
         if chosen
         else ""
@@ -351,7 +360,7 @@ def write_effects(answer: Answer, kinds: Sequence[Kind], path: Path) -> None:
         raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
 
 
-def _node(one: Selected, kind: Kind) -> dict:
+def _build_node(one: Selected, kind: EffectType) -> dict:
     target = kind.target
     node: dict = {"_target_": f"{target.__module__}.{target.__name__}"}
     if "joints" in target.__annotations__:

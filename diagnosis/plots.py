@@ -20,7 +20,7 @@ from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, make_joint_p
 from brokk_rl.split import COMMANDED
 from diagnosis.answer import Answer, Outcome, format_error
 from diagnosis.error_growth import READINGS, compute_rmse_curve
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.sanity import name_recording
 
 BEFORE, AFTER, FLOOR = RED, BLUE, GREY
@@ -68,7 +68,7 @@ def draw_gap_bars(answer: Answer) -> Figure | None:
     return figure
 
 
-def draw_gap_map(answer: Answer, before: FreeRuns, machine: Machine) -> Figure:
+def draw_gap_map(answer: Answer, before: WindowedRuns, machine: Machine) -> Figure:
     """Draw the gap by joint and regime, and the error of each joint over the running time."""
     location = answer.more["location"]
     parts = location["parts"]["regime"]
@@ -292,7 +292,7 @@ def draw_tip_budget(budget: Mapping[str, Any]) -> Figure:
     return figure
 
 
-def _draw_error_over_time(axis: Axes, before: FreeRuns, machine: Machine) -> None:
+def _draw_error_over_time(axis: Axes, before: WindowedRuns, machine: Machine) -> None:
     """Fill the axis with the error of each joint over running time, in parts of its travel."""
     square = np.nanmean(before.error**2, 1) / (machine.upper - machine.lower) ** 2
     order = np.lexsort((before.row, before.source))

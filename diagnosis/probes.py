@@ -21,7 +21,7 @@ import torch
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.split import COMMANDED
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.permutation_test import number_parts
 from diagnosis.regimes import CREEP_COMMAND, REGIMES, TRANSIENT_S, label_regimes, shift_by_dead_time
 
@@ -34,7 +34,7 @@ MAD = 1.4826
 
 
 def measure_onsets(
-    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Return the spread of the lateness of starts (s) and the ringing (rad or m), by joint.
 
@@ -64,7 +64,7 @@ def measure_onsets(
 
 
 def _measure_lateness(
-    runs: FreeRuns, label: np.ndarray, joint: int, machine: Machine
+    runs: WindowedRuns, label: np.ndarray, joint: int, machine: Machine
 ) -> Iterator[float]:
     """Yield for each start within a window how much later the machine moves, s."""
     ahead = round(TRANSIENT_S / machine.period_s)
@@ -86,7 +86,7 @@ def _measure_lateness(
             yield float(late_s)
 
 
-def _measure_ringing(runs: FreeRuns, label: list[np.ndarray], joint: int) -> Iterator[float]:
+def _measure_ringing(runs: WindowedRuns, label: list[np.ndarray], joint: int) -> Iterator[float]:
     """Yield the scatter about a straight line in the second half of the time after each stop."""
     for recording, regime in zip(runs.recordings, label, strict=True):
         is_stop = regime == REGIMES.index("stop")
@@ -198,7 +198,7 @@ TEXTS = {
 
 
 def probe_residuals(
-    runs: FreeRuns, reference: FreeRuns | None, machine: Machine, dead_time_s: np.ndarray
+    runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine, dead_time_s: np.ndarray
 ) -> list[Probe]:
     """Return all figures, those that stand out most first.
 
@@ -234,7 +234,7 @@ def _describe_coefficient(effect: str, value: float, unit: str) -> str:
 
 
 def _fit_coefficients(
-    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Return the coefficient of each probe and its standard error, by effect and joint."""
     span = max(1, round(SPAN_S / machine.period_s))
@@ -266,7 +266,7 @@ def _fit_coefficients(
 class _ProbeColumns:
     """Regressors of the excess speed, one an effect, `(W, K)` for each joint."""
 
-    def __init__(self, runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
+    def __init__(self, runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
         acting = [shift_by_dead_time(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
         self._u = runs.cut(acting)
         self._regime = runs.cut(

@@ -11,43 +11,43 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.effect_library import Candidates, Kind
-from diagnosis.residuals import Evidence, Ray, robust_loss, robust_weight
-from diagnosis.responses import PRIOR, plain_joints
-from diagnosis.search import LEAST, Chosen, Price, Subset
+from diagnosis.effect_library import EffectSimulator, EffectType
+from diagnosis.residuals import ParameterRay, Residuals, compute_loss, weigh_residuals
+from diagnosis.responses import SIZE_PRIOR, fit_joint_faults
+from diagnosis.search import MIN_SIZE, EffectSet, PenaltyFunction, Subset
 
-STEPS = 6
+MAX_FIT_STEPS = 6
 """Steps of a fit at most."""
 
-FEW = 2
+REFIT_STEPS = 2
 """The same where it is only to be told what is left without some effects."""
 
-STEP = 0.05
+SIZE_STEP = 0.05
 """Finite difference, of the typical size."""
 
-STARTS = (1.0, 0.5, 1.6)
+START_FACTORS = (1.0, 0.5, 1.6)
 """Multiples of the first guess at which a fit may begin: what adding up the effects said is far off
 where they are large."""
 
-DAMPING = (0.03, 1.0, 30.0)
+DAMPING_FACTORS = (0.03, 1.0, 30.0)
 """Factors on the damping that are tried at each step."""
 
-WITHIN = (1e-4, 1e4)
+DAMPING_BOUNDS = (1e-4, 1e4)
 """Damping, over the diagonal of the normal matrix."""
 
-ENOUGH = 0.02
+MIN_FIT_GAIN = 0.02
 """Gain in log likelihood below which a fit ends."""
 
 DRAWN, FOLLOWED, SPREAD = 40, 3, 0.5
 """Starts of a search, those of a joint that are followed, and how far they scatter (of the
 logarithm)."""
 
-BEYOND = 2.5
+MAX_EXTRAPOLATION = 2.5
 """Sizes may grow to so many times the largest that was simulated before."""
 
 
 @dataclass(frozen=True, eq=False)
-class Repair:
+class FittedSet:
     """Effects with their sizes.
 
     Attributes:
@@ -62,7 +62,7 @@ class Repair:
         deviation: Standard errors of the sizes, `(R, J)`.
     """
 
-    rays: Sequence[Ray]
+    rays: Sequence[ParameterRay]
     mask: np.ndarray
     sizes: np.ndarray
     halves: np.ndarray
@@ -72,22 +72,22 @@ class Repair:
     deviation: np.ndarray
 
     @property
-    def kinds(self) -> list[Kind]:
+    def kinds(self) -> list[EffectType]:
         """Effects of the set, each once."""
         return list({ray.kind.name: ray.kind for ray in self.rays}.values())
 
-    def effects(self) -> list[tuple[Kind, dict[str, np.ndarray]]]:
-        """Returns the effects with their numbers, each `(1, J)` or `(1, 1)`."""
-        return _effects(self.rays, self.sizes[None])
+    def effects(self) -> list[tuple[EffectType, dict[str, np.ndarray]]]:
+        """Return the effects with their numbers, each `(1, J)` or `(1, 1)`."""
+        return _collect_effects(self.rays, self.sizes[None])
 
-    def joints_of(self, kind: Kind) -> np.ndarray:
-        """Returns which joints have an effect, `(J,)` bool."""
+    def joints_of(self, kind: EffectType) -> np.ndarray:
+        """Return which joints have an effect, `(J,)` bool."""
         return np.any(
             [mask for ray, mask in zip(self.rays, self.mask, strict=True) if ray.kind is kind], 0
         )
 
     def size(self, name: str, joint: int) -> float:
-        """Returns the largest size of an effect on a joint, along any of its rays."""
+        """Return the largest size of an effect on a joint, along any of its rays."""
         return max(
             (
                 abs(float(row[joint]))
@@ -98,26 +98,30 @@ class Repair:
         )
 
 
-def simulate(candidates: Candidates, rays: Sequence[Ray], sizes: np.ndarray) -> np.ndarray:
-    """Returns free runs `(C, W, K, J)` with the effects at sizes `(C, R, J)`."""
-    return candidates.paths(_effects(rays, sizes), len(sizes))
+def simulate_sizes(
+    simulator: EffectSimulator, rays: Sequence[ParameterRay], sizes: np.ndarray
+) -> np.ndarray:
+    """Return free runs `(C, W, K, J)` with the effects at sizes `(C, R, J)`."""
+    return simulator.simulate(_collect_effects(rays, sizes), len(sizes))
 
 
-def _effects(rays: Sequence[Ray], sizes: np.ndarray) -> list[tuple[Kind, dict[str, np.ndarray]]]:
-    values: dict[str, tuple[Kind, dict[str, np.ndarray]]] = {}
+def _collect_effects(
+    rays: Sequence[ParameterRay], sizes: np.ndarray
+) -> list[tuple[EffectType, dict[str, np.ndarray]]]:
+    values: dict[str, tuple[EffectType, dict[str, np.ndarray]]] = {}
     for r, ray in enumerate(rays):
         values.setdefault(ray.kind.name, (ray.kind, {}))[1].update(ray.values(sizes[:, r]))
     return list(values.values())
 
 
-def repair(
-    evidence: Evidence,
+def fit_set(
+    residuals: Residuals,
     subsets: Sequence[frozenset[str]],
-    rays: Mapping[str, Sequence[Ray]],
+    rays: Mapping[str, Sequence[ParameterRay]],
     start: Sequence[Mapping[str, np.ndarray]],
-    steps: int = STEPS,
-) -> Repair:
-    """Fits a set of effects by simulation, all sizes of a joint at once.
+    steps: int = MAX_FIT_STEPS,
+) -> FittedSet:
+    """Fit a set of effects by simulation, all sizes of a joint at once.
 
     The fit to all entries begins at the best of several multiples of `start`; those to all but one
     half begin where it ended, and
@@ -131,48 +135,55 @@ def repair(
         start: Sizes of each effect along its rays, by joint and name.
         steps: Steps of each fit at most.
     """
-    found, mask, sizes = _laid_out(subsets, rays, start)
+    found, mask, sizes = _lay_out(subsets, rays, start)
     every, halves = (
-        np.ones((1, len(evidence.fold))),
-        np.stack([evidence.fold != 0, evidence.fold != 1]).astype(float),
+        np.ones((1, len(residuals.fold))),
+        np.stack([residuals.fold != 0, residuals.fold != 1]).astype(float),
     )
-    fit = _Fit(evidence, found, mask)
+    fit = _Fit(residuals, found, mask)
     whole = fit.descended(fit.nearest(sizes)[None], every, steps)
     apart = fit.descended(np.repeat(whole, 2, 0), halves, max(1, steps // 2), whole)
-    z, slopes, _ = _linear(evidence, found, whole)
+    z, slopes, _ = _linearise(residuals, found, whole)
     z_apart, paths = fit.simulated(apart)
-    half = evidence.fold.reshape(len(evidence.way), -1)[:, 0]
+    half = residuals.fold.reshape(len(residuals.increments), -1)[:, 0]
     first = (half == 0)[:, None, None]
-    mean = 0.0 if evidence.mean is None else evidence.mean
+    mean = 0.0 if residuals.mean is None else residuals.mean
     after, own = (
         np.where(first, paths[0], paths[1]) + mean,
         np.where(first, paths[1], paths[0]) + mean,
     )
-    held = np.where(evidence.fold == 0, z_apart[0], z_apart[1])
-    return Repair(
-        found, mask, whole[0], apart, after, own, held, _deviation(z[0], slopes[0], evidence, mask)
+    held = np.where(residuals.fold == 0, z_apart[0], z_apart[1])
+    return FittedSet(
+        found,
+        mask,
+        whole[0],
+        apart,
+        after,
+        own,
+        held,
+        _estimate_deviations(z[0], slopes[0], residuals, mask),
     )
 
 
-def refitted(
-    evidence: Evidence,
+def simulate_refit(
+    residuals: Residuals,
     subsets: Sequence[frozenset[str]],
-    rays: Mapping[str, Sequence[Ray]],
+    rays: Mapping[str, Sequence[ParameterRay]],
     start: Sequence[Mapping[str, np.ndarray]],
 ) -> np.ndarray:
-    """Returns free runs `(W, K, J)` with a set of effects, sizes fitted to all entries in a few steps from `start`."""
-    found, mask, sizes = _laid_out(subsets, rays, start)
-    fit = _Fit(evidence, found, mask)
-    sizes = fit.descended(fit.nearest(sizes)[None], np.ones((1, len(evidence.fold))), FEW)
-    return fit.simulated(sizes)[1][0] + (0.0 if evidence.mean is None else evidence.mean)
+    """Return free runs `(W, K, J)` with a set of effects, sizes fitted to all entries in a few steps from `start`."""
+    found, mask, sizes = _lay_out(subsets, rays, start)
+    fit = _Fit(residuals, found, mask)
+    sizes = fit.descended(fit.nearest(sizes)[None], np.ones((1, len(residuals.fold))), REFIT_STEPS)
+    return fit.simulated(sizes)[1][0] + (0.0 if residuals.mean is None else residuals.mean)
 
 
-def _laid_out(
+def _lay_out(
     subsets: Sequence[frozenset[str]],
-    rays: Mapping[str, Sequence[Ray]],
+    rays: Mapping[str, Sequence[ParameterRay]],
     start: Sequence[Mapping[str, np.ndarray]],
-) -> tuple[list[Ray], np.ndarray, np.ndarray]:
-    """Returns the rays of a set, which joints have them `(R, J)`, and sizes to begin at `(R, J)`."""
+) -> tuple[list[ParameterRay], np.ndarray, np.ndarray]:
+    """Return the rays of a set, which joints have them `(R, J)`, and sizes to begin at `(R, J)`."""
     chosen = [
         (ray, place)
         for name in sorted(frozenset().union(*subsets))
@@ -189,22 +200,22 @@ def _laid_out(
     return [ray for ray, _ in chosen], mask, np.array(sizes)
 
 
-def searched(
-    evidence: Evidence,
-    rays: Sequence[Ray],
+def search_sizes(
+    residuals: Residuals,
+    rays: Sequence[ParameterRay],
     mask: np.ndarray,
     known: np.ndarray,
     generator: np.random.Generator,
 ) -> np.ndarray:
-    """Returns sizes `(R, J)` fitted from many starts about those `known`; where these are 0, about the typical one."""
+    """Return sizes `(R, J)` fitted from many starts about those `known`; where these are 0, about the typical one."""
     drawn = np.exp(SPREAD * generator.standard_normal((DRAWN, *known.shape)))
     starts = np.where(known == 0.0, drawn**2, known * drawn) * mask
-    fit = _Fit(evidence, rays, mask)
+    fit = _Fit(residuals, rays, mask)
     starts = np.clip(starts, *fit.bounds)
-    order = _totals(fit.simulated(starts)[0], starts, 1.0).argsort(0)[:FOLLOWED]  # (F, J)
+    order = _compute_totals(fit.simulated(starts)[0], starts, 1.0).argsort(0)[:FOLLOWED]  # (F, J)
     best = np.take_along_axis(starts, order[:, None], 0)
-    found = fit.descended(best, np.ones((FOLLOWED, len(evidence.fold))), STEPS)
-    last = _totals(fit.simulated(found)[0], found, 1.0).argmin(0)
+    found = fit.descended(best, np.ones((FOLLOWED, len(residuals.fold))), MAX_FIT_STEPS)
+    last = _compute_totals(fit.simulated(found)[0], found, 1.0).argmin(0)
     return np.take_along_axis(found, last[None, None], 0)[0]
 
 
@@ -212,46 +223,49 @@ def searched(
 class _Fit:
     """Levenberg and Marquardt's descent of the sizes of all joints at once, `F` fits side by side."""
 
-    evidence: Evidence
-    rays: Sequence[Ray]
+    residuals: Residuals
+    rays: Sequence[ParameterRay]
     mask: np.ndarray
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest sizes, `(R, 1)`: beyond what was simulated before, within the bounds of the numbers."""
         low, high = (np.array([ray.sizes[end] for ray in self.rays])[:, None] for end in (0, -1))
-        by = np.array([1.0 if ray.is_tied else BEYOND for ray in self.rays])[:, None]
+        by = np.array([1.0 if ray.is_tied else MAX_EXTRAPOLATION for ray in self.rays])[:, None]
         return np.where(low < 0, by * low, low), by * high
 
     def simulated(self, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns errors over the noise `(F, J, E)` and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
-        paths = simulate(self.evidence.candidates, self.rays, sizes)
-        return self.evidence.whitened(self.evidence.error_of(paths)).swapaxes(0, 1), paths
+        """Return errors over the noise `(F, J, E)` and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
+        paths = simulate_sizes(self.residuals.simulator, self.rays, sizes)
+        return self.residuals.whiten(self.residuals.compute_error(paths)).swapaxes(0, 1), paths
 
     def nearest(self, sizes: np.ndarray) -> np.ndarray:
         """Returns, joint by joint, the best of several multiples of sizes `(R, J)`."""
-        trials = np.clip(np.stack([sizes * by for by in STARTS]), *self.bounds)
-        best = _totals(self.simulated(trials)[0], trials, 1.0).argmin(0)
+        trials = np.clip(np.stack([sizes * by for by in START_FACTORS]), *self.bounds)
+        best = _compute_totals(self.simulated(trials)[0], trials, 1.0).argmin(0)
         return np.where(self.mask, np.take_along_axis(trials, best[None, None], 0)[0], 0.0)
 
     def descended(
         self, now: np.ndarray, used: np.ndarray, steps: int, about: np.ndarray | float = 0.0
     ) -> np.ndarray:
-        """Returns the best sizes from `now` `(F, R, J)` on, entries weighed by `used` `(F, E)`, sizes a priori `about` so large."""
+        """Return the best sizes from `now` `(F, R, J)` on, entries weighed by `used` `(F, E)`, sizes a priori `about` so large."""
         damping, weights = np.full((len(now), now.shape[2]), 1e-2), used[:, None]
         for _ in range(steps):
-            z, slopes, _ = _linear(self.evidence, self.rays, now)
-            least = _totals(z, now - about, weights)
+            z, slopes, _ = _linearise(self.residuals, self.rays, now)
+            least = _compute_totals(z, now - about, weights)
             trials = np.stack(
-                [now + self._step(z, slopes, now - about, used, by * damping) for by in DAMPING]
+                [
+                    now + self._step(z, slopes, now - about, used, by * damping)
+                    for by in DAMPING_FACTORS
+                ]
             )
             trials = np.clip(trials, *self.bounds) * self.mask
             tried = self.simulated(trials.reshape(-1, *now.shape[1:]))[0].reshape(
-                len(DAMPING), *z.shape
+                len(DAMPING_FACTORS), *z.shape
             )
             totals = np.stack(
                 [
-                    _totals(one, sizes - about, weights)
+                    _compute_totals(one, sizes - about, weights)
                     for one, sizes in zip(tried, trials, strict=True)
                 ]
             )  # (D, F, J)
@@ -259,12 +273,14 @@ class _Fit:
             gained = least - totals.min(0)
             better = gained > 0.0
             damping = np.clip(
-                damping * np.where(better, np.array(DAMPING)[best], DAMPING[-1] ** 2), *WITHIN
+                damping
+                * np.where(better, np.array(DAMPING_FACTORS)[best], DAMPING_FACTORS[-1] ** 2),
+                *DAMPING_BOUNDS,
             )
             now = np.where(
                 better[:, None], np.take_along_axis(trials, best[None, :, None], 0)[0], now
             )
-            if gained.max() < ENOUGH:
+            if gained.max() < MIN_FIT_GAIN:
                 break
         return now
 
@@ -276,33 +292,35 @@ class _Fit:
         used: np.ndarray,
         damping: np.ndarray,
     ) -> np.ndarray:
-        """Returns how far sizes should change, `(F, R, J)`; `off`: how far they are from what they are a priori."""
+        """Return how far sizes should change, `(F, R, J)`; `off`: how far they are from what they are a priori."""
         step = np.zeros_like(off)
         for f, j in np.ndindex(damping.shape):
             rows = self.mask[:, j]
-            weighted = slopes[f, j][rows] * (robust_weight(z[f, j]) * used[f])
-            normal = weighted @ slopes[f, j][rows].T + np.eye(rows.sum()) / PRIOR**2
+            weighted = slopes[f, j][rows] * (weigh_residuals(z[f, j]) * used[f])
+            normal = weighted @ slopes[f, j][rows].T + np.eye(rows.sum()) / SIZE_PRIOR**2
             damped = normal + damping[f, j] * np.diag(np.diag(normal))
             step[f, rows, j] = np.linalg.solve(
-                damped, weighted @ z[f, j] - off[f, rows, j] / PRIOR**2
+                damped, weighted @ z[f, j] - off[f, rows, j] / SIZE_PRIOR**2
             )
         return step
 
 
-def _totals(z: np.ndarray, sizes: np.ndarray, used: np.ndarray | float) -> np.ndarray:
-    """Returns the loss of errors `(F, J, E)` and sizes `(F, R, J)`, `(F, J)`."""
-    return (robust_loss(z[..., None], -1) * used).sum(-1) + 0.5 * np.square(sizes / PRIOR).sum(1)
+def _compute_totals(z: np.ndarray, sizes: np.ndarray, used: np.ndarray | float) -> np.ndarray:
+    """Return the loss of errors `(F, J, E)` and sizes `(F, R, J)`, `(F, J)`."""
+    return (compute_loss(z[..., None], -1) * used).sum(-1) + 0.5 * np.square(
+        sizes / SIZE_PRIOR
+    ).sum(1)
 
 
-def _linear(
-    evidence: Evidence, rays: Sequence[Ray], sizes: np.ndarray
+def _linearise(
+    residuals: Residuals, rays: Sequence[ParameterRay], sizes: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns errors `(F, J, E)`, their slopes over the sizes `(F, J, R, E)`, and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
+    """Return errors `(F, J, E)`, their slopes over the sizes `(F, J, R, E)`, and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
     fits, count, joints = sizes.shape
     sign = np.array(
         [
             [
-                1.0 if (row + STEP <= ray.sizes[-1] * 2).all() else -1.0
+                1.0 if (row + SIZE_STEP <= ray.sizes[-1] * 2).all() else -1.0
                 for row, ray in zip(one, rays, strict=True)
             ]
             for one in sizes
@@ -310,10 +328,10 @@ def _linear(
     )
     varied = np.repeat(sizes[:, None], count + 1, 1)
     for r in range(count):
-        varied[:, r + 1, r] += STEP * sign[:, r, None]
-    paths = simulate(evidence.candidates, rays, varied.reshape(-1, count, joints))
-    z = evidence.whitened(evidence.error_of(paths)).reshape(joints, fits, count + 1, -1)
-    slopes = (z[:, :, :1] - z[:, :, 1:]) / (STEP * sign)[None, :, :, None]
+        varied[:, r + 1, r] += SIZE_STEP * sign[:, r, None]
+    paths = simulate_sizes(residuals.simulator, rays, varied.reshape(-1, count, joints))
+    z = residuals.whiten(residuals.compute_error(paths)).reshape(joints, fits, count + 1, -1)
+    slopes = (z[:, :, :1] - z[:, :, 1:]) / (SIZE_STEP * sign)[None, :, :, None]
     return (
         z[:, :, 0].swapaxes(0, 1),
         slopes.swapaxes(0, 1),
@@ -321,10 +339,10 @@ def _linear(
     )
 
 
-def _deviation(
-    z: np.ndarray, slopes: np.ndarray, evidence: Evidence, mask: np.ndarray
+def _estimate_deviations(
+    z: np.ndarray, slopes: np.ndarray, residuals: Residuals, mask: np.ndarray
 ) -> np.ndarray:
-    """Returns standard errors of the sizes, `(R, J)`.
+    """Return standard errors of the sizes, `(R, J)`.
 
     The larger of what the likelihood says and the spread between blocks, and what small faults of
     the simulator would make of them: a constant fault shows in no spread.
@@ -332,35 +350,35 @@ def _deviation(
     found = np.zeros(mask.shape)
     for j in np.flatnonzero(mask.any(0)):
         rows = mask[:, j]
-        weighted = slopes[j][rows] * robust_weight(z[j])
-        inverse = np.linalg.inv(weighted @ slopes[j][rows].T + np.eye(rows.sum()) / PRIOR**2)
+        weighted = slopes[j][rows] * weigh_residuals(z[j])
+        inverse = np.linalg.inv(weighted @ slopes[j][rows].T + np.eye(rows.sum()) / SIZE_PRIOR**2)
         scores = np.stack(
             [
-                (weighted * z[j])[:, evidence.block == one].sum(1)
-                for one in np.unique(evidence.block)
+                (weighted * z[j])[:, residuals.block == one].sum(1)
+                for one in np.unique(residuals.block)
             ]
         )
         factor = len(scores) / max(1, len(scores) - 1)
         spread = inverse @ (factor * scores.T @ scores) @ inverse
-        of_faults = np.square(inverse @ weighted @ evidence.faults[j].T).sum(1)
+        of_faults = np.square(inverse @ weighted @ residuals.faults[j].T).sum(1)
         found[rows, j] = np.sqrt(np.maximum(np.diag(spread), np.diag(inverse)) + of_faults)
     return found
 
 
-def gain(before: np.ndarray, after: np.ndarray) -> float:
-    """Returns by how much the loss of errors over the noise fell."""
-    return float(robust_loss(before) - robust_loss(after))
+def compute_gain(before: np.ndarray, after: np.ndarray) -> float:
+    """Return by how much the loss of errors over the noise fell."""
+    return float(compute_loss(before) - compute_loss(after))
 
 
-def kept(
-    evidence: Evidence,
-    chosen: Chosen,
-    repaired: Repair,
-    price: Price,
+def prune_set(
+    residuals: Residuals,
+    chosen: EffectSet,
+    fitted: FittedSet,
+    price: PenaltyFunction,
     scatter: np.ndarray,
     shared: Subset,
 ) -> tuple[Subset, ...]:
-    """Returns the set without effects of no size worth naming, and without joints where it does not pay when it is simulated.
+    """Return the set without effects of no size worth naming, and without joints where it does not pay when it is simulated.
 
     Args:
         evidence: Errors of the simulator.
@@ -372,7 +390,9 @@ def kept(
     """
     found = []
     joints = zip(
-        plain_joints(evidence, scatter), plain_joints(evidence, scatter, repaired.z), strict=True
+        fit_joint_faults(residuals, scatter),
+        fit_joint_faults(residuals, scatter, fitted.z),
+        strict=True,
     )
     for j, (subset, (before, after)) in enumerate(zip(chosen.subsets, joints, strict=True)):
         earned = float(before.loss.sum() - after.loss.sum()) + before.price - after.price
@@ -381,68 +401,68 @@ def kept(
             frozenset(
                 name
                 for name in subset
-                if name in shared or (pays and repaired.size(name, j) >= LEAST)
+                if name in shared or (pays and fitted.size(name, j) >= MIN_SIZE)
             )
         )
     return tuple(found)
 
 
-def without(
-    evidence: Evidence,
-    ways: Mapping[str, Sequence[Ray]],
-    repaired: Repair,
+def drop_effects(
+    residuals: Residuals,
+    ways: Mapping[str, Sequence[ParameterRay]],
+    fitted: FittedSet,
     subsets: Sequence[frozenset[str]],
-) -> Repair:
-    """Returns the repair with fewer effects, fitted anew from its sizes."""
-    return refit_from(evidence, ways, subsets, repaired.rays, repaired.sizes)
+) -> FittedSet:
+    """Return the repair with fewer effects, fitted anew from its sizes."""
+    return refit_from(residuals, ways, subsets, fitted.rays, fitted.sizes)
 
 
-def subsets_of(repaired: Repair) -> tuple[frozenset[str], ...]:
-    """Returns the effects of each joint."""
+def list_subsets(fitted: FittedSet) -> tuple[frozenset[str], ...]:
+    """Return the effects of each joint."""
     return tuple(
-        frozenset(ray.kind.name for ray, has in zip(repaired.rays, mask, strict=True) if has)
-        for mask in repaired.mask.T
+        frozenset(ray.kind.name for ray, has in zip(fitted.rays, mask, strict=True) if has)
+        for mask in fitted.mask.T
     )
 
 
 def refit_from(
-    evidence: Evidence,
-    ways: Mapping[str, Sequence[Ray]],
+    residuals: Residuals,
+    ways: Mapping[str, Sequence[ParameterRay]],
     subsets: Sequence[frozenset[str]],
-    rays_: Sequence[Ray],
+    rays_: Sequence[ParameterRay],
     sizes: np.ndarray,
-) -> Repair:
-    """Returns the repair with `subsets` whose fit begins at `sizes` `(R, J)` of `rays_`."""
+) -> FittedSet:
+    """Return the repair with `subsets` whose fit begins at `sizes` `(R, J)` of `rays_`."""
     place = {(ray.kind.name, ray.name): k for k, ray in enumerate(rays_)}
     start = [
         {n: np.array([sizes[place[n, ray.name], j] for ray in ways[n]]) for n in s}
         for j, s in enumerate(subsets)
     ]
-    return repair(evidence, subsets, ways, start)
+    return fit_set(residuals, subsets, ways, start)
 
 
-def thinned(evidence: Evidence, each: int) -> Evidence:
-    """Returns the simulator held against one of `each` parts of the recordings."""
-    rows = np.concatenate(evidence.groups[::each])
-    candidates = evidence.candidates
+def drop_windows(residuals: Residuals, each: int) -> Residuals:
+    """Return the simulator held against one of `each` parts of the recordings."""
+    rows = np.concatenate(residuals.groups[::each])
+    simulator = residuals.simulator
     cut = replace(
-        candidates.cut, **{name: getattr(candidates.cut, name)[rows] for name in ("u", "q", "run")}
+        simulator.cut, **{name: getattr(simulator.cut, name)[rows] for name in ("u", "q", "run")}
     )
     some = {
         name: value[rows]
-        for name in ("claims", "mean", "bias", "late")
-        if (value := getattr(evidence, name, None)) is not None
+        for name in ("valid_mask", "mean", "bias", "late")
+        if (value := getattr(residuals, name, None)) is not None
     }
     return replace(
-        evidence,
-        candidates=replace(candidates, cut=cut, running_s=candidates.running_s[rows]),
+        residuals,
+        simulator=replace(simulator, cut=cut, running_s=simulator.running_s[rows]),
         **some,
     )
 
 
-def known_sizes(rays_: Sequence[Ray], repaired: Repair) -> np.ndarray:
-    """Returns the sizes that are known already, 0 where none is, `(R, J)`."""
-    sizes = {(ray.kind.name, ray.name): repaired.sizes[k] for k, ray in enumerate(repaired.rays)}
+def look_up_sizes(rays_: Sequence[ParameterRay], fitted: FittedSet) -> np.ndarray:
+    """Return the sizes that are known already, 0 where none is, `(R, J)`."""
+    sizes = {(ray.kind.name, ray.name): fitted.sizes[k] for k, ray in enumerate(fitted.rays)}
     return np.stack(
-        [sizes.get((ray.kind.name, ray.name), np.zeros(repaired.sizes.shape[1])) for ray in rays_]
+        [sizes.get((ray.kind.name, ray.name), np.zeros(fitted.sizes.shape[1])) for ray in rays_]
     )

@@ -17,47 +17,57 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import lfilter
 
-from diagnosis.refine import Repair
-from diagnosis.residuals import SPAN, Evidence, robust_loss, robust_weight, to_increments
-from diagnosis.responses import fitted
+from diagnosis.refine import FittedSet
+from diagnosis.residuals import (
+    INCREMENT_SAMPLES,
+    Residuals,
+    compute_loss,
+    to_increments,
+    weigh_residuals,
+)
+from diagnosis.responses import fit_sizes
 
-RIDGES = (10.0, 100.0, 1000.0)
+DISCREPANCY_RIDGES = (10.0, 100.0, 1000.0)
 """Pulls towards no discrepancy, in features of unit size over the noise; that which predicts best
 is used."""
-TURNS = 2
+TURN_LAGS = 2
 """Increments before and after whose changes of speed may matter."""
-LEVELS = (0.0, 0.25, 0.5, 0.75)
+SPEED_LEVELS = (0.0, 0.25, 0.5, 0.75)
 """Speeds, of full speed, about which errors may differ."""
-ORDERS = (1, 2, 3, 4)
+POSITION_ORDERS = (1, 2, 3, 4)
 """Chebyshev polynomials of the position within the travel."""
-WIDEST = 5.0
+MAX_FAULT_SCALE = 5.0
 """Faults are no larger than so many times the usual."""
-TOLD = 0.5
+MAX_VARIANCE_SHARE = 0.5
 """Variance of an estimate, over that of its prior, up to which recordings tell anything about a
 fault."""
 WARM_S = 900.0
 """Time in which oil warms up."""
 
 
-def features(evidence: Evidence, j: int) -> np.ndarray:
-    """Returns what an error of joint `j` could depend on, in the simulator's own motion, `(W, I, F)`."""
-    way, machine = evidence.way, evidence.candidates.machine
-    full = machine.max_speed * machine.period_s * SPAN
+def build_features(residuals: Residuals, j: int) -> np.ndarray:
+    """Return what an error of joint `j` could depend on, in the simulator's own motion, `(W, I, F)`."""
+    way, machine = residuals.increments, residuals.simulator.machine
+    full = machine.max_speed * machine.period_s * INCREMENT_SAMPLES
     own, speed = way[..., j], way / full
     middle, half = (machine.upper + machine.lower)[j] / 2, (machine.upper - machine.lower)[j] / 2
-    place = np.clip((evidence.start[:, None, j] + np.cumsum(own, 1) - middle) / half, -1.0, 1.0)
+    place = np.clip((residuals.start[:, None, j] + np.cumsum(own, 1) - middle) / half, -1.0, 1.0)
     size, out = np.abs(speed[..., j]), (own > 0).astype(float)
     sides, turn = (out, 1.0 - out), np.diff(own, axis=1, prepend=own[:, :1])
-    warm = 1.0 - np.exp(-evidence.candidates.running_s / WARM_S)[:, None]
+    warm = 1.0 - np.exp(-residuals.simulator.running_s / WARM_S)[:, None]
     columns = [own * side for side in sides] + [np.full_like(own, 0.1 * full[j]), own * warm]
     columns += [
         own * np.maximum(1.0 - np.abs(size - level) / 0.25, 0.0) * side
-        for level in LEVELS
+        for level in SPEED_LEVELS
         for side in sides
     ]
-    columns += [own * np.cos(order * np.arccos(place)) * side for order in ORDERS for side in sides]
     columns += [
-        np.roll(turn, shift, 1) * side for shift in range(-TURNS, TURNS + 1) for side in sides
+        own * np.cos(order * np.arccos(place)) * side for order in POSITION_ORDERS for side in sides
+    ]
+    columns += [
+        np.roll(turn, shift, 1) * side
+        for shift in range(-TURN_LAGS, TURN_LAGS + 1)
+        for side in sides
     ]
     columns += [np.abs(turn), np.abs(np.roll(turn, 1, 1)), np.sign(own) * (size < 0.1) * full[j]]
     for k in range(way.shape[2]):
@@ -67,17 +77,19 @@ def features(evidence: Evidence, j: int) -> np.ndarray:
     return np.stack(columns, -1)
 
 
-def ridge(x: np.ndarray, z: np.ndarray, pull: float) -> np.ndarray:
-    """Returns coefficients `(F,)` of a robust ridge regression of `z` `(E,)` on features `(E, F)` of about unit size."""
+def fit_ridge(x: np.ndarray, z: np.ndarray, pull: float) -> np.ndarray:
+    """Return coefficients `(F,)` of a robust ridge regression of `z` `(E,)` on features `(E, F)` of about unit size."""
     beta = np.zeros(x.shape[1])
     for _ in range(3):
-        weighted = x * robust_weight(z - x @ beta)[:, None]
+        weighted = x * weigh_residuals(z - x @ beta)[:, None]
         beta = np.linalg.solve(weighted.T @ x + pull * np.eye(x.shape[1]), weighted.T @ z)
     return beta
 
 
-def learned(parts: Sequence[Evidence], field: Evidence) -> tuple[list[np.ndarray], np.ndarray]:
-    """Returns the discrepancy of each part, learned on the others, and of the field, learned on all, each `(W, I, J)`.
+def learn_discrepancy(
+    parts: Sequence[Residuals], field: Residuals
+) -> tuple[list[np.ndarray], np.ndarray]:
+    """Return the discrepancy of each part, learned on the others, and of the field, learned on all, each `(W, I, J)`.
 
     Joints of which no part predicts the others have none.
 
@@ -86,26 +98,29 @@ def learned(parts: Sequence[Evidence], field: Evidence) -> tuple[list[np.ndarray
             noise.
         field: The simulator against the field.
     """
-    found, of_field = [np.zeros_like(part.way) for part in parts], np.zeros_like(field.way)
+    found, of_field = (
+        [np.zeros_like(part.increments) for part in parts],
+        np.zeros_like(field.increments),
+    )
     if len(parts) < 2:
         return found, of_field
     for j in range(of_field.shape[2]):
-        raw = [features(part, j) for part in parts]
-        white = [part.whitened_joint(columns, j) for part, columns in zip(parts, raw, strict=True)]
+        raw = [build_features(part, j) for part in parts]
+        white = [part.whiten_joint(columns, j) for part, columns in zip(parts, raw, strict=True)]
         size = np.sqrt(np.mean(np.square(np.concatenate(white)), 0))
         by = np.where(size > 1e-9, 1.0 / np.maximum(size, 1e-9), 0.0)
         x, z = [one * by for one in white], [part.z[j] for part in parts]
         others = [[k for k in range(len(parts)) if k != out] for out in range(len(parts))]
-        best, lowest = None, sum(float(robust_loss(one)) for one in z)
-        for pull in RIDGES:
+        best, lowest = None, sum(float(compute_loss(one)) for one in z)
+        for pull in DISCREPANCY_RIDGES:
             betas = [
-                ridge(
+                fit_ridge(
                     np.concatenate([x[k] for k in rest]), np.concatenate([z[k] for k in rest]), pull
                 )
                 for rest in others
             ]
             total = sum(
-                float(robust_loss(one - columns @ beta))
+                float(compute_loss(one - columns @ beta))
                 for one, columns, beta in zip(z, x, betas, strict=True)
             )
             if total < lowest:
@@ -115,32 +130,32 @@ def learned(parts: Sequence[Evidence], field: Evidence) -> tuple[list[np.ndarray
         pull, betas = best
         for bias, columns, beta in zip(found, raw, betas, strict=True):
             bias[..., j] = columns @ (beta * by)
-        of_field[..., j] = features(field, j) @ (
-            ridge(np.concatenate(x), np.concatenate(z), pull) * by
+        of_field[..., j] = build_features(field, j) @ (
+            fit_ridge(np.concatenate(x), np.concatenate(z), pull) * by
         )
     return found, of_field
 
 
-def widths(parts: Sequence[Evidence]) -> np.ndarray:
-    """Returns how far the simulator's own numbers are off on parts of the reference, over what is usual, `(P,)`, 1 at least.
+def estimate_fault_scales(parts: Sequence[Residuals]) -> np.ndarray:
+    """Return how far the simulator's own numbers are off on parts of the reference, over what is usual, `(P,)`, 1 at least.
 
     All joints and parts together, less what chance alone does to an estimate.
     """
     squares, chance = [], []
     for part in parts:
         for z, faults in zip(part.z, part.faults, strict=True):
-            lines = WIDEST * faults
-            found = fitted(z, [], faults=lines)
+            lines = MAX_FAULT_SCALE * faults
+            found = fit_sizes(z, [], faults=lines)
             slack = np.diag(
                 np.linalg.inv(
-                    (lines * robust_weight(z - found @ lines)) @ lines.T + np.eye(len(lines))
+                    (lines * weigh_residuals(z - found @ lines)) @ lines.T + np.eye(len(lines))
                 )
             )
-            squares.append(np.where(slack < TOLD, np.square(found), np.nan))
-            chance.append(np.where(slack < TOLD, slack, np.nan))
+            squares.append(np.where(slack < MAX_VARIANCE_SHARE, np.square(found), np.nan))
+            chance.append(np.where(slack < MAX_VARIANCE_SHARE, slack, np.nan))
     told = np.isfinite(squares)
     excess = (np.nansum(squares, 0) - np.nansum(chance, 0)) / np.maximum(told.sum(0), 1)
-    return np.clip(WIDEST * np.sqrt(np.maximum(excess, 0.0)), 1.0, WIDEST)
+    return np.clip(MAX_FAULT_SCALE * np.sqrt(np.maximum(excess, 0.0)), 1.0, MAX_FAULT_SCALE)
 
 
 CLUE_RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
@@ -148,28 +163,28 @@ CLUE_RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 likely is used."""
 PAST_S = (2.0, 4.0, 8.0, 16.0)
 """Over how long work before may matter."""
-FAR = 9.0
+MAX_STRAY = 9.0
 """A window that strays further, over what the noise lets expect, counts no more than this."""
-FAST = 0.25
+MOVING_SHARE = 0.25
 """Share of full speed from which another joint counts as moving."""
 
 
 @dataclass(frozen=True)
-class Motion:
+class SimulatedMotion:
     """A simulator's own motion, as far as errors of joint `j` could depend on it; columns are `(W, I)`."""
 
-    evidence: Evidence
+    residuals: Residuals
     j: int
 
     @cached_property
     def own(self) -> np.ndarray:
         """Increments."""
-        return self.evidence.way[..., self.j]
+        return self.residuals.increments[..., self.j]
 
     @cached_property
     def slip(self) -> np.ndarray:
         """What increments lose where motion comes a sample late."""
-        q, start = self.evidence.base[..., self.j], self.evidence.start[:, None, self.j]
+        q, start = self.residuals.base[..., self.j], self.residuals.start[:, None, self.j]
         return to_increments(np.diff(q, axis=1, prepend=start)[..., None], np.zeros((len(q), 1)))[
             ..., 0
         ]
@@ -177,8 +192,10 @@ class Motion:
     @cached_property
     def share(self) -> np.ndarray:
         """Speeds of all joints over their full speed, `(W, I, J)`."""
-        machine = self.evidence.candidates.machine
-        return self.evidence.way / (machine.max_speed * machine.period_s * SPAN)
+        machine = self.residuals.simulator.machine
+        return self.residuals.increments / (
+            machine.max_speed * machine.period_s * INCREMENT_SAMPLES
+        )
 
     @cached_property
     def sides(self) -> tuple[np.ndarray, np.ndarray]:
@@ -190,8 +207,8 @@ class Motion:
     def place(self) -> np.ndarray:
         """Positions at both ends of each increment, over the travel, `(2, W, I)`."""
         machine, end = (
-            self.evidence.candidates.machine,
-            self.evidence.start[:, None, self.j] + np.cumsum(self.own, 1),
+            self.residuals.simulator.machine,
+            self.residuals.start[:, None, self.j] + np.cumsum(self.own, 1),
         )
         low, high = machine.lower[self.j], machine.upper[self.j]
         return np.clip((np.stack([end - self.own, end]) - low) / (high - low), 0.0, 1.0)
@@ -202,8 +219,8 @@ class Motion:
         return np.abs(self.share).sum(-1)
 
     def faded(self, column: np.ndarray, kept: float) -> np.ndarray:
-        """Returns the mean of what came before in the recording, the longer ago the less; windows follow one another."""
-        runs, found = self.evidence.candidates.cut.run, np.empty_like(column)
+        """Return the mean of what came before in the recording, the longer ago the less; windows follow one another."""
+        runs, found = self.residuals.simulator.cut.run, np.empty_like(column)
         for run in np.unique(runs):
             mine = runs == run
             found[mine] = np.asarray(
@@ -215,48 +232,50 @@ class Motion:
     def time(self) -> list[np.ndarray]:
         """Courses of the running time, `(W, 1)`: even, bent, to and fro, warming up."""
         at = np.linspace(-1.0, 1.0, len(self.own))[:, None]
-        warm = 1.0 - np.exp(-self.evidence.candidates.running_s / WARM_S)[:, None]
+        warm = 1.0 - np.exp(-self.residuals.simulator.running_s / WARM_S)[:, None]
         slow = [at, at**2 - 0.5, np.sin(3 * np.pi * at), np.cos(3 * np.pi * at)]
         return [*slow, (warm - warm.mean()) / max(float(warm.std()), 1e-9)]
 
 
-def repaired(evidence: Evidence, repair: Repair | None) -> Evidence:
-    """Returns the evidence of the simulator with the effects that were found, sizes from the half that they were not fitted to."""
-    if repair is None:
-        return evidence
-    candidates, mean = (
-        evidence.candidates,
-        0.0 if evidence.mean is None else evidence.mean,
+def apply_fitted_set(residuals: Residuals, fitted: FittedSet | None) -> Residuals:
+    """Return the evidence of the simulator with the effects that were found, sizes from the half that they were not fitted to."""
+    if fitted is None:
+        return residuals
+    simulator, mean = (
+        residuals.simulator,
+        0.0 if residuals.mean is None else residuals.mean,
     )  # `after` has it in, errors have it out
-    fixed = [*candidates.fixed, *repair.effects()]
-    return replace(evidence, candidates=replace(candidates, fixed=fixed), runs=repair.after - mean)
+    fixed = [*simulator.fixed, *fitted.effects()]
+    return replace(residuals, simulator=replace(simulator, fixed=fixed), runs=fitted.after - mean)
 
 
-def _changes(m: Motion) -> list[np.ndarray]:
+def _build_start_stop(m: SimulatedMotion) -> list[np.ndarray]:
     """Starts and stops, just before and after."""
     turn, faster = (
         np.diff(m.own, axis=1, prepend=m.own[:, :1]),
         np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0,
     )
     return [
-        _late(turn * when * side, by)
+        _shift_later(turn * when * side, by)
         for by in (-1, 0, 1, 2, 3)
         for when in (faster, ~faster)
         for side in m.sides
     ]
 
 
-def _curve(m: Motion) -> list[np.ndarray]:
+def _build_speed_curve(m: SimulatedMotion) -> list[np.ndarray]:
     return [
-        m.own * hat * side for hat in _hats(np.abs(m.share[..., m.j]), 1.0, 8) for side in m.sides
+        m.own * hat * side
+        for hat in _build_hats(np.abs(m.share[..., m.j]), 1.0, 8)
+        for side in m.sides
     ]
 
 
-def _position(m: Motion) -> list[np.ndarray]:
-    return [m.own * hat * side for hat in _hats(m.place.mean(0), 1.0, 10) for side in m.sides]
+def _build_position(m: SimulatedMotion) -> list[np.ndarray]:
+    return [m.own * hat * side for hat in _build_hats(m.place.mean(0), 1.0, 10) for side in m.sides]
 
 
-def _sensor(m: Motion) -> list[np.ndarray]:
+def _build_sensor_angle(m: SimulatedMotion) -> list[np.ndarray]:
     """An encoder whose error depends on where it stands."""
     return [
         np.diff(wave(2 * np.pi * turns * m.place), axis=0)[0]
@@ -265,7 +284,7 @@ def _sensor(m: Motion) -> list[np.ndarray]:
     ]
 
 
-def _joints(m: Motion) -> list[np.ndarray]:
+def _build_other_joints(m: SimulatedMotion) -> list[np.ndarray]:
     """What the others do, and all together ask for."""
     full, columns = np.abs(m.own).max() + 1e-12, []
     for k in range(m.share.shape[-1]):
@@ -273,31 +292,31 @@ def _joints(m: Motion) -> list[np.ndarray]:
             other = m.share[..., k]
             columns += [
                 m.own * np.abs(other),
-                m.own * (np.abs(other) > FAST),
+                m.own * (np.abs(other) > MOVING_SHARE),
                 full * other,
                 full * np.maximum(other, 0.0),
             ]
     return (
         columns
-        + [m.own * hat for hat in _hats(m.work, 2.0, 5)]
+        + [m.own * hat for hat in _build_hats(m.work, 2.0, 5)]
         + [m.own * np.maximum(m.work - at, 0.0) for at in (0.5, 1.0)]
     )
 
 
-def _time(m: Motion) -> list[np.ndarray]:
+def _build_running_time(m: SimulatedMotion) -> list[np.ndarray]:
     return [m.own * course for course in m.time] + [m.own * m.time[-1] * side for side in m.sides]
 
 
-def _delay_over_time(m: Motion) -> list[np.ndarray]:
+def _build_drifting_delay(m: SimulatedMotion) -> list[np.ndarray]:
     return [m.slip * m.time[k] for k in (0, 1, -1)]
 
 
-def _past(m: Motion) -> list[np.ndarray]:
+def _build_past_work(m: SimulatedMotion) -> list[np.ndarray]:
     """Work done just before, by all and by itself, and the direction it went."""
-    machine, columns = m.evidence.candidates.machine, []
+    machine, columns = m.residuals.simulator.machine, []
     went = np.sign(m.own) * (np.abs(m.share[..., m.j]) > 0.03)
     for past_s in PAST_S:
-        kept = np.exp(-SPAN * machine.period_s / past_s)
+        kept = np.exp(-INCREMENT_SAMPLES * machine.period_s / past_s)
         tired, own, way = (
             m.faded(one, kept) for one in (np.minimum(m.work, 1.0), np.abs(m.share[..., m.j]), went)
         )
@@ -311,41 +330,43 @@ def _past(m: Motion) -> list[np.ndarray]:
 
 STARTS, CURVE = "how it starts and stops", "how speed follows commands"
 TIME, LATER = "running time", "timing over the running time"
-CLUES: Mapping[str, Callable[[Motion], list[np.ndarray]]] = {
-    STARTS: _changes,
-    "its position": _position,
-    "the angle that the sensor reads": _sensor,
-    "the other joints": _joints,
-    TIME: _time,
-    LATER: _delay_over_time,
-    "what it did before": _past,
-    CURVE: _curve,
+CLUES: Mapping[str, Callable[[SimulatedMotion], list[np.ndarray]]] = {
+    STARTS: _build_start_stop,
+    "its position": _build_position,
+    "the angle that the sensor reads": _build_sensor_angle,
+    "the other joints": _build_other_joints,
+    TIME: _build_running_time,
+    LATER: _build_drifting_delay,
+    "what it did before": _build_past_work,
+    CURVE: _build_speed_curve,
 }
 """By what they are about."""
 FORMS = (STARTS, CURVE)
 """Clues that explain first, one after the other, what the rest may not."""
 
 
-def predictable(evidence: Evidence, z: np.ndarray) -> np.ndarray:
-    """Returns what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
+def score_clues(residuals: Residuals, z: np.ndarray) -> np.ndarray:
+    """Return what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
     found, order = (
         np.zeros((len(CLUES), len(z))),
         [*FORMS, *(name for name in CLUES if name not in FORMS)],
     )
     for j, errors in enumerate(z):
-        motion = Motion(evidence, j)
+        motion = SimulatedMotion(residuals, j)
         for name in order:
-            x = evidence.whitened_joint(np.stack(CLUES[name](motion), -1), j)
+            x = residuals.whiten_joint(np.stack(CLUES[name](motion), -1), j)
             size = np.sqrt(np.mean(np.square(x), 0))
-            found[list(CLUES).index(name), j], left = _earned(
+            found[list(CLUES).index(name), j], left = _score_ridge(
                 x / np.where(size > 1e-9, size, np.inf), errors
             )
             errors = left if name in FORMS else errors
     return found
 
 
-def beyond(earned: np.ndarray, nulls: Sequence[np.ndarray], entries: Sequence[float]) -> np.ndarray:
-    """Returns the most that clues earn on reference recordings at the length of the field, `(clues, J)`; 0 without any.
+def scale_reference_gains(
+    earned: np.ndarray, left_out: Sequence[np.ndarray], entries: Sequence[float]
+) -> np.ndarray:
+    """Return the most that clues earn on reference recordings at the length of the field, `(clues, J)`; 0 without any.
 
     Args:
         earned: What they earn in the field.
@@ -353,39 +374,43 @@ def beyond(earned: np.ndarray, nulls: Sequence[np.ndarray], entries: Sequence[fl
         entries: Length of the field over that of each part.
     """
     return np.max(
-        [np.zeros_like(earned), *(one * by for one, by in zip(nulls, entries, strict=True))], 0
+        [np.zeros_like(earned), *(one * by for one, by in zip(left_out, entries, strict=True))], 0
     )
 
 
-def strayed(evidence: Evidence, error: np.ndarray) -> np.ndarray:
-    """Returns how far free runs stray over what the noise lets expect, `(J,)`: mean squares of windows, cut at `FAR`.
+def measure_straying(residuals: Residuals, error: np.ndarray) -> np.ndarray:
+    """Return how far free runs stray over what the noise lets expect, `(J,)`: mean squares of windows, cut at `FAR`.
 
     Args:
         evidence: The simulator against recordings.
         error: Increments that it misses, `(W, I, J)`.
     """
-    assert evidence.noise is not None, "noise is known by now"
+    assert residuals.noise is not None, "noise is known by now"
     expected = np.stack(
-        [noise.strayed(evidence.way[..., j]).mean(1) for j, noise in enumerate(evidence.noise)], -1
+        [
+            noise.strayed(residuals.increments[..., j]).mean(1)
+            for j, noise in enumerate(residuals.noise)
+        ],
+        -1,
     )
-    if evidence.late is not None:
-        expected = expected + np.square(np.cumsum(evidence.late, 2)).sum(1).mean(1)
+    if residuals.late is not None:
+        expected = expected + np.square(np.cumsum(residuals.late, 2)).sum(1).mean(1)
     over = (
-        np.minimum(np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18), FAR)
-        * evidence.claims
+        np.minimum(np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18), MAX_STRAY)
+        * residuals.valid_mask
     )
-    return over.sum(0) / np.maximum(evidence.claims.sum(0), 1)
+    return over.sum(0) / np.maximum(residuals.valid_mask.sum(0), 1)
 
 
-def _earned(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
-    """Returns by how much features `(E, F)` make errors `(E,)` more likely, by Laplace's approximation, and what they leave."""
+def _score_ridge(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
+    """Return by how much features `(E, F)` make errors `(E,)` more likely, by Laplace's approximation, and what they leave."""
     best, least = 0.0, z
     for pull in CLUE_RIDGES:
-        beta = ridge(x, z, pull)
+        beta = fit_ridge(x, z, pull)
         left = z - x @ beta
-        told = (x * robust_weight(left)[:, None]).T @ x / pull + np.eye(x.shape[1])
+        told = (x * weigh_residuals(left)[:, None]).T @ x / pull + np.eye(x.shape[1])
         gain = (
-            float(robust_loss(z) - robust_loss(left))
+            float(compute_loss(z) - compute_loss(left))
             - 0.5 * pull * float(beta @ beta)
             - 0.5 * float(np.linalg.slogdet(told)[1])
         )
@@ -393,16 +418,16 @@ def _earned(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
     return best, least
 
 
-def _hats(values: np.ndarray, high: float, count: int) -> list[np.ndarray]:
-    """Returns `count` + 1 tents over 0 to `high`, whose sum is 1."""
+def _build_hats(values: np.ndarray, high: float, count: int) -> list[np.ndarray]:
+    """Return `count` + 1 tents over 0 to `high`, whose sum is 1."""
     return [
         np.maximum(1.0 - np.abs(np.minimum(values, high) / high * count - place), 0.0)
         for place in range(count + 1)
     ]
 
 
-def _late(column: np.ndarray, by: int) -> np.ndarray:
-    """Returns a column by so many increments later; 0 where a window has nothing before."""
+def _shift_later(column: np.ndarray, by: int) -> np.ndarray:
+    """Return a column by so many increments later; 0 where a window has nothing before."""
     moved = np.roll(column, by, 1)
     moved[:, : max(by, 0)] = 0.0
     if by < 0:

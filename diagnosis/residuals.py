@@ -20,34 +20,34 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
-from diagnosis.effect_library import Candidates, Kind
+from diagnosis.effect_library import EffectSimulator, EffectType
 
-SPAN = 5
+INCREMENT_SAMPLES = 5
 """Samples in an increment: a quarter of a second at 20 Hz."""
-FREEDOM = 5.0
+T_FREEDOM = 5.0
 """Degrees of freedom of the t distribution that whitened errors are taken to have."""
-LONGEST = 80
+MAX_BLOCK_INCREMENTS = 80
 """Increments in a block."""
-STILL = 0.1
+MIN_TYPICAL_ERROR = 0.1
 """Smallest typical error, over the root of the mean square."""
 
 
 def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Returns the ways in `SPAN` samples each of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
-    count = paths.shape[-2] // SPAN
-    ends = paths[..., SPAN - 1 : count * SPAN : SPAN, :]
+    """Return the ways in `SPAN` samples each of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
+    count = paths.shape[-2] // INCREMENT_SAMPLES
+    ends = paths[..., INCREMENT_SAMPLES - 1 : count * INCREMENT_SAMPLES : INCREMENT_SAMPLES, :]
     first = np.broadcast_to(start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
     return np.diff(ends, axis=-2, prepend=first)
 
 
-def robust_loss(z: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Returns the negative log likelihood of whitened errors, up to a constant, summed."""
-    return 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(z) / FREEDOM).sum(axis)
+def compute_loss(z: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Return the negative log likelihood of whitened errors, up to a constant, summed."""
+    return 0.5 * (T_FREEDOM + 1.0) * np.log1p(np.square(z) / T_FREEDOM).sum(axis)
 
 
-def robust_weight(z: np.ndarray) -> np.ndarray:
-    """Returns the weights that turn squares of `z` into `loss` (iteratively reweighted least squares)."""
-    return (FREEDOM + 1.0) / (FREEDOM + np.square(z))
+def weigh_residuals(z: np.ndarray) -> np.ndarray:
+    """Return the weights that turn squares of `z` into `loss` (iteratively reweighted least squares)."""
+    return (T_FREEDOM + 1.0) / (T_FREEDOM + np.square(z))
 
 
 @dataclass(frozen=True)
@@ -69,43 +69,52 @@ class ErrorCovariance:
     memory: float
     reading: float = 0.0
 
-    def covariance(self, way: np.ndarray) -> np.ndarray:
-        """Returns the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `way` `(B, S)`."""
-        lag = np.abs(np.subtract.outer(np.arange(way.shape[1]), np.arange(way.shape[1])))
+    def covariance(self, increments: np.ndarray) -> np.ndarray:
+        """Return the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `increments` `(B, S)`."""
+        lag = np.abs(
+            np.subtract.outer(np.arange(increments.shape[1]), np.arange(increments.shape[1]))
+        )
         kept = np.exp(-lag / self.memory)
-        turn = np.abs(np.diff(way, axis=1, prepend=way[:, :1])) + np.abs(
-            np.diff(way, axis=1, append=way[:, -1:])
+        turn = np.abs(np.diff(increments, axis=1, prepend=increments[:, :1])) + np.abs(
+            np.diff(increments, axis=1, append=increments[:, -1:])
         )
         single = self.sensor**2 + (self.change * turn) ** 2
         read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
         return (
-            self.wander**2 * way[:, :, None] * way[:, None, :] * kept
-            + single[:, :, None] * np.eye(way.shape[1])
+            self.wander**2 * increments[:, :, None] * increments[:, None, :] * kept
+            + single[:, :, None] * np.eye(increments.shape[1])
             + read
         )
 
-    def strayed(self, way: np.ndarray) -> np.ndarray:
-        """Returns the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
-        return np.diagonal(self.covariance(way).cumsum(1).cumsum(2), axis1=1, axis2=2)
+    def strayed(self, increments: np.ndarray) -> np.ndarray:
+        """Return the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
+        return np.diagonal(self.covariance(increments).cumsum(1).cumsum(2), axis1=1, axis2=2)
 
-    def whitener(self, way: np.ndarray) -> np.ndarray:
-        """Returns the inverse Cholesky factors of the covariance, `(B, S, S)`."""
-        return np.linalg.inv(np.linalg.cholesky(self.covariance(way)))
+    def whitener(self, increments: np.ndarray) -> np.ndarray:
+        """Return the inverse Cholesky factors of the covariance, `(B, S, S)`."""
+        return np.linalg.inv(np.linalg.cholesky(self.covariance(increments)))
 
 
-def fit_noise(error: np.ndarray, way: np.ndarray) -> ErrorCovariance:
-    """Returns the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
+def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
+    """Return the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
     # a joint that stands still most of the time, read by a coarse sensor, has a median error of 0
-    typical = max(1.4826 * np.median(np.abs(error)), STILL * np.sqrt(np.mean(error**2))) + 1e-9
-    size = np.sqrt(np.mean(way**2)) + 1e-9
-    error = np.clip(error, -12.0 * typical - 0.3 * np.abs(way), 12.0 * typical + 0.3 * np.abs(way))
+    typical = (
+        max(1.4826 * np.median(np.abs(error)), MIN_TYPICAL_ERROR * np.sqrt(np.mean(error**2)))
+        + 1e-9
+    )
+    size = np.sqrt(np.mean(increments**2)) + 1e-9
+    error = np.clip(
+        error, -12.0 * typical - 0.3 * np.abs(increments), 12.0 * typical + 0.3 * np.abs(increments)
+    )
 
     def minus_log(x: np.ndarray) -> float:
         noise = ErrorCovariance(*np.exp(x))
-        factor = np.linalg.cholesky(noise.covariance(way) + 1e-18 * np.eye(way.shape[1]))
+        factor = np.linalg.cholesky(
+            noise.covariance(increments) + 1e-18 * np.eye(increments.shape[1])
+        )
         z = np.linalg.solve(factor, error[..., None])[..., 0]
         log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
-        return float(robust_loss(z) + log_size + 0.02 * np.square(x[3] - np.log(10.0)) * 10)
+        return float(compute_loss(z) + log_size + 0.02 * np.square(x[3] - np.log(10.0)) * 10)
 
     start = np.log([typical, 0.05, max(0.01, 0.5 * np.sqrt(np.mean(error**2)) / size), 10.0])
     low, high = (
@@ -122,20 +131,20 @@ def fit_noise(error: np.ndarray, way: np.ndarray) -> ErrorCovariance:
     return ErrorCovariance(*np.exp(found.x))
 
 
-GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
+SIZE_GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
 """Sizes, over the typical one, at which an effect is simulated; in between its doing is
 interpolated."""
 
-GAIN, FAULT_S, FAULT = 0.01, 0.004, 0.01
+GAIN_FAULT, TIME_FAULT_S, NUMBER_FAULT = 0.01, 0.004, 0.01
 """What a simulator gets wrong from day to day, and what is no effect: speeds by a percent, times in
 s, other numbers."""
 
-UNSURE = 0.5
+MEAN_FORM_ERROR = 0.5
 """What effects of chance change on average is known up to so much of it: their forms differ."""
 
 
 @dataclass(frozen=True, eq=False)
-class Ray:
+class ParameterRay:
     """A way to make an effect grow: one of its numbers, or all at once where they make sense only together.
 
     Attributes:
@@ -147,14 +156,14 @@ class Ray:
         is_tied: The size is known up to `sizes`, and goes no further.
     """
 
-    kind: Kind
+    kind: EffectType
     name: str
     sizes: np.ndarray
     shape: Mapping[str, np.ndarray] = field(default_factory=dict)
     is_tied: bool = False
 
     def values(self, size: np.ndarray) -> dict[str, np.ndarray]:
-        """Returns the numbers at sizes `(C, J)`, each `(C, J)` or `(C, 1)`."""
+        """Return the numbers at sizes `(C, J)`, each `(C, J)` or `(C, 1)`."""
         found = {}
         for name in (self.name,) if self.name else self.kind.fitted:
             number = self.kind.numbers[name]
@@ -169,28 +178,28 @@ class Ray:
         return found
 
 
-def rays(kind: Kind, grid: Sequence[float] = GRID) -> list[Ray]:
-    """Returns the ways in which an effect can grow."""
+def build_rays(kind: EffectType, grid: Sequence[float] = SIZE_GRID) -> list[ParameterRay]:
+    """Return the ways in which an effect can grow."""
     found = []
     for name in kind.fitted if kind.target.smooth else ("",):
-        ends = [_reach(kind, one) for one in ((name,) if name else kind.fitted)]
+        ends = [_find_size_bounds(kind, one) for one in ((name,) if name else kind.fitted)]
         low, high = max(end[0] for end in ends), min(end[1] for end in ends)
         sizes = np.array([-size for size in grid[::-1]] + [0.0, *grid])
         sizes = np.unique(np.clip(sizes, low, high))
         if len(sizes) > 1:
-            found.append(Ray(kind, name, sizes))
+            found.append(ParameterRay(kind, name, sizes))
     return found
 
 
-def _reach(kind: Kind, name: str) -> tuple[float, float]:
-    """Returns the smallest and largest size of a number within its bounds."""
+def _find_size_bounds(kind: EffectType, name: str) -> tuple[float, float]:
+    """Return the smallest and largest size of a number within its bounds."""
     number = kind.numbers[name]
     ends = [(bound - number.none) / kind.size(name) for bound in number.bounds]
     return min(ends), max(ends)
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class Residuals:
     """A simulator held against recordings.
 
     Attributes:
@@ -207,9 +216,9 @@ class Evidence:
         runs: Its free runs without any effect, `(W, K, J)`, where they are known already.
     """
 
-    candidates: Candidates
+    simulator: EffectSimulator
     noise: Sequence[ErrorCovariance] | None
-    claims: np.ndarray
+    valid_mask: np.ndarray
     mean: np.ndarray | None = None
     bias: np.ndarray | None = None
     widths: np.ndarray | None = None
@@ -219,30 +228,30 @@ class Evidence:
     @cached_property
     def base(self) -> np.ndarray:
         """Positions without any effect, `(W, K, J)`."""
-        return self.candidates.paths([])[0] if self.runs is None else self.runs
+        return self.simulator.simulate([])[0] if self.runs is None else self.runs
 
     @cached_property
     def start(self) -> np.ndarray:
         """Measured positions at which the free runs begin, `(W, J)`."""
-        return self.candidates.cut.q[:, self.candidates.cut.num_before - 1]
+        return self.simulator.cut.q[:, self.simulator.cut.num_before - 1]
 
     @cached_property
-    def way(self) -> np.ndarray:
+    def increments(self) -> np.ndarray:
         """Increments that the simulator makes, `(W, I, J)`."""
         return to_increments(self.base, self.start)
 
     @cached_property
     def error(self) -> np.ndarray:
         """Measured less simulated increments, `(W, I, J)`."""
-        return self.error_of(self.base)
+        return self.compute_error(self.base)
 
-    def error_of(self, paths: np.ndarray) -> np.ndarray:
-        """Returns measured less simulated increments, `(…, W, I, J)`, of free runs `(…, W, K, J)`."""
+    def compute_error(self, paths: np.ndarray) -> np.ndarray:
+        """Return measured less simulated increments, `(…, W, I, J)`, of free runs `(…, W, K, J)`."""
         still = np.zeros_like(self.start)
         known = 0.0 if self.mean is None else to_increments(self.mean, still)
         known = known if self.bias is None else known + self.bias
         return (
-            to_increments(self.candidates.cut.measured, self.start)
+            to_increments(self.simulator.cut.measured, self.start)
             - to_increments(paths, self.start)
             - known
         )
@@ -250,8 +259,8 @@ class Evidence:
     @cached_property
     def groups(self) -> list[np.ndarray]:
         """Windows in a row that are whitened together."""
-        size = max(1, LONGEST // self.way.shape[1])
-        runs = self.candidates.cut.run
+        size = max(1, MAX_BLOCK_INCREMENTS // self.increments.shape[1])
+        runs = self.simulator.cut.run
         breaks = [0, *(np.flatnonzero(runs[1:] != runs[:-1]) + 1), len(runs)]
         return [
             np.arange(i, min(i + size, b)) for a, b in pairwise(breaks) for i in range(a, b, size)
@@ -260,8 +269,8 @@ class Evidence:
     @cached_property
     def fold(self) -> np.ndarray:
         """Half of the recordings, 0 or 1, that each entry belongs to, `(E,)`."""
-        steps = self.way.shape[1]
-        half = np.empty(len(self.way), dtype=int)
+        steps = self.increments.shape[1]
+        half = np.empty(len(self.increments), dtype=int)
         for number, group in enumerate(self.groups):
             half[group] = number % 2
         return np.repeat(half, steps)
@@ -269,57 +278,60 @@ class Evidence:
     @cached_property
     def block(self) -> np.ndarray:
         """Number of the group that each entry belongs to, `(E,)`."""
-        of = np.empty(len(self.way), dtype=int)
+        of = np.empty(len(self.increments), dtype=int)
         for number, group in enumerate(self.groups):
             of[group] = number
-        return np.repeat(of, self.way.shape[1])
+        return np.repeat(of, self.increments.shape[1])
 
     @cached_property
     def _whiteners(self) -> list[list[np.ndarray]]:
         return [
             [
                 np.linalg.inv(np.linalg.cholesky(self._covariance(group, j)))
-                for j in range(self.way.shape[2])
+                for j in range(self.increments.shape[2])
             ]
             for group in self.groups
         ]
 
     def _covariance(self, group: np.ndarray, j: int) -> np.ndarray:
-        """Returns the covariance of the increments of joint `j` in windows in a row, `(S, S)`."""
+        """Return the covariance of the increments of joint `j` in windows in a row, `(S, S)`."""
         assert self.noise is not None, "noise is found before anything is whitened"
-        found = self.noise[j].covariance(self.way[group, :, j].reshape(1, -1))[0]
+        found = self.noise[j].covariance(self.increments[group, :, j].reshape(1, -1))[0]
         for place, window in enumerate(group if self.late is not None else ()):
             assert self.late is not None, "asked before"
             own, moved = (
-                slice(place * self.way.shape[1], (place + 1) * self.way.shape[1]),
+                slice(place * self.increments.shape[1], (place + 1) * self.increments.shape[1]),
                 self.late[window, ..., j],
             )
             found[own, own] += moved.T @ moved
         return found
 
-    def rewhitened(self, other: Evidence, values: np.ndarray, j: int) -> np.ndarray:
-        """Returns values of joint `j` over the noise of `other`, `(…, E)`, over this one's: the same windows, another noise."""
-        found, steps = np.empty_like(values), self.way.shape[1]
+    def rewhiten(self, other: Residuals, values: np.ndarray, j: int) -> np.ndarray:
+        """Return values of joint `j` over the noise of `other`, `(…, E)`, over this one's: the same windows, another noise."""
+        found, steps = np.empty_like(values), self.increments.shape[1]
         for group, mine, theirs in zip(self.groups, self._whiteners, other._whiteners, strict=True):
             entries = slice(group[0] * steps, (group[-1] + 1) * steps)
             found[..., entries] = np.linalg.solve(theirs[j], values[..., entries].T).T @ mine[j].T
         return found
 
-    def whitened(self, ways: np.ndarray) -> np.ndarray:
-        """Returns increments `(C, W, I, J)` over their noise, `(J, C, E)`; 0 where a window says nothing."""
+    def whiten(self, ways: np.ndarray) -> np.ndarray:
+        """Return increments `(C, W, I, J)` over their noise, `(J, C, E)`; 0 where a window says nothing."""
         count, _, steps, joints = ways.shape
-        ways = ways * self.claims[:, None]
-        found = np.empty((joints, count, len(self.way) * steps), dtype=np.float64)
+        ways = ways * self.valid_mask[:, None]
+        found = np.empty((joints, count, len(self.increments) * steps), dtype=np.float64)
         for group, whiteners in zip(self.groups, self._whiteners, strict=True):
             entries = slice(group[0] * steps, (group[-1] + 1) * steps)
             for j in range(joints):
                 found[j, :, entries] = ways[..., j][:, group].reshape(count, -1) @ whiteners[j].T
         return found
 
-    def whitened_joint(self, columns: np.ndarray, j: int) -> np.ndarray:
-        """Returns columns of increments of joint `j`, `(W, I, F)`, over its noise, `(E, F)`."""
+    def whiten_joint(self, columns: np.ndarray, j: int) -> np.ndarray:
+        """Return columns of increments of joint `j`, `(W, I, F)`, over its noise, `(E, F)`."""
         count, steps, size = columns.shape
-        columns, found = columns * self.claims[:, j, None, None], np.empty((count * steps, size))
+        columns, found = (
+            columns * self.valid_mask[:, j, None, None],
+            np.empty((count * steps, size)),
+        )
         for group, whiteners in zip(self.groups, self._whiteners, strict=True):
             found[group[0] * steps : (group[-1] + 1) * steps] = whiteners[j] @ columns[
                 group
@@ -329,37 +341,38 @@ class Evidence:
     @cached_property
     def z(self) -> np.ndarray:
         """The error over its noise, `(J, E)`."""
-        return self.whitened(self.error[None])[:, 0]
+        return self.whiten(self.error[None])[:, 0]
 
     @cached_property
     def faults(self) -> np.ndarray:
         """What small faults of the simulator itself change, over the noise, `(J, P, E)`, each by its prior standard deviation."""
         found = [
-            self.whitened((self.way * GAIN * side)[None]) for side in (self.way > 0, self.way < 0)
+            self.whiten((self.increments * GAIN_FAULT * side)[None])
+            for side in (self.increments > 0, self.increments < 0)
         ]
-        candidates = self.candidates
-        model: Any = candidates.base.build(candidates.machine, 1, torch.device("cpu"))
+        simulator = self.simulator
+        model: Any = simulator.base.build(simulator.machine, 1, torch.device("cpu"))
         for name, value in (getattr(model, "parameters", None) or {}).items():
-            by = FAULT_S if name.endswith("_s") else FAULT
+            by = TIME_FAULT_S if name.endswith("_s") else NUMBER_FAULT
             moved = (
-                to_increments(candidates.paths([], 1, {name: value.numpy() + by})[0], self.start)
-                - self.way
+                to_increments(simulator.simulate([], 1, {name: value.numpy() + by})[0], self.start)
+                - self.increments
             )
-            found.append(self.whitened(moved[None]))
+            found.append(self.whiten(moved[None]))
         lines = np.concatenate(found, 1)
         lines = lines if self.widths is None else lines * self.widths[:, None]
         if self.mean is None:
             return lines
         known = to_increments(self.mean, np.zeros_like(self.start))
-        return np.concatenate([lines, self.whitened(UNSURE * known[None])], 1)
+        return np.concatenate([lines, self.whiten(MEAN_FORM_ERROR * known[None])], 1)
 
-    def response(self, ray: Ray) -> np.ndarray:
-        """Returns what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""
-        joints = self.way.shape[2]
+    def response(self, ray: ParameterRay) -> np.ndarray:
+        """Return what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""
+        joints = self.increments.shape[2]
         sizes = ray.sizes[ray.sizes != 0.0]
-        paths = self.candidates.paths(
+        paths = self.simulator.simulate(
             [(ray.kind, ray.values(np.repeat(sizes[:, None], joints, 1)))], len(sizes)
         )
-        changed = np.zeros((len(ray.sizes), *self.way.shape))
-        changed[ray.sizes != 0.0] = to_increments(paths, self.start) - self.way
-        return self.whitened(changed)
+        changed = np.zeros((len(ray.sizes), *self.increments.shape))
+        changed[ray.sizes != 0.0] = to_increments(paths, self.start) - self.increments
+        return self.whiten(changed)

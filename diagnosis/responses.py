@@ -14,31 +14,39 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from diagnosis.effect_library import Kind, shared
-from diagnosis.residuals import FREEDOM, GRID, Evidence, Ray, rays, robust_loss, robust_weight
+from diagnosis.effect_library import EffectType, list_shared_effects
+from diagnosis.residuals import (
+    SIZE_GRID,
+    T_FREEDOM,
+    ParameterRay,
+    Residuals,
+    build_rays,
+    compute_loss,
+    weigh_residuals,
+)
 
-PARTS = (0.25, 0.5, 0.75)
+BETWEEN = (0.25, 0.5, 0.75)
 """Of the way between two simulated sizes: a fit also begins there."""
-STEPS = 10
+MAX_SIZE_STEPS = 10
 """Gauss-Newton steps at most."""
-ENOUGH = 0.02
+MIN_STEP_GAIN = 0.02
 """Gain in log likelihood below which the steps end."""
-FAULTS = 6.0
+MAX_FAULT = 6.0
 """Faults of a simulator are no larger, in standard deviations."""
-PRIOR = 1.0
+SIZE_PRIOR = 1.0
 """Standard deviation of a size, over the typical one: tells nothing where the recordings do, and
 settles what they leave open."""
 
 
 @dataclass(frozen=True, eq=False)
-class Shape:
+class Response:
     """What growing along a ray does to one joint: `change` `(S, E)` at `sizes` `(S,)`."""
 
     sizes: np.ndarray
     change: np.ndarray
 
     def at(self, size: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the change at a size and its slope over the size, each `(E,)`."""
+        """Return the change at a size and its slope over the size, each `(E,)`."""
         cell = min(
             max(int(np.searchsorted(self.sizes, size, side="right")) - 1, 0), len(self.sizes) - 2
         )
@@ -48,19 +56,19 @@ class Shape:
         return self.change[cell] + (size - self.sizes[cell]) * slope, slope
 
 
-def predicted(shapes: Sequence[Shape], sizes: np.ndarray) -> np.ndarray:
-    """Returns the sum of the changes, `(E,)`."""
+def sum_responses(shapes: Sequence[Response], sizes: np.ndarray) -> np.ndarray:
+    """Return the sum of the changes, `(E,)`."""
     return np.sum([shape.at(size)[0] for shape, size in zip(shapes, sizes, strict=True)], 0)
 
 
-def fitted(
+def fit_sizes(
     z: np.ndarray,
-    shapes: Sequence[Shape],
+    shapes: Sequence[Response],
     start: np.ndarray | None = None,
     faults: np.ndarray | None = None,
     used: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Returns the sizes that explain the errors best: most likely under a t distribution and a wide prior.
+    """Return the sizes that explain the errors best: most likely under a t distribution and a wide prior.
 
     Args:
         z: Errors over the noise, `(E,)`.
@@ -77,13 +85,15 @@ def fitted(
     lines = np.zeros((0, len(z))) if faults is None else faults
     used = np.ones(len(z)) if used is None else used
     if start is None:
-        start = np.array([alone(z, shape, used) for shape in shapes]) * (1.0 if count == 1 else 0.7)
+        start = np.array([fit_single_size(z, shape, used) for shape in shapes]) * (
+            1.0 if count == 1 else 0.7
+        )
     size = np.concatenate([start, np.zeros(count + len(lines) - len(start))])
     if not len(size):
         return size
-    high = np.concatenate([[shape.sizes[-1] for shape in shapes], np.full(len(lines), FAULTS)])
-    low = np.concatenate([[shape.sizes[0] for shape in shapes], np.full(len(lines), -FAULTS)])
-    precision = np.concatenate([np.full(count, PRIOR**-2.0), np.ones(len(lines))])
+    high = np.concatenate([[shape.sizes[-1] for shape in shapes], np.full(len(lines), MAX_FAULT)])
+    low = np.concatenate([[shape.sizes[0] for shape in shapes], np.full(len(lines), -MAX_FAULT)])
+    precision = np.concatenate([np.full(count, SIZE_PRIOR**-2.0), np.ones(len(lines))])
 
     def left_at(at: np.ndarray) -> np.ndarray:
         return (
@@ -95,15 +105,15 @@ def fitted(
         )
 
     def total(left: np.ndarray, at: np.ndarray) -> float:
-        return 0.5 * (FREEDOM + 1.0) * float(
-            used @ np.log1p(np.square(left) / FREEDOM)
+        return 0.5 * (T_FREEDOM + 1.0) * float(
+            used @ np.log1p(np.square(left) / T_FREEDOM)
         ) + 0.5 * float(precision @ np.square(at))
 
     left = left_at(size)
     now, damping = total(left, size), 1e-3
-    for _ in range(STEPS):
-        slope = _slopes(shapes, lines, size)
-        weighted = slope * (robust_weight(left) * used)
+    for _ in range(MAX_SIZE_STEPS):
+        slope = _stack_slopes(shapes, lines, size)
+        weighted = slope * (weigh_residuals(left) * used)
         normal, gradient = (
             weighted @ slope.T + np.diag(precision),
             weighted @ left - precision * size,
@@ -122,33 +132,36 @@ def fitted(
                 gain, size, left, now, damping = now - then, trial, remains, then, damping / 5
                 break
             damping = 10 * max(damping, 1e-3)
-        if gain < ENOUGH:
+        if gain < MIN_STEP_GAIN:
             break
     return size
 
 
-def _slopes(shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> np.ndarray:
+def _stack_slopes(shapes: Sequence[Response], lines: np.ndarray, size: np.ndarray) -> np.ndarray:
     return np.concatenate(
         [*(shape.at(one)[1][None] for shape, one in zip(shapes, size, strict=False)), lines]
     )
 
 
-def alone(z: np.ndarray, shape: Shape, used: np.ndarray | None = None) -> float:
-    """Returns the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
+def fit_single_size(z: np.ndarray, shape: Response, used: np.ndarray | None = None) -> float:
+    """Return the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
     used = np.ones(len(z)) if used is None else used
-    between = [(1.0 - part) * shape.change[:-1] + part * shape.change[1:] for part in PARTS]
+    between = [(1.0 - part) * shape.change[:-1] + part * shape.change[1:] for part in BETWEEN]
     trials = np.concatenate(
-        [shape.sizes, *((1.0 - part) * shape.sizes[:-1] + part * shape.sizes[1:] for part in PARTS)]
+        [
+            shape.sizes,
+            *((1.0 - part) * shape.sizes[:-1] + part * shape.sizes[1:] for part in BETWEEN),
+        ]
     )
     left = z - np.concatenate([shape.change, *between])
-    totals = 0.5 * (FREEDOM + 1.0) * np.log1p(np.square(left) / FREEDOM) @ used + 0.5 * np.square(
-        trials / PRIOR
-    )
+    totals = 0.5 * (T_FREEDOM + 1.0) * np.log1p(
+        np.square(left) / T_FREEDOM
+    ) @ used + 0.5 * np.square(trials / SIZE_PRIOR)
     return float(trials[int(np.argmin(totals))])
 
 
 @dataclass(frozen=True)
-class Plain:
+class JointResiduals:
     """A joint's errors without any effect, small faults of the simulator itself fitted.
 
     Attributes:
@@ -164,74 +177,83 @@ class Plain:
     price: float
 
 
-def plain(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> Plain:
-    """Returns a joint's errors with the simulator's faults, `(P, E)`, fitted."""
+def fit_faults(z: np.ndarray, faults: Sequence[np.ndarray] | np.ndarray) -> JointResiduals:
+    """Return a joint's errors with the simulator's faults, `(P, E)`, fitted."""
     lines = np.reshape(np.asarray(faults, dtype=float), (-1, len(z)))
-    whole = fitted(z, [], faults=lines)
+    whole = fit_sizes(z, [], faults=lines)
     left = z - whole @ lines
-    return Plain(z, lines, robust_loss(left[:, None], axis=1), _price(left, [], lines, whole))
+    return JointResiduals(
+        z, lines, compute_loss(left[:, None], axis=1), _compute_penalty(left, [], lines, whole)
+    )
 
 
-def earned(
-    joint: Plain, shapes: Sequence[Shape], start: np.ndarray | None = None
+def score_responses(
+    joint: JointResiduals, shapes: Sequence[Response], start: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns by how much shapes make the errors more likely, entry by entry `(E,)`, and their best sizes.
+    """Return by how much shapes make the errors more likely, entry by entry `(E,)`, and their best sizes.
 
     Prices of sizes and faults are spread over the entries.
     """
-    whole = fitted(joint.z, shapes, start, joint.faults)
+    whole = fit_sizes(joint.z, shapes, start, joint.faults)
     count = len(shapes)
     left = (
         joint.z
         - whole[count:] @ joint.faults
-        - (predicted(shapes, whole[:count]) if shapes else 0.0)
+        - (sum_responses(shapes, whole[:count]) if shapes else 0.0)
     )
-    saved = joint.price - _price(left, shapes, joint.faults, whole)
-    return joint.loss - robust_loss(left[:, None], axis=1) + saved / len(left), whole[:count]
+    saved = joint.price - _compute_penalty(left, shapes, joint.faults, whole)
+    return joint.loss - compute_loss(left[:, None], axis=1) + saved / len(left), whole[:count]
 
 
-def _price(left: np.ndarray, shapes: Sequence[Shape], lines: np.ndarray, size: np.ndarray) -> float:
-    """Returns the loss of sizes and faults under their priors, and Occam's factor: how much narrower the recordings make them."""
-    slope = _slopes(shapes, lines, size)
-    precision = np.concatenate([np.full(len(shapes), PRIOR**-2.0), np.ones(len(lines))])
-    told = (slope * robust_weight(left)) @ slope.T / precision + np.eye(len(size))
+def _compute_penalty(
+    left: np.ndarray, shapes: Sequence[Response], lines: np.ndarray, size: np.ndarray
+) -> float:
+    """Return the loss of sizes and faults under their priors, and Occam's factor: how much narrower the recordings make them."""
+    slope = _stack_slopes(shapes, lines, size)
+    precision = np.concatenate([np.full(len(shapes), SIZE_PRIOR**-2.0), np.ones(len(lines))])
+    told = (slope * weigh_residuals(left)) @ slope.T / precision + np.eye(len(size))
     return 0.5 * float(precision @ np.square(size)) + 0.5 * float(np.linalg.slogdet(told)[1])
 
 
-def crossed(z: np.ndarray, shapes: Sequence[Shape], fold: np.ndarray) -> np.ndarray:
-    """Returns what shapes change, `(E,)`, on each half `fold` with sizes fitted to the other."""
+def cross_validate_change(
+    z: np.ndarray, shapes: Sequence[Response], fold: np.ndarray
+) -> np.ndarray:
+    """Return what shapes change, `(E,)`, on each half `fold` with sizes fitted to the other."""
     change = np.zeros(len(z))
     for half in (0, 1):
         other = fold == half
         if shapes and other.any() and not other.all():
-            change[other] = predicted(shapes, fitted(z, shapes, used=np.where(other, 0.0, 1.0)))[
-                other
-            ]
+            change[other] = sum_responses(
+                shapes, fit_sizes(z, shapes, used=np.where(other, 0.0, 1.0))
+            )[other]
     return change
 
 
-SHAPES = (0.35, 0.5, 0.7, 1.4, 2.0)
+SHAPE_FACTORS = (0.35, 0.5, 0.7, 1.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
-FINE = tuple(np.geomspace(GRID[0], GRID[-1], 20).round(3).tolist())
+FINE_GRID = tuple(np.geomspace(SIZE_GRID[0], SIZE_GRID[-1], 20).round(3).tolist())
 """Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of
 step, and only a dull one fits."""
-SMALL = GRID[:4]
+REFERENCE_GRID = SIZE_GRID[:4]
 """Sizes at which effects are simulated on the reference: small ones of the field's, as many effects
 begin at a threshold."""
-FELT = 1e-3
+MIN_RESPONSE = 1e-3
 """An effect that changes errors over the noise by less does nothing to a joint."""
 
 
-def rays_of(kind: Kind, grid: Sequence[float] = GRID) -> list[Ray]:
-    """Returns the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
-    fine = [size for size in FINE if size <= grid[-1]]
-    return rays(kind, fine if kind.shaping and not shared([kind]) else grid)
+def choose_rays(kind: EffectType, grid: Sequence[float] = SIZE_GRID) -> list[ParameterRay]:
+    """Return the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
+    fine = [size for size in FINE_GRID if size <= grid[-1]]
+    return build_rays(kind, fine if kind.shaping and not list_shared_effects([kind]) else grid)
 
 
-def add(
-    shapes: Sequence[dict[str, list[Shape]]], name: str, ways: Sequence[Ray], evidence: Evidence
-) -> list[Ray]:
-    """Adds the shapes of an effect to the joints that it does something to.
+def add_responses(
+    shapes: Sequence[dict[str, list[Response]]],
+    name: str,
+    ways: Sequence[ParameterRay],
+    residuals: Residuals,
+) -> list[ParameterRay]:
+    """Add the shapes of an effect to the joints that it does something to.
 
     Numbers that only shape the effect are tried at several values; each joint keeps the best, and
     the rays remember them.
@@ -239,25 +261,30 @@ def add(
     kind = ways[0].kind
     trials: list[dict[str, float]] = [{}]
     if not ways[0].shape:
-        trials += [{number: part} for number in kind.shaping for part in SHAPES]
+        trials += [{number: part} for number in kind.shaping for part in SHAPE_FACTORS]
     shaped = [
-        [replace(ray, shape=_all(trial, len(shapes))) if trial else ray for ray in ways]
+        [
+            replace(ray, shape=_repeat_per_joint(trial, len(shapes))) if trial else ray
+            for ray in ways
+        ]
         for trial in trials
     ]
-    responses = [[evidence.response(ray) for ray in one] for one in shaped]
+    responses = [[residuals.response(ray) for ray in one] for one in shaped]
     best = np.zeros(len(shapes), dtype=int)
     for j, mine in enumerate(shapes):
-        if max(np.abs(response[j]).max() for response in responses[0]) < FELT:
+        if max(np.abs(response[j]).max() for response in responses[0]) < MIN_RESPONSE:
             continue
         made = [
-            [Shape(ray.sizes, r[j]) for ray, r in zip(ways, response, strict=True)]
+            [Response(ray.sizes, r[j]) for ray, r in zip(ways, response, strict=True)]
             for response in responses
         ]
         if len(made) > 1:
             best[j] = int(
                 np.argmin(
                     [
-                        robust_loss(evidence.z[j] - predicted(one, fitted(evidence.z[j], one)))
+                        compute_loss(
+                            residuals.z[j] - sum_responses(one, fit_sizes(residuals.z[j], one))
+                        )
                         for one in made
                     ]
                 )
@@ -271,23 +298,23 @@ def add(
     return [replace(ray, shape=shape) for ray in ways]
 
 
-def plain_joints(
-    evidence: Evidence, scatter: np.ndarray | None = None, z: np.ndarray | None = None
-) -> list[Plain]:
-    """Returns the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
+def fit_joint_faults(
+    residuals: Residuals, scatter: np.ndarray | None = None, z: np.ndarray | None = None
+) -> list[JointResiduals]:
+    """Return the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
 
     Args:
         evidence: Errors over the noise.
         scatter: Mean square error over what the noise says, `(J,)`.
         z: Errors to explain in place of those of the evidence, `(J, E)`.
     """
-    by = np.ones(len(evidence.z)) if scatter is None else 1.0 / np.sqrt(scatter)
-    z = evidence.z if z is None else z
+    by = np.ones(len(residuals.z)) if scatter is None else 1.0 / np.sqrt(scatter)
+    z = residuals.z if z is None else z
     return [
-        plain(one * part, lines * part)
-        for one, lines, part in zip(z, evidence.faults, by, strict=True)
+        fit_faults(one * part, lines * part)
+        for one, lines, part in zip(z, residuals.faults, by, strict=True)
     ]
 
 
-def _all(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
+def _repeat_per_joint(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
     return {name: np.full(joints, part) for name, part in trial.items()}

@@ -16,34 +16,43 @@ from itertools import combinations
 
 import numpy as np
 
-from diagnosis.residuals import Evidence, Ray
-from diagnosis.responses import Plain, Shape, add, alone, earned, plain, plain_joints, predicted
+from diagnosis.residuals import ParameterRay, Residuals
+from diagnosis.responses import (
+    JointResiduals,
+    Response,
+    add_responses,
+    fit_faults,
+    fit_joint_faults,
+    fit_single_size,
+    score_responses,
+    sum_responses,
+)
 
-MOST = 4
+MAX_EFFECTS = 4
 """Effects in a set."""
-KEPT = 5
+BEAM_WIDTH = 5
 """Subsets of each size that a joint goes on from."""
-NAMES = 12
+MAX_NAMES = 12
 """Names among which whole sets are chosen."""
-LEAST = 0.15
+MIN_SIZE = 0.15
 """Smallest size, over the typical one, that is worth naming: what is smaller any simulator gets
 wrong."""
-SURELY = 1.0
+SIMPLER_MARGIN = 1.0
 """Standard errors by which a set must earn more than a simpler one."""
-TRIED = 14
+MAX_PENALISED = 14
 """Subsets of each joint that are tried on the reference too."""
 
-THERE = 3.0
+ALREADY_THERE = 3.0
 """Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be
 there already."""
 
 Subset = frozenset[str]
-Price = Callable[[int, Subset], float]
+PenaltyFunction = Callable[[int, Subset], float]
 """What a subset costs on a joint, by its number."""
 
 
 @dataclass
-class Scored:
+class SubsetScore:
     """What a subset of effects earns on a joint.
 
     Attributes:
@@ -61,38 +70,40 @@ class Scored:
 
 
 @dataclass
-class Table:
+class SubsetTable:
     """Subsets of effects that were tried on one joint, and what they earn.
 
     Attributes:
         joint: The joint's errors over the noise.
         shapes: By effect: one shape a ray; effects that do nothing to the joint are absent.
         block: Part of the recordings, the same for neighbours, of each entry.
-        scored: What subsets earn, as far as they were tried.
+        scores: What subsets earn, as far as they were tried.
         single: Best sizes of shapes by themselves, by their identity.
     """
 
-    joint: Plain
-    shapes: dict[str, list[Shape]]
+    joint: JointResiduals
+    shapes: dict[str, list[Response]]
     block: np.ndarray
-    scored: dict[Subset, Scored] = field(default_factory=dict)
+    scores: dict[Subset, SubsetScore] = field(default_factory=dict)
     single: dict[int, float] = field(default_factory=dict)
 
-    def score(self, subset: Subset) -> Scored:
-        """Returns what a subset earns."""
-        if subset not in self.scored:
+    def score(self, subset: Subset) -> SubsetScore:
+        """Return what a subset earns."""
+        if subset not in self.scores:
             names = sorted(subset)
             shapes = [shape for name in names for shape in self.shapes[name]]
             if not shapes:
-                return Scored(np.zeros(len(self.joint.z)), {})
-            found = [earned(self.joint, shapes, start) for start in self._starts(names)]
+                return SubsetScore(np.zeros(len(self.joint.z)), {})
+            found = [score_responses(self.joint, shapes, start) for start in self._starts(names)]
             gain, sizes = max(found, key=lambda one: one[0].sum())
             ends = np.cumsum([len(self.shapes[name]) for name in names])[:-1]
-            self.scored[subset] = Scored(gain, dict(zip(names, np.split(sizes, ends), strict=True)))
-        return self.scored[subset]
+            self.scores[subset] = SubsetScore(
+                gain, dict(zip(names, np.split(sizes, ends), strict=True))
+            )
+        return self.scores[subset]
 
     def _starts(self, names: Sequence[str]) -> list[np.ndarray]:
-        """Returns sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
+        """Return sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
 
         What begins at a threshold does nothing below it, and a fit that begins there stays there.
         So a set also begins where the best set with one effect less ended, with the other at what
@@ -102,7 +113,7 @@ class Table:
         starts = [
             np.array([self.alone(shape) for shape in every]) * (1.0 if len(every) == 1 else 0.7)
         ]
-        tried = self.score if len(names) == 2 else self.scored.get
+        tried = self.score if len(names) == 2 else self.scores.get
         smaller = [
             (one, new)
             for new in names
@@ -111,30 +122,30 @@ class Table:
         if smaller:
             best, new = max(smaller, key=lambda pair: pair[0].total)
             known = [shape for name in sorted(best.sizes) for shape in self.shapes[name]]
-            left = self.joint.z - predicted(
+            left = self.joint.z - sum_responses(
                 known, np.concatenate([best.sizes[name] for name in sorted(best.sizes)])
             )
-            added = [alone(left, shape) for shape in self.shapes[new]]
+            added = [fit_single_size(left, shape) for shape in self.shapes[new]]
             starts.append(
                 np.concatenate([added if name == new else best.sizes[name] for name in names])
             )
         return starts
 
-    def alone(self, shape: Shape) -> float:
-        """Returns the size of a shape that explains the joint's errors best by itself."""
+    def alone(self, shape: Response) -> float:
+        """Return the size of a shape that explains the joint's errors best by itself."""
         if id(shape) not in self.single:
-            self.single[id(shape)] = alone(self.joint.z, shape)
+            self.single[id(shape)] = fit_single_size(self.joint.z, shape)
         return self.single[id(shape)]
 
     def explore(self, price: Mapping[str, float], most: int) -> None:
-        """Tries all single effects, and larger subsets that contain one of the best of the size below."""
+        """Try all single effects, and larger subsets that contain one of the best of the size below."""
 
         def net(subset: Subset) -> float:
             return self.score(subset).total - sum(price[name] for name in subset)
 
         single = sorted((frozenset({name}) for name in self.shapes), key=net, reverse=True)
-        level = [a | b for a, b in combinations(single[: KEPT + 1], 2)]
-        best = sorted([*single, *level], key=net, reverse=True)[:KEPT]
+        level = [a | b for a, b in combinations(single[: BEAM_WIDTH + 1], 2)]
+        best = sorted([*single, *level], key=net, reverse=True)[:BEAM_WIDTH]
         if not best or net(best[0]) <= 0.0:
             return  # a joint without a gap
         for _ in range(2, most + 1):
@@ -145,22 +156,22 @@ class Table:
                 for name in self.shapes
                 if name not in one and len(one) < most
             }
-            best = sorted({*best, *level}, key=net, reverse=True)[:KEPT]
+            best = sorted({*best, *level}, key=net, reverse=True)[:BEAM_WIDTH]
             if net(best[0]) <= before:
                 return
 
 
 @dataclass(frozen=True)
-class Chosen:
+class EffectSet:
     """A set of effects, joint by joint.
 
     Attributes:
         subsets: Effects of each joint.
-        worth: What they earn in all, less their prices.
+        net_gain: What they earn in all, less their prices.
     """
 
     subsets: tuple[Subset, ...]
-    worth: float
+    net_gain: float
 
     @property
     def names(self) -> Subset:
@@ -168,16 +179,16 @@ class Chosen:
         return frozenset().union(*self.subsets)
 
 
-def choose(
-    tables: Sequence[Table],
-    price: Price,
+def choose_set(
+    tables: Sequence[SubsetTable],
+    price: PenaltyFunction,
     name_price: float,
     share: float,
     shared: Subset = frozenset(),
     partial: float = 0.0,
     least: float = 0.0,
-) -> Chosen:
-    """Returns the set that is worth most, or one of fewer effects that is not surely worth less.
+) -> EffectSet:
+    """Return the set that is worth most, or one of fewer effects that is not surely worth less.
 
     Args:
         tables: What was tried on each joint.
@@ -192,32 +203,32 @@ def choose(
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
         priced = {
-            subset: table.scored[subset].total - price(j, subset)
-            for subset in promising(table, least, share, shared)
+            subset: table.scores[subset].total - price(j, subset)
+            for subset in list_promising_subsets(table, least, share, shared)
         }
         worth.append(
             {subset: value for subset, value in priced.items() if value > 0 or subset <= shared}
         )
     felt = [shared & table.shapes.keys() for table in tables]
-    best = _best(worth, felt, name_price, partial)
-    while simpler := _simpler(best, worth, tables, felt, name_price, partial, share):
+    best = _find_best_set(worth, felt, name_price, partial)
+    while simpler := _find_simpler_set(best, worth, tables, felt, name_price, partial, share):
         best = simpler
     return best
 
 
-def _best(
+def _find_best_set(
     worth: Sequence[Mapping[Subset, float]],
     felt: Sequence[Subset],
     name_price: float,
     partial: float,
-) -> Chosen:
-    """Returns the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
+) -> EffectSet:
+    """Return the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
     names = sorted(
         {name for by_subset in worth for subset in by_subset for name in subset},
-        key=lambda n: -_sum(worth, n),
-    )[:NAMES]
-    best = Chosen((frozenset(),) * len(worth), 0.0)
-    for size in range(1, MOST + 1):
+        key=lambda n: -_sum_best(worth, n),
+    )[:MAX_NAMES]
+    best = EffectSet((frozenset(),) * len(worth), 0.0)
+    for size in range(1, MAX_EFFECTS + 1):
         for chosen in combinations(names, size):
             among = frozenset(chosen)
             total, subsets = -name_price * size, []
@@ -226,23 +237,23 @@ def _best(
                 net[frozenset()] = -partial * len(among & every)
                 subsets.append(max(net, key=net.__getitem__))
                 total += net[subsets[-1]]
-            if total > best.worth and frozenset().union(*subsets) == among:
-                best = Chosen(tuple(subsets), total)
+            if total > best.net_gain and frozenset().union(*subsets) == among:
+                best = EffectSet(tuple(subsets), total)
     return best
 
 
-def _simpler(
-    best: Chosen,
+def _find_simpler_set(
+    best: EffectSet,
     worth: Sequence[Mapping[Subset, float]],
-    tables: Sequence[Table],
+    tables: Sequence[SubsetTable],
     felt: Sequence[Subset],
     name_price: float,
     partial: float,
     share: float,
-) -> Chosen | None:
-    """Returns a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
+) -> EffectSet | None:
+    """Return a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
     for name in sorted(best.names):
-        other = _best(
+        other = _find_best_set(
             [{s: value for s, value in w.items() if name not in s} for w in worth],
             felt,
             name_price,
@@ -256,42 +267,42 @@ def _simpler(
                 difference = table.score(mine).gain - table.score(others).gain
                 lost, whole = lost + difference.sum(), whole + table.score(mine).total
                 blocks += np.bincount(table.block, difference, len(blocks))
-        if lost < max(SURELY * blocks.std() * np.sqrt(len(blocks)), share * whole):
+        if lost < max(SIMPLER_MARGIN * blocks.std() * np.sqrt(len(blocks)), share * whole):
             return other
     return None
 
 
-def promising(
-    table: Table, least: float, share: float, shared: Subset = frozenset()
+def list_promising_subsets(
+    table: SubsetTable, least: float, share: float, shared: Subset = frozenset()
 ) -> list[Subset]:
-    """Returns the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
+    """Return the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
 
     An effect that is `shared` by all joints may earn little on each.
     """
 
     def pays(subset: Subset) -> bool:
         own = subset - shared
-        return table.scored[subset].total > least * len(own) and _each_adds(
+        return table.scores[subset].total > least * len(own) and _adds_each(
             subset, own, table, share
         )
 
-    paying = [subset for subset in list(table.scored) if subset and pays(subset)]
-    paying.sort(key=lambda s: table.scored[s].total, reverse=True)
-    return [s for place, s in enumerate(paying) if place < TRIED or len(s) == 1]
+    paying = [subset for subset in list(table.scores) if subset and pays(subset)]
+    paying.sort(key=lambda s: table.scores[s].total, reverse=True)
+    return [s for place, s in enumerate(paying) if place < MAX_PENALISED or len(s) == 1]
 
 
-def _each_adds(subset: Subset, own: Subset, table: Table, share: float) -> bool:
-    """Says whether each of the effects `own` has a size worth naming and adds its share: else it mends the form of another."""
-    total, sizes = table.scored[subset].total, table.scored[subset].sizes
-    if any(np.abs(sizes[name]).max() < LEAST for name in own):
+def _adds_each(subset: Subset, own: Subset, table: SubsetTable, share: float) -> bool:
+    """Return True where each of the effects `own` has a size worth naming and adds its share: else it mends the form of another."""
+    total, sizes = table.scores[subset].total, table.scores[subset].sizes
+    if any(np.abs(sizes[name]).max() < MIN_SIZE for name in own):
         return False
     return len(subset) == 1 or all(
         total - table.score(subset - {name}).total >= share * total for name in own
     )
 
 
-def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
-    """Returns the most that a subset with `name` is worth, summed over joints."""
+def _sum_best(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
+    """Return the most that a subset with `name` is worth, summed over joints."""
     return sum(
         max([value for subset, value in by_subset.items() if name in subset], default=0.0)
         for by_subset in worth
@@ -299,7 +310,7 @@ def _sum(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
 
 
 @dataclass
-class Nulls:
+class ReferenceScores:
     """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for.
 
     Attributes:
@@ -314,21 +325,21 @@ class Nulls:
         known: Effects that were simulated on the reference.
     """
 
-    parts: Sequence[Evidence]
+    parts: Sequence[Residuals]
     num_entries: int
-    rays: Mapping[str, Sequence[Ray]]
-    grown: Mapping[str, Sequence[Ray]]
-    plain: Sequence[Plain]
-    shapes: Sequence[Mapping[str, Sequence[Shape]]]
+    rays: Mapping[str, Sequence[ParameterRay]]
+    grown: Mapping[str, Sequence[ParameterRay]]
+    joints: Sequence[JointResiduals]
+    shapes: Sequence[Mapping[str, Sequence[Response]]]
     shared: frozenset[str]
-    tables: list[list[Table]] = field(default_factory=list)
+    tables: list[list[SubsetTable]] = field(default_factory=list)
     known: set[str] = field(default_factory=set)
 
-    def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[Scored, float]]:
-        """Returns what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
+    def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[SubsetScore, float]]:
+        """Return what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
         if not self.tables:
             self.tables = [
-                [Table(joint, {}, part.block) for joint in plain_joints(part)]
+                [SubsetTable(joint, {}, part.block) for joint in fit_joint_faults(part)]
                 for part in self.parts
             ]
         for name in subset - self.known:
@@ -336,7 +347,7 @@ class Nulls:
                 replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]
             ]  # shaped as they are in the field
             for tables, part in zip(self.tables, self.parts, strict=True):
-                add([table.shapes for table in tables], name, ways, part)
+                add_responses([table.shapes for table in tables], name, ways, part)
             self.known.add(name)
         found = []
         for mine in (tables[j] for tables in self.tables):
@@ -345,7 +356,7 @@ class Nulls:
         return found
 
     def earned(self, j: int, subset: frozenset[str]) -> float:
-        """Returns the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
+        """Return the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
 
         Of a cause that all joints share the mean: its price adds up over the joints, and the most
         of each adds up to too much.
@@ -354,30 +365,30 @@ class Nulls:
         return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0
 
     def repeated(self, j: int, subset: frozenset[str]) -> float:
-        """Returns what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
+        """Return what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
         parts = [scored for scored, _ in self._scored(j, subset)]
-        if not parts or sum(scored.total for scored in parts) < THERE:
+        if not parts or sum(scored.total for scored in parts) < ALREADY_THERE:
             return 0.0
-        joint, change = self.plain[j], np.zeros(len(self.plain[j].z))
+        joint, change = self.joints[j], np.zeros(len(self.joints[j].z))
         for name in subset & self.shapes[j].keys():
             if sizes := [scored.sizes[name] for scored in parts if name in scored.sizes]:
-                change = change + predicted(self.shapes[j][name], np.mean(sizes, 0))
-        left = plain(joint.z - change, joint.faults)
+                change = change + sum_responses(self.shapes[j][name], np.mean(sizes, 0))
+        left = fit_faults(joint.z - change, joint.faults)
         return max(0.0, float(joint.loss.sum() - left.loss.sum()) + joint.price - left.price)
 
 
-PLAY = 0.3
+SHARED_PLAY = 0.3
 """Sizes may differ by so much of what they have in common: an effect's form is not quite the same
 on all joints."""
 
-Rays = Mapping[str, Sequence[Ray]]
-Shapes = Sequence[Mapping[str, Sequence[Shape]]]
+Rays = Mapping[str, Sequence[ParameterRay]]
+Shapes = Sequence[Mapping[str, Sequence[Response]]]
 
 
 def bind_shared_sizes(
-    names: Subset, tables: Sequence[Table], grown: Rays, shapes: Shapes
-) -> tuple[dict[str, list[Ray]], list[dict[str, list[Shape]]]]:
-    """Returns rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
+    names: Subset, tables: Sequence[SubsetTable], grown: Rays, shapes: Shapes
+) -> tuple[dict[str, list[ParameterRay]], list[dict[str, list[Response]]]]:
+    """Return rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
     rays, narrow = (
         {name: list(ways) for name, ways in grown.items()},
         [{n: list(s) for n, s in mine.items()} for mine in shapes],
@@ -389,22 +400,22 @@ def bind_shared_sizes(
             told = np.array([max(one.total, 0.0) for one in scored]) / np.maximum(
                 np.square(size), 1e-6
             )
-            common = weighted_median(size, told)
+            common = find_weighted_median(size, told)
             if common == 0.0:
                 continue
-            ends = np.sort(common * np.array([1.0 - PLAY, 1.0, 1.0 + PLAY]))
+            ends = np.sort(common * np.array([1.0 - SHARED_PLAY, 1.0, 1.0 + SHARED_PLAY]))
             rays[name][place] = replace(ray, sizes=ends, is_tied=True)
             for mine in narrow:
                 if name in mine:
                     shape = mine[name][place]
-                    mine[name][place] = Shape(
+                    mine[name][place] = Response(
                         ends, np.stack([shape.at(float(size))[0] for size in ends])
                     )
     return rays, narrow
 
 
-def weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
-    """Returns the weighted median: a joint that has another effect too is far off."""
+def find_weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    """Return the weighted median: a joint that has another effect too is far off."""
     order = np.argsort(values)
     below = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(below, 0.5 * below[-1])]) if below[-1] > 0 else 0.0

@@ -15,8 +15,8 @@ import torch
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
-from diagnosis.case import Case, parts
-from diagnosis.effect_library import Found, Kind, Still, fit_interval
+from diagnosis.case import GapCase, split_recordings
+from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel, estimate_interval
 
 SIZES = np.geomspace(0.05, 6.0, 25)
 """Sizes that are tried, of typical; steps of 22 %, chosen by hand."""
@@ -84,10 +84,10 @@ def measure_excess_scatter(
 
 
 def find_sensor_effects(
-    case: Case, kinds: Sequence[Kind], price: float, name_price: float
-) -> list[Found]:
+    case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
+) -> list[DetectedEffect]:
     """Return the effects on sensors that the scatter of the field's samples shows."""
-    field, reference, machine = case.field, parts(case.reference), case.machine
+    field, reference, machine = case.field, split_recordings(case.reference), case.machine
     if len(reference) < 2:
         return []
     kinds = [
@@ -125,7 +125,7 @@ def find_sensor_effects(
             continue
         parameters: dict[str, dict[str, Estimate]] = {}
         for j in np.flatnonzero(mask):
-            ends = np.array(fit_interval(SIZES, likelihood[kind.name][:, j]))
+            ends = np.array(estimate_interval(SIZES, likelihood[kind.name][:, j]))
             for name in kind.fitted:
                 mean, low, high = kind.numbers[name].none + kind.size(name) * ends
                 parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(
@@ -147,7 +147,9 @@ def find_sensor_effects(
             np.square((seen - plain.mean(0)) / STATISTICS_SIGMA)[mask]
         )
         found.append(
-            Found(kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals)
+            DetectedEffect(
+                kind, mask, parameters, worth, earned, float(np.clip(closed, 0.0, 1.0)), rivals
+            )
         )
     return found
 
@@ -167,7 +169,7 @@ def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) 
 
 
 def _simulate_statistics(
-    kind: Kind, size: float, reference: Sequence[Recording], machine: Machine
+    kind: EffectType, size: float, reference: Sequence[Recording], machine: Machine
 ) -> np.ndarray:
     """Return the statistics of the reference with an effect on all joints, `(P, J, F)`."""
     found = []
@@ -175,7 +177,7 @@ def _simulate_statistics(
         q = torch.as_tensor(recording.q, dtype=torch.float32)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            model = kind.wrap(Still(), machine, len(q), torch.device("cpu"))
+            model = kind.wrap(StationaryModel(), machine, len(q), torch.device("cpu"))
         for name in kind.fitted:
             value = kind.clipped(name, np.array(kind.numbers[name].none + size * kind.size(name)))
             model.parameters[name].fill_(float(value))

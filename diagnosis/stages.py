@@ -24,7 +24,7 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import JointGap, RegimeGap, Stage, Where
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points
 from diagnosis.probes import SPAN_S, Probe, probe_residuals
 from diagnosis.sanity import RecordingRemark, examine_recordings
@@ -79,7 +79,7 @@ class TipErrorBudget:
         }
 
 
-def measure_tip_error(runs: FreeRuns, machine: Machine) -> TipError:
+def measure_tip_error(runs: WindowedRuns, machine: Machine) -> TipError:
     """Return the error of the tip over free runs.
 
     Raises:
@@ -155,7 +155,7 @@ class StageEvidence:
 
 
 def attribute_to_stages(
-    known: StageEvidence, runs: FreeRuns, reference: FreeRuns | None, machine: Machine
+    known: StageEvidence, runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine
 ) -> list[StageFinding]:
     """Return the contribution of each stage about which the recordings tell something."""
     whole_m = _compute_tip_excess(known.budget) if known.budget else None
@@ -194,8 +194,8 @@ def _compute_tip_excess(budget: TipErrorBudget) -> float:
 
 def _split_joint_gap(
     known: StageEvidence,
-    runs: FreeRuns,
-    reference: FreeRuns | None,
+    runs: WindowedRuns,
+    reference: WindowedRuns | None,
     machine: Machine,
     whole_m: float | None,
 ) -> list[StageFinding]:
@@ -308,7 +308,7 @@ def assess_perception(recordings: Sequence[Recording], machine: Machine) -> Stag
     return StageFinding("perception", None, rms_m, text)
 
 
-def _assess_contact(runs: FreeRuns) -> StageFinding | None:
+def _assess_contact(runs: WindowedRuns) -> StageFinding | None:
     if not all("force_n" in recording.extra for recording in runs.recordings):
         return None
     force = runs.cut([recording.extra["force_n"] for recording in runs.recordings])
@@ -371,14 +371,14 @@ class Survey:
 
 
 def examine_gap(
-    before: FreeRuns,
-    floor: FreeRuns | None,
-    after: FreeRuns | None,
+    before: WindowedRuns,
+    floor: WindowedRuns | None,
+    after: WindowedRuns | None,
     machine: Machine,
     thresholds: InspectionThresholds,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
-    whole: FreeRuns | None = None,
+    whole: WindowedRuns | None = None,
 ) -> Survey:
     """Survey a gap before any effect is fitted.
 

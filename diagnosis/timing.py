@@ -18,39 +18,39 @@ import numpy as np
 from scipy import stats
 
 from diagnosis.answer import Estimate
-from diagnosis.effect_library import Found, Kind, Values, fit_interval
-from diagnosis.residuals import Evidence, to_increments
-from diagnosis.responses import fitted
-from diagnosis.search import weighted_median
+from diagnosis.effect_library import DetectedEffect, EffectType, EffectValues, estimate_interval
+from diagnosis.residuals import Residuals, to_increments
+from diagnosis.responses import fit_sizes
+from diagnosis.search import find_weighted_median
 
-CHANGE = 0.06
+MIN_COMMAND_CHANGE = 0.06
 """Smaller changes of a command tell nothing about when it arrived."""
-WIDE = 1.5
+DELAY_PRIOR = 1.5
 """Prior standard deviation of a delay, periods."""
-LEAST = 0.3
+MIN_TELLING = 0.3
 """A delay of one period that changes no error over the noise by more tells nothing."""
-NEAR = 0.1
+TIMING_ERROR = 0.1
 """Delays that differ by so few periods are the same: a simulator's own timing is no better."""
-SURE = 0.4
+MAX_DELAY_ERROR = 0.4
 """Largest standard error, in periods, of a delay that counts."""
-FEWEST = 20
+MIN_DELAYS = 20
 """Fewer delays tell nothing about how they scatter."""
-SIZES = np.geomspace(0.2, 8.0, 12)
-DRAWN = 3
+JITTER_SIZES = np.geomspace(0.2, 8.0, 12)
+DRAWS_PER_WINDOW = 3
 """Times that the chances of each window are drawn."""
-MOST = 300
+MAX_DRAWN = 300
 """Delays drawn by which those seen are judged."""
-BEYOND = 2.0
+MAX_EXTRA_MEAN = 2.0
 """The mean of delays by chance is off by so much of itself at most; what joints are late by beyond
 is an effect of its own."""
 SCALES, FREEDOMS = np.linspace(0.7, 1.5, 9), (3.0, 5.0, 7.0, 10.0)
 """Among which the distribution of the errors of delays is found."""
-WIDER = 1.1
+MIN_SCATTER_RATIO = 1.1
 """Scatter of the delays, over that of reference recordings, below which nothing is looked for."""
 
 
 @dataclass(frozen=True)
-class Delays:
+class FrameDelays:
     """Hidden delays of frames that could be measured, less what is late always.
 
     Attributes:
@@ -63,14 +63,14 @@ class Delays:
     error: np.ndarray
     joint: np.ndarray
 
-    def of(self, joint: int) -> Delays:
-        """Returns those of one joint."""
+    def of(self, joint: int) -> FrameDelays:
+        """Return those of one joint."""
         mine = self.joint == joint
-        return Delays(self.value[mine], self.error[mine], self.joint[mine])
+        return FrameDelays(self.value[mine], self.error[mine], self.joint[mine])
 
 
 @dataclass(frozen=True)
-class Usual:
+class DelayErrorModel:
     """How delays err where all frames arrive in time: a t distribution.
 
     Attributes:
@@ -82,8 +82,8 @@ class Usual:
     freedom: float
 
     @classmethod
-    def of(cls, known: Sequence[Delays]) -> Usual:
-        """Returns the most likely one for the delays of recordings in which no frame is late."""
+    def of(cls, known: Sequence[FrameDelays]) -> DelayErrorModel:
+        """Return the most likely one for the delays of recordings in which no frame is late."""
         tried = [cls(scale, freedom) for scale in SCALES for freedom in FREEDOMS]
         return max(
             tried,
@@ -91,12 +91,12 @@ class Usual:
         )
 
     def log(self, off: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """Returns the logarithm of the density of what delays with these standard errors are off by."""
-        width = np.hypot(self.scale * error, NEAR)
+        """Return the logarithm of the density of what delays with these standard errors are off by."""
+        width = np.hypot(self.scale * error, TIMING_ERROR)
         return stats.t.logpdf(off / width, self.freedom) - np.log(width)
 
-    def gain(self, seen: Delays, drawn: np.ndarray) -> float:
-        """Returns the log likelihood of the delays seen, where true ones are like those `drawn`, over that without any."""
+    def gain(self, seen: FrameDelays, drawn: np.ndarray) -> float:
+        """Return the log likelihood of the delays seen, where true ones are like those `drawn`, over that without any."""
         if not len(seen.value):
             return 0.0
         among = np.exp(self.log(seen.value[:, None] - drawn[None], seen.error[:, None])).mean(1)
@@ -104,37 +104,37 @@ class Usual:
 
 
 @dataclass(frozen=True)
-class Changes:
+class CommandChanges:
     """The changes of commands in some windows, and what it would do if they came one period later."""
 
-    evidence: Evidence
+    residuals: Residuals
 
     @cached_property
     def _ranks(self) -> np.ndarray:
         """Which of a joint's changes in a window a sample is, from 1 on; 0 where its command stays, `(W, L, J)`."""
-        cut = self.evidence.candidates.cut
-        jump = np.abs(np.diff(cut.u, axis=1)) > CHANGE
+        cut = self.residuals.simulator.cut
+        jump = np.abs(np.diff(cut.u, axis=1)) > MIN_COMMAND_CHANGE
         jump[:, : cut.num_before - cut.num_history] = False  # over when the free run begins
         return np.cumsum(jump, 1) * jump
 
     @cached_property
     def responses(self) -> np.ndarray:
         """Increments that change where the n-th change of each joint's command in a window comes late, `(C, W, I, J)`."""
-        cut, rank = self.evidence.candidates.cut, self._ranks
+        cut, rank = self.residuals.simulator.cut, self._ranks
         count, windows = int(rank.max(initial=0)), len(cut.u)
         if not count:
-            return np.zeros((0, *self.evidence.way.shape))
+            return np.zeros((0, *self.residuals.increments.shape))
         late = [
             np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:]) for number in range(1, count + 1)
         ]
         u = np.concatenate([np.repeat(cut.u[None, :, :1], count, 0), np.stack(late)], 2)
         rows = np.tile(np.arange(windows), count)
         many = replace(cut, u=u.reshape(-1, *u.shape[2:]), q=cut.q[rows], run=cut.run[rows])
-        candidates = replace(
-            self.evidence.candidates, cut=many, running_s=self.evidence.candidates.running_s[rows]
+        simulator = replace(
+            self.residuals.simulator, cut=many, running_s=self.residuals.simulator.running_s[rows]
         )
-        paths = candidates.paths([])[0].reshape(count, windows, *self.evidence.base.shape[1:])
-        return to_increments(paths, self.evidence.start) - self.evidence.way
+        paths = simulator.simulate([])[0].reshape(count, windows, *self.residuals.base.shape[1:])
+        return to_increments(paths, self.residuals.start) - self.residuals.increments
 
     @cached_property
     def _told(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -142,19 +142,19 @@ class Changes:
 
         With the number of the joint that tells most of each, `(D,)`.
         """
-        assert self.evidence.noise is not None, "noise is known by now"
-        found, joints = [], self.evidence.way.shape[2]
+        assert self.residuals.noise is not None, "noise is known by now"
+        found, joints = [], self.residuals.increments.shape[2]
         for w, ranks in enumerate(self._ranks):
             frames = np.flatnonzero(ranks.any(1))
-            columns = np.zeros((joints, self.evidence.way.shape[1], len(frames)))
+            columns = np.zeros((joints, self.residuals.increments.shape[1], len(frames)))
             for j, whiteners in enumerate(self._whiteners if len(frames) else ()):
                 rank = ranks[frames, j]
                 columns[j][:, rank > 0] = (
                     whiteners[w]
                     @ self.responses[rank[rank > 0] - 1, w, :, j].T
-                    * self.evidence.claims[w, j]
+                    * self.residuals.valid_mask[w, j]
                 )
-            telling = np.abs(columns).max((0, 1)) > LEAST
+            telling = np.abs(columns).max((0, 1)) > MIN_TELLING
             columns = columns[..., telling]
             found.append(
                 (
@@ -166,9 +166,10 @@ class Changes:
 
     @cached_property
     def _whiteners(self) -> list[np.ndarray]:
-        assert self.evidence.noise is not None, "noise is known by now"
+        assert self.residuals.noise is not None, "noise is known by now"
         return [
-            noise.whitener(self.evidence.way[..., j]) for j, noise in enumerate(self.evidence.noise)
+            noise.whitener(self.residuals.increments[..., j])
+            for j, noise in enumerate(self.residuals.noise)
         ]
 
     @cached_property
@@ -177,15 +178,15 @@ class Changes:
 
     def _solved(self, without: int | None) -> list[tuple[np.ndarray, np.ndarray]]:
         """Per window: matrix from errors over the noise to delays, and their standard errors."""
-        found, steps = [], self.evidence.way.shape[1]
+        found, steps = [], self.residuals.increments.shape[1]
         for x, _ in self._told:
             counted = x * np.repeat(np.arange(len(x) // steps) != without, steps)[:, None]
-            inverse = np.linalg.inv(counted.T @ counted + np.eye(x.shape[1]) / WIDE**2)
+            inverse = np.linalg.inv(counted.T @ counted + np.eye(x.shape[1]) / DELAY_PRIOR**2)
             found.append((inverse @ counted.T, np.sqrt(np.diag(inverse))))
         return found
 
-    def delays(self, error: np.ndarray, without: int | None = None) -> Delays:
-        """Returns the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
+    def delays(self, error: np.ndarray, without: int | None = None) -> FrameDelays:
+        """Return the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
 
         What a joint alone is late by on average is none of them; `without`: a joint whose errors do
         not count.
@@ -194,12 +195,12 @@ class Changes:
             [(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)], 1
         )  # (W, J, I)
         always = np.stack([x.sum(1).reshape(z.shape[1:]) for x, _ in self._told])
-        share = (always * z).sum((0, 2)) / (np.square(always).sum((0, 2)) + WIDE**-2)
+        share = (always * z).sum((0, 2)) / (np.square(always).sum((0, 2)) + DELAY_PRIOR**-2)
         z = z - share[:, None] * always
         value, deviation, joint = [], [], []
         solutions = self._every if without is None else self._solved(without)
         for row, (matrix, errors), (_, most) in zip(z, solutions, self._told, strict=True):
-            sure = errors < SURE
+            sure = errors < MAX_DELAY_ERROR
             value.append((matrix @ row.ravel())[sure])
             deviation.append(errors[sure])
             joint.append(most[sure])
@@ -208,28 +209,28 @@ class Changes:
             np.concatenate(deviation),
             np.concatenate(joint),
         )
-        return Delays(
+        return FrameDelays(
             value - np.average(value, weights=deviation**-2) if len(value) else value,
             deviation,
             joint,
         )
 
     def spread(self, error: np.ndarray) -> np.ndarray:
-        """Returns what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
+        """Return what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
         seen = self.delays(error)
         by = np.sqrt(max(0.0, float(np.mean(np.square(seen.value) - np.square(seen.error)))))
         return by * self.responses.swapaxes(0, 1)
 
 
-def search(
-    changes: Changes,
+def detect_timing_effect(
+    changes: CommandChanges,
     error: np.ndarray,
-    nulls: Sequence[Evidence],
-    kinds: Sequence[Kind],
+    left_out: Sequence[Residuals],
+    kinds: Sequence[EffectType],
     price: float,
     name_price: float,
-) -> Found | None:
-    """Returns the effect on the arrival of commands that the scatter of hidden delays shows, if any.
+) -> DetectedEffect | None:
+    """Return the effect on the arrival of commands that the scatter of hidden delays shows, if any.
 
     Args:
         changes: Of the commands in the field.
@@ -240,24 +241,28 @@ def search(
         name_price: For the effect as such.
     """
     kinds = [kind for kind in kinds if kind.target.stochastic and kind.target.side == "command"]
-    others = [Changes(one) for one in nulls]
-    seen, known = changes.delays(error), [one.delays(one.evidence.error) for one in others]
-    if not kinds or len(seen.value) < FEWEST or sum(len(one.value) for one in known) < FEWEST:
+    others = [CommandChanges(one) for one in left_out]
+    seen, known = changes.delays(error), [one.delays(one.residuals.error) for one in others]
+    if (
+        not kinds
+        or len(seen.value) < MIN_DELAYS
+        or sum(len(one.value) for one in known) < MIN_DELAYS
+    ):
         return None
-    usual = Usual.of(known)
-    if _scatter(seen.value / seen.error) < WIDER * _scatter(
+    usual = DelayErrorModel.of(known)
+    if _compute_scatter(seen.value / seen.error) < MIN_SCATTER_RATIO * _compute_scatter(
         np.concatenate([one.value / one.error for one in known])
     ):
         return None
     gains, earned = {}, {}
     for kind in kinds:
-        drawn = [_thinned(one) for one in _drawn(changes, kind)]
+        drawn = [_subsample_delays(one) for one in _draw_delays(changes, kind)]
         gains[kind.name] = np.array([usual.gain(seen, one) for one in drawn])
         best = drawn[int(np.argmax(gains[kind.name]))]
         by_joint = {
             int(j): usual.gain(seen.of(j), best)
             for j in np.unique(seen.joint)
-            if len(seen.of(j).value) >= FEWEST
+            if len(seen.of(j).value) >= MIN_DELAYS
         }
         rest = (
             changes.delays(error, max(by_joint, key=by_joint.__getitem__))
@@ -277,8 +282,8 @@ def search(
     best = max(kinds, key=lambda kind: worth[kind.name])
     if worth[best.name] <= 0:
         return None
-    ends = np.array(fit_interval(SIZES, gains[best.name]))
-    machine = changes.evidence.candidates.machine
+    ends = np.array(estimate_interval(JITTER_SIZES, gains[best.name]))
+    machine = changes.residuals.simulator.machine
     parameters = {}
     for name in best.fitted:
         mean, low, high = (
@@ -287,19 +292,21 @@ def search(
         parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
     rest = {name: float(gain.max()) for name, gain in gains.items() if name != best.name}
     every = np.ones(machine.num_joints, dtype=bool)
-    return Found(
+    return DetectedEffect(
         best,
         every,
         parameters,
         worth[best.name],
         float(gains[best.name].max()),
-        _explained(seen, usual.scale),
+        _compute_explained_share(seen, usual.scale),
         rest,
     )
 
 
-def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Values]]) -> Evidence:
-    """Returns the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
+def add_mean_delay(
+    residuals: Residuals, found: DetectedEffect, steady: Sequence[tuple[EffectType, EffectValues]]
+) -> Residuals:
+    """Return the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
 
     How delays scatter does not tell their mean: frames that may not overtake each other wait twice
     as long as others that scatter alike. Frames are late for all joints alike, so that what one
@@ -310,59 +317,67 @@ def expected(evidence: Evidence, found: Found, steady: Sequence[tuple[Kind, Valu
         found: The effect.
         steady: Other effects that are there.
     """
-    count, candidates = (
-        4 * DRAWN,
-        replace(evidence.candidates, fixed=[*evidence.candidates.fixed, *steady]),
+    count, simulator = (
+        4 * DRAWS_PER_WINDOW,
+        replace(residuals.simulator, fixed=[*residuals.simulator.fixed, *steady]),
     )
     mean = (
-        candidates.paths([(found.kind, found.values(count))], count).mean(0)
-        - candidates.paths([])[0]
+        simulator.simulate([(found.kind, found.values(count))], count).mean(0)
+        - simulator.simulate([])[0]
     )
-    u = evidence.candidates.cut.u
-    late = replace(evidence.candidates.cut, u=np.concatenate([u[:, :1], u[:, :-1]], 1))
-    later = replace(evidence.candidates, cut=late).paths([])[0] - evidence.base
-    known = replace(evidence, mean=mean)
+    u = residuals.simulator.cut.u
+    late = replace(residuals.simulator.cut, u=np.concatenate([u[:, :1], u[:, :-1]], 1))
+    later = replace(residuals.simulator, cut=late).simulate([])[0] - residuals.base
+    known = replace(residuals, mean=mean)
     moved, usual = (
-        known.whitened(to_increments(one, np.zeros_like(evidence.start))[None])[:, 0]
+        known.whiten(to_increments(one, np.zeros_like(residuals.start))[None])[:, 0]
         for one in (later, mean)
     )
     shares = [
-        fitted(z, [], faults=np.concatenate([faults, WIDE * line[None]]))[-1] * WIDE
+        fit_sizes(z, [], faults=np.concatenate([faults, DELAY_PRIOR * line[None]]))[-1]
+        * DELAY_PRIOR
         for z, faults, line in zip(known.z, known.faults, moved, strict=True)
     ]
     told = np.square(moved).sum(1)
-    own = weighted_median((moved * usual).sum(1) / np.maximum(told, 1e-9), told)
-    more = weighted_median(np.array(shares), told)
-    return replace(evidence, mean=mean + more * later) if abs(more) <= BEYOND * abs(own) else known
+    own = find_weighted_median((moved * usual).sum(1) / np.maximum(told, 1e-9), told)
+    more = find_weighted_median(np.array(shares), told)
+    return (
+        replace(residuals, mean=mean + more * later)
+        if abs(more) <= MAX_EXTRA_MEAN * abs(own)
+        else known
+    )
 
 
-def _drawn(changes: Changes, kind: Kind) -> list[np.ndarray]:
-    """Returns hidden delays that an effect of each size makes, without errors of measurement, each `(D,)`."""
-    evidence, joints = changes.evidence, changes.evidence.way.shape[2]
-    sizes = np.repeat(SIZES, DRAWN)[:, None]
+def _draw_delays(changes: CommandChanges, kind: EffectType) -> list[np.ndarray]:
+    """Return hidden delays that an effect of each size makes, without errors of measurement, each `(D,)`."""
+    residuals, joints = changes.residuals, changes.residuals.increments.shape[2]
+    sizes = np.repeat(JITTER_SIZES, DRAWS_PER_WINDOW)[:, None]
     values = {}
     for name in kind.fitted:
         values[name] = np.repeat(
             kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1
         )
-    paths = evidence.candidates.paths([(kind, values)], len(sizes))
-    moved = to_increments(paths, evidence.start) - evidence.way
+    paths = residuals.simulator.simulate([(kind, values)], len(sizes))
+    moved = to_increments(paths, residuals.start) - residuals.increments
     found = [changes.delays(one).value for one in moved]
-    return [np.concatenate(found[start : start + DRAWN]) for start in range(0, len(found), DRAWN)]
+    return [
+        np.concatenate(found[start : start + DRAWS_PER_WINDOW])
+        for start in range(0, len(found), DRAWS_PER_WINDOW)
+    ]
 
 
-def _scatter(values: np.ndarray) -> float:
-    """Returns the root mean square, outliers cut."""
+def _compute_scatter(values: np.ndarray) -> float:
+    """Return the root mean square, outliers cut."""
     return float(np.sqrt(np.mean(np.minimum(np.square(values), 25.0))))
 
 
-def _thinned(drawn: np.ndarray) -> np.ndarray:
-    """Returns delays that are distributed alike, at most `MOST`."""
-    return np.sort(drawn)[np.linspace(0, len(drawn) - 1, min(MOST, len(drawn))).astype(int)]
+def _subsample_delays(drawn: np.ndarray) -> np.ndarray:
+    """Return delays that are distributed alike, at most `MOST`."""
+    return np.sort(drawn)[np.linspace(0, len(drawn) - 1, min(MAX_DRAWN, len(drawn))).astype(int)]
 
 
-def _explained(seen: Delays, scale: float) -> float:
-    """Returns the share of the scatter of the delays that is more than their errors."""
+def _compute_explained_share(seen: FrameDelays, scale: float) -> float:
+    """Return the share of the scatter of the delays that is more than their errors."""
     return float(
         np.clip(
             1.0 - np.mean((scale * seen.error) ** 2) / max(np.mean(seen.value**2), 1e-12), 0.0, 1.0

@@ -22,7 +22,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from diagnosis.error_growth import ErrorGrowth, measure_growth
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.permutation_test import (
     FALSE_DISCOVERY_RATE,
     adjust_p_values,
@@ -77,7 +77,7 @@ def trace_to_origin(error: np.ndarray, label: np.ndarray, num_categories: int) -
     return np.stack([np.cumsum(added * (label == c), 1) for c in range(num_categories)]) * given
 
 
-def sum_by_joint(runs: FreeRuns, machine: Machine) -> GroupSums:
+def sum_by_joint(runs: WindowedRuns, machine: Machine) -> GroupSums:
     """Return the sums of each joint as a single category."""
     count = np.isfinite(runs.error).sum(1)[..., None].astype(float)
     return GroupSums(
@@ -89,7 +89,7 @@ def sum_by_joint(runs: FreeRuns, machine: Machine) -> GroupSums:
 
 
 def sum_by_condition(
-    runs: FreeRuns, machine: Machine, dead_time_s: np.ndarray
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[str, GroupSums]:
     """Return the sums by regime, direction, load (where masses are known) and frequency."""
     every = group_samples(list(runs.recordings), machine, dead_time_s)
@@ -98,7 +98,7 @@ def sum_by_condition(
     }
 
 
-def sum_by_time(runs: FreeRuns, machine: Machine) -> dict[str, GroupSums]:
+def sum_by_time(runs: WindowedRuns, machine: Machine) -> dict[str, GroupSums]:
     """Return the sums by recording and by running time, which are those of whole windows."""
     edges = np.linspace(runs.elapsed_s.min(), runs.elapsed_s.max(), NUM_AGES + 1)
     age = np.clip(np.searchsorted(edges, runs.elapsed_s, "right") - 1, 0, NUM_AGES - 1)
@@ -117,14 +117,14 @@ def sum_by_time(runs: FreeRuns, machine: Machine) -> dict[str, GroupSums]:
     }
 
 
-def _measure_increments(runs: FreeRuns, machine: Machine) -> np.ndarray:
+def _measure_increments(runs: WindowedRuns, machine: Machine) -> np.ndarray:
     """Return the absolute increment of the error within `INCREMENT_S`, `(W, K, J)`."""
     span = max(1, round(INCREMENT_S / machine.period_s))
     before = np.pad(runs.error, ((0, 0), (span, 0), (0, 0)))[:, : runs.error.shape[1]]
     return np.nan_to_num(np.abs(runs.error - before))
 
 
-def _sum_by_origin(runs: FreeRuns, dimension: SampleGrouping, machine: Machine) -> GroupSums:
+def _sum_by_origin(runs: WindowedRuns, dimension: SampleGrouping, machine: Machine) -> GroupSums:
     label, error, added = (
         runs.cut(dimension.label),
         np.nan_to_num(runs.error),
@@ -137,7 +137,7 @@ def _sum_by_origin(runs: FreeRuns, dimension: SampleGrouping, machine: Machine) 
     return GroupSums(names, *(np.moveaxis(values, 0, 2) for values in sums))
 
 
-def _sum_by_band(runs: FreeRuns, machine: Machine) -> GroupSums:
+def _sum_by_band(runs: WindowedRuns, machine: Machine) -> GroupSums:
     """Split by Parseval's theorem; the error after the end of a recording counts as 0."""
     error = np.nan_to_num(runs.error)
     power = np.abs(np.fft.rfft(error, axis=1)) ** 2 / error.shape[1]
@@ -255,12 +255,12 @@ class GapLocation:
 
 
 def locate_gap(
-    runs: FreeRuns,
-    reference: FreeRuns | None,
+    runs: WindowedRuns,
+    reference: WindowedRuns | None,
     machine: Machine,
     dead_time_s: np.ndarray,
     generator: np.random.Generator,
-    whole: FreeRuns | None = None,
+    whole: WindowedRuns | None = None,
 ) -> GapLocation:
     """Return where the gap lies.
 
@@ -289,8 +289,8 @@ class _GapTest:
 
     def __init__(
         self,
-        runs: FreeRuns,
-        reference: FreeRuns | None,
+        runs: WindowedRuns,
+        reference: WindowedRuns | None,
         machine: Machine,
         generator: np.random.Generator,
     ) -> None:

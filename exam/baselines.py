@@ -18,7 +18,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from diagnosis import responses
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict, Where
-from diagnosis.residuals import robust_loss
+from diagnosis.residuals import compute_loss
 from exam import oracle
 from exam.oracle import JointErrors
 
@@ -124,16 +124,18 @@ def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
 def score_held_out(errors: JointErrors, names: frozenset[str]) -> float:
     """Return the gain in log likelihood on the half that was not fitted to."""
     return float(
-        robust_loss(errors.z)
-        - robust_loss(errors.z - responses.crossed(errors.z, errors.rays(names), errors.fold))
+        compute_loss(errors.z)
+        - compute_loss(
+            errors.z - responses.cross_validate_change(errors.z, errors.rays(names), errors.fold)
+        )
     )
 
 
 def score_bic(errors: JointErrors, names: frozenset[str]) -> float:
     """Return the gain in log likelihood on all entries, less the price of the parameters."""
     rays = errors.rays(names)
-    left = errors.z - responses.predicted(rays, responses.fitted(errors.z, rays))
-    return float(robust_loss(errors.z) - robust_loss(left)) - 0.5 * len(rays) * float(
+    left = errors.z - responses.sum_responses(rays, responses.fit_sizes(errors.z, rays))
+    return float(compute_loss(errors.z) - compute_loss(left)) - 0.5 * len(rays) * float(
         np.log(len(errors.z))
     )
 

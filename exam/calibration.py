@@ -25,9 +25,9 @@ from brokk_rl.machine import Machine
 from diagnosis import answer, decision
 from diagnosis import calibration as certainty
 from diagnosis.answer import Answer, Selected, Where
-from diagnosis.calibration import Certainty
-from diagnosis.detection import Prices
-from diagnosis.effect_library import Kind
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.detection import Penalties
+from diagnosis.effect_library import EffectType
 from exam import dataset, score
 from exam.score import QUIET_KINDS, CaseScore, ParameterScore
 
@@ -116,25 +116,38 @@ class ClaimSigns:
 
 
 def answer_case(
-    item: WeighedCase, prices: Prices, weights: Certainty, kinds: Sequence[Kind], machine: Machine
+    item: WeighedCase,
+    prices: Penalties,
+    weights: ProbabilityModel,
+    kinds: Sequence[EffectType],
+    machine: Machine,
 ) -> tuple[Answer, ClaimSigns]:
     """Return the answer at these penalties, without parameters, and the predictors behind it."""
-    found = decision.likely(decision.restore_result(item.told, prices, kinds), prices, weights)
+    found = decision.drop_unlikely_effects(
+        decision.restore_result(item.told, prices, kinds), prices, weights
+    )
     unknown = decision.is_unknown(found, prices, weights)
     selected = (
-        [] if unknown else [decision.other(found, one, weights, machine) for one in found.others]
+        []
+        if unknown
+        else [
+            decision.describe_detected_effect(found, one, weights, machine)
+            for one in found.detected
+        ]
     )
-    signs = [(one.kind.name, decision.other_signs(found, weights, one)) for one in found.others]
+    signs = [
+        (one.kind.name, decision.read_detected_signs(found, weights, one)) for one in found.detected
+    ]
     for name in found.chosen.names:
-        swaps = decision.rivals(found, name)
-        like = decision.same_as(swaps, decision.own_gain(found, name))
-        signs.append((name, decision.named_signs(found, prices, weights, name, swaps, like)))
+        swaps = decision.rank_substitutions(found, name)
+        like = decision.list_equivalents(swaps, decision.compute_own_gain(found, name))
+        signs.append((name, decision.read_chosen_signs(found, prices, weights, name, swaps, like)))
         joints = tuple(
             j
             for j, subset in zip(machine.joint_names, found.chosen.subsets, strict=True)
             if name in subset
         )
-        chance = certainty.chance(weights.right, signs[-1][1])
+        chance = certainty.compute_probability(weights.right, signs[-1][1])
         one = Selected(
             effect=name,
             joints=joints,
@@ -145,13 +158,15 @@ def answer_case(
         )
         selected += [] if unknown else [one]
     told = "unknown" if unknown else "effects" if selected else "none"
-    chance = decision.unknown_chance(found, prices, weights)
-    ranked = tuple(decision.ranking(found, selected, prices, weights, machine, chance))
+    chance = decision.compute_unknown_probability(found, prices, weights)
+    ranked = tuple(decision.rank_hypotheses(found, selected, prices, weights, machine, chance))
     said = Answer(
         verdict=told, selected=tuple(selected), ranking=ranked, where=Where({}, (), None), gap=None, next_experiment=None
     )  # fmt: skip
     return said, ClaimSigns(
-        certainty.outside(found), signs, decision.none_signs(found, prices, weights)
+        certainty.collect_outside_signs(found),
+        signs,
+        decision.read_none_signs(found, prices, weights),
     )
 
 
@@ -185,7 +200,7 @@ class PenaltyFit:
     """
 
     machine: Machine
-    kinds: Sequence[Kind]
+    kinds: Sequence[EffectType]
     classes: Sequence[Sequence[str]]
     of_machine: Sequence[str]
     trials: int
@@ -193,13 +208,13 @@ class PenaltyFit:
     workers: int
 
     def marks(
-        self, cases: Sequence[WeighedCase], prices: Prices, weights: Certainty
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
     ) -> list[CaseScore]:
         """Return the marks of all cases at these prices, with these weights."""
         return [mark for mark, _ in self._marked(cases, prices, weights)]
 
     def _marked(
-        self, cases: Sequence[WeighedCase], prices: Prices, weights: Certainty
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
     ) -> list[tuple[CaseScore, ClaimSigns]]:
         said = [answer_case(item, prices, weights, self.kinds, self.machine) for item in cases]
         return [
@@ -207,7 +222,9 @@ class PenaltyFit:
             for i, (one, claims) in zip(cases, said, strict=True)
         ]
 
-    def value(self, cases: Sequence[WeighedCase], prices: Prices, weights: Certainty) -> float:
+    def value(
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
+    ) -> float:
         """Return the mean worth of the answers."""
         pairs = np.array([rate_answer(mark) for mark in self.marks(cases, prices, weights)])
         return float(pairs[:, 0].sum() / pairs[:, 1].sum())
@@ -215,10 +232,10 @@ class PenaltyFit:
     def fitted(
         self,
         cases: Sequence[WeighedCase],
-        start: Prices,
-        weights: Certainty,
+        start: Penalties,
+        weights: ProbabilityModel,
         advance: Callable[[], None],
-    ) -> tuple[Prices, Certainty]:
+    ) -> tuple[Penalties, ProbabilityModel]:
         """Return the best penalties of a random search, and the weights of the predictors."""
         weights = self.weighed(cases, start, weights)
         generator, best = (
@@ -236,7 +253,9 @@ class PenaltyFit:
                         best = value, prices
         return best[1], self.weighed(cases, best[1], weights)
 
-    def weighed(self, cases: Sequence[WeighedCase], prices: Prices, start: Certainty) -> Certainty:
+    def weighed(
+        self, cases: Sequence[WeighedCase], prices: Penalties, start: ProbabilityModel
+    ) -> ProbabilityModel:
         """Return the weights with the largest likelihood, and the model-form errors."""
         is_outside = [item.label["kind"] == "outside" for item in cases]
         outside = fit_logistic(
@@ -261,7 +280,7 @@ class PenaltyFit:
         return replace(weights, form=self.forms(cases, weights.form), **found)
 
     def _named(
-        self, cases: Sequence[WeighedCase], prices: Prices, weights: Certainty
+        self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
     ) -> tuple[list[dict[str, float]], list[bool]]:
         """Return the signs of all effects that are named, and whether they are there."""
         signs, true = [], []
@@ -296,7 +315,7 @@ class PenaltyFit:
             found |= dict.fromkeys(group, round(float(holds[0]), 3)) if holds else {}
         return found
 
-    def _drawn(self, near: Prices, half: int, generator: np.random.Generator) -> Prices:
+    def _drawn(self, near: Penalties, half: int, generator: np.random.Generator) -> Penalties:
         drawn = {}
         for name, (low, high) in RANGES.items():
             at = (
@@ -313,12 +332,12 @@ _work: list[Any] = []
 
 
 def _start_worker(
-    calibration: PenaltyFit, cases: Sequence[WeighedCase], weights: Certainty
+    calibration: PenaltyFit, cases: Sequence[WeighedCase], weights: ProbabilityModel
 ) -> None:
     _work[:] = [calibration, cases, weights]
 
 
-def _evaluate_trial(prices: Prices) -> float:
+def _evaluate_trial(prices: Penalties) -> float:
     calibration, cases, weights = _work
     return calibration.value(cases, prices, weights)
 

@@ -18,10 +18,10 @@ import torch
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
 from diagnosis import baseline, case, effect_library, gap
-from diagnosis.baseline import Base
-from diagnosis.refine import repair
-from diagnosis.residuals import Ray, rays
-from diagnosis.responses import Shape, fitted
+from diagnosis.baseline import Baseline
+from diagnosis.refine import fit_set
+from diagnosis.residuals import ParameterRay, build_rays
+from diagnosis.responses import Response, fit_sizes
 
 MIN_RESPONSE = 1e-3
 """Response over noise below which an effect does not reach a joint; chosen by hand."""
@@ -39,10 +39,10 @@ class JointErrors:
     """
 
     z: np.ndarray
-    shapes: dict[str, list[Shape]]
+    shapes: dict[str, list[Response]]
     fold: np.ndarray
 
-    def rays(self, names: frozenset[str]) -> list[Shape]:
+    def build_rays(self, names: frozenset[str]) -> list[Response]:
         """Return the shapes of several effects, in the order of their names."""
         return [shape for name in sorted(names) for shape in self.shapes[name]]
 
@@ -57,43 +57,43 @@ class CaseEvidence:
         errors: Of each joint.
     """
 
-    base: Base
-    rays: dict[str, Sequence[Ray]]
+    base: Baseline
+    build_rays: dict[str, Sequence[ParameterRay]]
     errors: list[JointErrors]
 
 
 def load_case_evidence(
     folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[str] | None = None
 ) -> CaseEvidence:
-    """Return the evidence of a case, for the effects `names`, or for all that a free run can show.
+    """Return the residuals of a case, for the effects `names`, or for all that a free run can show.
 
     Raises:
         RecordingError: the simulator cannot be fitted.
     """
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
-        base = baseline.fitted(
-            case.load(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
+        base = baseline.fit_baseline(
+            case.load_case(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
         )
-    evidence, grown = base.field.evidence, {}
-    shapes: list[dict[str, list[Shape]]] = [{} for _ in range(machine.num_joints)]
+    residuals, grown = base.field.residuals, {}
+    shapes: list[dict[str, list[Response]]] = [{} for _ in range(machine.num_joints)]
     for kind in effect_library.load_effects(machine, None if names is None else tuple(names)):
         if kind.target.stochastic or kind.target.side == "kinematics":
             continue
-        ways = grown[kind.name] = rays(kind)
-        responses = [evidence.response(ray) for ray in ways]
+        ways = grown[kind.name] = build_rays(kind)
+        responses = [residuals.response(ray) for ray in ways]
         for j, mine in enumerate(shapes):
             if (
                 max((np.abs(response[j]).max() for response in responses), default=0.0)
                 > MIN_RESPONSE
             ):
                 mine[kind.name] = [
-                    Shape(ray.sizes, response[j])
+                    Response(ray.sizes, response[j])
                     for ray, response in zip(ways, responses, strict=True)
                 ]
     return CaseEvidence(
         base,
         grown,
-        [JointErrors(z, mine, evidence.fold) for z, mine in zip(evidence.z, shapes, strict=True)],
+        [JointErrors(z, mine, residuals.fold) for z, mine in zip(residuals.z, shapes, strict=True)],
     )
 
 
@@ -119,28 +119,30 @@ def close_gap(
         RecordingError: the simulator cannot be fitted.
     """
     found = load_case_evidence(folder, fit, machine, tuple(effects))
-    evidence = found.base.field.evidence
+    residuals = found.base.field.residuals
     subsets = [
         frozenset(
             name for name, joints in effects.items() if joint in joints and name in errors.shapes
         )
         for joint, errors in zip(machine.joint_names, found.errors, strict=True)
     ]
-    measured = evidence.candidates.cut.measured
-    before = gap.squares(evidence.base, measured, machine)
+    measured = residuals.simulator.cut.measured
+    before = gap.compute_squares(residuals.base, measured, machine)
     floors = [
-        gap.squares(one.evidence.base, one.evidence.candidates.cut.measured, machine)
-        for one in found.base.nulls
+        gap.compute_squares(one.residuals.base, one.residuals.simulator.cut.measured, machine)
+        for one in found.base.left_out
     ]
     floor = np.concatenate(floors)
-    if not any(subsets) or gap.rmse(before) < MIN_GAP_RATIO * gap.rmse(floor):
+    if not any(subsets) or gap.compute_rmse(before) < MIN_GAP_RATIO * gap.compute_rmse(floor):
         return None
     start = [
         _fit_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)
     ]
-    after = gap.squares(repair(evidence, subsets, found.rays, start).after, measured, machine)
+    after = gap.compute_squares(
+        fit_set(residuals, subsets, found.rays, start).after, measured, machine
+    )
     return float(
-        gap.shares(before, after, floor, [])[0]
+        gap.compute_shares(before, after, floor, [])[0]
     )  # as an answer says it: no repair is better than the floor
 
 
@@ -162,5 +164,5 @@ def _fit_start(errors: JointErrors, names: frozenset[str]) -> dict[str, np.ndarr
         return {}
     ends = np.cumsum([len(errors.shapes[name]) for name in sorted(names)])[:-1]
     return dict(
-        zip(sorted(names), np.split(fitted(errors.z, errors.rays(names)), ends), strict=True)
+        zip(sorted(names), np.split(fit_sizes(errors.z, errors.rays(names)), ends), strict=True)
     )

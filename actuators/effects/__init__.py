@@ -1,4 +1,4 @@
-"""Effects: what a simulator leaves out of a machine, each a small spec that wraps any actuator model and is neutral at its `none`.
+"""Effects: imperfections that a simulator leaves out, each a small spec around an actuator model.
 
     side          acts on                                             names
     command       `history.u` as the inner model sees it               dead_time delay_jitter

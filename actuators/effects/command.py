@@ -90,7 +90,7 @@ class RateLimit(EffectSpec):
 
 @spec
 class Stiction(EffectSpec):
-    """A joint starts later than it stops: at rest it takes a larger command to move it than to keep it moving.
+    """A joint starts at a larger command than the one at which it stops.
 
     Attributes:
         joints: Joints it acts on, or `all`.

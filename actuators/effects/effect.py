@@ -1,14 +1,21 @@
-"""What all effects share: the spec's part that a diagnosis reads, and the actuator model with one effect around it."""
+"""Effects around an actuator model: the base class of their specs, and the one model of all.
+
+An effect of a package of your own is a spec that derives from `EffectSpec`, sets `side` and
+`numbers`, and overrides the method of its side. `EffectChain` does the rest: parameters per
+environment, memory, resets and random draws.
+"""
 
 import re
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import ClassVar, Literal
 
 import torch
 
-from actuators.effects.ranges import CHANCE, EffectNumber, Joints, ParameterRanges
+from actuators.effects.ranges import CHANCE, EffectNumber, Joints, ParameterRanges, Value
 from actuators.models import random_draws
 from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.gravity import Gravity
@@ -18,20 +25,24 @@ from brokk_rl.machine import Machine
 
 Memory = dict[str, torch.Tensor]
 Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
+MOTION: tuple[Side, ...] = ("speed", "joints")
+"""Sides that change the increment which the inner model returns."""
+SALT_STEP = 2_654_435_761
+"""Knuth's multiplicative hash constant (2^32 / golden ratio): spreads the salts of effects."""
 
 
 class MachineTensors:
-    """What effects need of the machine: `full_step` (way at full speed in one period) and the like, `(J,)`; weight; geometry.
+    """Constants of the machine as tensors: full step, limits, weight, geometry.
 
-    Weight and geometry are made when an effect asks for them: most do not, and work on machines
-    known by their joints only. Those
-    that always do say so beforehand: a traced step can hold their work, but not their making.
+    Weight and geometry are built when an effect first asks for them. Most effects do not ask, and
+    so they also work on machines of which only the joints are known. A captured step can hold the
+    computation but not the construction: effects that always need them say so beforehand.
 
     Args:
         machine: The machine.
         device: Where the tensors live.
         weighed: Whether the weight is asked for in every step.
-        placed: Whether the geometry is.
+        placed: Whether the geometry is asked for in every step.
     """
 
     def __init__(
@@ -57,31 +68,31 @@ class MachineTensors:
 
     @cached_property
     def gravity(self) -> Gravity:
-        """The weight on each joint."""
+        """Gravity load on each joint."""
         return Gravity(self._machine, self._device)
 
     def weight(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns how hard the weight pushes each joint in its positive direction at `q`, over its yield force, `(N, J)`."""
+        """Return gravity load over yield force at `q`, positive direction, `(N, J)`."""
         return self.gravity.load(q) / self.yield_force
 
     @cached_property
     def kinematics(self) -> Kinematics:
-        """The geometry."""
+        """Forward kinematics."""
         return Kinematics(self._machine, self._device)
 
 
 @dataclass(frozen=True)
 class StepInputs:
-    """What an effect looks at in one control period.
+    """Everything that an effect may use in one control period.
 
     Attributes:
         value: Parameters by name, `(N, J)` or `(N, 1)`.
-        memory: What the effect returned as its memory one period ago.
+        memory: The memory that the effect returned one period ago.
         history: Positions and commands; the newest command has just come into force.
-        plant: The machine.
+        plant: Constants of the machine.
         moved: Increment of the inner model, `(N, J)`; speed side only.
         counter: Counter of random draws, `(N,)`; stochastic effects only.
-        weight: `plant.weight` here where someone has worked it out already.
+        weight: `plant.weight` of the newest position, where it is computed already.
     """
 
     value: dict[str, torch.Tensor]
@@ -94,17 +105,19 @@ class StepInputs:
 
     @property
     def chance(self) -> torch.Tensor:
-        """A number in [0, 1) for each environment, the same for all joints: they share frames. `(N, 1)`."""
+        """A uniform number in [0, 1) per environment, `(N, 1)`; all joints share one frame."""
         assert self.counter is not None, "only a stochastic effect has chances"
         return random_draws.draw_uniform(self.counter, CHANCE, 1)
 
 
 class EffectSpec:
-    """An effect; a spec in `conf/effect` overrides what it changes. Class attributes say what a diagnosis must know.
+    """Base class of effects: an effect overrides the method of its side and keeps the others.
+
+    The class attributes are read by the diagnosis too.
 
     Attributes:
-        side: What it acts on; see `actuators.effects`.
-        stage: Where on the way from command to estimate it lies (`where.stage` of
+        side: Where the effect acts; see `actuators.effects`.
+        stage: Where it lies on the way from command to estimate (`where.stage` of
             `diagnosis.json`).
         numbers: Unit, neutral value, typical size and bounds of each number.
         stochastic: Whether it draws random numbers in every step.
@@ -113,8 +126,8 @@ class EffectSpec:
         weighed: Whether it asks for the weight on the joints.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
-        running: Name of the number that is the time since the machine was started, which is known
-            and not fitted.
+        running: Name of the number that is the time since the machine was started. That number is
+            known and not fitted.
     """
 
     side: ClassVar[Side]
@@ -131,39 +144,48 @@ class EffectSpec:
 
     @classmethod
     def name(cls) -> str:
-        """Returns the name of the effect, as in `effect=[name]`."""
+        """Return the name of the effect, as in `effect=[name]`."""
         return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
-    ) -> "Wrapped":
-        """Returns `model` with the effect around it.
+    ) -> "EffectChain":
+        """Return `model` with the effect around it.
 
         Raises:
-            ConfigError: a number is out of bounds, or a joint unknown.
+            ConfigError: A number is out of bounds, or a joint is unknown.
         """
-        return Wrapped(self, model, machine, num_envs, device)
+        name = self.name()
+        return EffectChain(
+            {"": self},
+            model,
+            machine,
+            num_envs,
+            device,
+            salt=zlib.crc32(name.encode()),
+            where=f"effect.{name}",
+        )
 
     def begin(self, now: StepInputs) -> Memory:
-        """Returns the memory with which the effect begins at `now`, at rest or in the middle of a recording."""
+        """Return the initial memory at `now`, at rest or in the middle of a recording."""
         return {}
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """Returns the commands that the inner model sees, `(N, H, J)`, and the memory; command side."""
+        """Return the commands for the inner model, `(N, H, J)`, and the memory."""
         return now.history.u, {}
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """Returns how much further than `now.moved` the joints move, `(N, J)`, and the memory; speed side."""
+        """Return the motion beyond `now.moved`, `(N, J)`, and the memory; speed side."""
         return torch.zeros_like(now.moved), {}
 
     def measured(
         self, q: torch.Tensor, value: dict[str, torch.Tensor], counter: torch.Tensor | None
     ) -> torch.Tensor:
-        """Returns what the sensors say at the true positions `q`, `(N, J)`; measurement side."""
+        """Return the sensor readings at the true positions `q`, `(N, J)`; measurement side."""
         return q
 
     def truth(self, q: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`; measurement side."""
+        """Return likely true positions for readings `q`, `(N, J)` or `(N, H, J)`."""
         return q
 
     def tool(
@@ -173,71 +195,101 @@ class EffectSpec:
         value: dict[str, torch.Tensor],
         plant: MachineTensors,
     ) -> torch.Tensor:
-        """Returns where the tool point is that the model has at `point_m`, `(N, 3)`; kinematics."""
+        """Return the true place of the tool that the model has at `point_m`, `(N, 3)`."""
         return point_m
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Returns where the camera sees a point, `(N, 3)` in the base frame; kinematics."""
+        """Return where the camera sees a point, `(N, 3)` in the base frame; kinematics."""
         return point_m
 
 
-class Wrapped:
-    """An actuator model with one effect around it, again an actuator model; a neutral effect leaves the inner one bit for bit.
+class EffectChain:
+    """An actuator model with effects around it; fulfils `brokk_rl.contracts.actuator.SensingModel`.
+
+    A command passes from the last effect to the first, motion and measurement from the first to
+    the last. A neutral effect leaves the inner model unchanged bit for bit.
+
+    Args:
+        effects: Effects by name, the first nearest to the machine. The name is a prefix of the
+            names of its parameters and its state; a single effect has the empty name.
+        inner: The model inside.
+        machine: The machine.
+        num_envs: Number of environments, `N`.
+        device: Where the tensors live.
+        salt: Keeps the random draws of several chains apart.
+        where: Config node named in messages.
+        shares: Part of the environments that have an effect, by effect; see `ParameterRanges`.
+        num_recent: Number of commands that effects on commands see; they are then applied once to
+            each command, and commands from before an episode stay as they are. `None`: the whole
+            history, at each step anew.
 
     Attributes:
-        effect: The spec.
+        effects: The effects by name.
         inner: The model inside.
         parameters: Numbers by name, `(N, J)` or `(N, 1)`. Write in place or replace an entry to
-            simulate `N` candidates side by side; gradients flow to an entry that wants them until
-            the next `reset`.
+            simulate `N` candidates side by side. Gradients flow to an entry that requires them
+            until the next `reset`.
     """
 
     def __init__(
         self,
-        effect: EffectSpec,
+        effects: Mapping[str, EffectSpec],
         inner: ActuatorModel,
         machine: Machine,
         num_envs: int,
         device: torch.device,
+        *,
+        salt: int,
+        where: str,
+        shares: Mapping[str, float] = MappingProxyType({}),
+        num_recent: int | None = None,
     ) -> None:
-        self.effect, self.inner = effect, inner
-        name = effect.name()
-        given = {field.name: getattr(effect, field.name) for field in fields(effect)}  # pyright: ignore[reportArgumentType]
-        joints: Joints = given.pop("joints", "all")
-        salt = zlib.crc32(name.encode()) + len(inner.state)
-        where = f"effect.{name}"
+        self.inner, self.effects, self._num_recent = inner, dict(effects), num_recent
+        given: dict[str, Value] = {}
+        numbers: dict[str, EffectNumber] = {}
+        joints: dict[str, Joints] = {}
+        for name, effect in effects.items():
+            values = {field.name: getattr(effect, field.name) for field in fields(effect)}  # pyright: ignore[reportArgumentType]
+            joints[name] = values.pop("joints", "all")
+            given |= {_join(name, key): value for key, value in values.items()}
+            numbers |= {_join(name, key): number for key, number in effect.numbers.items()}
+        stochastic = any(effect.stochastic for effect in effects.values())
+        salt += len(inner.state)
         self._ranges = ParameterRanges(
-            given, effect.numbers, joints, machine, num_envs, device, effect.stochastic, salt, where
+            given, numbers, joints, machine, num_envs, device, stochastic, salt, where, shares
         )
         self.parameters = self._ranges.value
-        self.plant = MachineTensors(
-            machine, device, weighed=effect.weighed, placed=effect.side == "kinematics"
-        )
-        rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
+        self._salts: dict[str, int] = {}
+        for name, effect in effects.items():
+            if effect.stochastic:
+                self._salts[name] = zlib.crc32(name.encode()) * SALT_STEP
+        commanding = {name: e for name, e in effects.items() if e.side == "command"}
+        self._delays = {name: effect for name, effect in commanding.items() if effect.delays}
+        self._commands = {n: e for n, e in reversed(commanding.items()) if not e.delays}
+        self._motions = {name: e for name, e in effects.items() if e.side in MOTION}
+        self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
+        self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
+        self._weighed = any(effect.weighed for effect in self._motions.values())
+        self._plant = MachineTensors(machine, device, self._weighed, placed=bool(self._placed))
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
-        self._memory = {
-            key: value.clone()
-            for key, value in self._begin(self._moment(History(q=rest, u=rest), None)).items()
-        }
+        self._memory = self._build_memory(machine, num_envs, device)
         self._ranges.redraw(self._fresh)
 
     @property
     def state(self) -> Memory:
-        """The effect's memory and what it has drawn; `inner.…` for the model inside."""
+        """Memory and drawn parameters of the effects; `inner.…` for the model inside."""
         own = {"fresh": self._fresh, **self._memory} if self._memory else {}
-        return (
-            own
-            | self._ranges.state
-            | {f"inner.{name}": value for name, value in self.inner.state.items()}
-        )
+        inner = {f"inner.{name}": value for name, value in self.inner.state.items()}
+        return own | self._ranges.state | inner
 
     @property
     def sides(self) -> frozenset[str]:
-        """Sides of all effects from here inwards; says which of `measure` and `misplacement` do anything."""
-        return frozenset({self.effect.side}) | getattr(self.inner, "sides", frozenset())
+        """Sides of all effects, of the models inside too."""
+        own = frozenset(effect.side for effect in self.effects.values())
+        return own | getattr(self.inner, "sides", frozenset())
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Forgets in the environments of `mask`, shape `(N,)` bool, and draws their parameters; cuts all gradients."""
+        """Forget in the environments of `mask`, `(N,)`; draw parameters; cut gradients."""
         self.inner.reset(mask)
         for value in self._memory.values():
             if value.requires_grad:
@@ -246,103 +298,175 @@ class Wrapped:
         self._ranges.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)`."""
-        if self.effect.side not in ("command", "speed", "joints"):
+        """Return the joint positions one control period later, shape `(N, J)`."""
+        if not (self._commands or self._delays or self._motions):
             return self.inner.step(history)
-        if (
-            torch.is_grad_enabled()
-        ):  # the history is written in place, and autograd may need what it was
-            history = History(q=history.q.clone(), u=history.u.clone())
-        now = self._moment(history, self._ranges.advance() if self.effect.stochastic else None)
-        begun, fresh = self._begin(now), self._fresh.clone()
-        memory = {
-            key: torch.where(broadcast_rows(fresh, value), begun[key], value)
-            for key, value in self._memory.items()
-        }
-        now = replace(now, memory=memory)
-        result, memory = self._commanded(now) if self.effect.side == "command" else self._moved(now)
-        for key, value in memory.items():
-            self._memory[key].copy_(value)
+        fresh = self._fresh
+        if torch.is_grad_enabled():
+            # history and `fresh` are written in place, and autograd may need what they were
+            history, fresh = History(q=history.q.clone(), u=history.u.clone()), fresh.clone()
+        counter = self._ranges.advance() if self._salts else None
+        u = self._change_commands(history, fresh, counter)
+        if self._motions:
+            q = self._change_motion(history, u, fresh, counter)
+        else:
+            q = self.inner.step(History(q=history.q, u=u))
         self._fresh.fill_(False)
-        return result
+        return q
 
     def measure(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns what the sensors say at the true positions `q`, `(N, J)`; to be called once a control period."""
+        """Return the readings at true positions `q`, `(N, J)`; once a control period."""
         q = getattr(self.inner, "measure", _keep_unchanged)(q)
-        if self.effect.side != "measurement":
+        if not self._measured:
             return q
-        return self.effect.measured(
-            q, self.parameters, self._ranges.advance() if self.effect.stochastic else None
-        )
+        counter = self._ranges.advance() if self._salts else None
+        for name, effect in self._measured.items():
+            q = effect.measured(q, self._get_values(name), self._salt_counter(name, counter))
+        return q
 
     def truth(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`."""
-        q = self.effect.truth(q, self.parameters)
+        """Return the likeliest true positions for readings `q`, `(N, J)` or `(N, H, J)`."""
+        for name, effect in reversed(self._measured.items()):
+            q = effect.truth(q, self._get_values(name))
         return getattr(self.inner, "truth", _keep_unchanged)(q)
 
     def tool(self, point_m: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Returns where an outside instrument finds the tool that the model has at `point_m`, `(N, 3)` in the base frame."""
+        """Return the true place of the tool that the model has at `point_m`, `(N, 3)`."""
         point_m = getattr(self.inner, "tool", _keep_unchanged)(point_m, q)
-        return self.effect.tool(point_m, q, self.parameters, self.plant)
+        for name, effect in self._placed.items():
+            point_m = effect.tool(point_m, q, self._get_values(name), self._plant)
+        return point_m
 
     def target(self, point_m: torch.Tensor) -> torch.Tensor:
-        """Returns where the camera sees a point, `(N, 3)` in the base frame."""
+        """Return where the camera sees a point, `(N, 3)` in the base frame."""
         point_m = getattr(self.inner, "target", _keep_unchanged)(point_m)
-        return self.effect.target(point_m, self.parameters)
+        for name, effect in self._placed.items():
+            point_m = effect.target(point_m, self._get_values(name))
+        return point_m
 
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns how far from the truth the controller believes a target near the tool, `(N, 3)` in m, at the positions `q`.
+        """Return the error of the controller's estimate of a target near the tool, `(N, 3)` in m.
 
-        A controller that works with the drawings' kinematics on a machine that differs misses by as
-        much as one whose kinematics is right and whose target is displaced; so the simulated
-        geometry stays and the estimate moves.
+        A controller that uses the drawn kinematics on a machine that differs misses by as much as
+        one with right kinematics and a displaced target. So the simulated geometry stays and the
+        estimate moves.
         """
-        tip_m = self.plant.kinematics.pose(q).tip_in_base_m
-        return self.target(self.tool(tip_m, q)) - tip_m
+        if self._placed:
+            tip_m = self._plant.kinematics.pose(q).tip_in_base_m
+            return self.target(self.tool(tip_m, q)) - tip_m
+        inner = getattr(self.inner, "misplacement", None)
+        return torch.zeros_like(q[:, :3]) if inner is None else inner(q)
 
-    def _moment(self, history: History, counter: torch.Tensor | None) -> StepInputs:
-        return StepInputs(
-            self.parameters, {}, history, self.plant, torch.zeros_like(history.q[:, -1]), counter
-        )
+    def _change_commands(
+        self, history: History, fresh: torch.Tensor, counter: torch.Tensor | None
+    ) -> torch.Tensor:
+        """Return the commands as the inner model sees them, `(N, H, J)`."""
+        still = torch.zeros_like(history.q[:, -1])
+        recent = slice(-(self._num_recent or history.u.shape[1]), None)
+        u = history.u[:, recent]
+        for name in self._commands:
+            seen = History(q=history.q[:, recent], u=u)
+            u = self._apply("commands", name, seen, still, fresh, counter)
+        if self._num_recent is not None:
+            valve = self._memory["valve"]
+            before = torch.where(fresh[:, None, None], history.u[:, :-1], valve[:, 1:])
+            valve.copy_(torch.cat((before, u[:, -1:]), 1))
+            u = valve
+        for name in self._delays:
+            seen = History(q=history.q, u=u)
+            u = self._apply("commands", name, seen, still, fresh, counter)
+        return u
 
-    def _begin(self, now: StepInputs) -> Memory:
-        begun = self.effect.begin(now)
-        return begun | (
-            {"shift": torch.zeros_like(now.history.q)}
-            if self.effect.side in ("speed", "joints")
-            else {}
-        )
+    def _change_motion(
+        self, history: History, u: torch.Tensor, fresh: torch.Tensor, counter: torch.Tensor | None
+    ) -> torch.Tensor:
+        """Return the next positions, `(N, J)`, with all effects on speed.
 
-    def _commanded(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        u, memory = self.effect.commands(now)
-        return self.inner.step(History(q=now.history.q, u=u)), memory
-
-    def _moved(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """Steps the inner model on positions from which past doings of the effect are taken out.
-
-        A learned model goes on from the increments that it sees; a gain on them would compound from
-        step to step. So it is shown
-        increments as they would have been without the effect, ending at the true position: `shift`
-        is added to its history.
+        A learned model continues the increments that it sees, and a gain on them would compound
+        from step to step. So it sees the increments as they would be without the effects, ending
+        at the true position: `shift` is added to its history.
         """
-        history, shift, plant = now.history, now.memory["shift"], self.plant
-        predicted = self.inner.step(History(q=history.q + shift, u=history.u))
-        extra, memory = self.effect.extra(replace(now, moved=predicted - history.q[:, -1]))
-        lower, upper = (
-            torch.minimum(plant.lower, predicted),
-            torch.maximum(plant.upper, predicted),
-        )  # never through a stop
-        result = torch.minimum(torch.maximum(predicted + extra, lower), upper)
-        added = (result - predicted)[:, None]
-        return result, memory | {
-            "shift": torch.cat((shift[:, 1:] + added, torch.zeros_like(added)), 1)
-        }
+        q, plant = history.q[:, -1], self._plant
+        shift = self._memory["shift"]
+        shift = torch.where(fresh[:, None, None], torch.zeros_like(shift), shift)
+        predicted = moved_to = self.inner.step(History(q=history.q + shift, u=u))
+        weight = plant.weight(q) if self._weighed else None
+        for name in self._motions:
+            extra = self._apply("extra", name, history, moved_to - q, fresh, counter, weight)
+            moved_to = moved_to + extra
+        # an effect never moves a joint through a stop
+        lower, upper = torch.minimum(plant.lower, predicted), torch.maximum(plant.upper, predicted)
+        moved_to = torch.minimum(torch.maximum(moved_to, lower), upper)
+        added = (moved_to - predicted)[:, None]
+        self._memory["shift"].copy_(torch.cat((shift[:, 1:] + added, torch.zeros_like(added)), 1))
+        return moved_to
+
+    def _apply(
+        self,
+        method: Literal["commands", "extra"],
+        name: str,
+        history: History,
+        moved: torch.Tensor,
+        fresh: torch.Tensor,
+        counter: torch.Tensor | None,
+        weight: torch.Tensor | None = None,
+    ) -> torch.Tensor:
+        """Return the result of one effect and store its memory."""
+        effect = self.effects[name]
+        now = StepInputs(
+            self._get_values(name),
+            {},
+            history,
+            self._plant,
+            moved,
+            self._salt_counter(name, counter),
+            weight,
+        )
+        memory = {}
+        for key, begun in effect.begin(now).items():
+            kept = self._memory[_join(name, key)]
+            memory[key] = torch.where(broadcast_rows(fresh, begun), begun, kept)
+        result, memory = getattr(effect, method)(replace(now, memory=memory))
+        for key, value in memory.items():
+            self._memory[_join(name, key)].copy_(value)
+        return result
+
+    def _build_memory(self, machine: Machine, num_envs: int, device: torch.device) -> Memory:
+        """Return memory of the right shapes, as it begins at rest."""
+        rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
+        found: Memory = {}
+        if self._motions or self._num_recent is not None:
+            found["shift"] = rest.clone()
+        if self._num_recent is not None:
+            found["valve"] = rest.clone()
+        for name, effect in (self._commands | self._delays | self._motions).items():
+            u = rest if name in self._delays else rest[:, -(self._num_recent or len(rest[0])) :]
+            now = StepInputs(
+                self._get_values(name), {}, History(q=rest, u=u), self._plant, rest[:, -1], None
+            )
+            for key, value in effect.begin(now).items():
+                found[_join(name, key)] = value.clone()
+        return found
+
+    def _get_values(self, name: str) -> dict[str, torch.Tensor]:
+        """Return the parameters of one effect, by their own names."""
+        return {key: self.parameters[_join(name, key)] for key in self.effects[name].numbers}
+
+    def _salt_counter(self, name: str, counter: torch.Tensor | None) -> torch.Tensor | None:
+        """Return the counter of one effect's draws; `None` for an effect that draws none."""
+        if counter is None or name not in self._salts:
+            return None
+        return counter + self._salts[name]
+
+
+def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
+    """Return `mask`, `(N,)`, in a shape that broadcasts over the rows of `like`."""
+    return mask.reshape(-1, *[1] * (like.dim() - 1))
+
+
+def _join(name: str, key: str) -> str:
+    return f"{name}.{key}" if name else key
 
 
 def _keep_unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
     return value
-
-
-def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """Returns `mask`, `(N,)`, so that it broadcasts over rows of `like`."""
-    return mask.reshape(-1, *[1] * (like.dim() - 1))

@@ -1,4 +1,4 @@
-"""Effects on where tool and borehole are, against what the drawings say."""
+"""Effects on geometry: link lengths, base tilt and camera pose that differ from the drawings."""
 
 from typing import ClassVar
 
@@ -40,7 +40,7 @@ class LinkLength(EffectSpec):
         value: dict[str, torch.Tensor],
         plant: MachineTensors,
     ) -> torch.Tensor:
-        """Moves the point along each link by what the link is too long."""
+        """Move the point along each link by the link's excess length."""
         pose = plant.kinematics.pose(q)
         ends = torch.cat((pose.joints_in_base_m, pose.tip_in_base_m[:, None]), 1)
         links = ends[:, 1:] - ends[:, :-1]
@@ -73,13 +73,13 @@ class BaseTilt(EffectSpec):
         value: dict[str, torch.Tensor],
         plant: MachineTensors,
     ) -> torch.Tensor:
-        """Turns the point with the base."""
+        """Turn the point with the base."""
         return rotate_points(
             point_m, value["roll_rad"], value["pitch_rad"], torch.zeros_like(value["roll_rad"])
         )
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Turns it back: the camera stands on the base."""
+        """Turn it back: the camera stands on the base."""
         none = torch.zeros_like(value["roll_rad"])
         return rotate_points(
             rotate_points(point_m, none, -value["pitch_rad"], none), -value["roll_rad"], none, none
@@ -88,13 +88,13 @@ class BaseTilt(EffectSpec):
 
 @spec
 class Extrinsics(EffectSpec):
-    """The camera is not where its calibration says: what it sees is turned about the base and displaced.
+    """The camera pose is wrong: seen points are rotated about the base and displaced.
 
     Attributes:
-        x_m: Displacement of what is seen, forward.
+        x_m: Displacement of seen points, forward.
         y_m: To the left.
         z_m: Up.
-        roll_rad: Turn of what is seen about x.
+        roll_rad: Rotation of seen points about x.
         pitch_rad: About y.
         yaw_rad: About z.
     """
@@ -112,7 +112,7 @@ class Extrinsics(EffectSpec):
     }
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Turns the point about the base and displaces it."""
+        """Turn the point about the base and displaces it."""
         shift_m = torch.cat((value["x_m"], value["y_m"], value["z_m"]), 1)
         return (
             rotate_points(point_m, value["roll_rad"], value["pitch_rad"], value["yaw_rad"])
@@ -123,7 +123,10 @@ class Extrinsics(EffectSpec):
 def rotate_points(
     point_m: torch.Tensor, roll_rad: torch.Tensor, pitch_rad: torch.Tensor, yaw_rad: torch.Tensor
 ) -> torch.Tensor:
-    """Returns points `(N, 3)` turned about the fixed axes x, then y, then z, by angles `(N, 1)`; exact for angles of zero."""
+    """Return points `(N, 3)` rotated about fixed x, then y, then z, by angles `(N, 1)`.
+
+    Exact for angles of zero.
+    """
     x, y, z = point_m.split(1, 1)
     y, z = _rotate_plane(y, z, roll_rad)
     z, x = _rotate_plane(z, x, pitch_rad)

@@ -1,4 +1,4 @@
-"""Effects of what presses on the cylinders: the arm's weight, and the other joints on the same pump."""
+"""Effects of load: the arm's weight, and the other joints on the same pump."""
 
 from typing import ClassVar
 
@@ -30,7 +30,7 @@ class LoadDependence(EffectSpec):
     numbers: ClassVar = {"sensitivity": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 1.5))}
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """`moved (sqrt(1 + sensitivity sign(moved) weight / yield_force) - 1)`: the orifice equation."""
+        """`moved (sqrt(1 + sensitivity sign(moved) weight / yield_force) - 1)`: orifice."""
         head = 1.0 + now.value["sensitivity"] * now.moved.sign() * _weight(now)
         return now.moved * (head.clamp(LEAST_HEAD, MOST_HEAD).sqrt() - 1.0), {}
 
@@ -80,5 +80,5 @@ class FlowSharing(EffectSpec):
 
 
 def _weight(now: StepInputs) -> torch.Tensor:
-    """Returns the force with which the weight pushes each joint in its positive direction, over its yield force, `(N, J)`."""
+    """Return the gravity load over the yield force, positive direction, `(N, J)`."""
     return now.plant.weight(now.history.q[:, -1]) if now.weight is None else now.weight

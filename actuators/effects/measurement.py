@@ -1,4 +1,4 @@
-"""Effects on what controller and recording see of the positions."""
+"""Effects on the measured positions that controller and recording receive."""
 
 from typing import ClassVar
 
@@ -68,7 +68,7 @@ class EncoderBias(EffectSpec):
 
     Attributes:
         joints: Joints it acts on, or `all`.
-        bias_rad: What the encoder shows too much (m for a sliding joint).
+        bias_rad: Excess of the reading over the true position (m for a sliding joint).
     """
 
     joints: Joints
@@ -117,5 +117,5 @@ class EncoderScale(EffectSpec):
 
 
 def _broadcast_over_history(value: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-    """Returns parameters `(N, J)` so that they broadcast over `(N, J)` or `(N, H, J)`."""
+    """Return parameters `(N, J)` so that they broadcast over `(N, J)` or `(N, H, J)`."""
     return value if q.dim() == 2 else value[:, None]

@@ -1,4 +1,4 @@
-"""The numbers of an effect: a value or a range, for all joints or joint by joint, as tensors over environments."""
+"""Numbers of effects: values or ranges, per joint, as tensors over environments."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ PRESENT = 192
 
 @dataclass(frozen=True)
 class EffectNumber:
-    """What is known about one number of an effect.
+    """Unit, neutral value, typical size and bounds of one number of an effect.
 
     Attributes:
         unit: SI unit, `1` for none; `rad` and `rad/s` read m and m/s for a sliding joint.
@@ -46,16 +46,16 @@ class EffectNumber:
 
 
 class ParameterRanges:
-    """Parameters of one effect or of several for all environments; what is drawn is drawn in one go.
+    """Parameters of one or several effects for all environments; all draws are one draw.
 
     Attributes:
         value: `(N, J)` or `(N, 1)` by name. An entry may be written in place or replaced, by one
-            that wants gradients for example; what was replaced is not drawn again.
+            that wants gradients for example; a replaced entry is not drawn again.
         state: Counter and drawn values; empty where nothing is random.
 
     Args:
         fields: Numbers as configured, by name; those of several effects as `effect.number`.
-        numbers: What is known about them.
+        numbers: Unit, neutral value and bounds of each.
         joints: Joints that are acted on; elsewhere each number is at its `none`.
         machine: The machine.
         num_envs: Number of environments, `N`.
@@ -64,7 +64,7 @@ class ParameterRanges:
         salt: Keeps the draws of several effects apart.
         where: Config node named in messages.
         shares: Part of the environments that have an effect, by effect; all have those not named.
-            The others have its numbers at their `none`. Who has what is drawn at each reset.
+            The others have its numbers at their `none`. Each reset draws anew who has the effect.
 
     Raises:
         ConfigError: a number is out of bounds, a range upside down, or a joint unknown.
@@ -116,7 +116,7 @@ class ParameterRanges:
                 self.value[name] = self.state[f"drawn.{name}"] = columns
 
     def redraw(self, mask: torch.Tensor) -> None:
-        """Draws the ranges anew in the environments of `mask`, shape `(N,)` bool."""
+        """Draw the ranges anew in the environments of `mask`, shape `(N,)` bool."""
         if self._draw is None:
             return
         self._draw.add_(mask.to(torch.int64))
@@ -124,13 +124,13 @@ class ParameterRanges:
             self._all.copy_(torch.where(mask[:, None], self._drawn.fresh(self._draw), self._all))
 
     def advance(self) -> torch.Tensor | None:
-        """Moves on to the next draws of a stochastic effect and returns the counter, `(N,)`; `None` where nothing is random."""
+        """Advance to the next draws and return the counter, `(N,)`; `None` without draws."""
         return None if self._draw is None else self._draw.add_(1)
 
 
 @dataclass(frozen=True)
 class _Column:
-    """A number that is drawn: range, value where its effect is not there, keys of its draws, each `(J,)` or `(1,)`; its effect."""
+    """One drawn number: range, neutral value, keys of its draws, each `(J,)` or `(1,)`; its effect."""
 
     low: np.ndarray
     high: np.ndarray
@@ -140,7 +140,7 @@ class _Column:
 
 
 class _Drawn:
-    """All numbers that are drawn, side by side in `W` columns: one draw costs as many launches as ten."""
+    """All drawn numbers side by side in `W` columns: one draw costs as many launches as ten."""
 
     def __init__(
         self, columns: Sequence[_Column], shares: Mapping[str, float], device: torch.device
@@ -167,7 +167,7 @@ class _Drawn:
             )
 
     def fresh(self, counter: torch.Tensor) -> torch.Tensor:
-        """Returns fresh values, `(N, W)`, for the counter `(N,)`."""
+        """Return fresh values, `(N, W)`, for the counter `(N,)`."""
         counter = counter[:, None] * 65_536
         value = torch.minimum(
             self.low + (self.high - self.low) * random_draws.hash_uniform(counter + self._key),
@@ -180,7 +180,7 @@ class _Drawn:
 
 
 def _select_joints(joints: Joints, machine: Machine, where: str) -> np.ndarray:
-    """Returns which joints an effect acts on, `(J,)` bool."""
+    """Return which joints an effect acts on, `(J,)` bool."""
     if joints == "all":
         return np.ones(machine.num_joints, dtype=bool)
     for name in joints:
@@ -194,7 +194,7 @@ def _select_joints(joints: Joints, machine: Machine, where: str) -> np.ndarray:
 def _resolve_range(
     value: Value, number: EffectNumber, chosen: np.ndarray, machine: Machine, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the lower and upper ends of a number, each `(J,)`, or `(1,)` for one that joints do not have."""
+    """Return the lower and upper end of a number, each `(J,)`, or `(1,)` without joints."""
     if not number.per_joint:
         if isinstance(value, Mapping):
             raise ConfigError(

@@ -1,4 +1,4 @@
-"""Effects on how fast a joint moves for what the valve does, joint by joint."""
+"""Effects on the speed that a joint reaches for a valve opening, joint by joint."""
 
 import math
 from typing import ClassVar
@@ -75,7 +75,10 @@ class Lag(EffectSpec):
         return {"speed": measure_last_step(now)}
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """Exact solution of `time_constant v' + v = v_inner` over the period; `speed` is way in one period."""
+        """Solve `time_constant v' + v = v_inner` exactly over the period.
+
+        `speed` is the motion in one period.
+        """
         periods = now.value["time_constant_s"] / now.plant.period_s
         decay, behind = torch.exp(-1.0 / periods.clamp(min=1e-6)), now.memory["speed"] - now.moved
         return behind * periods * (1.0 - decay), {"speed": now.moved + behind * decay}
@@ -96,7 +99,7 @@ class Backlash(EffectSpec):
     numbers: ClassVar = {"gap_rad": EffectNumber("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2))}
 
     def begin(self, now: StepInputs) -> Memory:
-        """A moving joint lies against the side towards which it moves, a resting one in the middle."""
+        """A moving joint lies against the side in front; a resting one in the middle."""
         q = now.history.q
         return {"slack": 0.5 * now.value["gap_rad"] * (1.0 - (q[:, -1] - q[:, 0]).sign())}
 
@@ -136,7 +139,10 @@ class Compliance(EffectSpec):
         }
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """`d'' + 2 damping w d' + w^2 d = -v'`, where the inner speed `v` changes at the beginning of each period; exact."""
+        """Solve `d'' + 2 damping w d' + w^2 d = -v'` exactly.
+
+        The inner speed `v` changes at the beginning of each period.
+        """
         period_s, damping = now.plant.period_s, now.value["damping"]
         w = (
             2.0 * math.pi / now.value["ringing_s"].clamp(min=1e-5)
@@ -191,5 +197,5 @@ class ThermalDrift(EffectSpec):
 
 
 def measure_last_step(now: StepInputs) -> torch.Tensor:
-    """Returns how far the joints moved in the last period, `(N, J)`."""
+    """Return how far the joints moved in the last period, `(N, J)`."""
     return now.history.q[:, -1] - now.history.q[:, -2]

@@ -22,7 +22,7 @@ class _Delayed(EffectSpec):
     delays = True
 
     def begin(self, now: StepInputs) -> Memory:
-        """Before the history the command was what it is at its beginning."""
+        """Before the history the command equals its oldest entry."""
         u = now.history.u
         return {"older": u[:, :1].expand(-1, u.shape[1] - 1, -1)}
 
@@ -79,7 +79,7 @@ class ClockOffset(_Delayed):
 
 @spec
 class DelayJitter(EffectSpec):
-    """Each command frame is late by a time of its own, which joints share; no frame overtakes another.
+    """Each command frame has its own delay, shared by all joints; no frame overtakes another.
 
     Attributes:
         joints: Joints it acts on, or `all`.
@@ -142,13 +142,16 @@ class FrameLoss(EffectSpec):
 
 
 def append_command(now: StepInputs, newest: torch.Tensor) -> tuple[torch.Tensor, Memory]:
-    """Returns what the inner model has seen so far, `sent` of the memory, with `newest`, `(N, J)`, behind it; and the memory."""
+    """Return the commands seen so far with `newest`, `(N, J)`, appended; and the memory."""
     u = torch.cat((now.memory["sent"], newest[:, None]), 1)
     return u, {"sent": u[:, 1:]}
 
 
 def _delay_commands(u: torch.Tensor, periods: torch.Tensor, count: int) -> torch.Tensor:
-    """Returns the newest `count` of commands `(N, T, J)` as they are `periods`, `(N, J)`, later; held beyond both ends."""
+    """Return the newest `count` of commands `(N, T, J)`, delayed by `periods`, `(N, J)`.
+
+    Commands are held beyond both ends.
+    """
     last = u.shape[1] - 1
     # half a millionth of a period forgives 0.15 / 0.05 = 2.9999998
     whole = torch.floor(periods + 5e-7)

@@ -1,5 +1,5 @@
-"""Excitations: commands that show what an actuator does, for collecting the recordings it is identified and diagnosed from.
+"""Excitations: commands for recordings from which an actuator is identified and diagnosed.
 
-Numpy only: they also run on the machine's own computer. What each separates is said in its YAML
-file.
+Numpy only: they also run on the machine's own computer. The YAML file of each excitation says which
+effects it separates.
 """

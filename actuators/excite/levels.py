@@ -1,4 +1,4 @@
-"""Random levels on several joints at once: the broadest excitation, the only one here that shows joints sharing a pump."""
+"""Random levels on several joints at once: the only excitation that shows a shared pump."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from brokk_rl.spec import spec
 
 @spec
 class Levels:
-    """Random levels held for random times on several joints at once, exclusive joints by themselves, from poses of opposite load.
+    """Random levels for random times on several joints at once, from poses of opposite load.
 
     Attributes:
         share: Part of the time, relative to the others of the plan.
@@ -56,7 +56,7 @@ class Levels:
             )
 
     def weight(self, before: float) -> float:
-        """Returns `share`."""
+        """Return `share`."""
         return self.share
 
     def segments(
@@ -66,7 +66,7 @@ class Levels:
         generator: np.random.Generator,
         before: Sequence[Segment],
     ) -> list[Segment]:
-        """Returns segments of about `pose_s` each, which fill the time."""
+        """Return segments of about `pose_s` each, which fill the time."""
         total = max(1, int(duration_s / machine.period_s))
         count = min(max(1, round(duration_s / self.pose_s)), total)
         starts = draw_start_poses(machine, self.stop_margin, generator)
@@ -82,7 +82,7 @@ class Levels:
         ]
 
     def _program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
-        """Returns the commands, `(T, J)`."""
+        """Return the commands, `(T, J)`."""
         u = np.stack(
             [self._joint(steps, machine.period_s, generator) for _ in range(machine.num_joints)], 1
         )
@@ -99,7 +99,7 @@ class Levels:
         return u * mask_exclusive_joints(exclusive, np.repeat(alone, turn)[:steps])
 
     def _joint(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
-        """Returns the levels of one joint, `(T,)`."""
+        """Return the levels of one joint, `(T,)`."""
         most = -(-steps // max(1, int(self.shortest_s / period_s)))
         held_s = np.exp(generator.uniform(np.log(self.shortest_s), np.log(self.longest_s), most))
         kind = generator.random(most)

@@ -1,4 +1,4 @@
-"""Motifs: short programs for one joint from one pose, each made to separate effects that look alike in random commands."""
+"""Motifs: short single-joint programs that separate effects which look alike otherwise."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import count
@@ -14,19 +14,19 @@ from brokk_rl.spec import spec
 
 
 class Motif:
-    """What the motifs share: in each of several poses of opposite load each program once, in random order, until time is over."""
+    """Base of the motifs: each program once per pose, in random order, while time is left."""
 
     share: float
     stop_margin: float
 
     def weight(self, before: float) -> float:
-        """Returns `share`."""
+        """Return `share`."""
         return self.share
 
     def programs(
         self, machine: Machine, generator: np.random.Generator
     ) -> list[tuple[str, np.ndarray]]:
-        """Returns name and program `(T, J)` of all that is played in one pose."""
+        """Return name and program `(T, J)` of all that is played in one pose."""
         raise NotImplementedError
 
     def segments(
@@ -36,7 +36,7 @@ class Motif:
         generator: np.random.Generator,
         before: Sequence[Segment],
     ) -> list[Segment]:
-        """Returns as many segments as fit into `duration_s`."""
+        """Return as many segments as fit into `duration_s`."""
         return fill_duration(
             type(self).__name__.lower(), self._candidates(machine, generator), duration_s, machine
         )
@@ -55,7 +55,7 @@ class Motif:
 def fill_duration(
     name: str, candidates: Iterable[Segment], duration_s: float, machine: Machine
 ) -> list[Segment]:
-    """Returns segments as long as they fit into `duration_s`.
+    """Return segments as long as they fit into `duration_s`.
 
     Raises:
         ConfigError: the first one does not fit.
@@ -77,7 +77,7 @@ def fill_duration(
 def build_joint_programs(
     name: str, machine: Machine, program: Callable[[int], np.ndarray]
 ) -> list[tuple[str, np.ndarray]]:
-    """Returns name and `(T, J)` of `program(joint)`, `(T,)`, for each joint, the others at rest."""
+    """Return name and `(T, J)` of `program(joint)`, `(T,)`, for each joint, the others at rest."""
     found = []
     for joint, joint_name in enumerate(machine.joint_names):
         commands = program(joint)
@@ -88,7 +88,7 @@ def build_joint_programs(
 
 
 def hold_levels(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.ndarray:
-    """Returns each level held for its time, `(T,)`."""
+    """Return each level held for its time, `(T,)`."""
     return np.repeat(
         np.asarray(levels, dtype=float),
         np.maximum(1, np.round(np.asarray(holds_s) / period_s).astype(int)),
@@ -97,7 +97,7 @@ def hold_levels(levels: ArrayLike, holds_s: ArrayLike, period_s: float) -> np.nd
 
 @spec
 class Ramps(Motif):
-    """Slow ramps through zero on one joint, three slopes, both signs: dead band, friction and hysteresis differ here.
+    """Slow ramps of one joint through zero: separates dead band, friction and hysteresis.
 
     Attributes:
         share: Part of the time, relative to the others of the plan.
@@ -123,7 +123,10 @@ class Ramps(Motif):
     def programs(
         self, machine: Machine, generator: np.random.Generator
     ) -> list[tuple[str, np.ndarray]]:
-        """Returns a ramp up, through zero to the other side, and back, for each joint and slope; the first side is random."""
+        """Return a ramp to one side, to the other and back, per joint and slope.
+
+        The first side is random.
+        """
         way = self.reach * (machine.upper - machine.lower) / machine.max_speed
 
         def ramp(slope_per_s: float) -> Callable[[int], np.ndarray]:
@@ -149,7 +152,7 @@ class Ramps(Motif):
 
 @spec
 class Holds(Motif):
-    """Zero command for half a minute under different loads: leaks, drift of sensors, noise and quantisation.
+    """Zero command under different loads: shows leaks, sensor drift, noise and quantisation.
 
     Attributes:
         share: Part of the time, relative to the others of the plan.
@@ -164,7 +167,7 @@ class Holds(Motif):
     def programs(
         self, machine: Machine, generator: np.random.Generator
     ) -> list[tuple[str, np.ndarray]]:
-        """Returns one hold: the way to each pose does the rest."""
+        """Return one hold: the way to each pose does the rest."""
         return [
             ("holds", np.zeros((max(1, round(self.hold_s / machine.period_s)), machine.num_joints)))
         ]
@@ -172,7 +175,7 @@ class Holds(Motif):
 
 @spec
 class Reversals(Motif):
-    """Small reversals of one joint, of several speeds and lengths: play that must be taken up shows as motion that is missing.
+    """Small reversals of one joint at several speeds and lengths: shows play as missing motion.
 
     Attributes:
         share: Part of the time, relative to the others of the plan.
@@ -193,7 +196,7 @@ class Reversals(Motif):
     def programs(
         self, machine: Machine, generator: np.random.Generator
     ) -> list[tuple[str, np.ndarray]]:
-        """Returns all reversals of a joint in one program."""
+        """Return all reversals of a joint in one program."""
         parts = []
         for level in self.levels:
             for hold_s in self.holds_s:
@@ -208,7 +211,7 @@ class Reversals(Motif):
 
 @spec
 class Staircase(Motif):
-    """Held levels of one joint, up and down, to and fro: flow curve, dead band, saturation, and what differs by direction.
+    """Held levels of one joint, up and down, both ways: flow curve, dead band, saturation.
 
     Attributes:
         share: Part of the time, relative to the others of the plan.
@@ -239,7 +242,7 @@ class Staircase(Motif):
     def programs(
         self, machine: Machine, generator: np.random.Generator
     ) -> list[tuple[str, np.ndarray]]:
-        """Returns the staircase of each joint."""
+        """Return the staircase of each joint."""
         stairs = np.array([*self.levels, *self.levels[::-1]])
 
         def program(joint: int) -> np.ndarray:

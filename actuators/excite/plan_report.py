@@ -1,4 +1,4 @@
-"""What was played when: the notes that recordings carry, and `plan.json`."""
+"""Report of a plan: `plan.json`, `plan.png`, and the notes that recordings carry."""
 
 from collections.abc import Iterable
 from itertools import pairwise
@@ -48,7 +48,9 @@ class PlanTrack:
 def describe_run(
     track: PlanTrack, run: int, segments: tuple[Segment, ...], period_s: float
 ) -> list[dict[str, Any]]:
-    """Returns what one run did on this track, in order, as plain JSON data; times count from the first sample.
+    """Return the actions of one run on this track, in order, as plain JSON data.
+
+    Times count from the first sample.
 
     Each entry: `name` of the segment; `part`: `approach` (with the rest after it) or `program`;
     `start_s` and `end_s`; for programs `offset_s`, how far the program was at `start_s` (0 unless a
@@ -82,7 +84,7 @@ def describe_run(
 
 
 def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> dict[str, Any]:
-    """Returns `plan.json`: for each run its segments with predicted times, travel and commands, and the time it leaves unused."""
+    """Return `plan.json`: segments of each run with predicted times, travel and commands."""
     used = (track.stage != AFTER).sum(0)
     return {
         "schema": 1,
@@ -99,7 +101,7 @@ def summarise_plan(plan: ExcitationPlan, track: PlanTrack, machine: Machine) -> 
 def _summarise_run(
     run: tuple[Segment, ...], track: PlanTrack, n: int, machine: Machine
 ) -> list[dict[str, Any]]:
-    """Returns the segments of one run; one that finds no time has no `start_s`."""
+    """Return the segments of one run; one that finds no time has no `start_s`."""
     period_s, found = machine.period_s, []
     for i, segment in enumerate(run):
         mine = track.segment[:, n] == i
@@ -135,7 +137,7 @@ def _summarise_run(
 
 
 def split_stretches(values: np.ndarray) -> list[tuple[int, int]]:
-    """Returns begin and end of each stretch of equal values."""
+    """Return begin and end of each stretch of equal values."""
     edges = [0, *(np.flatnonzero(values[1:] != values[:-1]) + 1).tolist(), len(values)]
     return list(pairwise(edges))
 
@@ -160,7 +162,7 @@ def draw_plan(
     path: Path,
     run: int = 0,
 ) -> None:
-    """Draws one run into a PNG: segments, command and predicted position of each joint between its stops, predicted tool speed.
+    """Draw one run as PNG: segments, commands, predicted positions and tool speed.
 
     Args:
         plan: Gives names.
@@ -216,7 +218,7 @@ def draw_plan(
 
 
 def _find_spans(plan: ExcitationPlan, track: PlanTrack, run: int) -> list[dict[str, Any]]:
-    """Returns start and end in minutes, name and colour of the ways and the programs of a run."""
+    """Return start and end in minutes, name and colour of the ways and the programs of a run."""
     stage, number = track.stage[:, run], track.segment[:, run]
     period_s = float(np.median(np.diff(track.t_s))) if len(track.t_s) > 1 else 0.0
     found = []
@@ -247,7 +249,7 @@ def _find_spans(plan: ExcitationPlan, track: PlanTrack, run: int) -> list[dict[s
 
 
 def _draw_segments(axis: plt.Axes, spans: list[dict[str, Any]]) -> None:
-    """Draws the strip of segments on top, with the names that find room."""
+    """Draw the strip of segments on top, with the names that find room."""
     whole = spans[-1]["end"]
     for span in spans:
         width = span["end"] - span["start"]
@@ -286,7 +288,7 @@ def _draw_segments(axis: plt.Axes, spans: list[dict[str, Any]]) -> None:
 def _draw_joint(
     axis: plt.Axes, minutes: np.ndarray, q: np.ndarray, u: np.ndarray, machine: Machine, joint: int
 ) -> None:
-    """Draws command (grey, from the middle: full command is half the height), position and stops of one joint."""
+    """Draw command (grey; full is half the height), position and stops of one joint."""
     lower, upper, alone = machine.lower[joint], machine.upper[joint], machine.is_exclusive[joint]
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     color = ALONE if alone else "#8c8c8c"

@@ -1,4 +1,14 @@
-"""Guards of a collection: bounds that no program can exceed. They do not replace the machine's own guard."""
+"""Playing a plan on `N` machines at once: guards, state machine, control loop.
+
+    approach --arrived or given up--> rest --over--> play --program over--> approach of the next
+                                                    |  ^
+                    stop near, segment with `home`  v  |  program passes zero
+                                                   return --arrived--> wait
+
+Approaches run in closed loop, programs in open loop, both within the guards. The clock of a
+program keeps running while its joint is brought home, so a segment lasts as long as its program.
+A repeat plays the commands that were really sent in the original: only then are both comparable.
+"""
 
 import logging
 import time
@@ -19,7 +29,7 @@ from brokk_rl.spec import spec
 
 @spec
 class CommandGuards:
-    """What commands may do at most.
+    """Bounds on the commands of a collection; they do not replace the machine's own guard.
 
     Attributes:
         max_command: Largest command.
@@ -67,13 +77,16 @@ class ToolSpeed:
         self._kinematics, self._tensor = Kinematics(machine), torch.as_tensor
 
     def of(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Returns the speed of the tool point in m/s, `(N,)`, for joints at `q` that move with `speed`, each `(N, J)`."""
+        """Return the tool speed in m/s, `(N,)`, at `q` and joint speeds `speed`, each `(N, J)`."""
         tip = self._kinematics.jacobian(self._tensor(q.astype(np.float32))).tip.numpy()
         return np.linalg.norm((tip @ speed[..., None])[..., 0], axis=-1)
 
 
 def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
-    """Returns the speed of the tool point in m/s along a path `q`, `(T, J)`: `(T,)`; `None` where geometry or torch are missing."""
+    """Return the tool speed in m/s, `(T,)`, along a path `q`, `(T, J)`.
+
+    `None` where geometry or torch are missing.
+    """
     if not machine.has_bodies:
         return None
     try:
@@ -130,7 +143,7 @@ class PlanPlayer:
         self._index, self._left = np.zeros(count, dtype=int), np.zeros(count, dtype=int)
 
     def command(self, q: np.ndarray) -> np.ndarray:
-        """Returns the commands for the coming control period, `(N, J)`, at the measured positions `q`, `(N, J)`."""
+        """Return the commands of the coming period, `(N, J)`, at measured positions `q`, `(N, J)`."""
         if self._seen is None:
             self._seen = np.repeat(q[None], SPEED_WINDOW + 1, 0)
             self._left = self._patience(q)
@@ -165,7 +178,7 @@ class PlanPlayer:
         return self._guarded(u, slow)
 
     def took(self, u: np.ndarray) -> None:
-        """Is told the commands that were really sent, `(N, J)`, and moves on by one control period."""
+        """Take the commands that were really sent, `(N, J)`, and advance by one control period."""
         self._in_flight = np.concatenate([self._in_flight[:, 1:], u[:, None]], 1)
         inside = INSIDE[self.phase]
         self._sent[self._rows[inside], self._index[inside]] = u[inside]
@@ -193,14 +206,14 @@ class PlanPlayer:
         return bool((self.phase == DONE).all())
 
     def _take_up_repeat(self, n: int, segment: int) -> None:
-        """Makes what was sent in the original the program of a repeat; of any other segment the program stays."""
+        """Copy the commands sent in the original into a repeat; leave other segments."""
         original = self._original[n, segment]
         if original >= 0:
             there, here = (slice(self._begin[n, i], self._end[n, i]) for i in (original, segment))
             self._program[n, here] = self._sent[n, there]
 
     def _advance(self, q: np.ndarray, far: np.ndarray) -> None:
-        """Goes on from approach to rest to play, and from return to wait to play."""
+        """Go on from approach to rest to play, and from return to wait to play."""
         phase, late = self.phase, self._left <= 0
         moving = MOVES[phase]
         arrived = moving & (~far.any(1) | late)
@@ -224,7 +237,7 @@ class PlanPlayer:
         phase[rested & (phase == WAIT) & at_zero] = PLAY
 
     def _rest_positions(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns where the joints would come to rest if the commands ended now, each `(N, J)`.
+        """Return where the joints would come to rest if the commands ended now, each `(N, J)`.
 
         First from the commands on their way at the machine's nominal speeds, then from the measured
         speed: whichever reaches further counts at the stops, so that a machine faster than its file
@@ -238,7 +251,7 @@ class PlanPlayer:
         ) * self._speed * period_s, q + measured * self._machine.dead_time_s
 
     def _toward(self, error: np.ndarray, far: np.ndarray) -> np.ndarray:
-        """Returns commands that take the joints to their targets: first those that may move together, then the exclusive ones."""
+        """Return commands toward the targets: ordinary joints first, then exclusive ones."""
         approach, exclusive = self._approach, self._machine.is_exclusive
         size = np.clip(
             np.abs(error) / (self._speed * approach.settle_s), approach.smallest, approach.level
@@ -247,7 +260,7 @@ class PlanPlayer:
         return np.sign(error) * size * far * mask_exclusive_joints(exclusive, ~first)
 
     def _guarded(self, u: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Returns the commands within the guards; exclusive joints wait for the others, whatever a program says."""
+        """Return the commands within the guards; exclusive joints wait for the others."""
         exclusive = self._machine.is_exclusive
         together = (u[:, ~exclusive] != 0).any(1)
         u = np.where(exclusive & together[:, None], 0.0, u).clip(
@@ -264,14 +277,14 @@ class PlanPlayer:
         )
 
     def _patience(self, q: np.ndarray) -> np.ndarray:
-        """Returns the control periods after which the way from `q` to the start of the present segment is given up, `(N,)`."""
+        """Return the periods after which the approach from `q` is given up, `(N,)`."""
         needed_s = self._approach.duration_s(
             self._machine, q, self._start[self._rows, self.segment]
         )
         return np.ceil(self._approach.patience * needed_s / self._machine.period_s).astype(int)
 
     def _pack(self) -> None:
-        """Lays the segments of all runs into arrays: programs behind one another, `(N, L, J)`, the rest by number, `(N, S, …)`."""
+        """Pack segments into arrays: programs end to end, `(N, L, J)`, the rest `(N, S, …)`."""
         runs, machine = self._plan.runs, self._machine
         count, most = len(runs), max(len(run) for run in runs)
         if not all(runs):
@@ -322,10 +335,10 @@ class Sample:
         t_s: Time on the link's clock.
         q: Measured positions, `(N, J)`.
         u: Commands really sent, in force from `t_s` on, `(N, J)`.
-        phase: What each run is doing, `(N,)`; see `runner`.
+        phase: Phase of each run, `(N,)`: `APPROACH`, `REST`, …
         segment: Number of its segment, `(N,)`.
         played: Control periods since the program of that segment began, `(N,)`.
-        extra: What the link measures besides, each `(N,)`.
+        extra: Further measurements of the link, each `(N,)`.
     """
 
     t_s: float
@@ -340,9 +353,9 @@ class Sample:
 def drive(
     link: Link, runner: PlanPlayer, machine: Machine, num_runs: int, run_s: float
 ) -> Iterator[Sample]:
-    """Plays the runner's plan over an open link, one sample a control period, until it is done or `run_s` is over.
+    """Play the plan over an open link, one sample a control period, until it or `run_s` ends.
 
-    What is not needed at once belongs between two samples: the loop sleeps only until the next
+    Slow work belongs between two samples: the loop sleeps only until the next
     control period is due.
 
     Raises:
@@ -381,7 +394,10 @@ def drive(
 
 
 def _wait_for_state(link: Link, due_s: float) -> JointState:
-    """Returns the first state at or after `due_s`, sleeping until then; a simulated machine is always due."""
+    """Return the first state at or after `due_s`, sleeping until then.
+
+    A simulated machine is always due.
+    """
     given_up = time.monotonic() + SILENCE_S
     while (state := link.read()).t_s < due_s:
         if time.monotonic() > given_up:
@@ -394,7 +410,7 @@ def _wait_for_state(link: Link, due_s: float) -> JointState:
 
 @spec
 class NominalMachine:
-    """A machine as its file has it: dead time and full speed times command. Needs neither simulator nor torch."""
+    """A machine as its file describes it: dead time and full speed times command."""
 
     @property
     def source(self) -> str:
@@ -402,12 +418,15 @@ class NominalMachine:
         return "nominal machine"
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> Link:
-        """Returns a link to `num_runs` of them."""
+        """Return a link to `num_runs` of them."""
         return NominalLink(machine, num_runs, alone=num_runs == 1)
 
 
 class NominalLink:
-    """A machine as its file has it: dead time, full speed times command, stops; `N` of them, or one alone without that axis."""
+    """Link to `N` nominal machines: dead time, full speed times command, stops.
+
+    One machine alone has no axis `N`.
+    """
 
     def __init__(self, machine: Machine, num_runs: int, alone: bool = False) -> None:
         self._machine, self._t_s, self._form = (
@@ -421,11 +440,11 @@ class NominalLink:
         )
 
     def read(self) -> JointState:
-        """Returns the true positions."""
+        """Return the true positions."""
         return JointState(self._t_s, self._q.reshape(self._form))
 
     def send(self, command: Command) -> Command:
-        """Moves on by one control period."""
+        """Move on by one control period."""
         machine = self._machine
         u = np.nan_to_num(np.asarray(command.u, dtype=float), nan=0.0, posinf=0.0, neginf=0.0).clip(
             -1.0, 1.0

@@ -1,4 +1,4 @@
-"""Start poses of opposite load: the same command must meet weight that helps and weight that resists.
+"""Start poses of opposite load: each command meets helping and resisting weight.
 
 Under a weight of one sign the unequal speed of the two directions, load dependence, leaks and an
 uneven dead band look alike.
@@ -18,7 +18,7 @@ NUM_CANDIDATES = 128
 def draw_start_poses(
     machine: Machine, margin: float, generator: np.random.Generator
 ) -> Iterator[np.ndarray]:
-    """Yields start poses `(J,)` without end, each the one of many random ones whose load best opposes the sum of those before.
+    """Yield start poses `(J,)` without end, each opposing the load of those before.
 
     So the weight on each joint takes both signs, in turn, where it can. Where masses are not known
     the poses are random.
@@ -52,7 +52,7 @@ def draw_start_poses(
 
 
 def compute_load(machine: Machine, q: np.ndarray) -> np.ndarray:
-    """Returns the force with which gravity pushes each joint in its positive direction at `q`, `(N, J)`: Nm or N, shape of `q`.
+    """Return the gravity load in the positive direction at `q`, `(N, J)`, Nm or N.
 
     The slope of the potential energy of a machine that stands level, by central differences.
 
@@ -69,7 +69,7 @@ def compute_load(machine: Machine, q: np.ndarray) -> np.ndarray:
 
 
 def _compute_potential_j(machine: Machine, q: np.ndarray) -> np.ndarray:
-    """Returns the potential energy at `q`, `(N, J)`: J, `(N,)`."""
+    """Return the potential energy at `q`, `(N, J)`: J, `(N,)`."""
     rotation, origin_m, energy_j = (
         np.broadcast_to(np.eye(3), (len(q), 3, 3)),
         np.zeros((len(q), 3)),

@@ -13,7 +13,7 @@ from brokk_rl.spec import spec
 
 @spec
 class Repeat:
-    """Everything before it in the plan once more, from the same poses with the commands really sent: what differs is noise.
+    """All segments before it once more, with the commands really sent: the difference is noise.
 
     Attributes:
         times: How many repeats.
@@ -26,7 +26,7 @@ class Repeat:
             raise ConfigError(f"excitation: times: expected 1 or more, got {self.times}")
 
     def weight(self, before: float) -> float:
-        """Returns as much as all before it have, for each repeat.
+        """Return as much as all before it have, for each repeat.
 
         Raises:
             ConfigError: there is nothing before it.
@@ -44,7 +44,7 @@ class Repeat:
         generator: np.random.Generator,
         before: Sequence[Segment],
     ) -> list[Segment]:
-        """Returns the segments `before`, renamed; their length is what it is."""
+        """Return the segments `before`, renamed; their length stays."""
         return [
             replace(
                 segment,

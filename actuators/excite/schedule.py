@@ -1,4 +1,4 @@
-"""How excitations share the time of a run."""
+"""Schedule of a run: the excitations share its time."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ longest that fits is taken."""
 
 @spec
 class Approach:
-    """How a segment's start pose is taken up.
+    """Approach to the start pose of a segment.
 
     Attributes:
         level: Largest command on the way.
@@ -27,7 +27,7 @@ class Approach:
         tolerance: A joint this close, as a part of its travel, has arrived.
         rest_s: Rest before the program begins; longer than the dead time, so that each program
             begins at rest.
-        patience: An approach is given up after this many times what it should take.
+        patience: An approach is given up after this many times its nominal duration.
     """
 
     level: float
@@ -48,7 +48,7 @@ class Approach:
             )
 
     def duration_s(self, machine: Machine, start: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Returns how long the way from `start` to `target`, each `(…, J)`, should take, with the rest, at the machine's speeds."""
+        """Return the nominal time from `start` to `target`, each `(…, J)`, with the rest."""
         way = np.abs(target - start)
         far = way > self.tolerance * (machine.upper - machine.lower)
         slowing_s = self.settle_s * np.log(
@@ -65,7 +65,7 @@ class Approach:
 
 @dataclass(frozen=True)
 class ExcitationPlan:
-    """What each run plays.
+    """Segments of each run.
 
     Attributes:
         runs: Segments of each run, in order.
@@ -86,7 +86,7 @@ def plan_runs(
     run_s: float,
     generator: np.random.Generator,
 ) -> ExcitationPlan:
-    """Returns a plan in which each run plays all excitations in order, with draws of its own, within `run_s`.
+    """Return a plan in which each run plays all excitations in order, with its own draws.
 
     Raises:
         ConfigError: there are no excitations, or one of them finds no room.
@@ -124,7 +124,7 @@ def _collect_segments(
     programs_s: float,
     seed: int,
 ) -> list[Segment]:
-    """Returns the segments of one run; the same seed draws the same."""
+    """Return the segments of one run; the same seed draws the same."""
     generator, found = np.random.default_rng(seed), []
     for name, excitation in excitations.items():
         found += excitation.segments(machine, parts[name] * programs_s, generator, tuple(found))
@@ -132,7 +132,10 @@ def _collect_segments(
 
 
 def _estimate_duration_s(segments: list[Segment], machine: Machine, approach: Approach) -> float:
-    """Returns the time that programs and approaches should take, from home on; motion within a segment is left out."""
+    """Return the nominal time of programs and approaches, from home on.
+
+    Motion within a segment is left out.
+    """
     at = np.stack([machine.home, *(segment.start for segment in segments[:-1])])
     ways_s = approach.duration_s(machine, at, np.stack([segment.start for segment in segments]))
     return float(ways_s.sum()) + sum(len(segment.u) for segment in segments) * machine.period_s

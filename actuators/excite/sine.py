@@ -12,7 +12,7 @@ from brokk_rl.spec import spec
 
 @spec
 class Sine:
-    """One joint at a time, sine commands of random frequency and amplitude, back home at the stops (the paper's excitation).
+    """One joint at a time, sines of random frequency and amplitude (the paper's excitation).
 
     Attributes:
         share: Part of the time, relative to the others of the plan.
@@ -42,7 +42,7 @@ class Sine:
             )
 
     def weight(self, before: float) -> float:
-        """Returns `share`."""
+        """Return `share`."""
         return self.share
 
     def segments(
@@ -52,7 +52,7 @@ class Sine:
         generator: np.random.Generator,
         before: Sequence[Segment],
     ) -> list[Segment]:
-        """Returns one segment a joint, from home, each of the same length, the joints in random order."""
+        """Return one segment per joint, from home, of equal length, in random order."""
         steps = int(duration_s / machine.num_joints / machine.period_s)
         if steps * machine.period_s < 1.0 / self.highest_hz:
             raise ConfigError(
@@ -72,7 +72,7 @@ class Sine:
         return found
 
     def _waves(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
-        """Returns full waves, each from a command of zero, one after the other; the last one ends with the program. `(T,)`."""
+        """Return full waves end to end, `(T,)`; each begins at a command of zero."""
         u, at = np.zeros(steps), 0
         shortest = max(2, round(1.0 / self.highest_hz / period_s))
         while steps - at >= shortest:

@@ -1,1 +1,1 @@
-"""How good a fitted actuator model is, and where it fails: scores of free runs, regimes, verdict, pictures, the page."""
+"""Identification: fits of actuator models, scores of their free runs, verdict and report."""

@@ -1,4 +1,4 @@
-"""Dead time of each joint from recordings: the delay at which a static curve of the command explains the motion best.
+"""Dead time of each joint: the delay at which a static curve explains the motion best.
 
 The lag of spool and oil counts as delay here (at 20 Hz the two can hardly be told apart), so this
 is the total that a controller has to look ahead, not the time to first motion.
@@ -50,14 +50,14 @@ class DeadTimeEstimate:
 
     @property
     def is_found(self) -> bool:
-        """False where the best delay is the longest that was tried: the true one may be longer, or the joint does not follow."""
+        """False where the best delay is the longest tried: it may be longer, or not exist."""
         return self.value_s < float(self.tried_s[-1]) - RESOLUTION_S / 2
 
 
 def estimate_dead_times(
     recordings: Sequence[Recording], machine: Machine, generator: np.random.Generator
 ) -> dict[str, DeadTimeEstimate | None]:
-    """Returns the dead time of each joint; `None` for a joint that is hardly commanded.
+    """Return the dead time of each joint; `None` for a joint that is hardly commanded.
 
     Raises:
         RecordingError: no recording is long enough to search in.
@@ -116,7 +116,7 @@ def _estimate_dead_time(
 def _compute_moments(
     recording: Recording, joint: int, grid_s: np.ndarray, machine: Machine
 ) -> np.ndarray:
-    """Returns, for each delay, the sums of products of the curve's features and the increment, shape `(D, F + 1, F + 1)`."""
+    """Return moments of curve features and increment per delay, `(D, F + 1, F + 1)`."""
     u, q = recording.u[:, joint].astype(np.float64), recording.q[:, joint].astype(np.float64)
     knots, reach = np.array(KNOTS), int(LONGEST_S / machine.period_s) + 1
     curve = np.concatenate(
@@ -143,7 +143,7 @@ def _compute_moments(
 
 
 def _compute_residual(moments: np.ndarray) -> np.ndarray:
-    """Returns the sum of squares that the best curve leaves, for each delay, shape `(D,)`."""
+    """Return the sum of squares that the best curve leaves, for each delay, shape `(D,)`."""
     gram, cross, total = moments[:, :-1, :-1], moments[:, :-1, -1], moments[:, -1, -1]
     ridge = 1e-6 * np.trace(gram, axis1=1, axis2=2)[:, None, None] / gram.shape[1] + 1e-12
     weight = np.linalg.solve(gram + ridge * np.eye(gram.shape[1]), cross[..., None])[..., 0]

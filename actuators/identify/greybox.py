@@ -1,4 +1,4 @@
-"""What a grey-box fit leaves: its numbers with intervals, what the recordings do not tell, and a config option to run it again."""
+"""Grey-box fits: physical parameters of an actuator model from free runs, with intervals."""
 
 import dataclasses
 import hashlib
@@ -48,7 +48,7 @@ def tabulate_parameters(
     x: np.ndarray,
     sure: ParameterUncertainty,
 ) -> dict[str, Any]:
-    """Returns each number `found` by name and joint with its standard error, its interval, and whether the recordings tell it."""
+    """Return each parameter with standard error, interval and whether it is determined."""
     low, high = (
         runs.values(np.clip(x - sure.half, 0.0, 1.0)),
         runs.values(np.clip(x + sure.half, 0.0, 1.0)),
@@ -73,7 +73,7 @@ def tabulate_parameters(
 def find_correlated_pairs(
     machine: Machine, runs: CandidateRuns, sure: ParameterUncertainty
 ) -> list[dict[str, Any]]:
-    """Returns the pairs of numbers that stand for each other: their correlation exceeds `TANGLED`."""
+    """Return the pairs of parameters whose correlation exceeds `TANGLED`."""
     labels = [f"{name} {joint}" for name in runs.names for joint in machine.joint_names]
     pairs = np.argwhere(np.triu(np.abs(sure.correlation), 1) > TANGLED)
     return [
@@ -83,7 +83,7 @@ def find_correlated_pairs(
 
 
 def format_option(fitted: Any, facts: dict[str, Any]) -> str:
-    """Returns the text of a config option of the group `actuator`."""
+    """Return the text of a config option of the group `actuator`."""
     kind = type(fitted)
     node = {"_target_": f"{kind.__module__}.{kind.__qualname__}", **dataclasses.asdict(fitted)}
     lines = [
@@ -111,7 +111,7 @@ def format_option(fitted: Any, facts: dict[str, Any]) -> str:
 
 
 def log_undetermined(facts: dict[str, Any]) -> None:
-    """Logs what the recordings do not determine."""
+    """Log the parameters that the recordings do not determine."""
     for name, row in facts["parameters"].items():
         if vague := [joint for joint, cell in row.items() if not cell["told"]]:
             log.warning(
@@ -139,10 +139,10 @@ ACTIVE_SHARE = 0.1
 
 @spec
 class GreyBoxFit:
-    """Fits the numbers of a physical model by free runs: a search over their ranges, then Gauss-Newton steps with a robust loss.
+    """Fits physical parameters by free runs: search over ranges, then Gauss-Newton steps.
 
     Attributes:
-        name: Name of the model in tables and of what it leaves: `<name>.yaml`, an option for
+        name: Name of the model in tables and of its files: `<name>.yaml`, an option for
             `actuator=@…`, and `<name>.json`.
         actuator: The model; numbers that are not free keep the values they have here.
         free: Lower and upper bound of each number that is fitted, joint by joint, by name.
@@ -211,9 +211,11 @@ class GreyBoxFit:
         seed: int,
         device: torch.device,
     ) -> Actuator:
-        """Fits to `train`, chooses among the starts by `validation`, writes `<name>.yaml` and `<name>.json` into `folder`.
+        """Fit to `train`, choose the start by `validation`, and write the result into `folder`.
 
-        Goes on exactly from what an interrupted fit with the same settings and recordings left
+        The files are `<name>.yaml` and `<name>.json`.
+
+        Resumes exactly where an interrupted fit with the same settings and recordings stopped
         there.
 
         Raises:
@@ -263,7 +265,10 @@ class GreyBoxFit:
         return fitted
 
     def _nominal(self, machine: Machine, device: torch.device) -> np.ndarray:
-        """Returns the actuator's own numbers in units of their ranges, `(P, J)`, and sees that the bounds make sense."""
+        """Return the actuator's own parameters in units of their ranges, `(P, J)`.
+
+        Also checks the bounds.
+        """
         names = tuple(self.free)
         parameters = get_parameters(self.actuator.build(machine, 1, device), names)
         for side in (0, 1):
@@ -308,7 +313,7 @@ class GreyBoxFit:
 
 @dataclass
 class _Search:
-    """The search at work; what it has found so far lies in `place` after each step, for an interrupted fit to go on from."""
+    """The running search; each step is saved in `place`, from which an interrupted fit resumes."""
 
     config: GreyBoxFit
     runs: CandidateRuns
@@ -317,7 +322,7 @@ class _Search:
     before_s: float = 0.0
 
     def run(self, nominal: np.ndarray, seed: int) -> list[np.ndarray]:
-        """Returns where each start leads, each `(P, J)`."""
+        """Return where each start leads, each `(P, J)`."""
         config, began = self.config, time.monotonic()
         with Progress(transient=True) as progress:
             task = progress.add_task(
@@ -349,7 +354,7 @@ class _Search:
         return done
 
     def choose(self, found: list[np.ndarray], held: CandidateRuns) -> np.ndarray:
-        """Returns the numbers that run freely best on the validation windows, joint by joint where joints are independent."""
+        """Return the parameters with the best validation runs, per joint if uncoupled."""
         stacked = np.stack(found)
         score, fallback = (
             _average_rmse(runs.squares(stacked), runs.active) for runs in (held, self.runs)
@@ -362,7 +367,7 @@ class _Search:
         return np.stack([stacked[best][:, j] for j, best in enumerate(score.argmin(0))], 1)
 
     def _starts(self, nominal: np.ndarray, seed: int) -> np.ndarray:
-        """Returns the best points of a Latin hypercube and the nominal one, joint by joint, `(S, P, J)`."""
+        """Return the best starts of a Latin hypercube and the nominal point, `(S, P, J)`."""
         num, joints = nominal.shape
         points = qmc.LatinHypercube(num, rng=np.random.default_rng(seed)).random(
             self.config.candidates
@@ -375,7 +380,7 @@ class _Search:
         return np.stack([candidates[order[:, j], :, j] for j in range(joints)], 2)
 
     def _left(self) -> dict[str, Any] | None:
-        """Returns what an interrupted fit with the same settings left, if anything."""
+        """Return the state of an interrupted fit with the same settings, if any."""
         try:
             state = json.loads(self.place.read_text())
         except (OSError, ValueError):
@@ -403,7 +408,7 @@ class _Search:
 def _select_windows(
     active: np.ndarray, run: np.ndarray, count: int, random: np.random.Generator
 ) -> np.ndarray:
-    """Returns rows such that each joint is active in about `count` of them, taken in turn from the runs that move it."""
+    """Return rows with each joint active in about `count` of them, evenly over the runs."""
     chosen = np.zeros(len(active), dtype=bool)
     for j in range(active.shape[1]):
         rows = random.permutation(np.flatnonzero(active[:, j]))
@@ -418,7 +423,7 @@ def _select_windows(
 
 
 def _average_rmse(squares: np.ndarray, active: np.ndarray) -> np.ndarray:
-    """Returns the mean over active windows of the root mean square error, `(C, J)`; NaN where a joint is never active."""
+    """Return mean RMS errors over active windows, `(C, J)`; NaN for an inactive joint."""
     count = np.where(active.any(0), active.sum(0), np.nan)
     return np.sqrt(squares).sum(1) / count
 
@@ -426,7 +431,7 @@ def _average_rmse(squares: np.ndarray, active: np.ndarray) -> np.ndarray:
 def _hash_fit(
     config: GreyBoxFit, machine: Machine, runs: CandidateRuns, held: CandidateRuns, seed: int
 ) -> str:
-    """Returns a hash of all that the result depends on."""
+    """Return a hash of all that the result depends on."""
     told = hashlib.sha256(
         repr((config, machine.fingerprint(), machine.max_speed.tolist(), seed)).encode()
     )

@@ -1,4 +1,4 @@
-"""One update of a fit, with everything it changes: on a GPU captured in a CUDA graph, on the CPU the same code called step by step.
+"""Fits of actuator networks to recordings, all joints in one batch.
 
 A free run of 60 steps is some thousand tiny kernels forth and back; launched one by one they take
 far longer than they run.
@@ -40,13 +40,13 @@ class FreeRunOptimizer:
     update can be steered.
 
     Args:
-        networks: What is fitted, on its device.
+        networks: The fitted networks, on their device.
         machine: Gives the ends of travel.
         seed: Of the draws.
 
     Attributes:
         networks: The networks at work.
-        averaged: The running average of their weights, which is what is validated and kept.
+        averaged: The running average of their weights, which is validated and kept.
     """
 
     def __init__(self, networks: JointNetworks, machine: Machine, seed: int) -> None:
@@ -66,7 +66,7 @@ class FreeRunOptimizer:
         self._begin_adam()
 
     def state(self) -> dict[str, torch.Tensor]:
-        """Returns all that an update changes, by name; the tensors themselves, to be copied from and into."""
+        """Return the tensors that an update changes, by name, to be copied from and into."""
         found = {
             f"networks.{name}": value.detach() for name, value in self.networks.named_parameters()
         }
@@ -81,7 +81,10 @@ class FreeRunOptimizer:
     def updater(
         self, windows: TrainingWindows, batch: int, still_share: float, busy_share: float
     ) -> Callable[[], None]:
-        """Returns one update on `batch` windows a joint as a function; capturing it, on a GPU, leaves the state as it was."""
+        """Return one update on `batch` windows a joint as a function.
+
+        On a GPU it is captured, which leaves the state unchanged.
+        """
 
         def update() -> None:
             self._update(
@@ -99,14 +102,17 @@ class FreeRunOptimizer:
         return graph.replay
 
     def steer(self, number: int, rate: float, average: float) -> None:
-        """Sets number, learning rate and decay of the average of the update to come, without waiting for the device."""
+        """Set number, learning rate and averaging decay of the coming update.
+
+        Does not wait for the device.
+        """
         self._key.fill_(self._seed * 2**20 + number)
         self._rate.fill_(rate)
         self._share_of_new.fill_(1.0 - average)
 
     @torch.no_grad()
     def run(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Returns the free runs of the averaged networks through windows `(J, B, H + K)`, shape `(J, B, K)`."""
+        """Return free runs of the averaged networks through windows, `(J, B, K)`."""
         return self.averaged.roll_out(
             u[..., :-1], q[..., : self.averaged.num_history], self._lower, self._upper
         )
@@ -137,7 +143,7 @@ class FreeRunOptimizer:
                 mean.lerp_(value, self._share_of_new)
 
     def _begin_adam(self) -> None:
-        """Makes Adam's state exist, with fixed addresses, before anything is captured: a step of rate and gradient zero."""
+        """Create Adam's state at fixed addresses before capture: a step with zero rate."""
         for parameter in self._parameters:
             parameter.grad = torch.zeros_like(parameter)
         self._adam.step()
@@ -157,7 +163,7 @@ BEYOND_DEAD_BAND = 0.1
 
 @spec
 class NetworkFit:
-    """Actuator networks, fitted by free runs over growing horizons (`rollout`) or step by step as in the paper (`one_step`).
+    """Actuator networks, fitted by free runs (`rollout`) or single steps (`one_step`, the paper).
 
     Attributes:
         name: Name of the model in tables and of its checkpoint.
@@ -177,7 +183,7 @@ class NetworkFit:
         busy_share: Part of the windows drawn from the tenth of all times in which most is commanded
             at once: joints hinder each other rarely, and where recordings of single joints abound
                 hardly ever.
-        average: Decay of the running average of the weights, which is what is validated and kept.
+        average: Decay of the running average of the weights, which is validated and kept.
         validate_every: Updates between two validations.
         validation_s: Horizon of the free run on which the weights are chosen.
         patience: Validations without improvement after which a horizon is given up.
@@ -222,7 +228,7 @@ class NetworkFit:
         seed: int,
         device: torch.device,
     ) -> Mlp | Coupled:
-        """Fits to `train`, keeps the weights that run freely best on `validation`, writes `<name>.safetensors` into `folder`.
+        """Fit to `train`, keep the best weights on `validation`, write `<name>.safetensors`.
 
         A fit that was interrupted goes on from `<name>.partial.safetensors`, saved every
         `save_every_s` seconds: on a CPU bit for bit as if it had never stopped.
@@ -278,7 +284,7 @@ class NetworkFit:
 
 @dataclasses.dataclass
 class _FitProgress:
-    """Where a fit is: stage, updates done in it, validations without improvement, and the time spent so far."""
+    """Progress of a fit: stage, updates in it, validations without improvement, time spent."""
 
     stage: int = 0
     update: int = 0
@@ -340,7 +346,7 @@ class _NetworkFitting:
             ]
 
     def run(self, interruption: ResumeFile) -> float:
-        """Fits, going on from `interruption` if there is one; returns the time it took in all, s."""
+        """Fit, going on from `interruption` if there is one; returns the time it took in all, s."""
         found = interruption.load(self._state())
         if found:
             log.info("going on with the fit that was interrupted after %.0f s", found["seconds"])
@@ -354,13 +360,13 @@ class _NetworkFitting:
 
     @property
     def result(self) -> tuple[dict[str, torch.Tensor], list[float]]:
-        """The best averaged networks, normalisation included, and the error of each joint on the recordings held out."""
+        """The best averaged networks, with normalisation, and each joint's validation error."""
         return {**self._descent.averaged.state_dict(), **self._kept}, self._best.tolist()
 
     def _run_stage(
         self, place: _FitProgress, interruption: ResumeFile, progress: Progress, task: TaskID
     ) -> None:
-        """Runs what is left of the stage at `place`."""
+        """Run the rest of the stage at `place`."""
         config, stage = self._config, self._stages[place.stage]
         windows = TrainingWindows(
             self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device
@@ -393,7 +399,7 @@ class _NetworkFitting:
 
     @torch.no_grad()
     def _validate(self) -> bool:
-        """Runs the averaged weights freely on unseen recordings; keeps the best so far, joint by joint where they are separate."""
+        """Validate the averaged weights by free runs; keep the best, per joint if separate."""
         u, q = self._held
         averaged, path = self._descent.averaged, self._descent.run(u, q)
         error = (path - q[..., averaged.num_history :]).square().mean((1, 2)).sqrt()
@@ -419,7 +425,7 @@ class _NetworkFitting:
         }
 
     def _normalise(self, networks: JointNetworks) -> None:
-        """Sets the normalisation from the training data (increments, commands, noise) and from the machine (positions)."""
+        """Set the normalisation from training data and machine limits."""
         for joint in range(self._machine.num_joints):
             commands = np.concatenate([r.u[1:, joint] for r in self._train])
             moved = np.concatenate([np.diff(r.q[:, joint]) for r in self._train])

@@ -1,4 +1,4 @@
-"""The report of an identification: one HTML page with the verdict on top, and its pictures as files beside it."""
+"""Report of an identification: one HTML page, the verdict first, pictures beside it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_page(
     drawings: Mapping[str, Figure],
     machine: Machine,
 ) -> None:
-    """Writes the pictures as `<stem>.png` and the page `identification.html` into `folder`.
+    """Write the pictures as `<stem>.png` and the page `identification.html` into `folder`.
 
     Raises:
         StorageError: something could not be written.

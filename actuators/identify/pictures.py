@@ -1,4 +1,4 @@
-"""Pictures of an identification, fit to be printed: measured and predicted, error over horizon, error by regime, dead time."""
+"""Pictures of an identification: predictions, error over horizon, regimes, dead time."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ COLOURS = {"hold": GREY, "arx": ORANGE}
 
 
 def assign_colours(names: Sequence[str], model: str) -> dict[str, str]:
-    """Returns the colour of each model: the same in all pictures."""
+    """Return the colour of each model: the same in all pictures."""
     others = iter(OTHERS * len(names))
     return {name: BLUE if name == model else COLOURS.get(name) or next(others) for name in names}
 
 
 def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
-    """Draws measured and predicted positions over commands, joint by joint: a typical, the liveliest and the worst window.
+    """Draw measured and predicted positions over commands: three windows per joint.
 
     Typical: the window of median error among those in which the joint is commanded; liveliest: of
     the longest way; worst: of the largest error of the model (the paper's figure 2).
@@ -98,7 +98,7 @@ def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
 
 
 def draw_error_over_horizon(scores: FreeRunScores, model: str) -> Figure:
-    """Draws the error of all models over the time of the free run, one panel a joint, with 95 % bands."""
+    """Draw the error of all models over the time of the free run, with 95 % bands."""
     machine = scores.machine
     figure, axes = make_joint_panels(machine, "xy")
     colour = assign_colours(list(scores.predicted), model)
@@ -135,7 +135,7 @@ def draw_error_over_horizon(scores: FreeRunScores, model: str) -> Figure:
 def draw_regimes(
     table: Mapping[str, Any], machine: Machine, model: str, names: Sequence[str]
 ) -> Figure:
-    """Draws how fast each model drifts in each regime, one panel a joint."""
+    """Draw how fast each model drifts in each regime, one panel a joint."""
     figure, axes = make_joint_panels(machine, "x")
     colour = assign_colours(names, model)
     travel = machine.upper - machine.lower
@@ -186,7 +186,7 @@ def draw_regimes(
 
 
 def draw_dead_times(delays: Mapping[str, DeadTimeEstimate | None], machine: Machine) -> Figure:
-    """Draws what each delay leaves unexplained, one panel a joint; the band is the interval of the best one."""
+    """Draw the unexplained variance over the delay, one panel a joint, with intervals."""
     figure, axes = make_joint_panels(machine, "xy")
     history_s = machine.num_history * machine.period_s
     for axis, (joint, delay) in zip(axes, delays.items(), strict=True):
@@ -246,7 +246,7 @@ def _select_windows(scores: FreeRunScores, model: str, joint: int) -> dict[str, 
 def _frame_axis(
     axis: Axes, measured: np.ndarray, predicted: np.ndarray, machine: Machine, joint: int
 ) -> None:
-    """Bounds the axis by what was measured and what the model says, so that a rival that runs away does not flatten them."""
+    """Bound the axis by measurement and model: a diverging rival does not flatten them."""
     shown = np.concatenate(
         [measured[np.isfinite(measured)], predicted[: np.isfinite(measured).sum()]]
     )

@@ -1,4 +1,4 @@
-"""What an identification says, in sentences: is the model good, on which joint is it worst, and what to do about it."""
+"""Results of an identification: the fields of `identification.json` and the verdict."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class VerdictSentence:
 
 
 def write_verdict(result: Mapping[str, Any], machine: Machine) -> list[VerdictSentence]:
-    """Returns the sentences of the verdict on an `identification.json`, the answer first."""
+    """Return the sentences of the verdict on an `identification.json`, the answer first."""
     given = [
         horizon
         for horizon, value in result["overall"][result["model"]].items()
@@ -250,14 +250,14 @@ def _phrase_regime(regime: str) -> str:
 
 @dataclass(frozen=True)
 class IdentificationRun:
-    """All that was fitted.
+    """All fits of an identification.
 
     Attributes:
         machine: The machine.
-        model: Name of the model that is kept; the others are what it is compared with.
+        model: Name of the model that is kept; the others are compared with it.
         stages: Fits in their order; the last one made the model that is kept.
         cuts: Windows of each stage, `None` where it judges nothing.
-        done: What each stage's fits left, by model.
+        done: Results of each stage's fits, by model.
         horizons_s: Horizons that fit into the recordings judged by.
         wanted_s: Horizons that were wanted.
     """
@@ -274,10 +274,10 @@ class IdentificationRun:
 def build_results(
     identified: IdentificationRun, resampling: np.random.Generator, delaying: np.random.Generator
 ) -> tuple[dict[str, Any], list[VerdictSentence], dict[str, Figure]]:
-    """Returns the fields of `identification.json`, the verdict, and the pictures by file stem.
+    """Return `identification.json`, the verdict, and the pictures by file stem.
 
     Args:
-        identified: What was fitted.
+        identified: All fits.
         resampling: Draws the resamples of the errors.
         delaying: Draws those of the dead times.
 
@@ -335,7 +335,7 @@ def build_results(
 
 
 def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> dict[str, Any]:
-    """Returns `joints`, `overall`, `one_step`, `against` and `missing`."""
+    """Return `joints`, `overall`, `one_step`, `against` and `missing`."""
     machine, model = identified.machine, identified.model
     names, units = machine.joint_names, [joint.unit for joint in machine.joints]
     found: dict[str, Any] = {
@@ -386,7 +386,7 @@ def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> di
 def _describe_data(
     identified: IdentificationRun, fitted_to: Sequence[Recording], scores: FreeRunScores
 ) -> dict[str, Any]:
-    """Returns what was fitted to and judged by: how much, which runs, and how far each joint was excited."""
+    """Return facts on the data: amount, runs of each part, excitation of each joint."""
     machine, last = identified.machine, identified.stages[-1]
     judged = [recording for stage in identified.stages for recording in list_recordings(stage.test)]
     u, q = (

@@ -59,12 +59,17 @@ class FreeRunScores:
         return len(self._runs)
 
     def mean(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the mean over windows of `values`, `(W, …)`, NaN where there is none, and that of each resample, `(B, …)`."""
+        """Return the mean over windows of `values`, `(W, …)`, and of each resample, `(B, …)`.
+
+        NaN where there is no value.
+        """
         given = np.isfinite(values)
         return self.ratio(np.where(given, values, 0.0), given)
 
     def ratio(self, totals: np.ndarray, counts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the mean where each window holds `counts` values of sum `totals`, both `(W, …)`, and that of each resample.
+        """Return mean and resampled means of windows with `counts` values of sum `totals`.
+
+        Both are `(W, …)`.
 
         NaN where there is no value at all; the resamples also where only one run has any: it says
         nothing about other runs.
@@ -80,16 +85,16 @@ class FreeRunScores:
         return mean.reshape(shape), resampled.reshape(-1, *shape)
 
     def rmse(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the root mean square error after each step, `(K, J)`, and that of each resample, `(B, K, J)`."""
+        """Return the RMS error after each step, `(K, J)`, and its resamples, `(B, K, J)`."""
         mean, resampled = self._mean_squares[name]
         return np.sqrt(mean), np.sqrt(resampled)
 
     def step(self, horizon_s: float) -> int:
-        """Returns the index of the last step within a horizon."""
+        """Return the index of the last step within a horizon."""
         return round(horizon_s / self.machine.period_s) - 1
 
     def at(self, name: str, horizon_s: float) -> list[dict[str, Any]]:
-        """Returns the error of a model at a horizon, joint by joint.
+        """Return the error of a model at a horizon, joint by joint.
 
         `rmse` of the position at the end, rad or m, with `ci95`; `percent` of the joint's travel;
         over the same windows `path_rmse` and `path_mean` (absolute) along the path and `end_mean`
@@ -111,7 +116,7 @@ class FreeRunScores:
         ]
 
     def against(self, name: str, rival: str, horizon_s: float) -> list[dict[str, Any]]:
-        """Returns by how much a model's error at a horizon differs from a rival's, joint by joint, then for the mean over joints.
+        """Return the difference of a model's and a rival's error: per joint, then the mean.
 
         `difference` in rad or m (below 0: better than the rival; in % of travel for the mean) and
         `reduction_percent`, the part of the rival's error that is gone, each with an interval from
@@ -134,14 +139,14 @@ class FreeRunScores:
         return [_compare_errors(*row) for row in rows]
 
     def _by_run(self, values: np.ndarray) -> np.ndarray:
-        """Returns sums over the windows of each run, `(R, …)`."""
+        """Return sums over the windows of each run, `(R, …)`."""
         sums = np.zeros((self.num_runs, *values.shape[1:]))
         np.add.at(sums, self._number, values)
         return sums
 
 
 def bound_interval(resampled: np.ndarray) -> list[float] | None:
-    """Returns the interval of a figure from its resamples, `(B,)`; `None` where there are too few runs for one."""
+    """Return the interval of resamples `(B,)`; `None` where there are too few runs."""
     given = resampled[np.isfinite(resampled)]
     if len(given) < RESAMPLED // 2:
         return None
@@ -149,7 +154,7 @@ def bound_interval(resampled: np.ndarray) -> list[float] | None:
 
 
 def average_joints(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict[str, float]:
-    """Returns means over joints; those in rad or m only where all joints have the same unit."""
+    """Return means over joints; those in rad or m only where all joints have the same unit."""
     keys = (
         ("rmse", "percent", "path_rmse", "path_mean", "end_mean")
         if len(set(units)) == 1
@@ -190,7 +195,7 @@ REGIMES = (
 
 
 def classify_seconds(scores: FreeRunScores, delay_s: np.ndarray) -> dict[str, np.ndarray]:
-    """Returns which seconds belong to each regime, `(W, S, J)` bool.
+    """Return which seconds belong to each regime, `(W, S, J)` bool.
 
     Args:
         scores: Holds windows and machine.
@@ -227,7 +232,7 @@ def classify_seconds(scores: FreeRunScores, delay_s: np.ndarray) -> dict[str, np
 def score_regimes(
     scores: FreeRunScores, delay_s: np.ndarray
 ) -> dict[str, dict[str, dict[str, Any]]]:
-    """Returns, by joint and regime, the part of the `time` spent in it and, by model, the drift.
+    """Return, by joint and regime, the part of the `time` spent in it and, by model, the drift.
 
     Drift: root mean square of the error added within a second, `drift_per_s` in rad/s or m/s with
     `ci95`, and `share` of all that the model's squared drift amounts to. Regimes overlap (a large
@@ -270,7 +275,10 @@ def _count_steps(scores: FreeRunScores) -> int:
 
 
 def _find_reversals(u: np.ndarray) -> np.ndarray:
-    """Says at which samples a command, `(W, T)`, has just changed its sign, whatever time it rested in between."""
+    """Return the samples at which a command, `(W, T)`, has changed sign, as bool.
+
+    A rest in between does not matter.
+    """
     sign = np.where(np.abs(u) > COMMANDED, np.sign(u), 0.0)
     place = np.where(sign != 0, np.arange(u.shape[1]), 0)
     last = np.take_along_axis(sign, np.maximum.accumulate(place, 1), 1)

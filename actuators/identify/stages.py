@@ -1,4 +1,4 @@
-"""The fits of an identification one after another, each remembered when it is done, so that an interrupted run goes on.
+"""Stages of an identification: its fits, each stored when done, so that a run can resume.
 
 With one split there is one stage; with cross-validation one for each fold, and a last one that fits
 the model that is kept.
@@ -33,10 +33,10 @@ FREE_RUNS = "free_runs"
 
 @dataclass(frozen=True)
 class FitStage:
-    """Recordings by run for one fit, and where what it learns is written.
+    """Recordings by run for one fit, and the folder of its results.
 
     Attributes:
-        name: What to call it in the log.
+        name: Name in the log.
         folder: Where the fitted model goes; rivals have folders of their own within it.
         seed: Of the fit.
         train: To fit to.
@@ -64,7 +64,7 @@ class FitStage:
 
 @dataclass(frozen=True)
 class FittedModel:
-    """What is left of a fit.
+    """Result of a fit.
 
     Attributes:
         predicted: Positions in free runs through the stage's windows, `(W, K, J)`.
@@ -79,7 +79,7 @@ class FittedModel:
 
 
 def list_recordings(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
-    """Returns the recordings of all runs."""
+    """Return the recordings of all runs."""
     return [recording for recordings in part.values() for recording in recordings]
 
 
@@ -92,7 +92,7 @@ def fit_or_restore(
     cut: open_loop.FreeRunWindows | None,
     device: torch.device,
 ) -> FittedModel:
-    """Fits a model and lets it run freely through windows, or returns what an earlier process left of the same fit.
+    """Fit a model and roll it out through windows, or restore an earlier result.
 
     Raises:
         StorageError: another fit, or one to other recordings, has been done in this folder.
@@ -140,7 +140,7 @@ def fit_or_restore(
 
 
 def find_overrides(actuator: Actuator, folder: Path, name: str) -> str:
-    """Returns the overrides with which `mode=train` and others use a fitted actuator; empty where there are none."""
+    """Return the overrides that use a fitted actuator in other modes; empty if none."""
     if (folder / f"{name}.yaml").exists():
         return f"actuator=@{folder / f'{name}.yaml'}"
     target = f"{type(actuator).__module__}.{type(actuator).__qualname__}"

@@ -22,7 +22,7 @@ class TrainingWindows:
         machine: Gives joints and history.
         horizon: Steps to predict, `K`.
         device: Where the tensors live.
-        purpose: What they are for, in error messages.
+        purpose: Their purpose, in error messages.
 
     Attributes:
         u: Commands of all recordings, `(J, T)`.
@@ -86,7 +86,9 @@ class TrainingWindows:
         key: torch.Tensor,
         together: bool = False,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draws windows for each joint, mostly of times at which it is commanded. Fixed shapes, no host: a CUDA graph may hold it.
+        """Draw windows for each joint, mostly of times at which it is commanded.
+
+        Shapes are fixed and no host is involved: a CUDA graph may hold it.
 
         Args:
             batch: Number of windows drawn a joint.
@@ -124,14 +126,14 @@ class TrainingWindows:
         return torch.cat(rows, 1)
 
     def _within(self, condition: torch.Tensor) -> torch.Tensor:
-        """Returns the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
+        """Return the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
         count = torch.cat(
             [torch.zeros(1, dtype=torch.int64, device=condition.device), condition.cumsum(0)]
         )
         return self.starts[count[self.starts + self._length] > count[self.starts]]
 
     def _busiest(self) -> torch.Tensor:
-        """Returns the tenth of the starts in whose windows the sum of all commands rises highest."""
+        """Return the tenth of the starts in whose windows the sum of all commands rises highest."""
         total = self.u.abs().sum(0).unfold(0, self._length, 1).amax(1)[self.starts]
         return self.starts[total.argsort(descending=True, stable=True)[: max(1, len(total) // 10)]]
 
@@ -151,7 +153,7 @@ has died away."""
 
 
 def measure_commanded_each_way_s(recordings: Sequence[Recording]) -> np.ndarray:
-    """Returns for how long each joint is commanded forth and back, s, shape `(2, J)`."""
+    """Return for how long each joint is commanded forth and back, s, shape `(2, J)`."""
     both = [
         np.stack([(r.u > COMMANDED).sum(0), (r.u < -COMMANDED).sum(0)]) / r.rate_hz
         for r in recordings
@@ -160,7 +162,7 @@ def measure_commanded_each_way_s(recordings: Sequence[Recording]) -> np.ndarray:
 
 
 def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
-    """Says where there is too little to fit to.
+    """Check that each joint is commanded long enough each way; warn where data are thin.
 
     Raises:
         RecordingError: a joint is hardly commanded, in figures.
@@ -190,7 +192,7 @@ def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
 
 
 def check_together(recordings: Sequence[Recording]) -> None:
-    """Warns where joints hardly move at the same time, so that nothing can be learned of what they do to each other."""
+    """Warn where joints hardly move at the same time: their coupling cannot be learned."""
     together_s = float(
         sum(((np.abs(r.u) > COMMANDED).sum(1) > 1).sum() / r.rate_hz for r in recordings)
     )
@@ -204,7 +206,7 @@ def check_together(recordings: Sequence[Recording]) -> None:
 
 
 def estimate_resting_noise(recordings: Sequence[Recording], machine: Machine) -> np.ndarray:
-    """Returns the size of an increment that is none, rad or m, shape `(J,)`: what the sensor shows of a joint at rest.
+    """Return the size of increments at rest, rad or m, shape `(J,)`.
 
     The larger of two: the spread of the increments where the joint has long been without a command
     (68 of 100 are smaller; one standard deviation of normal noise), and the error of an increment
@@ -236,7 +238,7 @@ def estimate_resting_noise(recordings: Sequence[Recording], machine: Machine) ->
 
 
 def _estimate_sensor_step(q: np.ndarray) -> float:
-    """Returns the step of a sensor that knows certain values only, `(T,)`; 0 where the values are continuous.
+    """Return the step of a coarse sensor from its values `(T,)`; 0 for continuous values.
 
     Neighbours among the values that occur are then whole multiples of the step apart, most often
     one.

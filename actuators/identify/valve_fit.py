@@ -1,10 +1,16 @@
-"""Speeds as a function of commands: what recordings say about valve curves, pose and pump for given dead times, play and lags.
+"""Fit of `actuators.models.valve` in seconds, by linear least squares on increments.
+
+Positions hardly feed back into the speed, so the speed is fitted as a function of commands. The
+model is driven by recorded commands and, for the pose, recorded positions. Increments of `WIDTH`
+samples are compared. For given dead time, play and lags the curves are a linear least-squares
+problem; pose and pump follow in a few sweeps.
 
 Axes: `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments, `P` widths of the
 play.
 """
 
 import dataclasses
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -67,11 +73,10 @@ class SpeedData:
         pose = PoseFeatures(machine, torch.device("cpu"))
         self._pose = [pose.features(torch.as_tensor(r.q)).numpy().astype(np.float64) for r in used]
         self.num_pose = pose.size
-        way = [
-            self._increments(np.diff(r.q.astype(np.float64), axis=0, append=r.q[-1:])) for r in used
-        ]
+        q = [r.q.astype(np.float64) for r in used]
+        way = [self._increments(np.diff(part, axis=0, append=part[-1:])) for part in q]
         self.way = np.concatenate(way).T  # (J, I)
-        self._free = np.concatenate([self._at_stop(r.q.astype(np.float64)) for r in used]).T
+        self._free = np.concatenate([self._at_stop(part) for part in q]).T
         self.scale = np.maximum(np.mean(self.way**2, 1), 1e-12)
         if (still := np.flatnonzero(self.scale < 1e-10)).size:
             names = ", ".join(machine.joint_names[j] for j in still)
@@ -84,7 +89,10 @@ class SpeedData:
     def features(
         self, j: int, dynamics: np.ndarray, known: Sequence[np.ndarray] | None = None
     ) -> np.ndarray:
-        """Returns increments per unit of the curve at each knot, `(I, 2 (K - 1))`, with factors `known` on the speed or none."""
+        """Return increments per unit of the curve at each knot, `(I, 2 (K - 1))`.
+
+        `known`: factors on the speed, or none.
+        """
         parts = []
         for n in range(len(self._u)):
             basis = self._basis(self._spool(n, j, dynamics), j)
@@ -93,14 +101,11 @@ class SpeedData:
         return np.concatenate(parts)
 
     def factors(self, found: StaticFit, dynamics: np.ndarray) -> list[list[np.ndarray]]:
-        """Returns the factor on the speed from pose and pump, by joint and recording, each `(T,)`."""
+        """Return the speed factor from pose and pump, by joint and recording, each `(T,)`."""
         joints, half = range(self.machine.num_joints), len(self._knots) - 1
         full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
         unit = self.machine.max_speed * self._period_s
-        spool = [
-            np.stack([self._spool(n, j, dynamics[j]) for j in joints], 1)
-            for n in range(len(self._u))
-        ]
+        spool = self._stack_spools(dynamics)
         plain = [
             np.stack([self._basis(s[:, j], j) @ found.curve[j] for j in joints], 1) / unit
             for s in spool
@@ -124,7 +129,7 @@ class SpeedData:
         noise: float | None = None,
         free: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Returns the curve that explains `way` `(I,)`, by ridge regression toward straight lines."""
+        """Return the curve that explains `way` `(I,)`: ridge regression to straight lines."""
         noise = 1e-3 * float(np.mean(way**2)) if noise is None else noise
         weighted = features if free is None else features * free[:, None]
         normal = weighted.T @ features + noise / STIFFNESS**2 * self._bend
@@ -134,12 +139,12 @@ class SpeedData:
     def statics(
         self, dynamics: np.ndarray, sweeps: int, demand: np.ndarray | None = None
     ) -> StaticFit:
-        """Returns curves, pose and demands for given dynamics `(J, 4)`, beginning at `demand` where it is known."""
+        """Return curves, pose and demands for given dynamics `(J, 4)`.
+
+        `demand`: where to begin, if known.
+        """
         joints, count, half = self.machine.num_joints, len(self._u), len(self._knots) - 1
-        spool = [
-            np.stack([self._spool(n, j, dynamics[j]) for j in range(joints)], 1)
-            for n in range(count)
-        ]
+        spool = self._stack_spools(dynamics)
         basis = [[self._basis(spool[n][:, j], j) for j in range(joints)] for n in range(count)]
         found = StaticFit(
             np.zeros((joints, 2 * half)),
@@ -163,9 +168,8 @@ class SpeedData:
             for j in range(joints):
                 out = [s[:, j] > 0 for s in spool]
                 factor = [self._factor(n, j, out[n], found.pose) for n in range(count)]
-                features = collect(
-                    [basis[n][j] * (factor[n] * share[n])[:, None] for n in range(count)], j
-                )
+                scaled = [basis[n][j] * (factor[n] * share[n])[:, None] for n in range(count)]
+                features = collect(scaled, j)
                 found.curve[j] = self.curve(features, self.way[j], noise[j], free[j])
                 plain = [basis[n][j] @ found.curve[j] for n in range(count)]
                 parts = [(plain[n] * share[n])[:, None] * self._pose[n][:, j] for n in range(count)]
@@ -196,16 +200,10 @@ class SpeedData:
                 np.abs(p) / unit / np.where(s > 0, full[:, 0], full[:, 1])
                 for p, s in zip(plain, spool, strict=True)
             ]
-            posed = [
-                np.stack(
-                    [
-                        plain[n][:, j] * self._factor(n, j, spool[n][:, j] > 0, found.pose)
-                        for j in range(joints)
-                    ],
-                    1,
-                )
-                for n in range(count)
-            ]
+            posed = []
+            for n, moved in enumerate(plain):
+                factor = [self._factor(n, j, spool[n][:, j] > 0, found.pose) for j in range(joints)]
+                posed.append(moved * np.stack(factor, 1))
             found.demand = self._demand(found.demand, posed, opening, dynamics, noise, free)
         return found
 
@@ -218,7 +216,7 @@ class SpeedData:
         noise: np.ndarray,
         free: np.ndarray,
     ) -> np.ndarray:
-        """Returns the demands on the pump that explain best how joints slow each other."""
+        """Return the demands on the pump that explain best how joints slow each other."""
         joints = self.machine.num_joints
         weight = np.sqrt(free / noise[:, None])
         if all((o > 0.05).sum(1).max() < 2 for o in opening):
@@ -259,8 +257,16 @@ class SpeedData:
             delay_signal(played, dead_time_s / self._period_s), spool_s, self._period_s
         )
 
+    def _stack_spools(self, dynamics: np.ndarray) -> list[np.ndarray]:
+        """Return the spool strokes of each recording, `(T, J)`, for dynamics `(J, 4)`."""
+        joints = range(self.machine.num_joints)
+        return [
+            np.stack([self._spool(n, j, dynamics[j]) for j in joints], 1)
+            for n in range(len(self._u))
+        ]
+
     def _basis(self, spool: np.ndarray, j: int) -> np.ndarray:
-        """Returns hat functions of the spool times the way in a period at full speed, signed, `(T, 2 (K - 1))`."""
+        """Return signed hat functions of the spool times full step, `(T, 2 (K - 1))`."""
         knots, half, size = self._knots, len(self._knots) - 1, np.minimum(np.abs(spool), 1.0)
         cell = np.clip(np.searchsorted(knots, size, side="right") - 1, 0, half - 1)
         part = (size - knots[cell]) / (knots[cell + 1] - knots[cell])
@@ -272,19 +278,19 @@ class SpeedData:
         return out * (np.sign(spool) * self.machine.max_speed[j] * self._period_s)[:, None]
 
     def _increments(self, steps: np.ndarray) -> np.ndarray:
-        """Sums steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""
+        """Sum steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""
         count = len(steps) // WIDTH
         return steps[: count * WIDTH].reshape(count, WIDTH, *steps.shape[1:]).sum(1)[self._skip :]
 
     def _at_stop(self, q: np.ndarray) -> np.ndarray:
-        """Returns 1 for increments away from both stops, else 0, `(I, J)`."""
+        """Return 1 for increments away from both stops, else 0, `(I, J)`."""
         margin = 0.005 * (self.machine.upper - self.machine.lower)
         inside = (q > self.machine.lower + margin) & (q < self.machine.upper - margin)
         return (self._increments(inside.astype(np.float64)) > WIDTH - 0.5).astype(np.float64)
 
 
 def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
-    """Returns `u` `(T,)` later by a fractional number of samples, its mean over each period."""
+    """Return `u` `(T,)` later by a fractional number of samples, its mean over each period."""
     whole = int(np.floor(periods + 5e-7))
     part = periods - whole
     known = np.pad(u, (whole + 1, 0), mode="edge")
@@ -292,7 +298,7 @@ def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
 
 
 def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.ndarray:
-    """Returns a first-order lag of `u` `(T, …)`, as it stands at the end of each period."""
+    """Return a first-order lag of `u` `(T, …)`, as it stands at the end of each period."""
     if time_constant_s < 1e-4:
         return u
     kept = np.exp(-period_s / time_constant_s)
@@ -300,7 +306,7 @@ def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.nda
 
 
 def _apply_plays(u: np.ndarray) -> np.ndarray:
-    """Returns the play operator of each of `PLAYS` on `u` `(T, J)`, `(P, T, J)`."""
+    """Return the play operator of each of `PLAYS` on `u` `(T, J)`, `(P, T, J)`."""
     out, now, half = (
         np.empty((len(PLAYS), *u.shape)),
         np.repeat(u[:1], len(PLAYS), 0),
@@ -317,7 +323,7 @@ def _compute_pump_share(demand: np.ndarray, opening: np.ndarray) -> np.ndarray:
 
 
 def _build_bend_penalty(knots: np.ndarray) -> np.ndarray:
-    """Returns the quadratic form of the changes of slope of both curves, each change over the root of its stroke."""
+    """Return the quadratic form of slope changes, each over the root of its stroke."""
     half, rows = len(knots) - 1, []
     for first in (0, half):
         for k in range(1, half):
@@ -367,7 +373,7 @@ class ValveFit:
         seed: int,
         device: torch.device,
     ) -> ValveActuator:
-        """Fits to all recordings (nothing is chosen by validation) and writes `<name>.yaml` into `folder`.
+        """Fit to all recordings and write `<name>.yaml` into `folder`; validation chooses nothing.
 
         Raises:
             RecordingError: a joint never moves.
@@ -386,7 +392,8 @@ class ValveFit:
                     data, j, known[j] if known else None, dynamics[j] if turn else None
                 )
         fitted = self._spec(data, dynamics)
-        facts = {key: _convert_to_plain(value) for key, value in dataclasses.asdict(fitted).items()}  # pyright: ignore[reportArgumentType]
+        # through JSON, which makes lists of tuples as YAML wants them
+        facts = json.loads(json.dumps(dataclasses.asdict(fitted)))  # pyright: ignore[reportArgumentType]
         try:
             folder.mkdir(parents=True, exist_ok=True)
             text = yaml.safe_dump(
@@ -405,7 +412,7 @@ class ValveFit:
     def refit(
         self, fitted: ValveActuator, machine: Machine, recordings: Sequence[Recording]
     ) -> ValveActuator:
-        """Returns `fitted` with curves, pose and pump fitted to other recordings; dead times, play and lags stay."""
+        """Return `fitted` with curves, pose and pump refitted; the dynamics stay."""
         columns = [getattr(fitted, name) for name in ("dead_time_s", "play", "spool_s", "speed_s")]
         dynamics = np.array([[column[name] for column in columns] for name in machine.joint_names])
         assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
@@ -417,7 +424,7 @@ class ValveFit:
     def _dynamics(
         self, data: SpeedData, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None
     ) -> np.ndarray:
-        """Returns dead time, play, spool lag and speed lag of joint `j` that explain its increments best.
+        """Return the dead time, play, spool lag and speed lag that explain joint `j` best.
 
         Args:
             data: The recordings.
@@ -491,10 +498,3 @@ class ValveFit:
             pose_extend=rows(found.pose[:, 0]),
             pose_retract=rows(found.pose[:, 1]),
         )
-
-
-def _convert_to_plain(value: object) -> object:
-    """Returns tuples as lists, for YAML."""
-    if isinstance(value, dict):
-        return {key: _convert_to_plain(inner) for key, inner in value.items()}
-    return [_convert_to_plain(inner) for inner in value] if isinstance(value, tuple) else value

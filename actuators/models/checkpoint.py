@@ -1,4 +1,4 @@
-"""Checkpoints of learned actuators: weights in safetensors, with the facts about them as JSON in its metadata."""
+"""Checkpoints of actuators in safetensors with a JSON header, and files to resume fits from."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 
 
 def find_checkpoint(checkpoint: str) -> Path:
-    """Returns the path of a checkpoint: as given if it exists, else the one of that name that ships with the package.
+    """Return the path of a checkpoint: a file, else the name of one in the package.
 
     Raises:
         CheckpointError: there is neither.
@@ -45,7 +45,7 @@ def write_checkpoint(
     tensors: Mapping[str, torch.Tensor],
     facts: Mapping[str, Any],
 ) -> None:
-    """Writes a checkpoint in one step.
+    """Write a checkpoint in one step.
 
     Args:
         path: Where to.
@@ -82,7 +82,7 @@ def write_checkpoint(
 def read_checkpoint(
     path: Path, kind: str, machine: Machine
 ) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-    """Returns the tensors and the header of a checkpoint made for `machine`.
+    """Return the tensors and the header of a checkpoint made for `machine`.
 
     Raises:
         CheckpointError: it is corrupt, of another kind, made for another machine, or holds numbers
@@ -115,7 +115,7 @@ def read_checkpoint(
 
 
 def hash_recordings(recordings: Sequence[Recording]) -> str:
-    """Returns a short hash of the commands and positions of recordings, in their order."""
+    """Return a short hash of the commands and positions of recordings, in their order."""
     found = hashlib.sha256()
     for recording in recordings:
         found.update(recording.u.tobytes())
@@ -136,7 +136,7 @@ class ResumeFile:
         self._stamp = json.loads(json.dumps(stamp))
 
     def load(self, state: Mapping[str, torch.Tensor]) -> dict[str, Any] | None:
-        """Restores `state` in place and returns the place that was saved with it; `None` where there is nothing to go on from.
+        """Restore `state` in place and return the saved progress; `None` without a file.
 
         Raises:
             CheckpointError: the file is corrupt, or belongs to a fit with other settings or data;
@@ -167,7 +167,7 @@ class ResumeFile:
         return place
 
     def save(self, state: Mapping[str, torch.Tensor], place: Mapping[str, Any]) -> None:
-        """Writes `state` and `place` in one step: the file is the old or the new one, never half of one.
+        """Write `state` and `place` in one step: the file is the old or the new one.
 
         Raises:
             StorageError: the file could not be written; the one before it is untouched.
@@ -189,12 +189,12 @@ class ResumeFile:
             part.unlink(missing_ok=True)
 
     def remove(self) -> None:
-        """Removes the file: the fit is done."""
+        """Remove the file: the fit is done."""
         self._path.unlink(missing_ok=True)
 
 
 def _list_differences(then: Any, now: Any, name: str = "") -> list[str]:
-    """Returns where two stamps differ, e.g. `fit.width (was 32, is 64)`."""
+    """Return where two stamps differ, e.g. `fit.width (was 32, is 64)`."""
     if isinstance(then, dict) and isinstance(now, dict):
         keys = sorted({*then, *now})
         return [

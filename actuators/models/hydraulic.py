@@ -1,4 +1,4 @@
-"""The rich plant that stands in for the machine: valves, one pump, cylinders, friction, weight and warm oil.
+"""Hydraulic plant: valves, one pump, cylinders, friction, weight and oil temperature.
 
 Equations, per joint, with time step `substep_s` (symplectic Euler; friction implicit, so that it
 can never drive a joint):
@@ -37,7 +37,7 @@ from brokk_rl.spec import spec
 
 @spec
 class Hydraulic:
-    """Valve spools, shared pump, oil compliance, friction, load, leak and oil temperature (stands in for the machine).
+    """Valve spools, shared pump, oil compliance, friction, load, leak and oil temperature.
 
     Attributes:
         transport_s: Pure delay of radio, bus and pilot stage. Spool and oil add to it until the
@@ -71,7 +71,7 @@ class Hydraulic:
         thermal_gain: Relative change of speed and spool frequency per kelvin.
         substep_s: Own time step; the control period is divided into the nearest whole number of
             them.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at
+        spread: Relative half width, by field name, of draws per environment and joint at
             reset.
     """
 
@@ -111,7 +111,7 @@ class Hydraulic:
             raise ConfigError(f"actuator.oil_time_s: expected more than 0, got {self.oil_time_s}")
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HydraulicModel":
-        """Returns a model for `num_envs` environments on `device`.
+        """Return a model for `num_envs` environments on `device`.
 
         Raises:
             ConfigError: a number makes no sense, or the delay does not fit the machine's history.
@@ -167,11 +167,11 @@ class HydraulicModel:
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """`pilot`, `spool` (of full stroke), `spool_rate` (1/s), `speed` (rad/s), `force` (Nm), each `(N, J)`; `oil_c` `(N,)`."""
+        """Spool (of full stroke), speed (rad/s), force (Nm), each `(N, J)`; `oil_c` `(N,)`."""
         return {**self._state, **self._parameters.state}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Lets the environments of `mask`, shape `(N,)` bool, go on from their history at the next step."""
+        """Let the environments of `mask`, `(N,)` bool, start from their history."""
         for name in ("pilot", "spool", "spool_rate", "speed", "force"):
             self._state[name].masked_fill_(mask[:, None], 0.0)
         self._state["oil_c"].masked_fill_(mask, self._config.oil_start_c)
@@ -179,7 +179,7 @@ class HydraulicModel:
         self._parameters.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)`."""
+        """Return the joint positions one control period later, shape `(N, J)`."""
         state, p, config = self._state, self.parameters, self._config
         q, dt = history.q[:, -1], self._period_s / self._num_substeps
         weight = self._gravity.load(q)
@@ -271,7 +271,7 @@ class HydraulicModel:
 
 
 def _check(nominal: dict[str, np.ndarray]) -> None:
-    """Raises a `ConfigError` for numbers outside the range in which the equations mean something."""
+    """Raise a `ConfigError` for numbers outside the range in which the equations mean something."""
     positive = (
         "spool_hz",
         "spool_damping",

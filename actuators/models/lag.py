@@ -1,4 +1,4 @@
-"""The actuator without any imperfection: what a simulator assumes that knows nothing of hydraulics."""
+"""Simple actuator models: ideal, and dead time with dead band and first-order lag."""
 
 from typing import ClassVar
 
@@ -23,12 +23,12 @@ class Ideal:
     speed_scale: float
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "IdealModel":
-        """Returns a model for `num_envs` environments on `device`."""
+        """Return a model for `num_envs` environments on `device`."""
         return IdealModel(self, machine, device)
 
 
 class IdealModel:
-    """`q' = q + period * speed_scale * max_speed * u`, held at the ends of travel. Has no memory."""
+    """`q' = q + period * speed_scale * max_speed * u`, clamped to the travel. No memory."""
 
     def __init__(self, config: Ideal, machine: Machine, device: torch.device) -> None:
         self._step_at_full = torch.as_tensor(
@@ -45,10 +45,10 @@ class IdealModel:
         return {}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)`."""
+        """Return the joint positions one control period later, shape `(N, J)`."""
         return (history.q[:, -1] + history.u[:, -1] * self._step_at_full).clamp(
             self._lower, self._upper
         )
@@ -65,7 +65,7 @@ class FirstOrderLag:
         dead_band_retract: The same for the negative direction.
         gain: Speed at full command over the machine's `max_speed`.
         time_constant_s: Time constant with which the speed follows the command; 0 for none.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at
+        spread: Relative half width, by field name, of draws per environment and joint at
             reset.
     """
 
@@ -79,7 +79,7 @@ class FirstOrderLag:
     spread: dict[str, float]
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "FirstOrderLagModel":
-        """Returns a model for `num_envs` environments on `device`.
+        """Return a model for `num_envs` environments on `device`.
 
         Raises:
             ConfigError: the dead time does not fit the machine's history, or a number makes no
@@ -89,7 +89,7 @@ class FirstOrderLag:
 
 
 class FirstOrderLagModel:
-    """Exact solution of `time_constant * v' + v = v_full * opened(u(t - dead_time))` over each part of the control period.
+    """Exact solution of `time_constant * v' + v = v_full * open_valve(u(t - dead_time))`.
 
     Attributes:
         parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
@@ -132,11 +132,14 @@ class FirstOrderLagModel:
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """`speed` `(N, J)` in rad/s or m/s, whether it is still to be read off the history, and what was drawn at reset."""
+        """`speed` `(N, J)` in rad/s or m/s, `fresh`, and the drawn parameters."""
         return {"speed": self._speed, "fresh": self._fresh, **self._parameters.state}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Lets the environments of `mask`, shape `(N,)` bool, go on from their history; draws their parameters; cuts gradients."""
+        """Let the environments of `mask`, `(N,)` bool, start from their history; redraw.
+
+        Cuts gradients.
+        """
         if self._speed.requires_grad:
             self._speed.detach_()
         self._speed.masked_fill_(mask[:, None], 0.0)
@@ -144,7 +147,7 @@ class FirstOrderLagModel:
         self._parameters.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)`."""
+        """Return the joint positions one control period later, shape `(N, J)`."""
         value = self.parameters
         earlier, later, part = select_commands_in_force(
             history.u, value["dead_time_s"] / self._period_s

@@ -19,7 +19,7 @@ class Hold:
     """Never moves: the error that any model must beat."""
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HoldModel":
-        """Returns the model."""
+        """Return the model."""
         return HoldModel()
 
 
@@ -32,10 +32,10 @@ class HoldModel:
         return {}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the newest position, shape `(N, J)`."""
+        """Return the newest position, shape `(N, J)`."""
         return history.q[:, -1].clone()
 
 
@@ -58,7 +58,7 @@ class HoldFit:
         seed: int,
         device: torch.device,
     ) -> Hold:
-        """Returns `Hold`."""
+        """Return `Hold`."""
         return Hold()
 
 
@@ -73,7 +73,7 @@ class Arx:
     checkpoint: str
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ArxModel":
-        """Returns the model.
+        """Return the model.
 
         Raises:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
@@ -101,10 +101,10 @@ class ArxModel:
         return {}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)`."""
+        """Return the joint positions one control period later, shape `(N, J)`."""
         u, q = history.u, history.q
         inputs = torch.cat([u, u.abs() * u, q[:, 1:] - q[:, :-1]], 1)
         moved = torch.einsum("nij,ji->nj", inputs, self._weight)
@@ -136,7 +136,7 @@ class ArxFit:
         seed: int,
         device: torch.device,
     ) -> Arx:
-        """Fits to `train` and writes `<name>.safetensors` into `folder`.
+        """Fit to `train` and writes `<name>.safetensors` into `folder`.
 
         Raises:
             RecordingError: too little data.

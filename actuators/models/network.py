@@ -1,9 +1,9 @@
-"""Actuator networks: a perceptron a joint, all joints computed as one.
+"""Actuator networks: one perceptron per joint, all joints computed in one batch.
 
 The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest
 position and the 12 increments
 between them: the same information in another basis, so that the network sees speeds at full
-resolution instead of small differences of large numbers, and what it learns in one place holds in
+resolution instead of small differences of large numbers, and a relation learned in one place holds in
 another unless the data say otherwise.
 
 Axes: `J` joints, `B` batch, `H` history, `K` steps.
@@ -27,7 +27,7 @@ function of the pose need few."""
 
 
 class SharedFlow(nn.Module):
-    """What is left of each joint's flow when together they ask for more than the pump gives.
+    """Share of its flow that each joint gets when together they demand more than the pump gives.
 
     Each joint's demand is a small perceptron of its own commands, in units of the pump's flow. Its
     last weights are positive (by their logarithm): a ReLU in their place dies where recordings of
@@ -62,7 +62,7 @@ class SharedFlow(nn.Module):
         self.log_sharpness = nn.Parameter(torch.full((1, 1, 1), 1.6))
 
     def forward(self, commands: torch.Tensor) -> torch.Tensor:
-        """Returns the part of their flow that joints get, `(B,)` in (0, 1], for normalised commands `(J, B, H)`."""
+        """Return each joint's share of flow, `(B,)` in (0, 1], for commands `(J, B, H)`."""
         hidden = torch.relu(torch.baddbmm(self.bias, commands, self.weight))
         demand = torch.bmm(hidden, self.log_share.exp()).sum(0).squeeze(1)
         sharpness = self.log_sharpness.exp().view(())
@@ -71,7 +71,7 @@ class SharedFlow(nn.Module):
 
 
 class PoseLoad(nn.Module):
-    """How much faster or slower each joint moves each way in a pose, because of the weight it carries there.
+    """Speed factor of each joint and direction in a pose, due to the load there.
 
     A factor, so that no pose can move a joint that rests.
 
@@ -93,7 +93,7 @@ class PoseLoad(nn.Module):
         self.out = nn.Parameter(torch.zeros(num_joints, COUPLING_WIDTH, 2))
 
     def forward(self, position: torch.Tensor) -> torch.Tensor:
-        """Returns the factors forth and back, `(J, B, 2)` in (0, 2), for normalised positions `(J, B)`."""
+        """Return factors of both directions, `(J, B, 2)` in (0, 2), at positions `(J, B)`."""
         seen = position.T.expand(len(position), -1, -1)
         return 2.0 * torch.sigmoid(
             torch.bmm(torch.tanh(torch.baddbmm(self.bias, seen, self.weight)), self.out)
@@ -101,10 +101,10 @@ class PoseLoad(nn.Module):
 
 
 class JointNetworks(nn.Module):
-    """For each joint a perceptron with two hidden ReLU layers, from `2 H` inputs to the next increment (paper, section III-A).
+    """Per joint a perceptron with two hidden ReLU layers to the next increment (paper, III-A).
 
-    Where they are coupled, their outputs are multiplied by what `SharedFlow` makes of the commands
-    of all joints, and by what `Load` makes of the positions of all.
+    Where they are coupled, their outputs are multiplied by the output of `SharedFlow` for the commands
+    of all joints, and by that of `PoseLoad` for the positions of all.
 
     The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the
     noise of the measurement is none. A machine at rest therefore stays at rest, however long the
@@ -165,17 +165,20 @@ class JointNetworks(nn.Module):
             )
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Returns normalised increments `(J, B)` before the dead zone, for normalised inputs `(J, B, 2 H)`."""
+        """Return normalised increments `(J, B)` before the dead zone, for inputs `(J, B, 2 H)`."""
         output = self._head(torch.baddbmm(self.bias[0], inputs, self.weight[0]))
         share = None if self.flow is None else self.flow(inputs[..., : self.num_history])
         return self._hindered(output, inputs[..., -1], share)
 
     def increment(self, output: torch.Tensor) -> torch.Tensor:
-        """Returns increments `(J, B)` in rad or m, after the dead zone, for the network's output `(J, B)`."""
+        """Return increments `(J, B)` in rad or m, after the dead zone."""
         return self._moved(output) * self.increment_scale[:, None]
 
     def inputs(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Returns normalised inputs `(J, B, 2 H)`: commands, increments, newest position, for `u` and `q` of shape `(J, B, H)`."""
+        """Return normalised inputs `(J, B, 2 H)` for `u` and `q` of shape `(J, B, H)`.
+
+        Commands, then increments, then the newest position.
+        """
         commands = u / self.command_scale[:, None, None]
         increments = (q[..., 1:] - q[..., :-1]) / self.increment_scale[:, None, None]
         return torch.cat([commands, increments, self._position(q[..., -1])[..., None]], 2)
@@ -183,7 +186,7 @@ class JointNetworks(nn.Module):
     def roll_out(
         self, u: torch.Tensor, q: torch.Tensor, lower: torch.Tensor, upper: torch.Tensor
     ) -> torch.Tensor:
-        """Runs freely on its own predictions.
+        """Run freely on its own predictions.
 
         The part of the first layer that sees commands is computed for all steps at once.
 
@@ -224,33 +227,33 @@ class JointNetworks(nn.Module):
         return torch.stack(path, 2)
 
     def _head(self, hidden: torch.Tensor) -> torch.Tensor:
-        """Returns what the last layer says, `(J, B)`, from the first before its ReLU, `(J, B, width)`."""
+        """Return the output of the last layer, `(J, B)`, for the first layer before its ReLU."""
         hidden = torch.relu(torch.baddbmm(self.bias[1], torch.relu(hidden), self.weight[1]))
         return torch.baddbmm(self.bias[2], hidden, self.weight[2]).squeeze(2)
 
     def _hindered(
         self, output: torch.Tensor, position: torch.Tensor, share: torch.Tensor | None
     ) -> torch.Tensor:
-        """Returns what flow (`share`, `(B,)`) and load leave of outputs `(J, B)` at normalised positions `(J, B)`."""
+        """Return outputs `(J, B)` reduced by flow share `(B,)` and load at `position` `(J, B)`."""
         if self.load is None:
             return output
         forth, back = self.load(position).unbind(2)
         return share * (torch.relu(output) * forth - torch.relu(-output) * back)
 
     def _moved(self, output: torch.Tensor) -> torch.Tensor:
-        """Returns normalised increments `(J, B)` after the dead zone."""
+        """Return normalised increments `(J, B)` after the dead zone."""
         quiet = (self.quiet / self.increment_scale)[:, None]
         return output - output.clamp(-quiet, quiet)
 
     def _position(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns normalised positions, `(J, B)`."""
+        """Return normalised positions, `(J, B)`."""
         return (q - self.position_center[:, None]) / self.position_scale[:, None]
 
 
 def _initialise_weights(
     num_joints: int, *shape: int, fan_in: int | None = None, generator: torch.Generator | None
 ) -> torch.Tensor:
-    """Draws weights `(J, …)` as `torch.nn.Linear` does."""
+    """Draw weights `(J, …)` as `torch.nn.Linear` does."""
     return (torch.rand(num_joints, *shape, generator=generator) * 2.0 - 1.0) / (
         fan_in or shape[0]
     ) ** 0.5
@@ -258,7 +261,7 @@ def _initialise_weights(
 
 @spec
 class Mlp:
-    """One perceptron a joint, 2 x 32 ReLU, from 13 commands and 13 positions to the next increment (the paper's model).
+    """One perceptron a joint, 2 x 32 ReLU, from 13 commands and 13 positions (the paper's model).
 
     Attributes:
         checkpoint: A file, or the name of one that ships with the package.
@@ -267,7 +270,7 @@ class Mlp:
     checkpoint: str
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "NetworkModel":
-        """Returns a model for any number of environments on `device`.
+        """Return a model for any number of environments on `device`.
 
         Raises:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds
@@ -292,17 +295,17 @@ class NetworkModel:
         return {}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)`."""
+        """Return the joint positions one control period later, shape `(N, J)`."""
         networks = self._networks
         output = networks(networks.inputs(history.u.permute(2, 0, 1), history.q.permute(2, 0, 1)))
         return (history.q[:, -1] + networks.increment(output).T).clamp(self._lower, self._upper)
 
 
 def load_networks(name: str, kind: str, machine: Machine) -> JointNetworks:
-    """Returns the networks of a checkpoint, on the CPU; `kind` is `mlp` (separate) or `coupled`.
+    """Return the networks of a checkpoint, on the CPU; `kind` is `mlp` (separate) or `coupled`.
 
     Raises:
         CheckpointError: as for `Mlp.build`.
@@ -326,7 +329,7 @@ def load_networks(name: str, kind: str, machine: Machine) -> JointNetworks:
 
 @spec
 class Coupled:
-    """A perceptron a joint, slowed down where joints ask for more than the pump gives and by the load of the pose (`mlp`: neither).
+    """A perceptron a joint, slowed by a shared pump and by the load of the pose.
 
     Attributes:
         checkpoint: A file, or the name of one that ships with the package.
@@ -335,7 +338,7 @@ class Coupled:
     checkpoint: str
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> NetworkModel:
-        """Returns a model for any number of environments on `device`.
+        """Return a model for any number of environments on `device`.
 
         Raises:
             CheckpointError: the checkpoint is missing, corrupt, made for another machine, or holds

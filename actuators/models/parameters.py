@@ -1,4 +1,4 @@
-"""Numbers of an actuator: given once or joint by joint, and, where asked for, drawn anew for each environment and episode."""
+"""Parameters of an actuator: one value or one per joint, and drawn per episode if asked for."""
 
 from collections.abc import Mapping
 
@@ -18,7 +18,7 @@ name."""
 
 
 def expand_per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:
-    """Returns `value` for every joint of `machine`, shape `(J,)`.
+    """Return `value` for every joint of `machine`, shape `(J,)`.
 
     A table that has `other` may name joints that this machine lacks, so that one file serves
     several machines; without `other` it must name exactly the joints of the machine.
@@ -44,7 +44,7 @@ def expand_per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarra
 
 
 class SpreadParameters:
-    """Numbers of an actuator for all environments: tensors `(N, J)` of fixed address, in `value` by name.
+    """Parameters for all environments: tensors `(N, J)` at fixed addresses, in `value` by name.
 
     With a `spread` a number is `nominal * (1 + spread * U(-1, 1))`, drawn per environment and joint
     at each reset. The draws come
@@ -101,7 +101,7 @@ class SpreadParameters:
             self._joint = torch.arange(num_joints, dtype=torch.int64, device=device) * 40_503
 
     def redraw(self, mask: torch.Tensor) -> None:
-        """Draws new values in the environments of `mask`, shape `(N,)` bool."""
+        """Draw new values in the environments of `mask`, shape `(N,)` bool."""
         if not self._width:
             return
         self._draw.add_(mask.to(torch.int64))

@@ -1,4 +1,4 @@
-"""Dead time: which commands of the history act during the coming control period, to the fraction of a sample."""
+"""Dead time and dead band: the commands that act during the coming control period."""
 
 import torch
 
@@ -7,7 +7,7 @@ from brokk_rl.machine import Machine
 
 
 def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
-    """Raises a `ConfigError` when the machine's history does not reach back `longest_s`."""
+    """Raise a `ConfigError` when the machine's history does not reach back `longest_s`."""
     reach_s = (machine.num_history - 1) * machine.period_s
     if not 0.0 <= longest_s <= reach_s + 1e-6:
         raise ConfigError(
@@ -19,7 +19,7 @@ def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
 def select_commands_in_force(
     u: torch.Tensor, delay_periods: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Splits the coming control period at the moment when the delayed command changes.
+    """Split the coming control period at the moment when the delayed command changes.
 
     A command is held for one period, so with a dead time of `n + f` periods the valve sees the
     command of `n + 1` periods ago for
@@ -47,7 +47,10 @@ def select_commands_in_force(
 def open_valve(
     u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor
 ) -> torch.Tensor:
-    """Returns how far the valve is open, shape of `u`, in [-1, 1]: zero inside the dead band, one at full command each way."""
+    """Return the valve opening in [-1, 1], shape of `u`.
+
+    Zero inside the dead band, one at full command each way.
+    """
     extend = torch.relu(u - dead_band_extend) / (1.0 - dead_band_extend)
     retract = torch.relu(-u - dead_band_retract) / (1.0 - dead_band_retract)
     return extend - retract

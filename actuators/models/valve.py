@@ -1,4 +1,4 @@
-"""A grey box whose valve curve is what recordings show: quick to fit, quick to run, near the floor on hydraulic arms.
+"""Grey box with a measured valve curve: quick to fit and to run.
 
 Per joint, once a control period; everything but the play is linear, or a table:
 
@@ -38,7 +38,7 @@ BEYOND = 1.2
 
 @spec
 class ValveActuator:
-    """Dead time, play, spool lag, a measured flow curve on each side, one pump, dependence on pose, and a second lag.
+    """Dead time, play, two lags, a measured flow curve on each side, one pump, pose dependence.
 
     Attributes:
         dead_time_s: Pure transport delay of the command; `null` takes the machine's.
@@ -53,7 +53,7 @@ class ValveActuator:
         pose_extend: Relative change of the speed per feature of the pose, positive direction, by
             joint; empty for none.
         pose_retract: The same for the negative direction.
-        spread: Relative half width, by field name, of what is drawn per environment and joint at
+        spread: Relative half width, by field name, of draws per environment and joint at
             reset.
     """
 
@@ -84,7 +84,7 @@ class ValveActuator:
             )
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ValveModel":
-        """Returns a model for `num_envs` environments on `device`.
+        """Return a model for `num_envs` environments on `device`.
 
         Raises:
             ConfigError: a number makes no sense, a table has the wrong length, or the dead time
@@ -94,7 +94,7 @@ class ValveActuator:
 
 
 class PoseFeatures:
-    """What the speed depends on besides the command: weight over yield force, its square, and all positions.
+    """Features of the speed besides the command: load, its square, and all positions.
 
     The weight on the joints of a planar arm is linear in the sines and cosines of the sums of its
     angles, which costs a tenth of the whole mechanics; where that is exact it is used, else the
@@ -133,7 +133,7 @@ class PoseFeatures:
         self._planar = bool((self._waves(at) @ self._linear - truth).abs().max() < 1e-3)
 
     def features(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns the features of each joint at positions `q` `(N, J)`, shape `(N, J, M)`."""
+        """Return the features of each joint at positions `q` `(N, J)`, shape `(N, J, M)`."""
         place = ((q - self._middle) / self._half).clamp(-BEYOND, BEYOND)
         place = place[:, None, :].expand(-1, q.shape[1], -1)
         if not self._weighs:
@@ -215,18 +215,18 @@ class ValveModel:
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """`pilot` and `spool` (of full stroke), `step` (way in one period), each `(N, J)`; what was drawn at reset."""
+        """`pilot`, `spool` (of full stroke), `step` (motion in a period), each `(N, J)`; draws."""
         return {**self._state, "fresh": self._fresh, **self._parameters.state}
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Lets the environments of `mask`, shape `(N,)` bool, go on from their history at the next step."""
+        """Let the environments of `mask`, `(N,)` bool, start from their history."""
         for value in self._state.values():
             value.masked_fill_(mask[:, None], 0.0)
         self._fresh.logical_or_(mask)
         self._parameters.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)`."""
+        """Return the joint positions one control period later, shape `(N, J)`."""
         value, state, dt = self.parameters, self._state, self._period_s
         earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / dt)
         q, fresh = history.q[:, -1], self._fresh[:, None]
@@ -268,7 +268,7 @@ class ValveModel:
 
 
 def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.ndarray:
-    """Returns signed speeds at `CELLS + 1` equal steps of the spool from -1 to 1, `(J, CELLS + 1)`; curves are `(J, K)`."""
+    """Return signed speeds at equal steps of the spool, `(J, CELLS + 1)`; curves `(J, K)`."""
     half = np.linspace(0.0, 1.0, CELLS // 2 + 1)
     rows = []
     for out, back in zip(extend, retract, strict=True):
@@ -279,7 +279,7 @@ def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) 
 
 
 def _compute_decay(period_s: float, time_constant_s: torch.Tensor) -> torch.Tensor:
-    """Returns the part of a first-order lag's state that is left after a period."""
+    """Return the part of a first-order lag's state that is left after a period."""
     return torch.exp(-period_s / time_constant_s.clamp(min=1e-6))
 
 
@@ -288,7 +288,7 @@ def _list_curves(config: ValveActuator) -> tuple[tuple[str, object], tuple[str, 
 
 
 def _expand_rows(value: object, machine: Machine, size: int, where: str) -> np.ndarray:
-    """Returns the table `value` as `(J, size)`; zeros for joints without a row in a table by joint that is empty."""
+    """Return the table `value` as `(J, size)`; zeros where it is empty."""
     if isinstance(value, tuple):
         value = dict.fromkeys(machine.joint_names, value)
     assert isinstance(value, dict)

@@ -1,4 +1,4 @@
-"""`brokk mode=collect`: plans an excitation, shows the plan, drives a machine through it, and writes recordings."""
+"""`brokk mode=collect`: plans an excitation, drives a machine through it, writes recordings."""
 
 import json
 import logging
@@ -38,7 +38,7 @@ CUT = 0.2
 
 @spec
 class Collection:
-    """How much to record, and within which bounds.
+    """Amount to record, and its bounds.
 
     Attributes:
         num_runs: Runs side by side, each on a machine of its own; a real machine has one.
@@ -72,7 +72,7 @@ class Collection:
 
 @spec
 class Collect:
-    """Drives a machine, simulated or real, through a plan of excitations; writes what was commanded and measured, as recordings."""
+    """Drives a machine, simulated or real, through excitations and writes recordings."""
 
     session: Session
     machine: Machine
@@ -81,11 +81,11 @@ class Collect:
     collect: Collection
 
     def run(self) -> None:
-        """Writes `plan.png` and `plan.json`, then `recordings/<run>_<part>.parquet`, into the run folder.
+        """Write `plan.png`, `plan.json` and `recordings/<run>_<part>.parquet` into the run folder.
 
         Raises:
             ConfigError: the plan finds no room in a run.
-            LinkError: the link to the machine failed; what was recorded until then is kept.
+            LinkError: the link to the machine failed; the recording until then is kept.
             StorageError: a file could not be written.
         """
         self.session.seed_all()
@@ -128,7 +128,7 @@ class Collect:
         return PlanPlayer(plan, self.machine, self.collect.approach, self.collect.guards)
 
     def _show(self, plan: ExcitationPlan) -> None:
-        """Tries the plan out on a nominal machine; writes picture and figures."""
+        """Try the plan out on a nominal machine; writes picture and figures."""
         machine, count = self.machine, self.collect.num_runs
         track = PlanTrack(
             drive(NominalLink(machine, count), self._runner(plan), machine, count, plan.run_s)
@@ -169,7 +169,7 @@ class Collect:
 
 
 class Writer:
-    """Cuts the samples of all runs into files and writes them; a file that grows is written again every now and then.
+    """Writer of the recordings of all runs; a growing file is rewritten at intervals.
 
     Attributes:
         files: Number of files written.
@@ -207,7 +207,7 @@ class Writer:
         self.files, self.recorded_s = 0, 0.0
 
     def add(self, sample: Sample) -> None:
-        """Appends one sample of all runs; begins new files where the old ones are long enough, or time has a gap."""
+        """Append one sample of all runs; begin new files at length limits and time gaps."""
         if not self.files and not self._samples:
             self._begin_s = sample.t_s
         if self._samples:
@@ -219,11 +219,11 @@ class Writer:
             self._write()
 
     def close(self) -> None:
-        """Writes what is pending."""
+        """Write pending samples."""
         self._finish()
 
     def _finish(self) -> None:
-        """Writes the present files for the last time; a single sample is no recording and is left out."""
+        """Write the present files for the last time; leave out a single sample."""
         if len(self._samples) > 1:
             self._write()
             self._part += 1
@@ -232,7 +232,7 @@ class Writer:
         self._samples = []
 
     def _write(self) -> None:
-        """Writes one file a run."""
+        """Write one file a run."""
         self._written = time.monotonic()
         if len(self._samples) < 2:
             return

@@ -20,7 +20,7 @@ class LogReader(Protocol):
     """A spec in `conf/import`: reads one kind of log."""
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Returns the pieces without gaps of the log at `path`, in order; they share the metadata `run`.
+        """Return the gapless pieces of the log at `path`, in order; they share metadata `run`.
 
         Raises:
             RecordingError: the log cannot be used; names file, row and column.
@@ -30,7 +30,7 @@ class LogReader(Protocol):
 
 @spec
 class Conversion:
-    """What to convert.
+    """Logs to convert.
 
     Attributes:
         input: Glob, or list of globs, of logs.
@@ -49,7 +49,7 @@ class Convert:
     convert: Conversion
 
     def run(self) -> None:
-        """Writes `recordings/<log>_<piece>.parquet` into the run folder; nothing if any of the logs cannot be used.
+        """Write `recordings/<log>_<piece>.parquet`; nothing if any log cannot be used.
 
         Raises:
             RecordingError: no log matches, one of them cannot be used, or two have the same name.

@@ -1,4 +1,4 @@
-"""`brokk mode=identify`: fits an actuator model to recordings and says how good it is on recordings it has not seen."""
+"""`brokk mode=identify`: fits an actuator model and tests it on unseen recordings."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Runs = Mapping[str, Sequence[Recording]]
 
 @spec
 class Identification:
-    """What to fit to and what to judge by. Runs are never split: parts of one run stay together.
+    """Recordings to fit to and to judge by. Parts of one run always stay together.
 
     Attributes:
         recordings: Glob, or list of globs, of recordings to fit to.
@@ -80,15 +80,15 @@ class Identification:
 
 @spec
 class Identify:
-    """Fits an actuator model to recordings; compares free runs on unseen ones with baselines and rivals.
+    """Fits an actuator model to recordings; compares free runs with baselines and rivals.
 
     Attributes:
         session: Folder, seed, device.
         machine: The machine that was recorded.
         fit: The model that is kept.
-        baselines: What it is compared with, by name: `hold`, `arx`, and any more
+        baselines: Models to compare with, by name: `hold`, `arx`, and any more
             (`+fit@baselines.<name>=<fit>`).
-        identify: What to fit to and what to judge by.
+        identify: Recordings to fit to and to judge by.
         resume: Run folder of an interrupted identification to go on with; the same as
             `session.out`.
     """
@@ -111,7 +111,7 @@ class Identify:
             )
 
     def run(self) -> float:
-        """Writes the model, `identification.json`, pictures and `identification.html`; returns the error at the longest horizon.
+        """Write model, `identification.json`, pictures and report; return the final error.
 
         Returns:
             Root mean square error at 10 s (or the longest horizon that fits), % of travel, mean
@@ -170,7 +170,7 @@ class Identify:
             )
 
     def _stages(self) -> list[FitStage]:
-        """Returns the fits to do, each with whole runs to fit to, to stop by, and to judge by."""
+        """Return the fits to do, each with whole runs to fit to, to stop by, and to judge by."""
         options, folder = self.identify, self.session.folder
         runs = group_by_run(record.read_recordings(options.recordings, self.machine))
         if options.folds:
@@ -259,7 +259,7 @@ class Identify:
 
 @contextmanager
 def _limit_threads(count: int) -> Iterator[None]:
-    """Limits torch to `count` CPU threads within the block."""
+    """Limit torch to `count` CPU threads within the block."""
     before = torch.get_num_threads()
     torch.set_num_threads(min(count, before))
     try:

@@ -1,4 +1,4 @@
-"""`brokk mode=inspect`: shows what is in recordings, broken ones too, before any physics is fitted to them."""
+"""`brokk mode=inspect`: shows the contents of recordings, broken ones too."""
 
 import logging
 from collections import Counter
@@ -32,7 +32,7 @@ FILES = ["file", "minutes", "rate", "jitter", "breaches", "findings"]
 
 @spec
 class InspectionRequest:
-    """What to inspect.
+    """Recordings to inspect.
 
     Attributes:
         recordings: Glob, or list of globs, of recordings.
@@ -50,7 +50,7 @@ class InspectionRequest:
 
 @dataclass(frozen=True)
 class InspectedFile:
-    """One file: what could be read of it, what breaks the format, and what is in it."""
+    """One file: its recording, its format breaches, and its inspection."""
 
     path: Path
     recording: Recording | None
@@ -63,7 +63,7 @@ class InspectedFile:
         return len(self.breaches) + (len(self.inspection.findings) if self.inspection else 0)
 
     def plain(self) -> dict[str, Any]:
-        """Returns it as plain JSON data."""
+        """Return it as plain JSON data."""
         metadata = dict(self.recording.metadata) if self.recording else {}
         return {
             "path": str(self.path),
@@ -83,7 +83,7 @@ class InspectedFile:
 
 @spec
 class Inspect:
-    """Shows what is in recordings: rates, gaps, ranges, noise, breaches of the format, stretches that want an explanation."""
+    """Shows rates, gaps, ranges, noise, format breaches and findings of recordings."""
 
     session: Session
     machine: Machine
@@ -91,7 +91,7 @@ class Inspect:
     thresholds: InspectionThresholds
 
     def run(self) -> None:
-        """Writes `inspection.json`, `inspection.html` and pictures into the run folder, and prints the tables.
+        """Write `inspection.json`, `inspection.html` and pictures, and print the tables.
 
         Raises:
             RecordingError: no recording matches; a broken one is no error here.
@@ -138,7 +138,7 @@ class Inspect:
         )
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
-        """Returns the dead time of each joint from all sound recordings, `None` where they do not tell."""
+        """Return each joint's dead time from all sound recordings, `None` where unknown."""
         try:
             found = dead_time.estimate_dead_times(
                 recordings, self.machine, self.session.generator("delay")
@@ -153,7 +153,7 @@ class Inspect:
         }
 
     def _overall(self, inspected: Sequence[InspectedFile]) -> dict[str, dict[str, float | None]]:
-        """Returns the figures of each joint over all recordings: extremes, and means weighted by duration."""
+        """Return figures of each joint over all recordings: extremes and weighted means."""
         table = {}
         known = [one for one in inspected if one.inspection]
         hours = np.array(
@@ -198,7 +198,7 @@ class Inspect:
         return table
 
     def _figures(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-        """Returns heading and cells of the table of joints."""
+        """Return heading and cells of the table of joints."""
         head = [
             "joint",
             "measured",
@@ -223,7 +223,7 @@ class Inspect:
         return head, rows
 
     def _counts(self, result: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-        """Returns heading and cells of the table of findings by joint."""
+        """Return heading and cells of the table of findings by joint."""
         counts = Counter(
             (f["joint"], f["kind"]) for entry in result["recordings"] for f in entry["findings"]
         )
@@ -315,7 +315,7 @@ class Inspect:
 
 
 def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
-    """Returns at what rates logs of other programs were, whose recordings have even periods only since they were converted."""
+    """Return the original rates of logs that were resampled when converted."""
     rates = {
         one.recording.run: one.recording.metadata.get("resampled_from")
         for one in inspected
@@ -325,7 +325,7 @@ def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
 
 
 def _check_clocks(inspected: Sequence[InspectedFile]) -> list[str]:
-    """Returns what the start times of the parts of each run say against them."""
+    """Return remarks on start times that contradict the parts of a run."""
     remarks, parts = [], {}
     for one in inspected:
         if one.recording:

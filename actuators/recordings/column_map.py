@@ -1,4 +1,4 @@
-"""CSV logs of other machines: which column means what, and the recordings that come of it.
+"""CSV logs of other machines: the meaning of their columns, and conversion to recordings.
 
 A log is cut at its gaps and each piece is brought to the machine's rate: positions linearly between
 samples, commands as the value in force (zero-order hold). Pieces of one log share the metadata
@@ -66,7 +66,7 @@ class CommandColumn:
             )
 
     def command(self, values: np.ndarray) -> np.ndarray:
-        """Returns commands, full at -1 and 1, for values of the log; same shape."""
+        """Return commands, full at -1 and 1, for values of the log; same shape."""
         away = values - self.neutral
         plus = away / (self.full_plus - self.neutral)
         return np.where(plus >= 0, plus, -away / (self.full_minus - self.neutral))
@@ -123,7 +123,7 @@ class ColumnMap:
             raise ConfigError(f"column map: time.scale {self.time.scale:g} must be positive")
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Returns the pieces of the log at `path` as recordings of `machine`.
+        """Return the pieces of the log at `path` as recordings of `machine`.
 
         Raises:
             ConfigError: the map is not for this machine.
@@ -205,11 +205,11 @@ class _Table:
         self._cells = _read_cells(path, delimiter)
 
     def where(self, row: int, column: str) -> str:
-        """Returns file, line, row and column for a message."""
+        """Return file, line, row and column for a message."""
         return f"{self._path}: line {self._cells.lines[row]} (row {row}), column '{column}'"
 
     def numbers(self, column: Column, empty: bool = False) -> np.ndarray:
-        """Returns a column, shape `(T,)`; an empty cell is NaN where `empty` allows it."""
+        """Return a column, shape `(T,)`; an empty cell is NaN where `empty` allows it."""
         header = self._cells.header
         if column.column not in header:
             raise RecordingError(
@@ -235,13 +235,13 @@ class _Table:
 
 
 def _find_first(condition: np.ndarray) -> int | None:
-    """Returns the first row where `condition` holds, or `None`."""
+    """Return the first row where `condition` holds, or `None`."""
     rows = np.flatnonzero(condition)
     return int(rows[0]) if len(rows) else None
 
 
 def _read_cells(path: Path, delimiter: str) -> Cells:
-    """Reads a CSV file; a last line that a crash may have cut off is left out with a warning."""
+    """Read a CSV file; a last line that a crash may have cut off is left out with a warning."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except FileNotFoundError as error:
@@ -286,7 +286,7 @@ def _resample(
     path: Path,
     machine: Machine,
 ) -> Recording:
-    """Returns a piece at the machine's rate."""
+    """Return a piece at the machine's rate."""
     ends_s = t_s - t_s[0]
     period_s = np.diff(t_s)
     was = f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"

@@ -1,4 +1,4 @@
-"""Pictures of recordings with what was found in them."""
+"""Pictures of recordings and their findings."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ class OverviewRow:
 
     Attributes:
         duration_s: Its length.
-        findings: What was found in it.
+        findings: Its findings.
         num_breaches: How often it breaks the format.
     """
 
@@ -46,7 +46,7 @@ def draw_recording(
     inspection: Inspection,
     breaches: Sequence[Breach],
 ) -> None:
-    """Draws commands and positions of each joint, findings shaded, breaches of the format as vertical lines; writes a PNG."""
+    """Draw commands, positions, findings (shaded) and breaches (lines) as PNG."""
     from matplotlib.figure import Figure
 
     count = machine.num_joints
@@ -95,7 +95,7 @@ def draw_recording(
 
 
 def draw_overview(path: Path, lines: Mapping[str, OverviewRow]) -> None:
-    """Draws one line a recording with its findings; writes a PNG."""
+    """Draw one line a recording with its findings; writes a PNG."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 1.2 + 0.26 * len(lines)), layout="constrained")
@@ -128,7 +128,7 @@ def draw_overview(path: Path, lines: Mapping[str, OverviewRow]) -> None:
 
 
 def _add_legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:
-    """Explains the colours that occur."""
+    """Explain the colours that occur."""
     from matplotlib.patches import Patch
 
     patches = [

@@ -26,7 +26,7 @@ NUM_STEPS = 20
 def check_actuator(
     actuator: Actuator, machine: Machine, device: torch.device | str = "cpu"
 ) -> None:
-    """Checks what `Actuator.build` returns against `ActuatorModel`."""
+    """Check the model of `Actuator.build` against `ActuatorModel`."""
     with isolate_randomness():
         check_actuator_model(
             actuator.build(machine, NUM_ENVS, torch.device(device)), machine, torch.device(device)
@@ -34,7 +34,7 @@ def check_actuator(
 
 
 def check_effect(effect: Effect, machine: Machine, device: torch.device | str = "cpu") -> None:
-    """Checks that an effect around the simplest actuator model is again an actuator model."""
+    """Check that an effect around the simplest actuator model is again an actuator model."""
     with isolate_randomness():
         inner = _Proportional(machine, torch.device(device))
         check_actuator_model(
@@ -45,7 +45,7 @@ def check_effect(effect: Effect, machine: Machine, device: torch.device | str = 
 
 
 def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.device) -> None:
-    """Checks an actuator model for `NUM_ENVS` environments; see `ActuatorModel` for the promises."""
+    """Check an actuator model for `NUM_ENVS` environments; see `ActuatorModel` for the promises."""
     everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=device)
     model.reset(everywhere)
     require_rows(model.state, "state")
@@ -94,7 +94,7 @@ class _Proportional:
         )
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Has no memory."""
+        """Have no memory."""
 
     def step(self, history: History) -> torch.Tensor:
         return history.q[:, -1] + history.u[:, -1] * self._step
@@ -103,7 +103,10 @@ class _Proportional:
 def _drive(
     model: ActuatorModel, machine: Machine, device: torch.device, alter_first: bool = False
 ) -> torch.Tensor:
-    """Returns the positions under random and full commands, `(T, N, J)`; `alter_first` changes those of environment 0."""
+    """Return positions under random and full commands, `(T, N, J)`.
+
+    `alter_first` changes the commands of environment 0.
+    """
     generator = torch.Generator().manual_seed(0)
     history, found = build_rest_history(machine, device), []
     for step in range(NUM_STEPS):

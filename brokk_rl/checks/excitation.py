@@ -12,7 +12,7 @@ DURATION_S = 300.0
 
 
 def check_excitation(excitation: Excitation, machine: Machine) -> None:
-    """Checks what `Excitation.segments` returns: programs within limits and time, exclusive joints alone, the same for a seed."""
+    """Check the segments of an excitation: limits, time, exclusive joints, repeatability."""
     still = np.zeros((20, machine.num_joints))
     before = [
         Segment(name="before_00", start=machine.home, u=still, stops="inward", stop_margin=0.1)

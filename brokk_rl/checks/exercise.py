@@ -1,4 +1,4 @@
-"""What the checkers share: a handful of environments, a history at rest, and comparisons of tensors by name."""
+"""Parts of the checkers: environments, a history at rest, comparisons of tensors by name."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NUM_ENVS = 4
 def build_rest_history(
     machine: Machine, device: torch.device, q: torch.Tensor | None = None
 ) -> History:
-    """Returns a history at rest at `q`, or in the middle of the travel."""
+    """Return a history at rest at `q`, or in the middle of the travel."""
     if q is None:
         q = torch.as_tensor(
             (machine.lower + machine.upper) / 2, dtype=torch.float32, device=device
@@ -30,20 +30,20 @@ def build_rest_history(
 
 @contextmanager
 def isolate_randomness() -> Iterator[None]:
-    """Leaves torch's global generators as they were."""
+    """Leave torch's global generators as they were."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         yield
 
 
 def require(condition: bool, message: str) -> None:
-    """Raises an `AssertionError` with `message` unless `condition` holds."""
+    """Raise an `AssertionError` with `message` unless `condition` holds."""
     if not condition:
         raise AssertionError(message)
 
 
 def require_rows(tensors: Mapping[str, torch.Tensor], what: str) -> None:
-    """Checks that every tensor has one row per environment."""
+    """Check that every tensor has one row per environment."""
     for name, value in tensors.items():
         require(
             len(value) == NUM_ENVS,
@@ -52,12 +52,12 @@ def require_rows(tensors: Mapping[str, torch.Tensor], what: str) -> None:
 
 
 def view_tensors(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Returns views of all tensors, which keep their memory from being given to others."""
+    """Return views of all tensors, which keep their memory from being given to others."""
     return {name: value.view_as(value) for name, value in tensors.items()}
 
 
 def is_in_place(tensors: Mapping[str, torch.Tensor], before: Mapping[str, torch.Tensor]) -> bool:
-    """Says whether all tensors lie where `places` saw them, in the same shape."""
+    """Return whether all tensors lie where `view_tensors` saw them, in the same shape."""
     return tensors.keys() == before.keys() and all(
         value.data_ptr() == before[name].data_ptr() and value.shape == before[name].shape
         for name, value in tensors.items()
@@ -65,23 +65,23 @@ def is_in_place(tensors: Mapping[str, torch.Tensor], before: Mapping[str, torch.
 
 
 def copy_tensors(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Returns copies of all tensors."""
+    """Return copies of all tensors."""
     return {name: value.clone() for name, value in tensors.items()}
 
 
 def restore(tensors: Mapping[str, torch.Tensor], kept: Mapping[str, torch.Tensor]) -> None:
-    """Writes `kept` back in place."""
+    """Write `kept` back in place."""
     for name, value in tensors.items():
         value.copy_(kept[name])
 
 
 def is_same(a: torch.Tensor, b: torch.Tensor, tolerance: float = 0.0) -> bool:
-    """Says whether two tensors hold the same numbers; NaN equals NaN."""
+    """Return whether two tensors hold the same numbers; NaN equals NaN."""
     return bool(torch.allclose(a.float(), b.float(), rtol=0.0, atol=tolerance, equal_nan=True))
 
 
 class Stateful(Protocol):
-    """What keeps its memory in `state` and forgets it by `reset`."""
+    """A model that keeps its memory in `state` and forgets it by `reset`."""
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
@@ -89,7 +89,7 @@ class Stateful(Protocol):
         ...
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Forgets in the environments of `mask`, `(N,)` bool."""
+        """Forget in the environments of `mask`, `(N,)` bool."""
         ...
 
 
@@ -99,12 +99,12 @@ def require_memory_in_state(
     first: torch.Tensor,
     run: Callable[[bool], torch.Tensor],
 ) -> None:
-    """Checks that a reset keeps to its mask, that all memory is in `state`, and that environments do not mix.
+    """Check that reset keeps to its mask, memory is in `state`, environments do not mix.
 
     Args:
         model: After the run that led to `first`.
         begin: Copies of its state before that run.
-        first: What came of it, `(T, N, …)`.
+        first: Its results, `(T, N, …)`.
         run: Does it again; told whether to treat environment 0 otherwise.
     """
     end = copy_tensors(model.state)

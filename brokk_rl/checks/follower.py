@@ -24,7 +24,7 @@ NUM_STEPS = 60
 def check_follower(
     follower: Follower, machine: Machine, device: torch.device | str = "cpu"
 ) -> None:
-    """Checks what `Follower.build` returns against `FollowerModel`."""
+    """Check the model of `Follower.build` against `FollowerModel`."""
     place = torch.device(device)
     with isolate_randomness():
         _check_model(follower.build(machine, NUM_ENVS, place), machine, place)
@@ -67,7 +67,7 @@ def _check_model(model: FollowerModel, machine: Machine, device: torch.device) -
 def _follow(
     model: FollowerModel, machine: Machine, device: torch.device, alter_first: bool = False
 ) -> torch.Tensor:
-    """Returns what is given, `(T, N, J)`, where proposals stay for a while, are full, random or none, and change sides."""
+    """Return the given commands, `(T, N, J)`, for held, full, random and zero proposals."""
     generator = torch.Generator().manual_seed(0)
     exclusive = torch.as_tensor(machine.is_exclusive)
     found = []

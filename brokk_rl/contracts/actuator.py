@@ -1,4 +1,4 @@
-"""Actuator models, what is fitted and recorded for them, effects and followers.
+"""Contracts of actuator models, their fits and excitations, effects and followers.
 
 `brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
 extensions.
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class ActuatorModel(Protocol):
-    """From the last `H` positions and commands to the next joint position, for all environments at once.
+    """Map from the last `H` positions and commands to the next position, for all environments.
 
     A model with a state of its own (spool position, pressure) keeps it in tensors of fixed shape
     listed by `state`. `step` works without a host synchronisation and without data-dependent
@@ -33,15 +33,15 @@ class ActuatorModel(Protocol):
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """Internal state by name, each of shape `(N, …)`; written in place. Empty for a model without memory."""
+        """Internal state by name, each `(N, …)`; written in place. Empty without memory."""
         ...
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Puts the environments of `mask`, shape `(N,)` bool, into the state of a machine at rest."""
+        """Put the environments of `mask`, `(N,)` bool, into the state of a machine at rest."""
         ...
 
     def step(self, history: History) -> torch.Tensor:
-        """Returns the joint positions one control period later, shape `(N, J)` in rad or m.
+        """Return the joint positions one control period later, shape `(N, J)` in rad or m.
 
         `history.u[:, -1]` is the command that has just come into force, `history.q[:, -1]` the
         position at this moment.
@@ -50,7 +50,7 @@ class ActuatorModel(Protocol):
 
 
 class SensingModel(ActuatorModel, Protocol):
-    """An actuator model that also says what is seen of the motion; what effects on sensors and geometry make of a model.
+    """An actuator model with sensors and geometry: effects around a model fulfil this.
 
     A loop asks an actuator for `sides` (absent: none) and calls `measure` and `misplacement` only
     where they do something, once a control period, after `reset`. `step` is given true positions.
@@ -62,15 +62,15 @@ class SensingModel(ActuatorModel, Protocol):
         ...
 
     def measure(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns what the sensors say at the true positions `q`, `(N, J)`."""
+        """Return the sensor readings at the true positions `q`, `(N, J)`."""
         ...
 
     def truth(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns the likeliest true positions where the sensors say `q`, `(N, J)` or `(N, H, J)`."""
+        """Return likely true positions for readings `q`, `(N, J)` or `(N, H, J)`."""
         ...
 
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
-        """Returns how far off the controller believes a target near the tool at the true positions `q`, `(N, 3)` in m."""
+        """Return the controller's error in a target near the tool at `q`, `(N, 3)` in m."""
         ...
 
 
@@ -78,27 +78,27 @@ class Actuator(Protocol):
     """A spec in `conf/actuator`: builds an actuator model."""
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
-        """Returns a model for `num_envs` environments on `device`."""
+        """Return a model for `num_envs` environments on `device`."""
         ...
 
 
 @dataclass(frozen=True)
 class Segment:
-    """A piece of an excitation: a pose and the commands that are played from it. Pure data for one machine.
+    """A pose and the commands that are played from it. Pure data for one machine.
 
     Attributes:
-        name: What it is, different from all others of its plan, e.g. `ramps_q3_02`.
+        name: Its name, unique in its plan, e.g. `ramps_q3_02`.
         start: Joint positions from which it is played, `(J,)`, rad or m.
         u: The program, `(T, J)` in [-1, 1]; row `k` is in force in control period `k`. Exclusive
             joints never together with others.
-        stops: What happens when a joint is about to come to rest closer to its stop than
+        stops: Reaction when a joint is about to come to rest closer to its stop than
             `stop_margin`. `home`: everything goes
             back to `start` and waits until the program, which runs on by the clock, next passes
                 zero. `inward`: this joint is
             driven the other way until its program next passes zero.
         stop_margin: Distance from the stops, as a part of the joint's travel.
-        repeat_of: Name of an earlier segment of the same length, of which this one repeats what was
-            really sent.
+        repeat_of: Name of an earlier segment of the same length, of which this one repeats the commands
+            that were really sent.
     """
 
     name: str
@@ -110,10 +110,13 @@ class Segment:
 
 
 class Excitation(Protocol):
-    """A spec in `conf/excitation`: commands that show what an actuator does. Numpy only: it also runs on the machine's computer."""
+    """A spec in `conf/excitation`: commands that reveal the behaviour of an actuator.
+
+    Numpy only: it also runs on the machine's computer.
+    """
 
     def weight(self, before: float) -> float:
-        """Returns its part of the time, relative to the others of the plan; those before it have `before` in all."""
+        """Return its share of the time; the excitations before it have `before` in all."""
         ...
 
     def segments(
@@ -123,7 +126,7 @@ class Excitation(Protocol):
         generator: np.random.Generator,
         before: Sequence[Segment],
     ) -> list[Segment]:
-        """Returns segments whose programs last `duration_s` in all, or as much of it as whole segments fill.
+        """Return segments of `duration_s` in all, or as much as whole segments fill.
 
         Args:
             machine: Gives limits, speeds, weights, and the joints that never move together with
@@ -153,22 +156,25 @@ class ActuatorFit(Protocol):
         seed: int,
         device: torch.device,
     ) -> Actuator:
-        """Fits to `train`, chooses by `validation`, leaves what it learned in `folder`, returns the fitted actuator."""
+        """Fit to `train`, choose by `validation`, write results into `folder`.
+
+        Returns the fitted actuator.
+        """
         ...
 
 
 class Effect(Protocol):
-    """A spec in `conf/effect`: something a simulator leaves out; wraps an actuator model and is again one."""
+    """A spec in `conf/effect`: wraps an actuator model; the result is one again."""
 
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
     ) -> ActuatorModel:
-        """Returns `model` with the effect added; with the effect's neutral value nothing changes."""
+        """Return `model` with the effect added; with the effect's neutral value nothing changes."""
         ...
 
 
 class FollowerModel(Protocol):
-    """From the command that the policy proposes to the one that is given, as a person at the levers does it, in `N` environments.
+    """Map from the proposed to the given command, as a person at the levers does it.
 
     `step` works without a host synchronisation and without data-dependent shapes, so that it can be
     captured in a CUDA graph.
@@ -176,25 +182,28 @@ class FollowerModel(Protocol):
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
-        """Everything needed to go on exactly, by name, each `(N, …)`; written in place. Empty for a follower without memory."""
+        """Complete state by name, each `(N, …)`; written in place. Empty without memory."""
         ...
 
     def reset(self, mask: torch.Tensor) -> None:
-        """Puts a new person at the levers in the environments of `mask`, shape `(N,)` bool, who has seen nothing yet."""
+        """Put a new person at the levers in the environments of `mask`, `(N,)` bool.
+
+        This person has seen no proposal yet.
+        """
         ...
 
     def step(self, proposed: torch.Tensor) -> torch.Tensor:
-        """Returns the command given during the coming control period, `(N, J)` in [-1, 1].
+        """Return the given command of the coming control period, `(N, J)` in [-1, 1].
 
-        `proposed`, `(N, J)`, is what the policy shows from now on. Where no proposal moves an
-        exclusive joint together with others, what is given does not either.
+        `proposed`, `(N, J)`, is the proposal from now on. Where no proposal moves an
+        exclusive joint together with others, the given command does not either.
         """
         ...
 
 
 class Follower(Protocol):
-    """A spec in `conf/follower`: builds what stands between policy and machine."""
+    """A spec in `conf/follower`: builds the model between policy and machine."""
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> FollowerModel:
-        """Returns followers for `num_envs` environments on `device`."""
+        """Return followers for `num_envs` environments on `device`."""
         ...

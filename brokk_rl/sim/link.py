@@ -16,7 +16,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.sim.scene import make_nominal_scenes
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 
 LOGGED_STATES = ("oil_c",)
 """States of an actuator model, one number a machine, that the machine's sensors show."""
@@ -42,7 +42,7 @@ class SimulatedMachines:
         """The actuator and its effects."""
         inner = getattr(self.actuator, "actuator", self.actuator)
         effects = getattr(self.actuator, "effects", {})
-        return "simulator: " + " + ".join([type(inner).__name__, *effects])
+        return "simulator: " + " + ".join([name_spec(inner).capitalize(), *effects])
 
     def build(self, machine: Machine, num_runs: int, session: Session) -> SimulatedMachinesLink:
         """Return a link to `num_runs` machines."""

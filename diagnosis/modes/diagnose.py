@@ -20,18 +20,18 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis import answer, baseline, case, effect_library, pipeline, report
 from diagnosis.answer import Answer
-from diagnosis.baseline import Base
-from diagnosis.calibration import Certainty
-from diagnosis.case import Case
-from diagnosis.detection import Prices
-from diagnosis.effect_library import Kind
-from diagnosis.pipeline import Diagnosis
+from diagnosis.baseline import Baseline
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.case import GapCase
+from diagnosis.detection import Penalties
+from diagnosis.effect_library import EffectType
+from diagnosis.pipeline import DiagnosisPipeline
 
 log = logging.getLogger(__name__)
 
 
 @spec
-class Subject:
+class DiagnosisSubject:
     """What is diagnosed.
 
     Attributes:
@@ -49,8 +49,8 @@ class Subject:
     field: str | tuple[str, ...] | None
     unseen: str | tuple[str, ...] | None
     effects: tuple[str, ...] | None
-    prices: Prices
-    certainty: Certainty
+    prices: Penalties
+    certainty: ProbabilityModel
 
     def check(self) -> None:
         if (self.case is None) == (self.field is None):
@@ -61,7 +61,7 @@ class Subject:
 
 @spec
 class Diagnose:
-    """Holds a simulator against recordings and says what it lacks.
+    """Hold a simulator against recordings and says what it lacks.
 
     Attributes:
         session: Folder, seed, device.
@@ -80,10 +80,10 @@ class Diagnose:
     actuator: Actuator | None
     thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
-    diagnosis: Subject
+    diagnosis: DiagnosisSubject
 
     def run(self) -> None:
-        """Writes `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
+        """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
 
         Raises:
             RecordingError: a recording cannot be used, or there is too little data to fit a
@@ -100,7 +100,7 @@ class Diagnose:
             base = self._base(given, kinds)
             generator = self.session.generator("diagnosis")
             prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
-            work = Diagnosis(
+            work = DiagnosisPipeline(
                 given, base, kinds, prices, certainty, self.thresholds, self.excitation, generator
             )
             outcome = work.run(
@@ -110,40 +110,42 @@ class Diagnose:
         outcome.save(folder)
         pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
         report.write_report(outcome, folder, self.machine)
-        _show(outcome.answer, folder)
+        _print_answer(outcome.answer, folder)
 
-    def _case(self) -> Case:
+    def _case(self) -> GapCase:
         subject = self.diagnosis
-        unseen = case.recorded(subject.unseen, self.machine) if subject.unseen else ()
+        unseen = case.read_recordings(subject.unseen, self.machine) if subject.unseen else ()
         if subject.case is not None:
-            return replace(case.load(Path(subject.case), self.machine), unseen=unseen)
+            return replace(case.load_case(Path(subject.case), self.machine), unseen=unseen)
         assert subject.field is not None, "checked by Subject"
         if self.actuator is None:
             raise ConfigError(
                 "diagnosis.field needs a simulator to hold it against: add actuator=<name>"
             )
-        return Case(self.machine, [], case.recorded(subject.field, self.machine), unseen)
+        return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine), unseen)
 
-    def _base(self, given: Case, kinds: Sequence[Kind]) -> Base:
+    def _base(self, given: GapCase, kinds: Sequence[EffectType]) -> Baseline:
         seed, device, folder = (
             self.session.stream("base"),
             self.session.torch_device(),
             self.session.folder,
         )
         if given.reference:
-            return baseline.fitted(
+            return baseline.fit_baseline(
                 given,
                 self.fit,
                 folder / "base",
                 seed,
                 device,
-                lambda base: baseline.refined(base, kinds, self.machine),
+                lambda base: baseline.add_reference_effects(base, kinds, self.machine),
             )
         assert self.actuator is not None, "there is one where there is no reference"
-        return baseline.given(given, self.actuator, self.fit, folder / "flexible", seed, device)
+        return baseline.accept_simulator(
+            given, self.actuator, self.fit, folder / "flexible", seed, device
+        )
 
 
-def _show(found: Answer, folder: Path) -> None:
+def _print_answer(found: Answer, folder: Path) -> None:
     console = Console()
     table = Table("effect", "joints", "probability", "numbers", "closes", "same as", box=None)
     for one in found.selected:

@@ -26,8 +26,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import answer, effect_library
-from diagnosis.calibration import Certainty
-from diagnosis.detection import Prices
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.detection import Penalties
 from exam import dataset, oracle, report, run_cases, score
 from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family
 from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
@@ -83,8 +83,8 @@ class ExamSettings:
     oracle: ActuatorFit
     oracles: str | None
     ledger: str | None
-    prices: Prices
-    certainty: Certainty
+    prices: Penalties
+    certainty: ProbabilityModel
     trials: int
     mix: CaseDistribution
     plants: PlantFamily

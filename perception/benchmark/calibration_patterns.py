@@ -1,4 +1,4 @@
-"""Synthetic pictures of calibration patterns, with the ellipses that are in them, and pictures in which there are none.
+"""Synthetic pictures of calibration patterns with their ellipses, and pictures without any.
 
 They stand for photographs: dots and rings in perspective, antialiased, lit unevenly, blurred,
 noisy, hazy, dark, partly covered.
@@ -22,7 +22,7 @@ SUPERSAMPLING = 4
 def draw_pattern(
     generator: np.random.Generator, condition: str, width: int = 1024, height: int = 768
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grey picture `(height, width)` uint8 of a calibration pattern and its ellipses `(C, 5)`.
+    """Return a picture, `(height, width)` uint8, of a pattern and its ellipses, `(C, 5)`.
 
     Args:
         generator: Decides everything.
@@ -168,7 +168,7 @@ def compute_ellipse_overlap(first: np.ndarray, second: np.ndarray) -> float:
 
 
 def count_matches(found: Sequence[Ellipse], truth: np.ndarray, least: float = 0.8) -> int:
-    """Return how many ellipses are found, each at most once, with at least this intersection over union."""
+    """Return the number of ellipses found, each once, with at least this overlap."""
     rows = [np.array([e.x, e.y, e.a, e.b, e.theta_rad]) for e in found]
     pairs = []
     for i, row in enumerate(rows):

@@ -1,4 +1,4 @@
-"""Pictures in which much of each ellipse is hidden, and shapes whose parts look like halves of ellipses: held out of tuning."""
+"""Pictures of half-hidden ellipses, and of shapes that resemble them; held out of tuning."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ from perception.ellipse import conic
 STYLES = ("behind", "outlines", "halves", "covered")
 SHAPES = ("hearts of arcs", "hearts of curves", "spirals", "polygons", "salt")
 MIN_VISIBLE = 0.4
-"""Part of a rim that must be seen for its ellipse to count; what shows less of itself is left out
-of the truth."""
+"""Part of a rim that must be visible for its ellipse to count as true."""
 
 
 def draw_occluded_ellipses(
     generator: np.random.Generator, style: str
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return a grey picture `(h, w)` uint8 and the ellipses `(C, 5)` of which at least `SEEN` of the rim is seen.
+    """Return a picture, `(h, w)` uint8, and its ellipses, `(C, 5)`, visible by `MIN_VISIBLE`.
 
     Args:
         generator: Decides everything.
@@ -137,7 +136,7 @@ def _build_shape(generator: np.random.Generator, kind: str) -> np.ndarray:
 def _scatter_ellipses(
     generator: np.random.Generator, number: int, width: int, height: int, apart: float
 ) -> np.ndarray:
-    """Return ellipses anywhere in a picture, each so many times its size from the others, `(C, 5)`."""
+    """Return random ellipses, `(C, 5)`, `apart` times the sum of their sizes apart."""
     found: list[np.ndarray] = []
     for _ in range(3 * number):
         a = generator.uniform(12, 60)
@@ -192,7 +191,7 @@ def _draw_ellipse(canvas: np.ndarray, ellipse: np.ndarray, level: float, line: i
 
 
 def _to_fixed_point(places: np.ndarray) -> np.ndarray:
-    """Return places of the picture on the supersampled canvas in sixteenths, as OpenCV draws them."""
+    """Return places of the picture in sixteenths of canvas pixels, as OpenCV draws them."""
     return np.round(((places + 0.5) * SUPERSAMPLING - 0.5) * 16).astype(np.int32)
 
 

@@ -1,7 +1,6 @@
-"""Pictures like photographs of calibration patterns, coloured and cluttered, with the ellipses in them: styles held out of tuning.
+"""Pictures like photographs of calibration patterns with their ellipses; held out of tuning.
 
-The detector's figures were set on `perception.benchmark.calibration_patterns`; these are what it is judged on
-besides.
+The detector was tuned on `perception.benchmark.calibration_patterns` and is judged on these too.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ def draw_photograph(
 def _draw_sheet(
     generator: np.random.Generator, num_x: int, num_y: int, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the corners of the sheet in the picture, `(4, 2)`, and the homography from the pattern to it."""
+    """Return the sheet's corners in the picture, `(4, 2)`, and the pattern's homography to it."""
     corners = np.array([[-1, -1], [num_x, -1], [num_x, num_y], [-1, num_y]], np.float32)
     frame = np.array([[0, 0], [width, 0], [width, height], [0, height]])
     inward = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * (width, height)
@@ -197,7 +196,7 @@ def _to_fixed_point(ellipse: np.ndarray) -> tuple[tuple[int, int], tuple[int, in
 
 
 def _simulate_camera(picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Return what a camera makes of a picture: blur, sometimes of motion, noise, JPEG; in grey."""
+    """Return a picture after blur, sometimes motion blur, noise and JPEG, in grey."""
     picture = cv2.GaussianBlur(picture, (0, 0), generator.uniform(0.4, 1.6))
     if generator.random() < 0.2:
         picture = cv2.filter2D(

@@ -1,4 +1,4 @@
-"""How good a finder is: what it makes of rendered frames, held against their truth."""
+"""Scores of a finder on rendered frames, by their truth."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ONE_SIGMA_2D = 1.515
 
 @dataclass
 class FinderScore:
-    """What was counted over the frames of one row.
+    """Counts and errors over the frames of one row.
 
     Attributes:
         frames: Frames looked at; those that were refused as a whole count too.
@@ -80,7 +80,7 @@ class FinderScore:
         }
 
     def noise(self) -> dict[str, float | None]:
-        """Return the error model for training: what stays the same over an episode, and what one more frame would change.
+        """Return the error model for training: errors of an episode and errors of a frame.
 
         A camera that stands still sees the same face with the same matcher: nearly all of the error
         is the episode's. The policy's task draws it as a shift of at most `target_bias_m`, here the
@@ -102,7 +102,7 @@ class FinderScore:
         return self.found == self.true and not (self.refused or self.false or self.fooled)
 
     def __add__(self, other: FinderScore) -> FinderScore:
-        """Return what was counted by both."""
+        """Return the sum of both."""
         both: dict[str, Any] = {
             name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "ms"
         }
@@ -115,7 +115,7 @@ class FinderScore:
 def score_frame(
     finder: BoreholeFinder, frame: Frame, truth: dataset.SceneTruth
 ) -> tuple[FinderScore, FrameDetections]:
-    """Return what was counted on one frame, and what the finder saw in it: nothing where it refused the frame as a whole."""
+    """Return score and detections of one frame; none where the finder refused the frame."""
     tally = FinderScore(frames=1)
     start = time.perf_counter()
     try:
@@ -132,7 +132,7 @@ def score_frame(
 def match_holes(
     holes: Sequence[HolePose], truth: dataset.SceneTruth, frame: Frame, tally: FinderScore
 ) -> None:
-    """Add one frame: each true hole is found by the target nearest to its line of sight, each target finds one at most.
+    """Add one frame: each hole goes to the target nearest to its line of sight, each target once.
 
     Holes of which more than half of the rim is hidden, or that leave the picture, need not be
     found; found, they are no mistake.

@@ -1,8 +1,8 @@
-"""Boreholes that were never drilled: an analytic renderer, and scenes for it; numpy and OpenCV only, no GL library.
+"""Synthetic boreholes: an analytic ray tracer and random scenes, in numpy and OpenCV, without OpenGL.
 
-`solids`, `drilled`, `texture`, `tracer`, `sensor` draw what there is; `scenes` (ranges), `drawing`,
-`concrete`, `arm` say what there is; `rig` is the camera pair, `studio` makes frames of it all.
+Geometry and light: `solids`, `drilled_block`, `materials`, `ray_tracer`, `stereo_camera`. Random
+scenes: `scene_ranges`, `scene_sampler`, `block_sampler`. `frame_renderer` makes frames of them.
 
-It is the oracle of perception: depth, masks and the rim are those of the mathematics, and both
-pictures of a stereo pair show the same texture at the same points of space.
+It is the oracle of perception: depth, masks and the rim are exact, and both pictures of a stereo
+pair show the same texture at the same points of space.
 """

@@ -41,7 +41,7 @@ def draw_block(
     turn_rad: float,
     generator: np.random.Generator,
 ) -> DrilledBlock:
-    """Return a block whose drilled face looks along `normal` and has its first hole, or its middle, at `target`."""
+    """Return a block that faces along `normal`, its first hole (or its middle) at `target`."""
     half = (
         np.array(
             [
@@ -87,7 +87,7 @@ def draw_block(
 def _scatter_discs(
     half_m: np.ndarray, radii: list[float], edge_m: float, generator: np.random.Generator
 ) -> list[np.ndarray]:
-    """Return places on the face for discs of these radii; those that find no room are left out, the first always has it."""
+    """Return places on the face for discs of these radii; the first alone always finds room."""
     found: list[np.ndarray] = []
     for number, radius in enumerate(radii):
         room = np.maximum(half_m - radius - edge_m, 0.0)
@@ -116,7 +116,7 @@ def _draw_hole(
 def _draw_side_hole(
     kind: BlockRanges, half: np.ndarray, radius: float, edge: float, generator: np.random.Generator
 ) -> DrilledHole:
-    """Return a hole in one of the four faces beside the drilled one; shallow, so that it meets no other."""
+    """Return a hole in a face beside the drilled one; shallow, so that it meets no other."""
     part = int(generator.integers(4))
     axis = part // 2
     center = np.zeros(3)
@@ -130,7 +130,7 @@ def _draw_side_hole(
 def draw_bars(
     kind: BlockRanges, block: DrilledBlock, generator: np.random.Generator
 ) -> list[Solid]:
-    """Return reinforcing bars, cut bare by some of the holes: cylinders in the concrete, seen through a rim only."""
+    """Return reinforcing bars inside the concrete that some of the holes cut bare."""
     bars: list[Solid] = []
     for hole in block.holes:
         if hole.part != FRONT or generator.random() >= kind.bar_probability:
@@ -161,7 +161,7 @@ def draw_bars(
 
 
 def _draw_chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
-    """Return pieces broken off a rim: balls whose bowls are centred near it and as wide along the face as `chip_m` says."""
+    """Return pieces broken off a rim: balls that cut bowls of width `chip_m` near it."""
     found = []
     for _ in range(int(generator.integers(kind.chips[0], kind.chips[1] + 1))):
         angle, wide = generator.uniform(-np.pi, np.pi), float(generator.uniform(*kind.chip_m))
@@ -208,7 +208,7 @@ def draw_block_materials(
 
 
 def _paint_marks(kind: BlockRanges, half: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Paint stains, wet patches, cracks and traces of formwork: relative brightness over the block's faces, `(h, w)` float32."""
+    """Return the relative brightness of stains, wet patches and cracks, `(h, w)` float32."""
     size = (2.4 * half[[1, 0]] / MARK_M).astype(int)
     marks = np.ones(tuple(size), np.float32)
     for _ in range(int(generator.integers(kind.stains[0], kind.stains[1] + 1))):

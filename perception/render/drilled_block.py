@@ -1,6 +1,6 @@
-"""The concrete block: a box with holes drilled into it, chips broken off the rims, and discs painted on it.
+"""The concrete block: a box with drilled holes, chipped rims and painted discs.
 
-What is cut away is a union of convex cavities (half-open cylinders for holes, balls for chips), so
+The missing volume is a union of convex cavities (half-open cylinders for holes, balls for chips), so
 a ray through it is followed
 exactly: from its entry on, it goes to the end of each cavity that it is in, until no cavity takes
 it further.
@@ -29,7 +29,7 @@ class DrilledHole:
     Attributes:
         center_m: Centre of the rim in the block's coordinates, on that face, `(3,)`.
         radius_m: Radius.
-        depth_m: From the face to the floor (of whatever fills it).
+        depth_m: From the face to the floor, or to the surface of a filling.
         part: The face.
         lamp: Light that shines inside, relative to full daylight; 0 for none.
     """
@@ -56,7 +56,7 @@ class DrilledHole:
         return self.sign * np.eye(3)[self.axis]
 
     def across_m(self, point: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the two coordinates across the axis and the depth below the face of points, `(…, 3)`, of the block."""
+        """Return two coordinates across the axis and the depth of points, `(…, 3)`, of the block."""
         one, two = (self.axis + 1) % 3, (self.axis + 2) % 3
         away = point - self.center_m.astype(np.float32)
         return away[..., one], away[..., two], -self.sign * away[..., self.axis]
@@ -64,7 +64,7 @@ class DrilledHole:
     def interval(
         self, start: np.ndarray, along: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return where rays, `(M, 3)` each, enter and leave the cavity, and whether they leave through the floor."""
+        """Return where rays, `(M, 3)`, enter and leave the cavity, and which leave by the floor."""
         x, y, depth = self.across_m(start)
         one, two = (self.axis + 1) % 3, (self.axis + 2) % 3
         dx, dy, sink = along[:, one], along[:, two], -self.sign * along[:, self.axis]
@@ -82,7 +82,7 @@ class DrilledHole:
 
 @dataclass(frozen=True)
 class Chip:
-    """A ball-shaped piece broken off: centre in the block's coordinates, outside of the face, and radius, m."""
+    """A ball-shaped piece broken off: centre, outside of the face, in block coordinates; radius."""
 
     center_m: np.ndarray
     radius_m: float
@@ -108,7 +108,10 @@ class Disc:
 
 @dataclass(frozen=True)
 class DrilledBlock:
-    """A box with holes, chips and discs. Parts: six faces, wall and floor of each hole, fresh breaks, then the discs."""
+    """A box with holes, chips and discs.
+
+    Parts: six faces, wall and floor of each hole, fresh breaks, then the discs.
+    """
 
     pose: SolidPose
     half_m: np.ndarray
@@ -167,7 +170,7 @@ class DrilledBlock:
         return Hits(t, part, mouth)
 
     def _march(self, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Follow rays from the face through the cavities; returns their further way and the part that ends it, -1 for none."""
+        """Return the way of rays through the cavities, and the part that ends it, -1 for none."""
         way, part = np.zeros(len(start), np.float32), np.full(len(start), -1, np.int16)
         cavities = []
         for number, hole in enumerate(self.holes):
@@ -186,7 +189,7 @@ class DrilledBlock:
         return way, part
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describe faces, breaks, discs, and the insides of the holes, where light falls off with depth."""
+        """Describe faces, breaks, discs and the insides of holes, where light falls with depth."""
         flat = np.where(
             (part >= NUM_FACES) & (part >= self.break_part), FRONT, np.minimum(part, FRONT)
         ).astype(np.int16)

@@ -1,4 +1,4 @@
-"""The studio: draws a scene, takes both pictures of it, matches them, and writes frame and truth."""
+"""Rendered frames: a random scene, both its pictures, matched depth, masks and truth."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class FrameRenderer:
 
     Attributes:
         rig: The camera pair.
-        scene: What there is to see.
+        scene: Ranges of the scenes.
         stereo: Makes the depth.
         depth: `matched` makes depth of the two pictures; `exact` writes the mathematical one;
             `none` leaves it to the reader.
@@ -67,13 +67,13 @@ class FrameRenderer:
             )
 
     def prepare(self, folder: Path) -> None:
-        """Write what all frames of a folder share."""
+        """Write the camera file that all frames of a folder share."""
         dataset.write_camera(
             folder, self.rig.left.matrix, self.rig.base_from_camera, self.rig.baseline_m
         )
 
     def has(self, stem: Path) -> bool:
-        """Says whether the frame at `stem` is there, whole."""
+        """Return whether the frame at `stem` exists and is complete."""
         return dataset.is_whole(stem)
 
     def shoot(self, stem: Path, generator: np.random.Generator) -> None:

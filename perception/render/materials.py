@@ -1,4 +1,4 @@
-"""Materials: a colour and two scales of grain, filtered to the size of a pixel so that nothing flickers between two views."""
+"""Materials: colour and grain, filtered to the size of a pixel so that both views agree."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Material:
 
 @lru_cache(maxsize=NUM_TEXTURES)
 def _build_pyramid(number: int) -> tuple[np.ndarray, ...]:
-    """Return a periodic pattern, mean 0 and standard deviation 1, and its reductions by two, down to one texel.
+    """Return a periodic pattern, mean 0 and deviation 1, and its reductions by two to one texel.
 
     The patterns are the same for every scene: a scene differs in where, how strong and in which
     colours they appear.
@@ -98,7 +98,7 @@ def _build_pyramid(number: int) -> tuple[np.ndarray, ...]:
 def _sample_pyramid(
     pyramid: tuple[np.ndarray, ...], uv: np.ndarray, level: np.ndarray
 ) -> np.ndarray:
-    """Return the pattern at `uv`, `(M, 2)` in texels of the finest level, blended between the two levels next to `level`."""
+    """Return the pattern at `uv`, `(M, 2)` finest texels, blended between the levels at `level`."""
     level = np.minimum(level, len(pyramid) - 1.001)
     total = np.zeros(len(uv), np.float32)
     for number in range(int(level.min()), int(level.max()) + 2):

@@ -1,4 +1,4 @@
-"""Rays through pixels: what each hits, how deep, and how bright that is.
+"""Ray tracer: surface, depth and radiance at each pixel.
 
 Every pixel has one exact ray through its centre, which gives depth and masks. Colour comes from
 that ray where the pixel shows one surface, filtered to the pixel's size, and from `OVER` x `OVER`
@@ -16,14 +16,14 @@ from perception.render.solids import Solid
 
 OVER = 4
 CHUNK = 1 << 17
-"""Rays at a time, so that what they need stays in the cache."""
+"""Rays at a time, so that their data stay in the cache; chosen by hand."""
 FAR_M = 80.0
 NOTHING = -1
 
 
 @dataclass(frozen=True)
 class Pinhole:
-    """A camera without distortion at `origin_m`, `(3,)`, looking along z of the left camera's coordinates.
+    """A camera without distortion, looking along z of the left camera's coordinates.
 
     Attributes:
         width: Pixels.
@@ -39,7 +39,7 @@ class Pinhole:
 
     @property
     def matrix(self) -> np.ndarray:
-        """Camera matrix, `(3, 3)`; the axis goes through the middle of the picture, pixel centres lie at whole numbers."""
+        """Camera matrix, `(3, 3)`: axis through the picture's middle, pixel centres at integers."""
         return np.array(
             [
                 [self.focal_px, 0, (self.width - 1) / 2],
@@ -79,7 +79,7 @@ class Light:
 
 @dataclass(frozen=True)
 class RenderedView:
-    """What a camera sees, without noise.
+    """Ideal picture of a camera, without noise.
 
     Attributes:
         radiance: Linear light, `(h, w, 3)` float32.
@@ -117,7 +117,7 @@ class Tracer:
     """Draw solids in a light, from any camera.
 
     Args:
-        solids: What there is to see; bars in a block come after it.
+        solids: All that can be seen; bars in a block come after it.
         light: How it is lit.
         sky: Radiance where nothing is, RGB.
     """
@@ -133,7 +133,7 @@ class Tracer:
         ]
 
     def view(self, camera: Pinhole) -> RenderedView:
-        """Return what `camera` sees."""
+        """Return the ideal picture of `camera`."""
         size = (camera.height, camera.width)
         rows = max(1, CHUNK // camera.width)
         columns = np.arange(camera.width, dtype=np.float64)
@@ -171,7 +171,7 @@ class Tracer:
     def first(
         self, origin_m: np.ndarray, direction: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return factor on the direction, solid and part of the first hit of rays, `(M, 3)` float32, from one point."""
+        """Return distance factor, solid and part of the first hits of rays, `(M, 3)` float32."""
         t, solid, part, _ = self._cast(origin_m, direction, None)
         return t, solid, part
 
@@ -217,7 +217,7 @@ class Tracer:
         direction: np.ndarray,
         pixel_m: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the radiance of points of one solid, `(M, 3)`, and whether the sun reaches them, `(M,)`."""
+        """Return the radiance of points of one solid, `(M, 3)`, and which are sunlit, `(M,)`."""
         surface = thing.surface(point, part, self.light.to_sun)
         along = np.einsum("ij,ij->i", surface.normal, direction)
         away = np.sign(along)
@@ -241,7 +241,7 @@ class Tracer:
 
 
 class Caster:
-    """A solid that throws a shadow; only points within its silhouette, seen from the sun, are looked at closely."""
+    """A solid that throws a shadow; only points within its silhouette from the sun are tested."""
 
     def __init__(self, solid: Solid, to_sun: np.ndarray) -> None:
         self.solid, self._to_sun = solid, to_sun.astype(np.float32)
@@ -267,7 +267,7 @@ class Caster:
 
 
 def _select_rays(thing: Solid, camera: Pinhole | None, direction: np.ndarray) -> np.ndarray | None:
-    """Return the rays that may hit the solid, `None` for all: those within the box around its corners in the picture."""
+    """Return the rays within the box around a solid's corners in the picture, `None` for all."""
     corners = thing.corners_m
     if camera is None or corners is None:
         return None

@@ -1,4 +1,4 @@
-"""Scenes to look at: which blocks, holes, stains, arms, lights and dust there may be, each drawn from a range."""
+"""Ranges of random scenes: viewpoint, block, surroundings, light, air and camera."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class ViewpointRanges:
 
 @spec
 class BlockRanges:
-    """The block and what has been done to it.
+    """The block, its holes and its marks.
 
     Attributes:
         present: Probability that there is a block.
@@ -50,7 +50,7 @@ class BlockRanges:
         holes: Number of holes in the drilled face, the first of them where the camera looks.
         side_holes: Number of holes in other faces.
         radius_m: Of the holes.
-        depth_m: Of the holes, down to whatever fills them.
+        depth_m: Of the holes, down to the surface of a filling.
         fill_brightness: Of the floor.
         lamp: Light inside a hole, relative to daylight.
         lamp_probability: That there is any.
@@ -94,17 +94,19 @@ class BlockRanges:
         need = 2 * (max(self.radius_m[1], self.decoy_radius_m[1]) + self.edge_m[0])
         if need > min(self.width_m[0], self.length_m[0]):
             raise ConfigError(
-                f"scene.block: a face of {self.width_m[0]} m has no room for a hole that needs {need:g} m"
+                f"scene.block: a face of {self.width_m[0]} m has no room for a hole that needs "
+                f"{need:g} m"
             )
         if self.depth_m[1] >= self.thickness_m[0]:
             raise ConfigError(
-                f"scene.block: holes of {self.depth_m[1]} m go through a block of {self.thickness_m[0]} m"
+                f"scene.block: holes of {self.depth_m[1]} m go through a block of "
+                f"{self.thickness_m[0]} m"
             )
 
 
 @spec
 class SurroundingsRanges:
-    """What else is there.
+    """Arm, clutter, ground and backdrop.
 
     Attributes:
         arm: Probability that the machine's arm is in the picture.
@@ -123,7 +125,8 @@ class SurroundingsRanges:
     def check(self) -> None:
         if self.hidden[1] > 0 and self.arm < 1 and self.hidden[0] > 0:
             raise ConfigError(
-                f"scene.around: hidden {self.hidden} needs an arm in every picture (arm: 1.0), got {self.arm}"
+                f"scene.around: hidden {self.hidden} needs an arm in every picture (arm: 1.0), got "
+                f"{self.arm}"
             )
 
 
@@ -136,7 +139,7 @@ class LightRanges:
         ambient: Strength of the light from everywhere.
         elevation_rad: Of the sun above the ground.
         shadows: Things out of sight that throw a shadow on the block.
-        level: Light there is, relative to what the exposure is set for; drawn evenly on a
+        level: Light there is, relative to the level that the exposure is set for; drawn evenly on a
             logarithmic scale.
         exposure: Brightness of the block's lit face in the picture at level 1, 1 saturates.
         transmission: Light that the air lets through on the way to the block; 1 is clear.
@@ -167,7 +170,8 @@ class LightRanges:
     def check(self) -> None:
         if not 0 < self.transmission[0] <= self.transmission[1] <= 1:
             raise ConfigError(
-                f"scene.light.transmission: expected values above 0 and up to 1, got {self.transmission}"
+                "scene.light.transmission: expected values above 0 and up to 1, got "
+                f"{self.transmission}"
             )
         if min(self.level[0], self.full_well_e[0], self.gamma[0]) <= 0:
             raise ConfigError("scene.light: expected level, full_well_e and gamma above 0")
@@ -185,7 +189,7 @@ class Scene:
         sky: Radiance where nothing is.
         hidden: Part of each rim that something else hides from the left camera, one for each hole.
         hidden_discs: Likewise for the discs.
-        conditions: What was drawn, for statistics.
+        conditions: Drawn values by name, for statistics.
     """
 
     solids: tuple[Solid, ...]
@@ -203,10 +207,10 @@ class SceneRanges:
     """A kind of scene; `perception.render.scene_sampler.compose_scene` draws one.
 
     Attributes:
-        name: What it is called in truth files and tables.
+        name: In truth files and tables.
         sight: From where the block is seen.
         block: The block and its holes.
-        around: What else is there.
+        around: Arm, clutter, ground and backdrop.
         light: Light, air and camera.
     """
 

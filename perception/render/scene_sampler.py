@@ -1,4 +1,4 @@
-"""The machine's arm before the block, pushed so far over a rim that it hides a given part of it."""
+"""Random scenes: block, arm, surroundings, light and exposure, drawn from ranges."""
 
 from __future__ import annotations
 
@@ -21,9 +21,6 @@ from perception.render.scene_ranges import (
 from perception.render.solids import Box, Cylinder, PlaneSolid, Solid, SolidPose
 from perception.render.stereo_camera import CameraExposure, StereoRig
 
-# --- from drawing: One scene out of the ranges of `perception.render.scene_ranges`: where
-# everything stands, and how it is lit.
-
 _CLEAR = 1.6
 """Where the arm hides nothing it stays away from the rim's centre by this factor of the rim's size
 at least."""
@@ -33,7 +30,7 @@ _BISECTIONS = 14
 def place_arm(
     rim: np.ndarray, rig: StereoRig, hidden: float, generator: np.random.Generator
 ) -> list[Solid]:
-    """Return boom, hose and chisel, coming from a random side, that hide the part `hidden` of the rim, `(P, 3)`, from the left."""
+    """Return an arm from a random side that hides the part `hidden` of a rim, `(P, 3)`."""
     middle = rim.mean(0)
     ray = middle / np.linalg.norm(middle)
     angle = generator.uniform(-np.pi, np.pi)
@@ -61,7 +58,7 @@ def place_arm(
 def _build_arm(
     start: np.ndarray, ray: np.ndarray, sideways: np.ndarray, generator: np.random.Generator
 ) -> list[Solid]:
-    """Return the arm with its edge along the line of sight through `start`; it lies on the side that `sideways` points to."""
+    """Return the arm on the side `sideways`, its edge on the line of sight through `start`."""
     along = np.cross(ray, sideways)
     wide = float(generator.uniform(0.06, 0.16))
     thick = float(generator.uniform(0.05, 0.12))
@@ -127,7 +124,7 @@ _GREY = 1 / 3
 
 
 def compose_scene(kind: SceneRanges, rig: StereoRig, generator: np.random.Generator) -> Scene:
-    """Return a scene: first the block before the camera, then the arm, then all the rest; the generator is the only chance."""
+    """Return a random scene: first the block, then the arm, then all the rest."""
     target, normal, turn = _draw_target(kind, rig, generator)
     block, arm = None, []
     if generator.random() < kind.block.present:
@@ -156,11 +153,11 @@ def add_surroundings(
     """Return a scene of this kind around a block and an arm that stand already.
 
     Args:
-        kind: Says what else there is, and how it is lit.
+        kind: Ranges of surroundings and light.
         rig: The camera pair.
         block: The block, `None` for none.
         arm: Parts of the arm.
-        target: What the camera is pointed at, `(3,)`, camera coordinates.
+        target: Point that the camera is aimed at, `(3,)`, camera coordinates.
         normal: Normal of the face there, `(3,)`.
         generator: The only source of chance.
         ground_m: How far below the camera the ground lies; `None` for where the block stands on it.
@@ -198,7 +195,7 @@ def add_surroundings(
 
 
 def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
-    """Return points on the rim of a hole or disc of the block in camera coordinates, `(NUM_RIM_POINTS, 3)`."""
+    """Return points on the rim of a hole or disc, camera coordinates, `(NUM_RIM_POINTS, 3)`."""
     axis = circle.axis if isinstance(circle, DrilledHole) else 2
     angle = np.linspace(0, 2 * np.pi, NUM_RIM_POINTS, endpoint=False)
     local = np.repeat(circle.center_m[None], NUM_RIM_POINTS, 0)
@@ -210,7 +207,7 @@ def sample_rim(block: DrilledBlock, circle: DrilledHole | Disc) -> np.ndarray:
 def compute_hidden_share(
     solids: Sequence[Solid], block: DrilledBlock, circle: DrilledHole | Disc
 ) -> float:
-    """Return the part of the rim of a hole or disc that other solids, or the block itself, hide from the left camera."""
+    """Return the part of a rim that other solids or the block hide from the left camera."""
     rim = sample_rim(block, circle)
     outward = block.pose.rotation @ (
         circle.outward if isinstance(circle, DrilledHole) else np.array([0.0, 0.0, 1.0])
@@ -227,7 +224,7 @@ def compute_hidden_share(
 def _draw_target(
     kind: SceneRanges, rig: StereoRig, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the point on the face that is looked at, the face's normal (both `(3,)`), and the turn of the block about it."""
+    """Return the aimed point and the face's normal, `(3,)` each, and the turn about it."""
     inner = 1.0 - 2.0 * kind.sight.margin
     size = np.array([rig.width, rig.height])
     pixel = (0.5 + inner * (generator.random(2) - 0.5)) * (size - 1)
@@ -307,7 +304,7 @@ def _draw_clutter(
     lowest_m: float,
     generator: np.random.Generator,
 ) -> list[Solid]:
-    """Return things on the ground, in the picture, not in front of a rim and not inside the block."""
+    """Return things on the ground, neither in front of a rim nor inside the block."""
     wanted, found = draw_integer(kind.around.clutter, generator), []
     for _ in range(_CLUTTER_TRIES):
         if len(found) == wanted:
@@ -375,7 +372,7 @@ def _draw_exposure(
     target: np.ndarray,
     generator: np.random.Generator,
 ) -> tuple[CameraExposure, float]:
-    """Return how the pictures are taken, and the level of light; the exposure is set for the face as it is lit without dust."""
+    """Return the exposure, set for the lit face without dust, and the level of light."""
     ranges = kind.light
     lit = light.ambient + light.sun * max(0.0, float(normal @ light.to_sun))
     face = lit * float(np.mean(kind.block.brightness))

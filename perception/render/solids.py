@@ -34,7 +34,7 @@ class Hits(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """What a solid is like at `M` points of its surface.
+    """Surface of a solid at `M` points.
 
     Attributes:
         normal: Unit normals, `(M, 3)`.
@@ -52,7 +52,7 @@ class Surface(NamedTuple):
 
 @dataclass(frozen=True)
 class SolidPose:
-    """A place in camera coordinates: `rotation` (columns: the solid's axes, `(3, 3)`) and `center_m`, `(3,)`."""
+    """Pose in camera coordinates: `rotation`, `(3, 3)`, its columns the axes; `center_m`, `(3,)`."""
 
     rotation: np.ndarray
     center_m: np.ndarray
@@ -90,7 +90,7 @@ class Solid(Protocol):
         ...
 
     def surface(self, point: np.ndarray, part: np.ndarray, to_sun: np.ndarray) -> Surface:
-        """Describe the surface at the points, `(M, 3)`; `to_sun` is the unit vector to the light."""
+        """Describe the surface at points, `(M, 3)`; `to_sun` is the unit vector to the light."""
         ...
 
 
@@ -123,7 +123,10 @@ class PlaneSolid:
 
 @dataclass(frozen=True)
 class Box:
-    """A box about the origin of `pose`. Parts: faces -x, +x, -y, +y, -z, +z; one material may serve all of them."""
+    """A box about the origin of `pose`.
+
+    Parts: faces -x, +x, -y, +y, -z, +z; one material may serve all of them.
+    """
 
     role: str
     pose: SolidPose

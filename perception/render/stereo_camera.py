@@ -1,4 +1,4 @@
-"""The camera pair that pictures are rendered for: its lens, its baseline, and where it stands on the machine."""
+"""The stereo camera: geometry of the pair, and from radiance to a noisy picture."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ import numpy as np
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from perception.render.ray_tracer import Pinhole
-
-# --- from sensor: From light to numbers: dust in the air, the lens, exposure, noise, and eight
-# bits.
 
 
 @spec
@@ -41,7 +38,8 @@ class StereoRig:
     def check(self) -> None:
         if min(self.width, self.height) < 16 or self.focal_px <= 0 or self.baseline_m <= 0:
             raise ConfigError(
-                f"rig: expected width and height of 16 or more, focal_px and baseline_m above 0, got {self.width} x {self.height}, "
+                "rig: expected width and height of 16 or more, focal_px and baseline_m above 0, got "
+                f"{self.width} x {self.height}, "
                 f"{self.focal_px}, {self.baseline_m}"
             )
 
@@ -81,7 +79,7 @@ class CameraExposure:
 
     Attributes:
         gain: Signal for unit radiance; 1 saturates.
-        extinction_per_m: Of the dusty air: what is left of the light after z metres is
+        extinction_per_m: Of the dusty air: the transmitted part of the light after z metres is
             exp(-extinction z).
         airlight: Radiance of the dust itself.
         patchiness: Standard deviation of the dust's density over the picture, relative; it drifts

@@ -1,4 +1,11 @@
-"""What JPEG leaves of pictures, in torch, for a whole batch at once and without files (ITU-T T.81; colours at full resolution)."""
+"""Augmentations of brightness, sharpness and noise; nothing moves in the pictures.
+
+The paper's five are blur, crop, contrast, gamma and noise; crop changes the geometry and is
+`samples.Crop`. All take and return a batch of RGB pictures in [0, 1], `(B, 3, h, w)` float32 on any
+device. Each picture is changed by its own draw from the given generator, of the same device.
+
+JPEG is computed in torch for a whole batch, without files (ITU-T T.81; colours at full resolution).
+"""
 
 from __future__ import annotations
 
@@ -12,12 +19,6 @@ from torch.nn import functional
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
-
-# --- from augment: Augmentations: what light, dust, lens, sensor and file do to pictures, without
-# moving anything in them. The paper's five are blur, crop, contrast, gamma and noise; crop
-# changes the geometry and is `training_data.Crop`. All take and return a batch of RGB pictures in
-# [0, 1], `(B, 3, h, w)` float32 on any device, each picture changed by a draw of its own from the
-# generator that they are given, which is of the same device, and from nothing else.
 
 LUMINANCE_STEPS = (
     (16, 11, 10, 16, 24, 40, 51, 61), (12, 12, 14, 19, 26, 58, 60, 55), (14, 13, 16, 24, 40, 57, 69, 56),
@@ -34,7 +35,7 @@ YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, -0.0
 
 
 def recompress_jpeg(pictures: torch.Tensor, quality: torch.Tensor) -> torch.Tensor:
-    """Return RGB pictures in [0, 1], `(B, 3, h, w)`, as files of a quality, `(B, 1, 1, 1)` from 1 to 100, give them back."""
+    """Return RGB pictures, `(B, 3, h, w)` in [0, 1], as JPEG of a quality, `(B, 1, 1, 1)`, leaves them."""
     height, width = pictures.shape[2:]
     percent = torch.where(quality < 50.0, 5000.0 / quality, 200.0 - 2.0 * quality) / 100.0
     tables, matrix, inverse, middle, wave = _build_jpeg_constants(pictures.device)
@@ -56,7 +57,7 @@ def recompress_jpeg(pictures: torch.Tensor, quality: torch.Tensor) -> torch.Tens
 
 @functools.cache
 def _build_jpeg_constants(device: torch.device) -> tuple[torch.Tensor, ...]:
-    """Returns, on a device, the steps at quality 50, YCC of RGB and back, the middle of each channel and the cosines."""
+    """Return steps at quality 50, YCC of RGB and its inverse, channel middles and cosines."""
     number = torch.arange(8.0)
     wave = ((number + 0.5) * number[:, None] * (math.pi / 8.0)).cos()
     wave = wave * torch.where(number > 0, 0.5, 0.125**0.5)[:, None]  # orthonormal
@@ -87,7 +88,7 @@ def apply_augmentations(
     chance: torch.Generator,
     generator: torch.Generator,
 ) -> torch.Tensor:
-    """Return the pictures after all augmentations in their order, each with its probability, clipped to [0, 1].
+    """Return the pictures after all augmentations, each with its probability, clipped to [0, 1].
 
     `chance`, on the CPU, says which pictures each one changes (whoever asks a graphics card for
     that waits); `generator` says how.
@@ -176,7 +177,7 @@ class Shadow:
 
     Attributes:
         probability: How often.
-        depth: Range of what is left of the light.
+        depth: Range of the remaining part of the light.
         width: Range of the band's width, as a part of the picture's.
         softness: Range of the edge's width, as a part of the picture's.
     """
@@ -208,11 +209,11 @@ class Shadow:
 
 @spec
 class Haze:
-    """Dust in the air: the picture fades into the dust's colour, unevenly (Koschmieder's law with a transmission that drifts).
+    """Dust in the air: the picture fades unevenly into its colour (Koschmieder's law).
 
     Attributes:
         probability: How often.
-        transmission: Range of what comes through.
+        transmission: Range of the transmitted part of the light.
         brightness: Range of the dust's brightness.
         unevenness: Largest change of the transmission across the picture.
     """
@@ -281,7 +282,7 @@ class MotionBlur:
         _check_ranges(self, length_px=self.length_px)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
-        """Return the pictures smeared along a line; what is shown stays where it was, in the middle of the way."""
+        """Return the pictures smeared along a line, centred on where they were."""
         half = math.ceil(self.length_px[1] / 2.0) + 1
         length, angle_rad = (
             _draw_uniform(one, pictures, generator) for one in (self.length_px, (0.0, math.pi))
@@ -298,7 +299,7 @@ class MotionBlur:
 
 @spec
 class SensorNoise:
-    """Noise of the sensor: a constant part and one that grows with the root of the light, partly grainy.
+    """Noise of the sensor: a constant part and one by the root of the light, with grain.
 
     Attributes:
         probability: How often.
@@ -371,7 +372,7 @@ def _build_gaussian_kernels(sigma_px: torch.Tensor, largest_px: float) -> torch.
 
 
 def _filter_pictures(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Tensor:
-    """Return each picture filtered by its own kernel, `(B, 1, k, l)`; what lies beyond a border is like the border."""
+    """Return each picture filtered by its own kernel, `(B, 1, k, l)`; borders are repeated."""
     down, across = kernels.shape[2] // 2, kernels.shape[3] // 2
     wide = functional.pad(pictures, (across, across, down, down), mode="replicate").flatten(0, 1)[
         None
@@ -381,7 +382,7 @@ def _filter_pictures(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Ten
 
 
 def _check_ranges(step: Augmentation, **ranges: Range) -> None:
-    """Raise a `ConfigError` for a probability outside [0, 1] and for ranges that are empty or reach below 0."""
+    """Raise a `ConfigError` for a probability outside [0, 1] or a range empty or below 0."""
     if not 0.0 <= step.probability <= 1.0:
         raise ConfigError(
             f"{type(step).__name__}.probability: expected 0 to 1, got {step.probability}"
@@ -389,5 +390,6 @@ def _check_ranges(step: Augmentation, **ranges: Range) -> None:
     for name, (low, high) in ranges.items():
         if not 0.0 <= low <= high:
             raise ConfigError(
-                f"{type(step).__name__}.{name}: expected 0 <= lowest <= highest, got [{low}, {high}]"
+                f"{type(step).__name__}.{name}: expected 0 <= lowest <= highest, got "
+                f"[{low}, {high}]"
             )

@@ -1,4 +1,4 @@
-"""How good a segmenter is on frames it has not seen, as numbers and as pictures."""
+"""Evaluation of a segmenter on unseen frames, as numbers and as pictures."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COLOURS = {"block": (0, 114, 178), "mouth": (213, 94, 0)}
 def crop_segmenter_views(
     views: TrainingViews, size_px: tuple[int, int]
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what the segmenter would see of each frame, `(F, 2, 3, h, w)` uint8, and what is there, `(F, 2, 2, h, w)` bool."""
+    """Return the segmenter's pictures, `(F, 2, 3, h, w)` uint8, and their masks, `(F, 2, 2, h, w)`."""
     width, height = size_px
     full = tuple(views.layers.shape[3:])
     room = (
@@ -60,7 +60,7 @@ def crop_segmenter_views(
 
 @torch.no_grad()
 def predict(network: UNet, pictures: torch.Tensor, device: torch.device) -> torch.Tensor:
-    """Return the probabilities for pictures `(F, 2, 3, h, w)` uint8, `(F, 2, 2, h, w)`, on the CPU."""
+    """Return probabilities, `(F, 2, 2, h, w)` on the CPU, for pictures `(F, 2, 3, h, w)` uint8."""
     network.eval()
     flat, found = pictures.flatten(0, 1), []
     for first in range(0, len(flat), BATCH):
@@ -109,7 +109,7 @@ def _compute_iou(said: torch.Tensor, known: torch.Tensor) -> float | None:
 
 
 def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
-    """Return how many mouths were found, how many there are, and how many pieces of `said` touch none."""
+    """Return the numbers of mouths found, of mouths, and of predicted pieces that touch none."""
     num_said, said_labels = cv2.connectedComponents(said.astype(np.uint8))
     num_known, known_labels = cv2.connectedComponents(known.astype(np.uint8))
     found = 0
@@ -127,7 +127,7 @@ def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
 
 @contextmanager
 def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
-    """Show how far a training is; yields what says that it is one update farther."""
+    """Show the progress of a training; yield the function that advances it by one update."""
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -143,7 +143,7 @@ def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
 def draw_samples(
     path: Path, pictures: torch.Tensor, probabilities: torch.Tensor, known: torch.Tensor
 ) -> None:
-    """Draw some frames in both views: what is there as a thin line, what the network says as colour; writes a PNG."""
+    """Write a PNG of some frames in both views: true masks as lines, predictions as colour."""
     rows = []
     for frame in np.linspace(0, len(pictures) - 1, min(SHOWN, len(pictures))).round().astype(int):
         tiles = []

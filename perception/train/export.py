@@ -1,4 +1,4 @@
-"""Networks in files: safetensors to go on with in torch, ONNX to run anywhere, and the proof that both say the same."""
+"""Networks in files: safetensors to train on, ONNX to run, and a check that both agree."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TOLERANCE = 1e-3
 def build_header(
     network: UNet, size_px: tuple[int, int], facts: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return what stands in a network's files: what it takes and gives, and `facts` about its training, JSON."""
+    """Return the header of a network's files: input, output and `facts` about its training."""
     return {
         "schema": SCHEMA,
         "channels": list(CHANNELS),
@@ -60,7 +60,7 @@ def write_onnx(
     Args:
         path: Where to.
         network: The network, on the CPU.
-        header: What `header_of` returned.
+        header: Of `build_header`.
         pictures: On which file and network are compared, `(B, 3, h, w)` float32 in [0, 1].
 
     Returns:
@@ -97,7 +97,8 @@ def write_onnx(
     )
     if not largest <= TOLERANCE:
         raise CheckpointError(
-            f"the exported network differs from the one in torch by {largest:.3g} of probability, over {TOLERANCE}; {path} was not "
+            f"the exported network differs from the one in torch by {largest:.3g} of "
+            f"probability, over {TOLERANCE}; {path} was not "
             "written. This is a bug of the exporter or of a layer."
         )
     write_bytes(path, model.SerializeToString())

@@ -1,4 +1,4 @@
-"""Pictures to train on: each frame becomes the two views at which the segmenter looks, with room to crop.
+"""Training samples: each frame as the segmenter's two views, with room to crop.
 
 A batch is a function of the seed and its number alone, so a training goes on exactly where it
 stopped. All of it is made by torch
@@ -28,7 +28,7 @@ from perception.segment.window import Window, bound_block, center_window, cover_
 from perception.train.augmentation import Augmentation, apply_augmentations
 
 ROOM = 1.5
-"""Size of a stored view over the network's picture: what a crop can take away without loss of
+"""Size of a stored view over the network's picture: room that a crop can use without loss of
 detail."""
 LOOKS = ("whole", "closer")
 SEEN = (1.0, 1.0 / ROOM)
@@ -47,7 +47,7 @@ THREADS = 16
 
 @spec
 class Crop:
-    """What a sample shows, beside what the segmenter would see.
+    """Random crop of a sample around the segmenter's view.
 
     Attributes:
         width: Range of its width, as a part of the width that the segmenter sees; beyond the view
@@ -101,7 +101,7 @@ class TrainingViews:
     Attributes:
         layers: `(F, 2, 5, H, W)` uint8: of the whole frame, and of the block with room around it,
             RGB, and how much of each pixel shows block and mouth, 255 for all of it.
-        conditions: Under what each frame was taken.
+        conditions: Kind of scene of each frame.
         names: Path of each frame without its endings.
     """
 
@@ -121,10 +121,10 @@ class Samples:
     """Endless batches by number, cut and changed where the network is trained.
 
     Args:
-        views: What they are cut from; kept on the device where it has room for them, else in the
+        views: They are cut from these; kept on the device where it has room for them, else in the
             computer's memory.
         crop: How.
-        steps: What happens to them.
+        steps: Augmentations, in order.
         size_px: Width and height of a sample.
         closer: How often a sample is cut from the closer view.
         seed: Of all draws.
@@ -151,7 +151,7 @@ class Samples:
         self._closer, self._seed, self._device = closer, seed, device
 
     def batch(self, number: int, count: int) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return pictures `(count, 3, h, w)` and shares of block and mouth `(count, 2, h, w)` of a batch, float32 in [0, 1]."""
+        """Return pictures, `(count, 3, h, w)`, and shares of block and mouth, `(count, 2, h, w)`."""
         seed = (self._seed * 0x9E3779B97F4A7C15 + number) % 2**63
         chance = torch.Generator().manual_seed(seed)
         frame = torch.randint(len(self._layers), (count,), generator=chance)
@@ -170,11 +170,11 @@ class Samples:
 def cut_windows(
     layers: torch.Tensor, windows: torch.Tensor, size_px: tuple[int, int]
 ) -> torch.Tensor:
-    """Return parts of pictures `(B, C, H, W)` uint8 in the size of a sample, `(B, C, h, w)` float32 in [0, 1].
+    """Return parts of pictures, `(B, C, H, W)` uint8, as samples, `(B, C, h, w)` float32 in [0, 1].
 
     Args:
         layers: Pictures.
-        windows: Which part, `(B, 2, 3)`, see `Crop.windows`; what lies beyond the picture is black.
+        windows: Which part, `(B, 2, 3)`, see `Crop.windows`; black beyond the picture.
         size_px: Width and height.
     """
     width, height = size_px
@@ -185,7 +185,7 @@ def cut_windows(
 
 
 def list_frames(folders: str | Sequence[str]) -> list[Path]:
-    """Return the frames with a mask in a folder, or in some, and those below them, as paths without endings, sorted.
+    """Return the frames with a mask in and below folders, as sorted paths without endings.
 
     Raises:
         FrameError: a folder holds none.

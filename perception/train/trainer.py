@@ -1,4 +1,4 @@
-"""Training the segmenter: samples and network on whatever device there is, best by unseen frames."""
+"""Training of the segmenter on any device; the best network by unseen frames is kept."""
 
 from __future__ import annotations
 
@@ -22,10 +22,9 @@ from perception.train.augmentation import Augmentation
 from perception.train.samples import Crop, Samples, TrainingViews
 
 STATE = "training.pt"
-"""What an interrupted training goes on from."""
+"""State of an interrupted training."""
 FREE = ("frames", "validation", "hold_out", "max_seconds", "validate_every")
-"""Settings that may be others when it does; frames and validation are compared by what they
-hold."""
+"""Settings that may differ on resuming; frames and validation are compared by content."""
 
 log = logging.getLogger(__name__)
 
@@ -45,12 +44,12 @@ class SegmenterTraining:
             name of one that ships with the package; `null` begins with chance.
         updates: Steps of the optimiser.
         max_seconds: It ends after as many seconds too, those before a resume included; `null` for
-            no such end. What was learned until then depends on the speed of the machine.
+            no such end. The result then depends on the speed of the machine.
         batch: Samples a step.
         rate: Learning rate at its highest; it rises for a twentieth of the updates, then falls as a
             cosine to nothing.
         decay: Weight decay.
-        average: The network is the mean of what it was lately, over about this part of the
+        average: The network is the running mean of its weights over about this part of the
             training: the steps of the last batches are as much chance as gain.
         bfloat16: Whether the network is trained in sixteen bits: in half the time on a graphics
             card or a processor that can.
@@ -58,8 +57,8 @@ class SegmenterTraining:
         margin: Room around the block in that view, as a part of its box; that of the segmenter.
         validate_every: Updates between two judgements, after each of which the training can go on
             if it is stopped.
-        crop: What a sample shows, beside what the segmenter would see.
-        augment: What happens to its picture, by name, in this order.
+        crop: Random crop around the segmenter's view.
+        augment: Augmentations by name, in this order.
     """
 
     frames: str | tuple[str, ...]
@@ -90,7 +89,8 @@ class SegmenterTraining:
             )
         if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2:
             raise ConfigError(
-                "training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or more"
+                "training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or "
+                "more"
             )
         if (
             min(self.average, self.rate, math.inf if self.max_seconds is None else self.max_seconds)
@@ -99,10 +99,10 @@ class SegmenterTraining:
             raise ConfigError("training: expected average, rate and max_seconds above 0")
 
     def fit(self, session: Session, resume: bool) -> dict[str, Any]:
-        """Train; leaves the network as safetensors and ONNX, curve and samples as PNG in the session's folder.
+        """Train; write network (safetensors, ONNX), curve and samples (PNG) into the session's folder.
 
         Returns:
-            What `training.json` says: `conditions` (see `training_report.judged`), `best_update`,
+            The content of `training.json`: `conditions` (see `evaluation.compute_metrics`), `best_update`,
                 `parameters`, `parity`, …
 
         Raises:
@@ -121,7 +121,7 @@ class _Training:
         self._device = session.torch_device()
         session.seed_all()
         self._train, self._unseen = self._views()
-        self._network = self._begun().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        self._network = self._build_network().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._optimizer = torch.optim.AdamW(
             self._network.parameters(), lr=settings.rate, weight_decay=settings.decay, fused=True
         )
@@ -166,7 +166,7 @@ class _Training:
                     self._save()
         return self._finish(pictures, known)
 
-    def _begun(self) -> UNet:
+    def _build_network(self) -> UNet:
         """Return the network as the training begins with it."""
         network, settings = UNet(self._settings.widths), self._settings
         if settings.start is not None:
@@ -189,7 +189,8 @@ class _Training:
             unseen = training_data.list_frames(settings.validation)
             if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
                 raise ConfigError(
-                    f"training.validation: {min(shared)} is also among training.frames; judge by other frames"
+                    f"training.validation: {min(shared)} is also among training.frames; judge by "
+                    "other frames"
                 )
         if not stems:
             raise ConfigError("training.frames: one frame is too few to train on and to judge by")
@@ -292,7 +293,7 @@ class _Training:
         }
 
     def _identity(self) -> dict[str, str]:
-        """Return what must be the same for a training to go on."""
+        """Return fingerprints of settings and data, which must be the same to resume."""
         same = {name: value for name, value in vars(self._settings).items() if name not in FREE}
         data = hashlib.sha256()
         for views in (self._train, self._unseen):
@@ -321,7 +322,7 @@ class _Training:
             return
         try:
             state = torch.load(path, map_location=self._device, weights_only=True)
-        except Exception as error:  # torch raises whatever its unpickler meets
+        except Exception as error:  # torch passes on any error of its unpickler
             raise CheckpointError(
                 f"{path}: corrupt ({error}); delete it to begin the training again"
             ) from error

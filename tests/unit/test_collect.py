@@ -16,7 +16,7 @@ from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
-from actuators.effects.composition import Affected
+from actuators.effects.composition import ActuatorWithEffects
 from actuators.excite.player import NominalLink
 from actuators.modes.collect import Collect
 from brokk_rl import record
@@ -74,7 +74,7 @@ def test_every_run_is_cut_into_files_that_know_each_other(
     first, second, *_ = files.values()
     assert second.metadata["created"] == record.add_seconds(first.metadata["created"], 12.0)
     assert (
-        first.metadata["source"] == "simulator: Lag, excitation: sine"
+        first.metadata["source"] == "simulator: FirstOrderLag, excitation: sine"
         and first.metadata["seed"] == "0"
     )
     assert json.loads(first.metadata["fingerprint"]) == machine.fingerprint()
@@ -294,7 +294,7 @@ def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(
 def test_a_simulated_machine_is_its_actuator_model_with_noise(
     machine: Machine, tmp_path: Path
 ) -> None:
-    plant = Affected(
+    plant = ActuatorWithEffects(
         actuator=option("actuator", "lag"), effects={"backlash": option("effect", "backlash")}
     )
     session = Session(out=str(tmp_path), seed=0, device="cpu")
@@ -304,7 +304,7 @@ def test_a_simulated_machine_is_its_actuator_model_with_noise(
     )
     model = option("actuator", "lag").build(machine, 2, torch.device("cpu"))
     neutral = SimulatedMachines(
-        actuator=Affected(actuator=option("actuator", "lag"), effects={}), noise=0.0
+        actuator=ActuatorWithEffects(actuator=option("actuator", "lag"), effects={}), noise=0.0
     ).build(machine, 2, session)
     home = torch.as_tensor(machine.home, dtype=torch.float32).repeat(2, 1)
     history = History(q=home[:, None].repeat(1, 13, 1), u=torch.zeros(2, 13, 5))

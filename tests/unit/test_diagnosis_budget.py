@@ -11,7 +11,7 @@ import torch
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, compare_tool_points
 from diagnosis.probes import probe_residuals
 from diagnosis.stages import (
@@ -52,13 +52,15 @@ def recording(
     )  # fmt: skip
 
 
-def runs(machine: Machine, recordings: list[Recording], change=lambda speed, r: speed) -> FreeRuns:
+def runs(
+    machine: Machine, recordings: list[Recording], change=lambda speed, r: speed
+) -> WindowedRuns:
     """Returns free runs of 5 s whose simulated speed is `change` of the measured one, `(T, J)`."""
     row = np.concatenate([np.arange(40, r.num_samples - 99, 100) for r in recordings])
     source = np.concatenate(
         [np.full(len(np.arange(40, r.num_samples - 99, 100)), n) for n, r in enumerate(recordings)]
     )
-    empty = FreeRuns(recordings, source, row, np.zeros((len(row), 100, 5)))
+    empty = WindowedRuns(recordings, source, row, np.zeros((len(row), 100, 5)))
     speed = empty.cut([change(np.diff(r.q, axis=0, prepend=r.q[:1]), r) for r in recordings])
     start = np.stack([recordings[s].q[k - 1] for s, k in zip(source, row, strict=True)])
     return replace(empty, simulated=start[:, None] + np.cumsum(speed, 1))
@@ -173,7 +175,7 @@ def test_the_probe_of_what_was_planted_stands_out(
     reference = [recording(machine, seed) for seed in range(10, 16)]
     rng = np.random.default_rng(0)
 
-    def shaken(run: FreeRuns) -> FreeRuns:
+    def shaken(run: WindowedRuns) -> WindowedRuns:
         return replace(
             run, simulated=run.simulated + 1e-4 * rng.standard_normal(run.simulated.shape).cumsum(1)
         )
@@ -192,7 +194,7 @@ def test_the_stage_is_where_the_error_was_planted(machine: Machine) -> None:
     reference = runs(machine, [recording(machine, seed) for seed in range(10, 18)])
     rng = np.random.default_rng(0)
 
-    def found(run: FreeRuns) -> tuple[str | None, dict[str, float | None]]:
+    def found(run: WindowedRuns) -> tuple[str | None, dict[str, float | None]]:
         mine, other = (
             replace(
                 r, simulated=r.simulated + 1e-4 * rng.standard_normal(r.simulated.shape).cumsum(1)

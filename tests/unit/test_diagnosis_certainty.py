@@ -15,25 +15,25 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import FreeRunWindows
 from diagnosis import calibration, decision, residual_model
-from diagnosis.calibration import Certainty
-from diagnosis.detection import Findings, Prices
-from diagnosis.effect_library import Candidates
-from diagnosis.refine import Repair
-from diagnosis.residuals import ErrorCovariance, Evidence
-from diagnosis.search import Chosen
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.effect_library import EffectSimulator
+from diagnosis.refine import FittedSet
+from diagnosis.residuals import INCREMENT_SAMPLES, ErrorCovariance, Residuals
+from diagnosis.search import EffectSet
 from exam.calibration import WeighedCase, fit_logistic, split_by_family
 
 
 @pytest.fixture
-def weights() -> Certainty:
+def weights() -> ProbabilityModel:
     return option("certainty", "default")
 
 
 def moving(
     machine: Machine, random: np.random.Generator, windows: int = 60, steps: int = 20
-) -> Evidence:
+) -> Residuals:
     """Returns a simulator's motion in levels, whose errors have a noise of 1."""
-    full = machine.max_speed * machine.period_s * residual_model.SPAN
+    full = machine.max_speed * machine.period_s * INCREMENT_SAMPLES
     way = (
         np.repeat(random.uniform(-0.4, 0.4, (windows, steps // 5, machine.num_joints)), 5, 1) * full
     )
@@ -42,15 +42,14 @@ def moving(
     cut = SimpleNamespace(
         run=np.repeat(["first", "second"], [windows // 2, windows - windows // 2])
     )
-    candidates = SimpleNamespace(
+    simulator = SimpleNamespace(
         machine=machine, running_s=np.linspace(0.0, 1800.0, windows), cut=cut
     )
-    white = {"whitened_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
-    base = start[:, None] + np.cumsum(
-        np.repeat(way, residual_model.SPAN, 1) / residual_model.SPAN, 1
-    )
+    white = {"whiten_joint": lambda columns, j: columns.reshape(-1, columns.shape[-1])}
+    base = start[:, None] + np.cumsum(np.repeat(way, INCREMENT_SAMPLES, 1) / INCREMENT_SAMPLES, 1)
     return cast(
-        Evidence, SimpleNamespace(way=way, base=base, start=start, candidates=candidates, **white)
+        Residuals,
+        SimpleNamespace(increments=way, base=base, start=start, simulator=simulator, **white),
     )
 
 
@@ -77,15 +76,15 @@ def test_what_is_left_is_traced_to_what_it_depends_on(
     machine: Machine, clue: str, error: residual_model.Callable
 ) -> None:
     random = np.random.default_rng(0)
-    evidence = moving(machine, random)
-    motion = residual_model.Motion(evidence, 2)
+    residuals = moving(machine, random)
+    motion = residual_model.SimulatedMotion(residuals, 2)
     column, own = error(motion).ravel(), motion.own.ravel()
     column = (
         column if clue in residual_model.FORMS else column - own * (own @ column) / (own @ own)
     )  # another gain is form
     z = random.standard_normal((machine.num_joints, column.size))
     z[2] += 0.5 * column / column.std()
-    earned = residual_model.predictable(evidence, z)
+    earned = residual_model.score_clues(residuals, z)
     best = list(residual_model.CLUES)[int(earned[:, 2].argmax())]
     assert best == clue and earned[:, 2].max() > 30.0
     assert np.delete(earned, 2, 1).max() < 6.0, "chance earns little on the other joints"
@@ -94,7 +93,7 @@ def test_what_is_left_is_traced_to_what_it_depends_on(
 def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(
     machine: Machine,
 ) -> None:
-    motion = residual_model.Motion(
+    motion = residual_model.SimulatedMotion(
         moving(machine, np.random.default_rng(6), windows=4), 2
     )  # two windows a recording
     worked = np.zeros((4, 20))
@@ -107,7 +106,7 @@ def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(
 
 
 def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> None:
-    # a dead band halves all speeds: errors of 5 % of what is left are 2.5 % of what was simulated
+    # a dead band split_by_family all speeds: errors of 5 % of what is left are 2.5 % of what was simulated
     # before
     random, noise = (
         np.random.default_rng(7),
@@ -115,27 +114,27 @@ def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> 
     )
     windows, joints = 120, machine.num_joints
     way = (
-        np.repeat(random.uniform(0.02, 0.05, (windows, 20, joints)), residual_model.SPAN, 1)
-        / residual_model.SPAN
+        np.repeat(random.uniform(0.02, 0.05, (windows, 20, joints)), INCREMENT_SAMPLES, 1)
+        / INCREMENT_SAMPLES
     )
     before, start = np.cumsum(way, 1), np.zeros((windows, joints))
-    steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), residual_model.SPAN, 1)
+    steady = np.repeat(0.05 * random.standard_normal((windows, 20, joints)), INCREMENT_SAMPLES, 1)
     measured = 0.5 * np.cumsum(way * (1.0 + steady), 1)
     q = np.concatenate([start[:, None], measured], 1)
     cut = FreeRunWindows(np.zeros((windows, 100, joints)), q, np.repeat("one", windows), 1, 1)
-    candidates = Candidates(cast(Actuator, None), machine, cut, np.zeros(windows), 0)
-    evidence = Evidence(
-        candidates, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before
+    simulator = EffectSimulator(cast(Actuator, None), machine, cut, np.zeros(windows), 0)
+    residuals = Residuals(
+        simulator, [noise] * joints, np.ones((windows, joints), dtype=bool), runs=before
     )
     none = np.zeros((0, joints))
-    repair = Repair(
-        [], none.astype(bool), none, none[None], 0.5 * before, 0.5 * before, evidence.z, none
+    fitted = FittedSet(
+        [], none.astype(bool), none, none[None], 0.5 * before, 0.5 * before, residuals.z, none
     )
-    left = residual_model.repaired(evidence, repair)
+    left = residual_model.apply_fitted_set(residuals, fitted)
     np.testing.assert_allclose(left.z.std(1), 1.0, atol=0.06)
-    np.testing.assert_allclose(residual_model.strayed(left, left.error), 1.0, atol=0.25)
-    assert evidence.whitened(left.error[None]).std() == pytest.approx(0.5, abs=0.03)
-    assert residual_model.repaired(evidence, None) is evidence
+    np.testing.assert_allclose(residual_model.measure_straying(left, left.error), 1.0, atol=0.25)
+    assert residuals.whiten(left.error[None]).std() == pytest.approx(0.5, abs=0.03)
+    assert residual_model.apply_fitted_set(residuals, None) is residuals
 
 
 def test_free_runs_stray_as_far_as_their_noise_says() -> None:
@@ -150,7 +149,7 @@ def test_free_runs_stray_as_far_as_their_noise_says() -> None:
 
 
 def test_the_error_of_a_form_is_added_to_that_of_a_size() -> None:
-    low, size, high = calibration.widened(
+    low, size, high = calibration.widen_interval(
         np.array([0.5 - 1.96 * 0.03, 0.5, 0.5 + 1.96 * 0.03]), 0.08
     )
     assert (
@@ -166,7 +165,8 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
         {"constant": 1.0, "margin": m, "names": n} for m, n in random.standard_normal((6000, 2))
     ]
     true = [
-        random.random() < calibration.chance({"constant": -1.0, "margin": 2.0, "names": 0.0}, one)
+        random.random()
+        < calibration.compute_probability({"constant": -1.0, "margin": 2.0, "names": 0.0}, one)
         for one in signs
     ]
     begin = {"constant": 0.0, "margin": 0.5, "names": 1.0}
@@ -178,27 +178,27 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
     assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
 
 
-def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> Findings:
+def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> DetectionResult:
     """Returns effects by joint, named by a letter each, and what sensors, frames and tool points show."""
-    fields = {field.name: None for field in dataclasses.fields(Findings)}
-    chosen = Chosen(tuple(frozenset(one) for one in subsets), 50.0)
+    fields = {field.name: None for field in dataclasses.fields(DetectionResult)}
+    chosen = EffectSet(tuple(frozenset(one) for one in subsets), 50.0)
     shown = [
         SimpleNamespace(kind=SimpleNamespace(name=name, stage="kinematics")) for name in others
     ]
-    return Findings(**cast(dict, {**fields, "chosen": chosen, "others": shown}))
+    return DetectionResult(**cast(dict, {**fields, "chosen": chosen, "detected": shown}))
 
 
 @pytest.mark.parametrize(("shown", "unknown"), [(0.95, False), (0.6, True)])
 def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
-    monkeypatch: pytest.MonkeyPatch, weights: Certainty, shown: float, unknown: bool
+    monkeypatch: pytest.MonkeyPatch, weights: ProbabilityModel, shown: float, unknown: bool
 ) -> None:
-    monkeypatch.setattr(decision, "named_chances", lambda *_: {"t": shown, "a": 0.4})
-    monkeypatch.setattr(decision, "unknown_chance", lambda *_: 0.7)
-    assert decision.is_unknown(found(("a", ""), ("t",)), cast(Prices, None), weights) is unknown
+    monkeypatch.setattr(decision, "compute_effect_probabilities", lambda *_: {"t": shown, "a": 0.4})
+    monkeypatch.setattr(decision, "compute_unknown_probability", lambda *_: 0.7)
+    assert decision.is_unknown(found(("a", ""), ("t",)), cast(Penalties, None), weights) is unknown
 
 
 def test_what_was_named_only_beside_another_goes_with_it(
-    monkeypatch: pytest.MonkeyPatch, weights: Certainty
+    monkeypatch: pytest.MonkeyPatch, weights: ProbabilityModel
 ) -> None:
     beside = {
         frozenset("abc"): {"a": 0.9, "b": 0.6, "c": 0.4},
@@ -207,27 +207,31 @@ def test_what_was_named_only_beside_another_goes_with_it(
         frozenset("d"): {"d": 0.3},
     }
     monkeypatch.setattr(
-        decision, "named_chances", lambda found, *_: beside.get(found.chosen.names, {"a": 0.9})
+        decision,
+        "compute_effect_probabilities",
+        lambda found, *_: beside.get(found.chosen.names, {"a": 0.9}),
     )
 
     def kept(subsets: tuple[str, ...]) -> tuple[set[str], ...]:
         return tuple(
             set(one)
-            for one in decision.likely(found(subsets), cast(Prices, None), weights).chosen.subsets
+            for one in decision.drop_unlikely_effects(
+                found(subsets), cast(Penalties, None), weights
+            ).chosen.subsets
         )
 
     assert kept(("ab", "c", "")) == ({"a"}, set(), set())
     assert kept(("de", "d")) == ({"d"}, {"d"}), "the most probable one stays"
 
 
-def test_no_answer_is_surer_than_answers_can_tell(weights: Certainty) -> None:
-    sure = calibration.right(margin=1e6, adds=1.0, size=1.0, names=1, outside=-6.0)
-    assert calibration.chance({**weights.right, "margin": 5.0}, sure) == pytest.approx(
+def test_no_answer_is_surer_than_answers_can_tell(weights: ProbabilityModel) -> None:
+    sure = calibration.collect_effect_signs(margin=1e6, adds=1.0, size=1.0, names=1, outside=-6.0)
+    assert calibration.compute_probability({**weights.right, "margin": 5.0}, sure) == pytest.approx(
         1.0 / (1.0 + np.exp(-6.0))
     )
 
 
-def test_a_missing_or_unknown_sign_is_named(weights: Certainty) -> None:
+def test_a_missing_or_unknown_sign_is_named(weights: ProbabilityModel) -> None:
     with pytest.raises(ConfigError, match="expected a number for nearest"):
         dataclasses.replace(weights, none={"constant": 0.0, "outside": 0.0})
     with pytest.raises(ConfigError, match="'margins' is no sign"):

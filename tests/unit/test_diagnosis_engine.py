@@ -14,7 +14,7 @@ import torch
 from composed import option
 
 from actuators.effects.command import DeadBand
-from actuators.effects.composition import Affected
+from actuators.effects.composition import ActuatorWithEffects
 from actuators.effects.speed import Compliance, FlowGain
 from actuators.models.lag import FirstOrderLag
 from brokk_rl import record
@@ -35,9 +35,9 @@ from diagnosis.answer import (
     Selected,
     Where,
 )
-from diagnosis.case import Case
-from diagnosis.detection import Prices
-from diagnosis.pipeline import Diagnosis
+from diagnosis.case import GapCase
+from diagnosis.detection import Penalties
+from diagnosis.pipeline import DiagnosisPipeline
 
 CPU = torch.device("cpu")
 PLANT = FirstOrderLag(
@@ -48,7 +48,7 @@ PLANT = FirstOrderLag(
     time_constant_s=0.08,
     spread={},
 )
-PRICES = Prices(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, tool=2.0)
+PRICES = Penalties(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, tool=2.0)
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def driven(
 ) -> list[Recording]:
     """Returns recordings of the plant with effects under levels and rests, its speed wandering by a percent or two."""
     random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
-    model = Affected(actuator=PLANT, effects=effects).build(machine, count, CPU)
+    model = ActuatorWithEffects(actuator=PLANT, effects=effects).build(machine, count, CPU)
     shape = (count, machine.num_history, machine.num_joints)
     history = History(q=torch.zeros(shape), u=torch.zeros(shape))
     history.reset(
@@ -108,12 +108,12 @@ def reference(axis: Machine) -> list[Recording]:
 def diagnosed(
     axis: Machine, reference: Sequence[Recording], effects: dict[str, Effect], folder: Path
 ) -> Answer:
-    given = Case(axis, reference, driven(axis, effects, 2, 100.0, 2))
-    base = baseline.fitted(given, option("fit", "valve"), folder, 0, CPU)
+    given = GapCase(axis, reference, driven(axis, effects, 2, 100.0, 2))
+    base = baseline.fit_baseline(given, option("fit", "valve"), folder, 0, CPU)
     thresholds, generator = option("thresholds", "default"), np.random.default_rng(0)
     excitations = {"levels": option("excitation", "levels")}
     certainty = option("certainty", "default")
-    work = Diagnosis(
+    work = DiagnosisPipeline(
         given,
         base,
         effect_library.load_effects(axis),
@@ -160,11 +160,11 @@ def test_what_the_reference_shows_already_is_put_around_the_simulator(
         effect_library.load_effects(axis, ("compliance", "dead_band", "lag")),
         option("fit", "valve"),
     )
-    given = Case(axis, soft, soft[:1])
-    after = baseline.fitted(
-        given, fit, tmp_path, 0, CPU, lambda base: baseline.refined(base, kinds, axis)
+    given = GapCase(axis, soft, soft[:1])
+    after = baseline.fit_baseline(
+        given, fit, tmp_path, 0, CPU, lambda base: baseline.add_reference_effects(base, kinds, axis)
     )
-    ((kind, values),) = after.field.evidence.candidates.fixed
+    ((kind, values),) = after.field.residuals.simulator.fixed
     assert kind.name == "compliance" and values["ringing_s"][0, 0] == pytest.approx(0.3, abs=0.1)
 
 
@@ -190,16 +190,16 @@ def test_a_dead_band_is_not_taken_for_a_speed(
 def test_recordings_that_can_tell_nothing_get_no_confident_name(
     axis: Machine, reference: list[Recording], change: Callable[[Recording], Recording], reason: str
 ) -> None:
-    doubts = Case(axis, reference, [change(reference[0])]).doubts()
+    doubts = GapCase(axis, reference, [change(reference[0])]).doubts()
     assert any(reason in doubt for doubt in doubts)
 
 
 def test_a_case_without_its_half_is_refused(tmp_path: Path, machine: Machine) -> None:
     with pytest.raises(RecordingError, match="no such folder"):
-        case.load(tmp_path / "nowhere", machine)
+        case.load_case(tmp_path / "nowhere", machine)
     (tmp_path / "field").mkdir()
     with pytest.raises(RecordingError, match=r"no reference/.*diagnosis.field"):
-        case.load(tmp_path, machine)
+        case.load_case(tmp_path, machine)
 
 
 def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Machine) -> None:
@@ -219,15 +219,15 @@ def test_recordings_of_another_machine_are_refused(tmp_path: Path, machine: Mach
             tmp_path / part / "a.parquet",
         )
     with pytest.raises(RecordingError, match="limits differ"):
-        case.load(tmp_path, machine)
+        case.load_case(tmp_path, machine)
 
 
 def test_too_little_reference_to_judge_by_is_refused(
     axis: Machine, reference: list[Recording], tmp_path: Path
 ) -> None:
-    given = Case(axis, reference[:1], reference[1:])
+    given = GapCase(axis, reference[:1], reference[1:])
     with pytest.raises(RecordingError, match="not fitted to"):
-        baseline.fitted(given, option("fit", "valve"), tmp_path, 0, CPU)
+        baseline.fit_baseline(given, option("fit", "valve"), tmp_path, 0, CPU)
 
 
 def said() -> Answer:

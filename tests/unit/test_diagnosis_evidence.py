@@ -9,10 +9,17 @@ import torch
 from actuators.models.valve import PoseFeatures
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
-from diagnosis import effect_library, gap, nonadditive_refit, residuals
-from diagnosis.residuals import ErrorCovariance, rays
-from diagnosis.responses import Shape, earned, fitted, plain, rays_of
-from diagnosis.search import Table, bind_shared_sizes, choose
+from diagnosis import effect_library, gap, nonadditive_refit
+from diagnosis.residuals import (
+    INCREMENT_SAMPLES,
+    ErrorCovariance,
+    build_rays,
+    compute_loss,
+    fit_noise,
+    to_increments,
+)
+from diagnosis.responses import Response, choose_rays, fit_faults, fit_sizes, score_responses
+from diagnosis.search import SubsetTable, bind_shared_sizes, choose_set
 
 
 def motion(random: np.random.Generator, rows: int = 80, steps: int = 60) -> np.ndarray:
@@ -32,7 +39,7 @@ def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -
     z = (truth.whitener(way) @ error[..., None])[..., 0]
     assert z.std() == pytest.approx(1.0, abs=0.03)
     assert abs(np.corrcoef(z[:, :-1].ravel(), z[:, 1:].ravel())[0, 1]) < 0.05
-    found = residuals.fit_noise(error, way)
+    found = fit_noise(error, way)
     assert found.sensor == pytest.approx(truth.sensor, rel=0.2)
     assert found.wander == pytest.approx(truth.wander, rel=0.25)
 
@@ -56,35 +63,35 @@ def test_what_a_coarse_reading_adds_to_one_increment_it_takes_from_the_next() ->
 def test_increments_add_up_to_the_way_since_the_start() -> None:
     random = np.random.default_rng(1)
     paths, start = random.standard_normal((2, 3, 20, 1)), random.standard_normal((3, 1))
-    found = residuals.to_increments(paths, start)
-    assert found.shape == (2, 3, 20 // residuals.SPAN, 1)
+    found = to_increments(paths, start)
+    assert found.shape == (2, 3, 20 // INCREMENT_SAMPLES, 1)
     np.testing.assert_allclose(found.sum(2), paths[:, :, -1] - start, atol=1e-12)
 
 
 def joint(
-    z: np.ndarray, shapes: dict[str, list[Shape]], faults: list[np.ndarray] | None = None
-) -> Table:
+    z: np.ndarray, shapes: dict[str, list[Response]], faults: list[np.ndarray] | None = None
+) -> SubsetTable:
     block = np.arange(len(z)) // 80
-    return Table(plain(z, faults or []), shapes, block)
+    return SubsetTable(fit_faults(z, faults or []), shapes, block)
 
 
-def line(column: np.ndarray) -> Shape:
+def line(column: np.ndarray) -> Response:
     """An effect that grows in proportion."""
     sizes = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-    return Shape(sizes, sizes[:, None] * column)
+    return Response(sizes, sizes[:, None] * column)
 
 
-def bend(column: np.ndarray) -> Shape:
+def bend(column: np.ndarray) -> Response:
     """An effect that only begins half way."""
     sizes = np.array([0.0, 0.5, 1.0, 2.0])
-    return Shape(sizes, np.maximum(sizes - 0.5, 0.0)[:, None] * column)
+    return Response(sizes, np.maximum(sizes - 0.5, 0.0)[:, None] * column)
 
 
 def test_the_size_of_an_effect_is_found_though_it_does_not_grow_in_proportion() -> None:
     random = np.random.default_rng(2)
     column = 2.0 * random.standard_normal(800)
     z = 0.7 * column + random.standard_normal(800)  # size 1.2: (1.2 - 0.5) = 0.7
-    assert fitted(z, [bend(column)])[0] == pytest.approx(1.2, abs=0.06)
+    assert fit_sizes(z, [bend(column)])[0] == pytest.approx(1.2, abs=0.06)
 
 
 def test_what_an_effect_earns_is_its_bayes_factor() -> None:
@@ -93,13 +100,11 @@ def test_what_an_effect_earns_is_its_bayes_factor() -> None:
     for size in (0.0, 0.6):
         z = size * column + random.standard_normal(400)
         fine = np.linspace(-2.0, 2.0, 4001)
-        likely = -residuals.robust_loss(
-            z[:, None] - fine * column[:, None], 0
-        ) + residuals.robust_loss(z)
+        likely = -compute_loss(z[:, None] - fine * column[:, None], 0) + compute_loss(z)
         whole = np.trapezoid(
             np.exp(likely - 0.5 * fine**2) / np.sqrt(2.0 * np.pi), fine
         )  # over the prior of the size
-        assert earned(plain(z, []), [line(column)])[0].sum() == pytest.approx(
+        assert score_responses(fit_faults(z, []), [line(column)])[0].sum() == pytest.approx(
             np.log(whole), abs=0.25
         )
 
@@ -108,7 +113,7 @@ def test_an_effect_that_is_not_there_earns_less_than_nothing() -> None:
     random, gains = np.random.default_rng(3), []
     for _ in range(40):
         z, column = random.standard_normal(800), random.standard_normal(800)
-        gains.append(earned(plain(z, []), [line(column)])[0].sum())
+        gains.append(score_responses(fit_faults(z, []), [line(column)])[0].sum())
     assert np.mean(gains) < -1.0 and np.max(gains) < 2.0
 
 
@@ -137,7 +142,7 @@ def test_a_pair_is_found_of_which_neither_pays_alone() -> None:
     shapes = {"a": [line(8.0 * a)], "b": [line(8.0 * b)], "c": [line(c)]}
     table = joint(z, shapes)
     table.explore(dict.fromkeys(shapes, 5.0), 3)
-    chosen = choose([table], lambda j, subset: 5.0 * len(subset), 5.0, 0.03)
+    chosen = choose_set([table], lambda j, subset: 5.0 * len(subset), 5.0, 0.03)
     assert table.score(frozenset("a")).total < 20.0 and table.score(frozenset("b")).total < 20.0
     assert chosen.names == {"a", "b"}
 
@@ -163,7 +168,7 @@ def test_two_joints_with_the_same_cause_get_one_name_where_another_would_hardly_
         )  # on the second joint b is a little nearer to the truth
         tables.append(joint(z[j], {names[0]: [line(own)], names[1]: [line(like)]}))
         tables[-1].explore({"a": 5.0, "b": 5.0}, 3)
-    chosen = choose(tables, lambda j, subset: 5.0 * len(subset), 2.0, 0.1)
+    chosen = choose_set(tables, lambda j, subset: 5.0 * len(subset), 2.0, 0.1)
     assert len(chosen.names) == 1 and all(chosen.subsets)
 
 
@@ -176,8 +181,8 @@ def test_an_effect_with_one_cause_for_all_joints_is_not_found_on_one_of_many() -
     for table in tables:
         table.explore({"clock": 5.0}, 3)
     price = {"price": lambda j, subset: 5.0 * len(subset), "name_price": 5.0, "share": 0.03}
-    assert choose(tables, **price).names == {"clock"}
-    assert not choose(tables, **price, shared=frozenset({"clock"}), partial=30.0).names
+    assert choose_set(tables, **price).names == {"clock"}
+    assert not choose_set(tables, **price, shared=frozenset({"clock"}), partial=30.0).names
 
 
 def test_a_cause_that_all_joints_share_may_earn_little_on_each() -> None:
@@ -187,8 +192,8 @@ def test_a_cause_that_all_joints_share_may_earn_little_on_each() -> None:
     tables = [joint(z[j], {"clock": [line(columns[j])]}) for j in range(5)]
     for table in tables:
         table.explore({"clock": 0.0}, 3)
-    apart = choose(tables, lambda j, subset: 12.0 * len(subset), 12.0, 0.03, least=12.0)
-    together = choose(
+    apart = choose_set(tables, lambda j, subset: 12.0 * len(subset), 12.0, 0.03, least=12.0)
+    together = choose_set(
         tables,
         lambda j, subset: 0.0,
         12.0,
@@ -214,7 +219,7 @@ def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(
         for size, x in zip(sizes, columns, strict=True)
     ]
     (kind,) = effect_library.load_effects(machine, ("clock_offset",))
-    grown = {"clock_offset": rays(kind)}
+    grown = {"clock_offset": build_rays(kind)}
     ways, shapes = bind_shared_sizes(
         frozenset(grown), tables, grown, [table.shapes for table in tables]
     )
@@ -229,14 +234,14 @@ def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(
 def test_the_closed_share_of_a_worked_example() -> None:
     generator = np.random.default_rng(8)
     before, after, floor = (np.full(40, value**2) for value in (0.03, 0.012, 0.01))
-    found = gap.closed(before, after, floor, generator)
+    found = gap.estimate_closed(before, after, floor, generator)
     assert found and found.mean == pytest.approx(0.9) and found.ci95 == pytest.approx((0.9, 0.9))
-    assert gap.closed(floor, floor, floor, generator) is None
+    assert gap.estimate_closed(floor, floor, floor, generator) is None
 
 
 def test_shares_of_effects_that_pay_only_together_are_equal_and_add_up() -> None:
     value = {frozenset(): 0.0, frozenset("a"): 0.0, frozenset("b"): 0.35, frozenset("ab"): 0.53}
-    found = gap.shapley(["a", "b"], lambda names: value[names])
+    found = gap.compute_shapley(["a", "b"], lambda names: value[names])
     assert found["a"] == pytest.approx(0.09) and found["b"] == pytest.approx(0.44)
     assert sum(found.values()) == pytest.approx(0.53)
 
@@ -266,11 +271,11 @@ def test_of_two_effects_that_are_alike_one_stays() -> None:
             "c": [line(random.standard_normal(800))],
         },
     )
-    kept = nonadditive_refit.paying(
+    kept = nonadditive_refit.drop_unneeded(
         [table], [frozenset("abc")], lambda j, subset: 4.0 * len(subset), 5.0
     )
     assert len(kept[0]) == 1 and kept[0] <= frozenset("ab")
-    assert nonadditive_refit.paying(
+    assert nonadditive_refit.drop_unneeded(
         [table], [frozenset("c")], lambda j, subset: 4.0 * len(subset), 5.0
     ) == (frozenset(),)
 
@@ -295,6 +300,6 @@ def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_
             np.corrcoef(a, b)[0, 1] for a, b in zip(told[seen], ringing(between)[seen], strict=True)
         )
 
-    (found,), (coarse,) = rays_of(kind), rays(kind)
+    (found,), (coarse,) = choose_rays(kind), build_rays(kind)
     assert in_step(found.sizes[found.sizes > 0.0]) > 0.95
     assert in_step(coarse.sizes[coarse.sizes > 0.0]) < 0.8

@@ -15,10 +15,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import baseline, effect_library, geometry, sensors, timing
 from diagnosis.answer import Estimate
-from diagnosis.case import Case
-from diagnosis.effect_library import Found, fit_interval
-from diagnosis.residuals import Evidence, rays
-from diagnosis.responses import Shape, fitted
+from diagnosis.case import GapCase
+from diagnosis.effect_library import DetectedEffect, estimate_interval
+from diagnosis.residuals import Residuals, build_rays
+from diagnosis.responses import Response, fit_sizes
 
 CPU = torch.device("cpu")
 PLANT = FirstOrderLag(
@@ -60,7 +60,7 @@ def test_a_coarse_sensor_and_a_noisy_one_are_told_apart_with_their_sizes(machine
     q[:, 1] += 1.5e-3 * np.random.default_rng(4).standard_normal(len(q))
     q[:, 3] = np.round(q[:, 3] / 0.004) * 0.004
     found = sensors.find_sensor_effects(
-        Case(machine, reference, [dataclasses.replace(field, q=q)]),
+        GapCase(machine, reference, [dataclasses.replace(field, q=q)]),
         effect_library.load_effects(machine),
         8.0,
         12.0,
@@ -73,7 +73,7 @@ def test_a_coarse_sensor_and_a_noisy_one_are_told_apart_with_their_sizes(machine
     )
     assert names["quantisation"].parameters["step_rad"]["q4"].mean == pytest.approx(0.004, rel=0.15)
     assert not sensors.find_sensor_effects(
-        Case(machine, reference, [field]), effect_library.load_effects(machine), 8.0, 12.0
+        GapCase(machine, reference, [field]), effect_library.load_effects(machine), 8.0, 12.0
     )
 
 
@@ -107,19 +107,19 @@ def test_an_encoders_zero_is_told_from_a_tilted_base_by_tool_points(machine: Mac
         tracked(swept(machine, 120.0, 7), machine, b, tilt, 8)
         for b, tilt in ((bias, 0.0), (none, 0.03))
     )
-    one = geometry.find_geometry_errors(Case(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    one = geometry.find_geometry_errors(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
     assert [found.kind.name for found in one.found] == ["encoder_bias"] and one.left < 1.2
     assert one.found[0].parameters["bias_rad"]["q3"].mean == pytest.approx(0.015, abs=0.002)
-    other = geometry.find_geometry_errors(Case(machine, [reference], [tilted]), kinds, 8.0, 12.0)
+    other = geometry.find_geometry_errors(GapCase(machine, [reference], [tilted]), kinds, 8.0, 12.0)
     assert [found.kind.name for found in other.found] == ["base_tilt"]
     assert other.found[0].parameters["roll_rad"]["machine"].mean == pytest.approx(0.03, abs=0.003)
     assert not geometry.find_geometry_errors(
-        Case(machine, [reference], [reference]), kinds, 8.0, 12.0
+        GapCase(machine, [reference], [reference]), kinds, 8.0, 12.0
     ).found
     # two milliradians are seen, explained, and not worth a name; nothing else is named in their
     # place
     faint = geometry.find_geometry_errors(
-        Case(
+        GapCase(
             machine, [reference], [tracked(swept(machine, 120.0, 7), machine, bias / 7.5, 0.0, 8)]
         ),
         kinds,
@@ -145,21 +145,21 @@ def test_a_tracker_with_a_clock_of_its_own_hides_no_error_of_an_encoder(machine:
         for seed, b in ((5, none), (7, none), (7, bias))
     )
     kinds = effect_library.load_effects(machine)
-    one = geometry.find_geometry_errors(Case(machine, [reference], [biased]), kinds, 8.0, 12.0)
+    one = geometry.find_geometry_errors(GapCase(machine, [reference], [biased]), kinds, 8.0, 12.0)
     assert [found.kind.name for found in one.found] == ["encoder_bias"] and one.left < 1.2
     assert one.found[0].joints.tolist() == [False, False, False, True, False]
     assert one.found[0].parameters["bias_rad"]["q4"].mean == pytest.approx(0.012, abs=0.001)
     # the clock itself is no error of geometry, even where the reference is not late at all
     plain = tracked(swept(machine, 120.0, 5), machine, none, 0.0, 5)
     assert not geometry.find_geometry_errors(
-        Case(machine, [plain], [field]), kinds, 8.0, 12.0
+        GapCase(machine, [plain], [field]), kinds, 8.0, 12.0
     ).found
 
 
 def test_without_measured_tool_points_geometry_says_nothing(machine: Machine) -> None:
     one = swept(machine, 20.0, 9)
     assert geometry.find_geometry_errors(
-        Case(machine, [one], [one]), effect_library.load_effects(machine), 8.0, 12.0
+        GapCase(machine, [one], [one]), effect_library.load_effects(machine), 8.0, 12.0
     ) == geometry.GeometryFindings([], 1.0)
 
 
@@ -207,15 +207,20 @@ def held_over(
 
 def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machine) -> None:
     rows = [held_over(machine, lost, seed) for lost, seed in ((0.0, 10), (0.0, 11), (0.2, 12))]
-    held = [baseline.held(PLANT, [(one, 0.0)], machine, 0) for one in rows]
-    noises = baseline.noises(held[:2], machine)
-    whole, other, lossy = (dataclasses.replace(one.evidence, noise=noises) for one in held)
+    held = [baseline.compare_simulator(PLANT, [(one, 0.0)], machine, 0) for one in rows]
+    noises = baseline.fit_covariances(held[:2], machine)
+    whole, other, lossy = (dataclasses.replace(one.residuals, noise=noises) for one in held)
     kinds = effect_library.load_effects(machine, ["frame_loss", "delay_jitter"])
-    changes = timing.Changes(lossy)
-    found = timing.search(changes, lossy.error, [whole, other], kinds, 8.0, 12.0)
+    changes = timing.CommandChanges(lossy)
+    found = timing.detect_timing_effect(changes, lossy.error, [whole, other], kinds, 8.0, 12.0)
     assert found and found.kind.name == "frame_loss" and found.joints.all()
     assert found.parameters["probability"]["q1"].mean == pytest.approx(0.2, abs=0.08)
-    assert timing.search(timing.Changes(other), other.error, [whole], kinds, 8.0, 12.0) is None
+    assert (
+        timing.detect_timing_effect(
+            timing.CommandChanges(other), other.error, [whole], kinds, 8.0, 12.0
+        )
+        is None
+    )
     # with their delays taken for chance, errors scatter far less: the rest is that lost frames
     # delay on average too
     chancy = dataclasses.replace(lossy, late=changes.spread(lossy.error))
@@ -223,7 +228,7 @@ def test_frames_that_were_lost_are_counted_by_where_joints_end_up(machine: Machi
     assert before > 5.0 and after < 0.4 * before
     for j in range(2):
         np.testing.assert_allclose(
-            chancy.rewhitened(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6
+            chancy.rewhiten(lossy, lossy.z[j : j + 1], j)[0], chancy.z[j], atol=1e-6
         )
 
 
@@ -233,13 +238,20 @@ def test_what_one_joint_alone_is_late_by_is_no_lost_frame(machine: Machine) -> N
         held_over(machine, 0.2, 12, only=slice(2, 3)),
         held_over(machine, 0.05, 13),
     ]
-    held = [baseline.held(PLANT, [(one, 0.0)], machine, 0) for one in rows]
-    noises = baseline.noises(held[:1], machine)
-    whole, alone, seldom = (dataclasses.replace(one.evidence, noise=noises) for one in held)
+    held = [baseline.compare_simulator(PLANT, [(one, 0.0)], machine, 0) for one in rows]
+    noises = baseline.fit_covariances(held[:1], machine)
+    whole, alone, seldom = (dataclasses.replace(one.residuals, noise=noises) for one in held)
     kinds = effect_library.load_effects(machine, ["frame_loss", "delay_jitter"])
-    assert timing.search(timing.Changes(alone), alone.error, [whole], kinds, 4.0, 12.0) is None
+    assert (
+        timing.detect_timing_effect(
+            timing.CommandChanges(alone), alone.error, [whole], kinds, 4.0, 12.0
+        )
+        is None
+    )
     # a frame carries the commands of all joints: one in twenty that is lost shows in all of them
-    found = timing.search(timing.Changes(seldom), seldom.error, [whole], kinds, 4.0, 12.0)
+    found = timing.detect_timing_effect(
+        timing.CommandChanges(seldom), seldom.error, [whole], kinds, 4.0, 12.0
+    )
     assert found and found.kind.name == "frame_loss"
     low, high = found.parameters["probability"]["q1"].ci95
     assert low < 0.05 < high
@@ -247,14 +259,14 @@ def test_what_one_joint_alone_is_late_by_is_no_lost_frame(machine: Machine) -> N
 
 def test_delays_err_as_they_do_where_no_frame_is_late() -> None:
     random, error = np.random.default_rng(3), np.full(4000, 0.3)
-    found = timing.Usual.of(
-        [timing.Delays(1.2 * error * random.standard_t(5.0, 4000), error, np.zeros(4000))]
+    found = timing.DelayErrorModel.of(
+        [timing.FrameDelays(1.2 * error * random.standard_t(5.0, 4000), error, np.zeros(4000))]
     )
     assert found.scale == pytest.approx(1.15, abs=0.11) and found.freedom in (
         5.0,
         7.0,
     )  # a little is what all timing is off by
-    seen = timing.Delays(np.repeat([0.0, 1.0], [90, 10]), np.full(100, 0.1), np.zeros(100))
+    seen = timing.FrameDelays(np.repeat([0.0, 1.0], [90, 10]), np.full(100, 0.1), np.zeros(100))
     assert (
         found.gain(seen, np.repeat([0.0, 1.0], [9, 1]))
         > 0.0
@@ -264,26 +276,28 @@ def test_delays_err_as_they_do_where_no_frame_is_late() -> None:
 
 def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Machine) -> None:
     rows = [held_over(machine, 0.0, 10), held_over(machine, 0.2, 12, (1, 1, 1, 4, 1))]
-    held = [baseline.held(PLANT, [(one, 0.0)], machine, 0) for one in rows]
-    evidence = dataclasses.replace(held[1].evidence, noise=baseline.noises(held[:1], machine))
+    held = [baseline.compare_simulator(PLANT, [(one, 0.0)], machine, 0) for one in rows]
+    residuals = dataclasses.replace(
+        held[1].residuals, noise=baseline.fit_covariances(held[:1], machine)
+    )
     loss, late = effect_library.load_effects(machine, ["frame_loss", "dead_time"])
-    (ray,) = rays(late)
+    (ray,) = build_rays(late)
 
-    def late_s(evidence: Evidence) -> list[float]:
-        shapes = [Shape(ray.sizes, change) for change in evidence.response(ray)]
+    def late_s(residuals: Residuals) -> list[float]:
+        shapes = [Response(ray.sizes, change) for change in residuals.response(ray)]
         return [
-            late.size("dead_time_s") * fitted(z, [shape])[0]
-            for z, shape in zip(evidence.z, shapes, strict=True)
+            late.size("dead_time_s") * fit_sizes(z, [shape])[0]
+            for z, shape in zip(residuals.z, shapes, strict=True)
         ]
 
     def expected(lost: float) -> list[float]:
         every = {
             "probability": {name: Estimate(lost, (lost, lost)) for name in machine.joint_names}
         }
-        found = Found(loss, np.ones(5, bool), every, 0.0, 0.0, 0.0, {})
-        return late_s(timing.expected(evidence, found, []))
+        found = DetectedEffect(loss, np.ones(5, bool), every, 0.0, 0.0, 0.0, {})
+        return late_s(timing.add_mean_delay(residuals, found, []))
 
-    assert late_s(evidence) == pytest.approx([0.05, 0.05, 0.05, 0.2, 0.05], abs=0.012)
+    assert late_s(residuals) == pytest.approx([0.05, 0.05, 0.05, 0.2, 0.05], abs=0.012)
     # where half of the frames are lost, these wait a period on average, and may two; what one joint
     # has alone is left
     shared = np.array(expected(0.5))
@@ -294,5 +308,5 @@ def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Ma
 
 def test_the_interval_of_a_gaussian_likelihood_is_its_own() -> None:
     sizes = np.geomspace(0.5, 2.0, 25)
-    mean, low, high = fit_interval(sizes, -0.5 * np.square((sizes - 1.0) / 0.1))
+    mean, low, high = estimate_interval(sizes, -0.5 * np.square((sizes - 1.0) / 0.1))
     assert (mean, low, high) == pytest.approx((1.0, 0.804, 1.196), abs=0.02)

@@ -15,7 +15,7 @@ from brokk_rl.record import Recording
 from diagnosis import answer as outcome
 from diagnosis import plots, report
 from diagnosis.answer import Answer, Estimate, Gap, NextExperiment, Outcome, Selected, Where
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.stages import Survey, examine_gap
 
 GAIN = Selected(
@@ -24,7 +24,7 @@ GAIN = Selected(
 )  # fmt: skip
 
 
-def runs(machine: Machine, count: int, seed: int, factor: float) -> FreeRuns:
+def runs(machine: Machine, count: int, seed: int, factor: float) -> WindowedRuns:
     """Returns free runs of a simulator whose q4 moves `factor` times as fast as the machine's."""
     rng, recordings, row, source = np.random.default_rng(seed), [], [], []
     for number in range(count):
@@ -38,7 +38,7 @@ def runs(machine: Machine, count: int, seed: int, factor: float) -> FreeRuns:
         )  # fmt: skip
         row += range(40, 1140, 100)
         source += [number] * 11
-    found = FreeRuns(recordings, np.array(source), np.array(row), np.zeros((len(row), 100, 5)))
+    found = WindowedRuns(recordings, np.array(source), np.array(row), np.zeros((len(row), 100, 5)))
     start = np.stack([recordings[s].q[k - 1] for s, k in zip(source, row, strict=True)])[:, None]
     way = np.where(np.arange(5) == 3, factor, 1.0) * (found.measured - start)
     return replace(found, simulated=start + way + 2e-4 * rng.standard_normal(way.shape).cumsum(1))

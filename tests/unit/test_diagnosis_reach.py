@@ -13,15 +13,15 @@ import torch
 from composed import option
 
 from actuators.effects.command import DeadBand, Saturation
-from actuators.effects.composition import Affected
+from actuators.effects.composition import ActuatorWithEffects
 from actuators.models.lag import FirstOrderLag
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import baseline, effect_library, gap, refine
-from diagnosis.case import Case
-from diagnosis.gap import Reach
-from diagnosis.residuals import ErrorCovariance, rays
+from diagnosis.case import GapCase
+from diagnosis.gap import GapClosure
+from diagnosis.residuals import ErrorCovariance, build_rays
 
 CPU = torch.device("cpu")
 LINEAR = FirstOrderLag(
@@ -36,20 +36,20 @@ LINEAR = FirstOrderLag(
 
 def held(base: np.ndarray, measured: np.ndarray) -> Any:
     return SimpleNamespace(
-        base=base, candidates=SimpleNamespace(cut=SimpleNamespace(measured=measured))
+        base=base, simulator=SimpleNamespace(cut=SimpleNamespace(measured=measured))
     )
 
 
-def reach(machine: Machine, before: float, after: float, own: float, floor: float) -> Reach:
+def reach(machine: Machine, before: float, after: float, own: float, floor: float) -> GapClosure:
     """Errors of one size everywhere: 40 windows, 10 steps."""
     measured = np.zeros((40, 10, machine.num_joints))
-    null = SimpleNamespace(evidence=held(measured + floor, measured))
+    null = SimpleNamespace(residuals=held(measured + floor, measured))
     base: Any = SimpleNamespace(
-        field=SimpleNamespace(evidence=held(measured + before, measured)),
-        nulls=[null],
+        field=SimpleNamespace(residuals=held(measured + before, measured)),
+        left_out=[null],
         is_flexible=False,
     )
-    return Reach(base, machine, measured + after, measured + own, np.random.default_rng(0))
+    return GapClosure(base, machine, measured + after, measured + own, np.random.default_rng(0))
 
 
 def test_what_is_closed_and_what_was_foretold_are_told_apart(machine: Machine) -> None:
@@ -72,16 +72,18 @@ def test_errors_in_metres_and_radians_are_taken_over_the_travel(machine: Machine
     mixed = replace(machine, mjcf=None, tool_m=None, joints=(slide, hinge), exclusive=(), levers=())
     paths = np.zeros((1, 2, 2))
     paths[..., 0], paths[..., 1] = 0.01, 0.2  # a tenth of the travel each
-    assert gap.unit_of(mixed) == "travel" and gap.unit_of(machine) == "rad"
-    assert gap.rmse(gap.squares(paths, np.zeros((1, 2, 2)), mixed)) == pytest.approx(0.1)
+    assert gap.choose_unit(mixed) == "travel" and gap.choose_unit(machine) == "rad"
+    assert gap.compute_rmse(
+        gap.compute_squares(paths, np.zeros((1, 2, 2)), mixed)
+    ) == pytest.approx(0.1)
 
 
 def test_the_part_of_an_effect_has_an_interval() -> None:
     value = {frozenset(): np.zeros(3), frozenset("a"): np.array([0.5, 0.4, 0.6]), frozenset("b"): np.array([0.2, 0.1, 0.3]),
              frozenset("ab"): np.array([0.9, 0.8, 1.0])}  # fmt: skip
     found = {
-        name: gap.estimate(values)
-        for name, values in gap.shapley(["a", "b"], lambda some: value[some]).items()
+        name: gap.summarise_draws(values)
+        for name, values in gap.compute_shapley(["a", "b"], lambda some: value[some]).items()
     }
     assert found["a"].mean == pytest.approx(0.6) and found["b"].mean == pytest.approx(
         0.3
@@ -107,7 +109,7 @@ def driven(machine: Machine, seed: int, dead_band: float = 0.35, gentle: bool = 
         "saturation": Saturation(joints="all", level=0.7),
     }
     model, random = (
-        Affected(actuator=LINEAR, effects=effects).build(machine, 1, CPU),
+        ActuatorWithEffects(actuator=LINEAR, effects=effects).build(machine, 1, CPU),
         np.random.default_rng(seed),
     )
     history = History(
@@ -146,40 +148,42 @@ def driven(machine: Machine, seed: int, dead_band: float = 0.35, gentle: bool = 
 def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together(
     axis: Machine, tmp_path: Path
 ) -> None:
-    case = Case(axis, [], [driven(axis, seed) for seed in (1, 2)])
-    base = baseline.given(case, LINEAR, option("fit", "valve"), tmp_path, 0, CPU)
-    assert base.is_flexible and base.nulls  # the floor is that of a flexible model
-    evidence = base.field.evidence
+    case = GapCase(axis, [], [driven(axis, seed) for seed in (1, 2)])
+    base = baseline.accept_simulator(case, LINEAR, option("fit", "valve"), tmp_path, 0, CPU)
+    assert base.is_flexible and base.left_out  # the floor is that of a flexible model
+    residuals = base.field.residuals
     ways = {
-        kind.name: rays(kind)
+        kind.name: build_rays(kind)
         for kind in effect_library.load_effects(axis, ["dead_band", "saturation"])
     }
     all_rays = [ray for name in sorted(ways) for ray in ways[name]]
     known = np.array(
         [[2.5], [2.5], [0.0]]
     )  # a dead band of 0.15, as a search that adds effects up would begin with
-    sizes = refine.searched(
-        evidence, all_rays, np.ones((3, 1), bool), known, np.random.default_rng(0)
+    sizes = refine.search_sizes(
+        residuals, all_rays, np.ones((3, 1), bool), known, np.random.default_rng(0)
     )
     start = [{"dead_band": sizes[:2, 0], "saturation": sizes[2:, 0]}]
-    found = refine.repair(evidence, [frozenset(ways)], ways, start)
+    found = refine.fit_set(residuals, [frozenset(ways)], ways, start)
     extend, retract, saturation = found.sizes[:, 0] * [0.06, 0.06, -0.25] + [0.0, 0.0, 1.0]
     assert extend == pytest.approx(0.35, abs=0.02) and retract == pytest.approx(0.35, abs=0.02)
     assert saturation == pytest.approx(0.7, abs=0.03)
-    measured = evidence.candidates.cut.measured
-    assert np.std(found.after - measured) < 0.15 * np.std(evidence.base - measured)
+    measured = residuals.simulator.cut.measured
+    assert np.std(found.after - measured) < 0.15 * np.std(residuals.base - measured)
 
 
 def test_a_half_of_the_recordings_that_says_nothing_of_a_size_does_not_deny_it(
     axis: Machine,
 ) -> None:
-    held = baseline.held(LINEAR, [(driven(axis, 3, 0.0, gentle=True), 0.0)], axis, 0)
-    evidence = replace(
-        held.evidence, noise=[ErrorCovariance(sensor=4e-4, change=0.01, wander=0.01, memory=10.0)]
+    held = baseline.compare_simulator(LINEAR, [(driven(axis, 3, 0.0, gentle=True), 0.0)], axis, 0)
+    residuals = replace(
+        held.residuals, noise=[ErrorCovariance(sensor=4e-4, change=0.01, wander=0.01, memory=10.0)]
     )
-    told = [float(np.square(evidence.z[:, evidence.fold == half]).mean()) for half in (0, 1)]
+    told = [float(np.square(residuals.z[:, residuals.fold == half]).mean()) for half in (0, 1)]
     assert 10.0 * min(told) < max(told)  # the saturation shows in one half only
-    ways = {kind.name: rays(kind) for kind in effect_library.load_effects(axis, ["saturation"])}
-    found = refine.repair(evidence, [frozenset(ways)], ways, [{"saturation": np.array([1.0])}])
-    np.testing.assert_allclose(found.halves[:, 0, 0], (1.0 - 0.7) / 0.25, atol=0.1)
-    assert np.square(found.z).mean() < 0.2 * np.square(evidence.z).mean()
+    ways = {
+        kind.name: build_rays(kind) for kind in effect_library.load_effects(axis, ["saturation"])
+    }
+    found = refine.fit_set(residuals, [frozenset(ways)], ways, [{"saturation": np.array([1.0])}])
+    np.testing.assert_allclose(found.split_by_family[:, 0, 0], (1.0 - 0.7) / 0.25, atol=0.1)
+    assert np.square(found.z).mean() < 0.2 * np.square(residuals.z).mean()

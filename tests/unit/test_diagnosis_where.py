@@ -10,7 +10,7 @@ import pytest
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.error_growth import measure_growth
-from diagnosis.free_runs import FreeRuns
+from diagnosis.free_runs import WindowedRuns
 from diagnosis.permutation_test import FALSE_DISCOVERY_RATE, adjust_p_values, compute_excess_p
 from diagnosis.regimes import REGIMES, label_loads, label_regimes, shift_by_dead_time
 from diagnosis.where import GapLocation, locate_gap, trace_to_origin
@@ -47,17 +47,19 @@ def recordings(machine: Machine, count: int, seed: int) -> list[Recording]:
     return found
 
 
-def runs(machine: Machine, count: int, seed: int, size: float = 0.0003) -> FreeRuns:
+def runs(machine: Machine, count: int, seed: int, size: float = 0.0003) -> WindowedRuns:
     """Returns free runs through `recordings` whose errors are random walks."""
     every = recordings(machine, count, seed)
     row = np.tile(np.arange(100, 1100, STEPS), count)
     source = np.repeat(np.arange(count), 10)
     walk = size * np.random.default_rng(seed + 1000).standard_normal((len(row), STEPS, 5)).cumsum(1)
-    empty = FreeRuns(every, source, row, walk)
+    empty = WindowedRuns(every, source, row, walk)
     return replace(empty, simulated=empty.measured + walk)
 
 
-def planted(base: FreeRuns, machine: Machine, joint: int, regime: str, speed: float) -> FreeRuns:
+def planted(
+    base: WindowedRuns, machine: Machine, joint: int, regime: str, speed: float
+) -> WindowedRuns:
     """Returns free runs in which one joint is simulated too fast, by `speed` rad/s, in one regime."""
     label = base.cut(
         [
@@ -74,7 +76,7 @@ def planted(base: FreeRuns, machine: Machine, joint: int, regime: str, speed: fl
     return replace(base, simulated=base.simulated + added)
 
 
-def located(field: FreeRuns, reference: FreeRuns | None, machine: Machine) -> GapLocation:
+def located(field: WindowedRuns, reference: WindowedRuns | None, machine: Machine) -> GapLocation:
     return locate_gap(field, reference, machine, np.full(5, DELAY_S), np.random.default_rng(0))
 
 

@@ -11,8 +11,7 @@ import pytest
 import torch
 from composed import names, option
 
-from actuators.effects.effect import EffectSpec, Wrapped
-from actuators.effects.library import LibraryModel
+from actuators.effects.effect import EffectChain, EffectSpec
 from brokk_rl.checks import NUM_ENVS, check_actuator_model
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -149,7 +148,7 @@ def test_the_typical_value_changes_something(name: str, machine: Machine) -> Non
         (places(model, path[-1]) - 1.0).abs().amax(),
     ]
     acting = {"command": 0, "speed": 0, "joints": 0, "measurement": 1, "kinematics": 2}[
-        model.effect.side
+        model.effects[""].side
     ]
     assert [float(size) > 1e-5 for size in moved] == [place == acting for place in range(3)]
 
@@ -161,7 +160,7 @@ def test_only_the_named_joints_have_it(name: str, machine: Machine) -> None:
     model = effect(name, joints=["q3"]).wrap(
         shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU
     )
-    for key, number in model.effect.numbers.items():
+    for key, number in model.effects[""].numbers.items():
         expected = torch.full(
             (3, machine.num_joints), number.typical if number.none is None else number.none
         )
@@ -406,7 +405,7 @@ def test_all_effects_can_be_captured_in_a_cuda_graph(those: list[str], machine: 
         model = shipped("actuator", "lag").build(machine, num, device)
         for name in those:
             model = shipped("effect", name).wrap(model, machine, num, device)
-        assert isinstance(model, (Wrapped, LibraryModel))
+        assert isinstance(model, EffectChain)
         shape = (num, machine.num_history, machine.num_joints)
         history = History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
         command, seen = torch.zeros(num, 5, device=device), torch.zeros(num, 8, device=device)

@@ -10,7 +10,7 @@ import pytest
 import torch
 from composed import option
 
-from actuators.effects.library import Library
+from actuators.effects.composition import Library
 from actuators.identify import dead_time
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -90,7 +90,7 @@ def test_all_together_are_one_around_the_other(machine: Machine) -> None:
         roll(together, machine, u), roll(stacked, machine, u), rtol=0, atol=2e-6
     )
     torch.testing.assert_close(together.measure(u[7]), stacked.measure(u[7]), rtol=0, atol=1e-6)
-    assert together.sides == {"speed", "measurement"}
+    assert together.sides == {"command", "speed", "joints", "measurement"}
 
 
 @pytest.mark.parametrize("actuator", ["mlp", "lag"])

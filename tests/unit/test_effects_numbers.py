@@ -14,7 +14,7 @@ from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actuators.effects.composition import Affected
+from actuators.effects.composition import ActuatorWithEffects
 from actuators.effects.kinematics import rotate_points
 from brokk_rl.checks import check_actuator
 from brokk_rl.history import History
@@ -383,9 +383,9 @@ def test_bias_and_scale_are_taken_back_by_truth(machine: Machine) -> None:
     torch.testing.assert_close(model.truth(1.02 * (histories + 0.01)), histories)
 
 
-def affected(actuator: str, **effects: Any) -> Affected:
+def affected(actuator: str, **effects: Any) -> ActuatorWithEffects:
     specs = {name: replace(shipped("effect", name), **numbers) for name, numbers in effects.items()}
-    return Affected(actuator=shipped("actuator", actuator), effects=specs)
+    return ActuatorWithEffects(actuator=shipped("actuator", actuator), effects=specs)
 
 
 def test_a_free_run_with_sensors_stays_in_measured_positions(machine: Machine) -> None:

@@ -15,11 +15,11 @@ from composed import option
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import decision, effect_library
-from diagnosis.calibration import Certainty
-from diagnosis.detection import Findings, Prices
-from diagnosis.residuals import Evidence
-from diagnosis.responses import Shape, plain
-from diagnosis.search import Table
+from diagnosis.calibration import ProbabilityModel
+from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.residuals import Residuals
+from diagnosis.responses import Response, fit_faults
+from diagnosis.search import SubsetTable
 from exam import dataset
 from exam.calibration import PenaltyFit, WeighedCase, load_weighed_cases
 
@@ -27,16 +27,16 @@ SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 
 
 @pytest.fixture
-def prices() -> Prices:
+def prices() -> Penalties:
     return option("prices", "default")
 
 
 @pytest.fixture
-def weights() -> Certainty:
+def weights() -> ProbabilityModel:
     return option("certainty", "default")
 
 
-def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findings:
+def found(machine: Machine, prices: Penalties, strength: float, seed: int) -> DetectionResult:
     """Returns findings on a machine whose first joint has a lag of some strength, in noise."""
     random, kinds = (
         np.random.default_rng(seed),
@@ -47,18 +47,18 @@ def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findi
         columns = random.standard_normal((2, 800))
         z = random.standard_normal(800) + (strength * columns[0] if j == 0 else 0.0)
         shapes = {
-            name: [Shape(SIZES, SIZES[:, None] * c)]
+            name: [Response(SIZES, SIZES[:, None] * c)]
             for name, c in zip(("lag", "dead_band"), columns, strict=True)
         }
-        tables.append(Table(plain(z, []), shapes, block))
+        tables.append(SubsetTable(fit_faults(z, []), shapes, block))
         tables[-1].explore({"lag": 2.0, "dead_band": 2.0}, 2)
 
     def price(j: int, subset: frozenset[str]) -> float:
         return prices.joint * len(subset) + prices.reference * 1.5
 
-    evidence = cast(Evidence, SimpleNamespace(z=np.zeros((len(tables), 800)), block=block))
-    chosen, still = decision.chosen_of(tables, price, prices, kinds), np.zeros(len(tables))
-    return Findings(
+    evidence = cast(Residuals, SimpleNamespace(z=np.zeros((len(tables), 800)), block=block))
+    chosen, still = decision.choose_again(tables, price, prices, kinds), np.zeros(len(tables))
+    return DetectionResult(
         evidence,
         tables,
         {"lag": [], "dead_band": []},
@@ -74,12 +74,14 @@ def found(machine: Machine, prices: Prices, strength: float, seed: int) -> Findi
     )
 
 
-def test_what_was_weighed_is_chosen_from_again_as_it_was(machine: Machine, prices: Prices) -> None:
+def test_what_was_weighed_is_chosen_from_again_as_it_was(
+    machine: Machine, prices: Penalties
+) -> None:
     first, kinds = found(machine, prices, 0.5, 0), effect_library.load_effects(machine)
     told = json.loads(json.dumps(decision.record_weights(first, prices)))
     again = decision.restore_result(told, prices, kinds)
     assert first.chosen.names == {"lag"} and again.chosen.subsets == first.chosen.subsets
-    assert again.chosen.worth == pytest.approx(first.chosen.worth, abs=0.1)
+    assert again.chosen.net_gain == pytest.approx(first.chosen.net_gain, abs=0.1)
     assert not decision.restore_result(
         told, dataclasses.replace(prices, joint=500.0), kinds
     ).chosen.names
@@ -96,7 +98,7 @@ def label(kind: str, effects: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def test_prices_are_found_that_name_what_is_there_and_nothing_else(
-    machine: Machine, prices: Prices, weights: Certainty
+    machine: Machine, prices: Penalties, weights: ProbabilityModel
 ) -> None:
     cheap = dataclasses.replace(prices, joint=2.0, name=2.0, reference=0.5)
     lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
@@ -124,7 +126,7 @@ def test_prices_are_found_that_name_what_is_there_and_nothing_else(
 
 
 def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothing_stands_above_it(
-    machine: Machine, prices: Prices, weights: Certainty
+    machine: Machine, prices: Penalties, weights: ProbabilityModel
 ) -> None:
     outside = {
         **dict.fromkeys(weights.outside, 0.0),
@@ -138,7 +140,7 @@ def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothin
         "a fifth of causes lies outside, so few are missed only so"
     )
     assert not decision.is_unknown(silent, prices, weights)
-    rows = decision.ranking(named, [], prices, weights, machine, 0.4)
+    rows = decision.rank_hypotheses(named, [], prices, weights, machine, 0.4)
     assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.4)
     assert {row.effect for row in rows} >= {"lag", "unknown", "none"}
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
-from diagnosis.responses import Shape
+from diagnosis.responses import Response
 from exam import baselines, metrics, score
 from exam.oracle import JointErrors
 from exam.score import CaseScore, Claim, score_answer
@@ -216,7 +216,7 @@ def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay(
     form, other = generator.standard_normal((2, 600))
     sizes = np.array([0.0, 1.0, 2.0])
     shapes = {
-        name: [Shape(sizes, np.outer(sizes, ray))]
+        name: [Response(sizes, np.outer(sizes, ray))]
         for name, ray in (("lag", form), ("creep", other))
     }
     errors = JointErrors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)

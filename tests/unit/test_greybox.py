@@ -293,7 +293,10 @@ def test_a_free_run_that_begins_in_motion_goes_on_with_it(name: str, machine: Ma
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"free": {"gian": (0.2, 2.0)}}, r"'gian' is no number of LagModel; did you mean 'gain'"),
+        (
+            {"free": {"gian": (0.2, 2.0)}},
+            r"'gian' is no number of FirstOrderLagModel; did you mean 'gain'",
+        ),
         (
             {"free": {"gain": (2.0, 0.2)}},
             r"fit\.free\.gain: expected \[low, high\] with low < high",

@@ -105,7 +105,7 @@ def test_figures_of_several_weigh_by_episodes(monkeypatch: pytest.MonkeyPatch) -
         {"x": 1.0, "episodes": 3.0, "fault_rate": 0.0},
         {"x": 0.0, "episodes": 1.0, "fault_rate": 0.5},
     ]
-    monkeypatch.setattr(group, "all", lambda figures: parts)
+    monkeypatch.setattr(group, "gather", lambda figures: parts)
     assert group.pool_statistics(parts[0]) == {"x": 0.75, "episodes": 4.0, "fault_rate": 0.25}
 
 
