@@ -36,7 +36,7 @@ class TargetScaling:
 
 
 def compute_size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
-    """Return the length of the observation vector: the paper's, with pitch and proposals behind it."""
+    """Return the length of the observation vector, with pitch and proposals if wanted."""
     return 3 + (2 + with_proposals) * machine.num_history * machine.num_joints + with_pitch
 
 
@@ -79,12 +79,13 @@ class ObservationEncoder:
         """Return the vector, shape `(N, size)`.
 
         Args:
-            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N, 3)`.
+            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N,
+                3)`.
             q: Measured joint positions, oldest first, shape `(N, H, J)`, rad or m.
             u: Commands in force, oldest first, shape `(N, H, J)`, in [-1, 1].
             pitch_rad: Wanted pitch of the tool, shape `(N,)`; left out where the task fixes it.
-            proposed: Proposals so far, oldest first, shape `(N, H, J)`; left out where no person stands
-                between.
+            proposed: Proposals so far, oldest first, shape `(N, H, J)`; left out where no person
+                stands between.
         """
         target = (target_in_base_m - self._target_mean_m) / self._target_std_m
         joints = ((q - self._q_mean) / self._q_std).reshape(len(q), -1)

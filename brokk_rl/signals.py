@@ -1,4 +1,4 @@
-"""The words that simulation, policy and machine share.
+"""Data types that simulation, policy and machine share.
 
 Shapes: `N` environments (absent on the machine), `J` joints. Arrays are numpy on the machine and
 torch in the simulator.
@@ -20,7 +20,7 @@ class JointState:
 
 @dataclass(frozen=True)
 class Command:
-    """Valve commands, shape `(…, J)`, each in [-1, 1]; + extends (moves the joint in its positive direction)."""
+    """Valve commands, shape `(…, J)`, each in [-1, 1]; + moves the joint in its positive direction."""
 
     u: Any
 
@@ -35,7 +35,7 @@ class LeverPose:
 
 @dataclass(frozen=True)
 class Borehole:
-    """An estimated borehole: centre of the rim and axis (pointing out of the hole) in the base frame, radius in m."""
+    """Estimated borehole: centre of the rim, unit axis out of the hole, radius, covariance."""
 
     center_in_base_m: np.ndarray
     axis_in_base: np.ndarray
@@ -52,15 +52,14 @@ class Frame:
         depth_m: Depth along z, `(h, w)` float32 in m, NaN where unknown; never 0, never infinite.
         camera_matrix: `(3, 3)`, px; pixel centres at whole numbers.
         base_from_camera: Pose of the camera in the base frame when the picture was taken, `(4, 4)`;
-            `None` where nobody knows it.
-        t_s: When the picture was taken.
+            `None` for unknown.
+        t_s: Time of the picture.
         distortion: Coefficients of the lens in OpenCV's order; `None` for a rectified picture.
         right: Right picture of a rectified stereo pair, as `color`; `None` where there is none.
         baseline_m: Distance between the two cameras of the pair.
         name: Path of a frame on disk without its endings, else ''.
-        camera_cov: How uncertain the camera's pose is, the same way in all frames: covariance of a
-            small motion of it in its own coordinates, `(6, 6)`, m and then rad; `None` where nobody
-            has told.
+        camera_cov: Covariance of the camera's pose, the same error in all frames: of a small motion
+            in its own coordinates, `(6, 6)`, m and then rad; `None` for unknown.
     """
 
     color: np.ndarray

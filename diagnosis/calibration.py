@@ -1,10 +1,8 @@
-"""How sure an answer is: the chances of what it says, from a few signs, by weights fitted to answers whose truth is known.
+"""Calibration of probabilities: logistic regressions on a few signs, fitted to answers of known truth.
 
-Evidence in log likelihood is no probability: simulators, noise and forms of effects are all a
-little wrong, and so a Bayes factor
-of e to 40 is wrong once in twenty. What it is worth is learned from development exams
-(`exam.do=calibrate`): logistic regressions on signs that mean the same on any machine.
-`conf/certainty` holds their weights.
+A log-likelihood gain is no probability: simulator, noise and forms of effects are all a little
+wrong, so a Bayes factor of e to 40 is wrong once in twenty. `exam.do=calibrate` fits the weights to
+development exams; `conf/certainty` holds them. All signs mean the same on any machine.
 Axes: `J` joints.
 """
 

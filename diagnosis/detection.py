@@ -176,7 +176,7 @@ class EffectSearch:
         wide = None
         if fitted and nonadditive_refit.is_needed(residuals, fitted, _sum_scores(tables, chosen)):
             wide, tables, chosen, fitted = self._around(residuals, grown, chosen, fitted, price)
-            grown = wide[1]
+            grown = wide.rays
         self.tell("frames", 0.8)
         after = fitted.after if fitted else residuals.base
         changes, error = timing.CommandChanges(residuals), residuals.compute_error(after)
@@ -337,16 +337,18 @@ class EffectSearch:
         for turn in range(MAX_REFITS):
             self.tell("simulating around what was found", 0.72 + 0.04 * turn)
             before = chosen
-            tables, chosen, now = self._round(residuals, *wide[1:], price, scatter, wide[0])
+            tables, chosen, now = self._round(
+                residuals, wide.rays, wide.shapes, price, scatter, wide.z
+            )
             tried += [now] if now else []
             more = now and nonadditive_refit.add_effect(
-                residuals, wide[1], tables, chosen, now, self.penalties.joint
+                residuals, wide.rays, tables, chosen, now, self.penalties.joint
             )
             tried += [more] if more else []
             if now is None or (more is None and chosen.subsets == before.subsets):
                 break
             wide = nonadditive_refit.simulate_beside(residuals, grown, more or now)
-        best = nonadditive_refit.combine_best(residuals, wide[1], tried, price)
+        best = nonadditive_refit.combine_best(residuals, wide.rays, tried, price)
         if best is None:
             return wide, tables, EffectSet((frozenset(),) * len(tables), 0.0), None
         for drops in (True, False):
@@ -354,11 +356,11 @@ class EffectSearch:
                 nonadditive_refit.simulate_beside(residuals, grown, best),
                 refine.list_subsets(best),
             )
-            tables = self._tables(residuals, *wide[1:], scatter, wide[0])
+            tables = self._tables(residuals, wide.rays, wide.shapes, scatter, wide.z)
             paying = nonadditive_refit.drop_unneeded(tables, subsets, price, self.penalties.name)
             if not drops or paying == subsets or not any(paying):
                 break
-            best = refine.drop_effects(residuals, wide[1], best, paying)
+            best = refine.drop_effects(residuals, wide.rays, best, paying)
         worth = sum(
             table.score(s).total - price(j, s)
             for j, (table, s) in enumerate(zip(tables, subsets, strict=True))

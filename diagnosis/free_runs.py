@@ -1,8 +1,7 @@
-"""Free runs of a simulator beside the recordings that they were cut from.
+"""Free runs of a simulator beside the recordings from which they were cut.
 
-Labels of what a joint was doing are made on whole recordings and then cut as the free runs were, so
-that what happened before a
-window is not forgotten. Axes: `W` windows, `K` steps, `J` joints, `T` rows of a recording.
+Regime labels are made on whole recordings and then cut like the free runs, so that they know the
+time before a window. Axes: `W` windows, `K` steps, `J` joints, `T` rows of a recording.
 """
 
 from __future__ import annotations

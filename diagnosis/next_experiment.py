@@ -1,7 +1,7 @@
-"""The next experiment: which excitation would separate best what these recordings leave open.
+"""The next experiment: the excitation that best separates the rivals that the recordings leave open.
 
-Each rival is simulated on each excitation; how far two of them end up apart, over the simulator's
-noise, is what one would learn.
+Each rival is simulated on each excitation. The distance of two simulations, over the simulator's
+noise, is the expected gain of the experiment.
 Axes: `C` rivals, `K` steps, `J` joints, `I` increments.
 """
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,9 +52,19 @@ ADDITION_WINDOWS = 4
 
 Shapes = list[dict[str, list[Response]]]
 
-WideResponses = tuple[np.ndarray, dict[str, list[ParameterRay]], Shapes]
-"""The errors that are to be explained `(J, E)`, the rays of each effect, and what they do to each
-joint."""
+
+class WideResponses(NamedTuple):
+    """Responses of effects beside a fitted set.
+
+    Attributes:
+        z: Residuals that are to be explained, over the noise, `(J, E)`.
+        rays: Rays of each effect.
+        shapes: Responses of each joint to each effect, one a ray.
+    """
+
+    z: np.ndarray
+    rays: dict[str, list[ParameterRay]]
+    shapes: Shapes
 
 
 def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
@@ -106,7 +117,7 @@ def simulate_beside(
             place = mine.get((name, ray.name))
             for j in range(joints) if place is not None else ():
                 left[j] += Response(ray.sizes, response[j]).at(float(fitted.sizes[place, j]))[0]
-    return left, wide, shapes
+    return WideResponses(left, wide, shapes)
 
 
 def _simulate_response(

@@ -1,10 +1,9 @@
-"""Frames that are late or lost: hidden delays of single commands, each measured by where its joint ends up.
+"""Frames that come late or get lost: hidden delays of single commands, estimated from the residuals.
 
-A command that changes acts a little earlier or later; what one period later would do is simulated.
-A frame carries the commands of
-all joints: the delays that explain the errors of all of them best, one for each frame that changes
-a command, scatter no more than on the reference where all frames arrive in time; how they scatter
-tells lost frames (whole periods, seldom) from jitter (parts of periods, always).
+The response to one period of delay is simulated for each change of a command. A frame carries the
+commands of all joints, so one delay a frame explains the residuals of all of them. On the reference
+all frames arrive in time; there the delays show their own estimation error. The distribution of the
+delays separates lost frames (whole periods, seldom) from jitter (parts of periods, always).
 Axes: `W` windows, `K` steps, `I` increments, `J` joints, `D` changes of a command, `C` candidates.
 """
 

@@ -1,4 +1,4 @@
-"""Frames on disk, and beside each rendered one its truth.
+"""Frames on disk with their masks, and the truth of rendered ones.
 
 A folder holds `camera.yaml` and for each frame `<stem>.color.png`, `<stem>.depth.npy` (float32, m,
 NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is a pair
@@ -35,7 +35,7 @@ CAMERA, COLOR, RIGHT, DEPTH, DEPTH_MM, TRUTH, MASK = (
 
 @dataclass(frozen=True)
 class TrueCircle:
-    """A rim, or a disc that is none, as it truly is.
+    """True pose of a rim, or of a flat disc.
 
     Attributes:
         center_m: Centre, `(3,)`, left camera's coordinates.
@@ -43,7 +43,7 @@ class TrueCircle:
         center_in_base_m: Centre in the base frame.
         axis_in_base: Axis in the base frame.
         radius_m: Radius.
-        depth_m: Of the hole; 0 for a disc.
+        depth_m: Depth of the hole; 0 for a disc.
         hidden: Part of the rim that cannot be seen from the left camera, in [0, 1].
         in_view: The whole rim lies within the picture.
     """
@@ -60,12 +60,12 @@ class TrueCircle:
 
 @dataclass(frozen=True)
 class SceneTruth:
-    """What a rendered frame shows.
+    """Content of a rendered frame.
 
     Attributes:
         scene: Kind of scene.
-        conditions: What was drawn for it by name, numbers.
-        holes: All of them; the first one is what the camera was pointed at.
+        conditions: Sampled conditions by name.
+        holes: All holes; the camera points at the first one.
         decoys: Flat discs.
         block: `center_m`, `rotation`, `half_m`; empty where there is no block.
     """
@@ -79,7 +79,7 @@ class SceneTruth:
 
 @dataclass(frozen=True)
 class FrameLabel:
-    """Masks of a frame, `(h, w)` bool: the block with its mouths, what is seen through rims, and the arm."""
+    """Masks of a frame, `(h, w)` bool: block with its holes, inside of the holes, arm."""
 
     block: np.ndarray
     hole_mask: np.ndarray
@@ -87,7 +87,7 @@ class FrameLabel:
 
 
 def list_stems(folder: Path) -> list[Path]:
-    """Returns the frames of a folder, sorted: each path without its endings.
+    """Return the frames of a folder, sorted, as paths without endings.
 
     Raises:
         FrameError: there is no such folder, or no frame in it.
@@ -107,7 +107,7 @@ def list_stems(folder: Path) -> list[Path]:
 
 
 def read_truth(stem: Path) -> SceneTruth:
-    """Returns the truth of the rendered frame at `stem`.
+    """Return the truth of the rendered frame at `stem`.
 
     Raises:
         FrameError: it has none, or one that cannot be read.
@@ -128,7 +128,7 @@ def read_truth(stem: Path) -> SceneTruth:
 
 
 def read_label(stem: Path) -> FrameLabel:
-    """Returns the masks of the rendered frame at `stem`.
+    """Return the masks of the rendered frame at `stem`.
 
     Raises:
         FrameError: it has none, or one that cannot be read.
@@ -137,14 +137,15 @@ def read_label(stem: Path) -> FrameLabel:
     bits = cv2.imread(str(path), cv2.IMREAD_UNCHANGED) if path.is_file() else None
     if bits is None or bits.ndim != 2:
         raise FrameError(
-            f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames have one"
+            f"{path}: {'not a mask' if path.is_file() else 'no mask'}; rendered and labelled frames "
+            "have one"
         )
     bits = np.asarray(bits, np.uint8)
     return FrameLabel((bits & BLOCK) > 0, (bits & HOLE_MASK) > 0, (bits & ARM) > 0)
 
 
 def encode_mask(label: FrameLabel) -> np.ndarray:
-    """Returns masks as they stand in the file, `(h, w)` uint8."""
+    """Return masks as they stand in the file, `(h, w)` uint8."""
     return (BLOCK * label.block + HOLE_MASK * label.hole_mask + ARM * label.arm).astype(np.uint8)
 
 
@@ -155,7 +156,7 @@ def write_camera(
     baseline_m: float | None,
     dist: Sequence[float] = (),
 ) -> None:
-    """Writes `camera.yaml`.
+    """Write `camera.yaml`.
 
     Raises:
         StorageError: it could not be written.
@@ -179,7 +180,7 @@ def write_frame(
     label: FrameLabel | None = None,
     truth: SceneTruth | None = None,
 ) -> None:
-    """Writes a frame, the truth last: where that stands, all of it does.
+    """Write a frame, the truth last: where that stands, all of it does.
 
     Raises:
         StorageError: a file could not be written.
@@ -202,7 +203,7 @@ def write_frame(
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:
-    """Writes a picture, grey or BGR, as PNG.
+    """Write a picture, grey or BGR, as PNG.
 
     Raises:
         StorageError: it could not be written.
@@ -223,7 +224,7 @@ def _build_path(stem: Path, ending: str) -> Path:
 
 
 def _write(path: Path, value: bytes | np.ndarray) -> None:
-    """Writes a file in one step: readers see all of it or none."""
+    """Write a file in one step: readers see all of it or none."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""Where holes are looked for, how large they look there, and in which resolution that is best seen."""
+"""Search levels: where holes may be, how large they look there, and the resolution to search in."""
 
 from __future__ import annotations
 
@@ -11,48 +11,48 @@ import numpy as np
 from brokk_rl.contracts.vision import Ellipse, EllipseDetector, SizePrior
 from brokk_rl.signals import Frame
 
+# Chosen by hand on rendered scenes (benchmarks/perception/table.py), unless a comment says otherwise.
 STEP = 8
-"""Pixels to one of the grid on which regions are put together."""
+"""Pixels of the picture to a cell of the grid on which regions are built."""
 OCTAVES = 5
 """Resolutions: the full one, half of it, and so on."""
 LEAST = 20
-"""Pixels of that grid below which a region is an accident of depth."""
+"""Cells below which a region is an accident of depth."""
 AROUND = 1.6
-"""Sizes of an ellipse within which the face around it tells how large it may be."""
+"""Major semi-axes around an ellipse within which the depth of the face limits its size."""
 BEFORE, NOISES = 1.04, 3.0
-"""By how many times as near as the face beside it something is that stands before it, and standard
-deviations of noise on top."""
+"""Ratio of inverse depths, and standard deviations of noise on top, from which something is an
+occluder of the face beside it."""
 NEAR = 2
-"""Cells of the grid across which one sees that."""
+"""Cells across which that is compared."""
 NOWHERE = 1e6
-"""As large as no hole looks, px."""
+"""Larger than any hole looks, px."""
 SPREAD_PX = 8
-"""By how much larger than it is a stereo matcher makes what stands before something: its edge lies
-within."""
+"""Width by which a stereo matcher enlarges an occluder: its true edge lies within."""
 DRAWN_PX = 1
-"""Beside what stands before a face: its own edge is there, and those of the face are bent towards
-it by the blur."""
+"""Margin beside an occluder in which its own edge and its blur lie."""
 HALF = 1.5
-"""What shows half of itself must look so many times larger to be known."""
+"""Factor on the size from which a hole that is half occluded is found: 2 finds little more and
+takes three times as long."""
 UNSEEN = 3.0
-"""Sizes of a hole across which a face may go on where nobody knows the depth: beside an arm, whose
-other side one camera sees."""
+"""Sizes of a hole across which a face may go on where depth is unknown: beside an arm, in the part
+that only one camera sees."""
+SIZE_PERCENTILES = 2.0, 98.0
+"""Percentiles of the sizes in a region that limit the size of its holes."""
 
 
 @dataclass(frozen=True)
 class SearchLevel:
-    """A part of the picture in which holes look alike large.
+    """A part of the picture in which holes look similarly large.
 
     Attributes:
         shrink: Pixels of the picture to one of this level.
-        region: Where to look, of the whole picture, on the grid of `STEP`, uint8 of 0 and 1.
-        prior: How large a hole may look there, px of the picture; `None` for any size.
-        sizes_px: How large a hole would look at each place of the grid of `STEP`, NaN where nobody
-            knows; `None` for nowhere.
-        slack: By how much the size may be off at a place, as a part of it.
-        depth_m: Of the picture, `(h, w)`; `None` if nobody knows.
-        nearest_m: Depth before which things stand before the face, at each place of the grid of
-            `STEP`, 0 where nothing does.
+        region: Cells to search, uint8 of 0 and 1, on the grid of the whole picture.
+        prior: Range of the size of a hole, px of the picture; `None` for any size.
+        sizes_px: Size of a hole at each cell, NaN where depth is unknown; `None` for all unknown.
+        slack: Allowed relative error of that size.
+        depth_m: Depth of the picture, `(h, w)`; `None` if unknown.
+        nearest_m: Depth at each cell below which something is an occluder, 0 for no occluder.
     """
 
     shrink: int
@@ -64,11 +64,11 @@ class SearchLevel:
     nearest_m: np.ndarray | None = None
 
     def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        """Returns the ellipses of this level that have a possible size where they are, in px of the picture `(h, w)`."""
-        return [one for one in self._found(detector, gray) if self._fits(one)]
+        """Return the ellipses of a possible size at their place, in px of the picture `(h, w)`."""
+        return [one for one in self._detect_all(detector, gray) if self._fits(one)]
 
     def _fits(self, one: Ellipse) -> bool:
-        """Says whether a circle of the face around an ellipse could look so large; it does if nobody knows the depth there."""
+        """Return whether a hole in the face around an ellipse can look as large; true for unknown depth."""
         if self.sizes_px is None:
             return True
         reach = AROUND * one.a
@@ -82,7 +82,8 @@ class SearchLevel:
             1.0 + self.slack
         )
 
-    def _found(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
+    def _detect_all(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
+        """Return the ellipses of the region, whatever their size at their place."""
         x, y, wide, high = cv2.boundingRect(self.region)
         left, top = x * STEP, y * STEP
         height, width = (
@@ -109,9 +110,11 @@ class SearchLevel:
                 top + middle : top + height * step : step,
                 left + middle : left + width * step : step,
             ]
+            # The edges of an occluder are no rims: search neither along them nor in their blur.
+            # Unknown depth compares false.
             before = cv2.morphologyEx(
                 (depth < nearest).view(np.uint8), cv2.MORPH_OPEN, _make_square(1)
-            )  # not where it is unknown
+            )
             inner = cv2.erode(before, _make_square(-(-SPREAD_PX // step)))
             roi = roi & ((cv2.dilate(before, _make_square(DRAWN_PX)) == 0) | (inner > 0))
         prior = self.prior and SizePrior(
@@ -126,19 +129,18 @@ class SearchLevel:
 def plan_search_levels(
     frame: Frame, mask: np.ndarray, radius_m: float, slack: float, comfortable_px: float
 ) -> list[SearchLevel]:
-    """Returns where to look: each part of the block in the coarsest resolution in which a hole there has a good size.
+    """Return the levels to search: each part of the block in the coarsest resolution that suits it.
 
-    A circle's major semi-axis is focal length times radius over depth, however it is tilted. What
-    is looked at reaches as far
-    beyond the mask as a hole is wide: one is a gap of the mask where the segmenter does not count
-    it to the block, and lies at its border where something stands before half of it; where depth is
-    unknown beside the mask, the face may go on a few times as far.
+    The major semi-axis of a circle is focal length times radius over depth, however it is tilted.
+    The search reaches beyond the mask by the size of a hole: a hole may be a gap of the mask, or lie
+    at its border where something hides half of it. Where depth is unknown beside the mask, the face
+    may go on a few times as far.
 
     Args:
-        frame: For depth and camera.
-        mask: The block, `(h, w)` bool.
-        radius_m: Of the holes.
-        slack: By how much the size may be off, as a part of it.
+        frame: Frame with depth and camera matrix.
+        mask: Block, `(h, w)` bool.
+        radius_m: Radius of the holes.
+        slack: Allowed relative error of their size.
         comfortable_px: Least semi-axis in the chosen resolution.
     """
     focal_px = float(np.sqrt(frame.camera_matrix[0, 0] * frame.camera_matrix[1, 1]))
@@ -151,83 +153,69 @@ def plan_search_levels(
         focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known
     )
     everywhere_px, unknown = np.where(known, size_px, np.nan), ~np.isfinite(depth)
-    before_px = _measure_occluders(
-        np.divide(
-            focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=~unknown
-        ),
-        known,
+    seen_px = np.divide(
+        focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=~unknown
     )
-    behind = size_px < cv2.dilate(
-        np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _make_square(1)
-    )
+    before_px = _measure_occluders(seen_px, known)
+    # Beside an occluder a hole may show only half of itself: search there in a finer resolution.
+    beside = cv2.dilate(np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _make_square(1))
+    behind = size_px < beside
     nearest_m = np.where(before_px < NOWHERE, focal_px * radius_m / before_px, np.float32(0.0))
     found, rest = [], known.copy()
     shown_px = np.where(behind, size_px / HALF, size_px)
     suited = [
         _select_sizes(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)
     ]
-    for _ in range(
-        OCTAVES
-    ):  # the resolution next that suits most of what is left, the coarser one of two alike
-        number = max(
-            range(OCTAVES), key=lambda octave: (np.count_nonzero(rest & suited[octave]), octave)
-        )
+    for _ in range(OCTAVES):
+        # Next is the resolution that suits most of the rest; of two the coarser one.
+        counts = [np.count_nonzero(rest & one) for one in suited]
+        number = max(range(OCTAVES), key=lambda octave: (counts[octave], octave))
         here = rest & suited[number]
         if np.count_nonzero(here) < LEAST:
             break
         rest &= ~here
-        reach = float(np.percentile(size_px[here], 98.0)) * (1.0 + slack) / STEP
+        reach = float(np.percentile(size_px[here], SIZE_PERCENTILES[1])) * (1.0 + slack) / STEP
         hidden = (_dilate(here, UNSEEN * reach) > 0) & unknown
         count, pieces = cv2.connectedComponents(_dilate(here | hidden, reach))
         for piece in range(1, count):
             part = pieces == piece
             some_px = size_px[part & here]
             if len(some_px) >= LEAST:
-                low, high = np.percentile(some_px, (2.0, 98.0))
+                low, high = np.percentile(some_px, SIZE_PERCENTILES)
                 prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
-                found.append(
-                    SearchLevel(
-                        2**number,
-                        part.astype(np.uint8),
-                        prior,
-                        everywhere_px,
-                        slack,
-                        frame.depth_m,
-                        nearest_m,
-                    )
+                region = part.astype(np.uint8)
+                level = SearchLevel(
+                    2**number, region, prior, everywhere_px, slack, frame.depth_m, nearest_m
                 )
+                found.append(level)
     return found
 
 
 def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[SearchLevel]:
-    """Returns one level instead, in full resolution: the bounding box of the mask, as large as a hole may be anywhere."""
+    """Return one level of full resolution: the bounding box of the mask, with all possible sizes."""
     x, y, wide, high = cv2.boundingRect(mask.view(np.uint8))
     region = np.zeros([-(-size // STEP) for size in mask.shape], np.uint8)
     region[y // STEP : (y + high - 1) // STEP + 1, x // STEP : (x + wide - 1) // STEP + 1] = 1
     priors = [level.prior for level in whole if level.prior]
-    prior = (
-        SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors))
-        if priors
-        else None
-    )
+    prior = None
+    if priors:
+        prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors))
     return [SearchLevel(1, region, prior)]
 
 
 def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Returns how large a hole looks at least on what stands before a face, `(h, w)`, `NOWHERE` where nothing does.
+    """Return the least size of a hole on an occluder of a face, `(h, w)`, `NOWHERE` for no occluder.
 
     Args:
-        seen_px: How large it would look at each place, 0 where nobody knows.
-        face: Where the faces are, bool.
+        seen_px: Size of a hole at each cell, 0 for unknown depth.
+        face: Cells of the faces, bool.
     """
-    reach = _make_square(round(float(np.percentile(seen_px[face], 98.0)) / STEP))
+    reach = _make_square(round(float(np.percentile(seen_px[face], SIZE_PERCENTILES[1])) / STEP))
     rough_px, seen_px = seen_px, cv2.medianBlur(seen_px, 5)
     noise = 1.4826 * float(np.median(np.abs(rough_px[face] / np.maximum(seen_px[face], 1.0) - 1.0)))
-    around = cv2.dilate(
-        np.where(face, seen_px, np.float32(0.0)), reach
-    )  # depth within a mouth is no face's
-    # where there is a face alone: beyond it, where something hides half of a mouth, nothing but the
-    # mouth's depth may be in reach
+    # A closing over the size of a hole: depth inside a hole is not that of the face. Only on the
+    # face: beyond it nothing but the inside of a half-hidden hole may be in reach.
+    around = cv2.dilate(np.where(face, seen_px, np.float32(0.0)), reach)
     around = cv2.erode(np.where(face & (around > 0), around, np.float32(NOWHERE)), reach)
     least = np.float32(BEFORE + NOISES * noise) * cv2.erode(
         np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _make_square(NEAR)
@@ -241,7 +229,7 @@ def _make_square(reach: int) -> np.ndarray:
 
 
 def _select_sizes(size_px: np.ndarray, comfortable_px: float, octave: int) -> np.ndarray:
-    """Says which sizes suit a resolution: from the least comfortable one to three times it, and what suits none beyond."""
+    """Find sizes that suit a resolution: up to three times the comfortable one, the rest beyond."""
     low = comfortable_px if octave else 0.0
     return (size_px >= low) & ((size_px < 3.0 * comfortable_px) | (octave == OCTAVES - 1))
 

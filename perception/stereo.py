@@ -1,4 +1,4 @@
-"""Depth from a rectified pair of pictures: semi-global matching, then least squares on the pictures themselves.
+"""Depth from a rectified pair of pictures: semi-global matching, refined by least squares.
 
 Semi-global matching answers in sixteenths of a pixel and leans towards whole ones: rendered pairs
 show a mean error of 0.05 px, which is 6 mm at 4 m and does not average out over a face. A few steps
@@ -14,31 +14,30 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 
 _SMOOTH_PX = 0.8
-"""Both pictures are smoothed this much before their difference is read, or noise would shrink the
-slope."""
+"""Blur of both pictures before refinement: noise would bias the gradient. Chosen by hand."""
 _LARGEST_STEP_PX = 0.5
+"""Largest step of refinement; longer ones leave the linear range. Chosen by hand."""
 _LARGEST_CHANGE_PX = 1.0
-"""Where refinement wants to move further than this the match was wrong."""
+"""Total change from which the match was wrong. Chosen by hand."""
 _LEAST_SLOPE = 0.01
-"""Mean squared slope of the grey values per pixel below which there is nothing to refine by."""
+"""Least mean squared gradient for refinement, (grey levels a pixel)². Chosen by hand."""
 
 
 @spec
 class Stereo:
-    """Makes depth of a pair by semi-global matching (Hirschmüller 2008) with sub-pixel refinement.
+    """Match a pair semi-globally (Hirschmüller 2008) and refine to sub-pixels.
 
     Attributes:
-        nearest_m: Nothing nearer is looked for; decides the range of disparities and the time it
-            takes.
+        nearest_m: Least depth; decides the range of disparities, and so the time.
         window_px: Side of the compared windows; odd.
         smoothness: Factor on the usual penalties for steps and jumps between neighbours.
         uniqueness: Percent by which the best match must beat the second.
-        consistency_px: How far the match back from right to left may miss.
-        speckle_px: Patches of fewer pixels that stand alone in depth are dropped; 0 keeps them.
-        speckle_range_px: Steps within such a patch.
-        refinements: Least squares steps; 0 for none.
+        consistency_px: Largest error of the match back from right to left.
+        speckle_px: Least pixels of a patch that stands alone in depth; 0 keeps all.
+        speckle_range_px: Largest step within such a patch.
+        refinements: Steps of least squares; 0 for none.
         refinement_px: Side of the window of a step; odd.
-        farthest_m: Depth beyond this is unknown.
+        farthest_m: Largest depth.
     """
 
     nearest_m: float
@@ -55,7 +54,8 @@ class Stereo:
     def check(self) -> None:
         if not 0 < self.nearest_m < self.farthest_m:
             raise ConfigError(
-                f"stereo: expected 0 < nearest_m < farthest_m, got {self.nearest_m} and {self.farthest_m}"
+                "stereo: expected 0 < nearest_m < farthest_m, got "
+                f"{self.nearest_m} and {self.farthest_m}"
             )
         if (
             min(self.window_px, self.refinement_px) < 1
@@ -63,17 +63,18 @@ class Stereo:
             or self.refinement_px % 2 == 0
         ):
             raise ConfigError(
-                f"stereo: windows are odd and positive, got {self.window_px} and {self.refinement_px}"
+                "stereo: windows are odd and positive, got "
+                f"{self.window_px} and {self.refinement_px}"
             )
 
     def depth_m(
         self, left: np.ndarray, right: np.ndarray, focal_px: float, baseline_m: float
     ) -> np.ndarray:
-        """Returns depth along z for each pixel of the left picture, `(h, w)` float32, NaN where unknown.
+        """Return the depth of each pixel of the left picture, m, `(h, w)` float32, NaN for unknown.
 
         Args:
             left: RGB, `(h, w, 3)` uint8.
-            right: Its partner, rectified: same rows, no distortion.
+            right: Its partner; both are rectified.
             focal_px: Focal length.
             baseline_m: Distance between the cameras.
         """
@@ -90,7 +91,7 @@ class Stereo:
         ).astype(np.float32)
 
     def _matched(self, left: np.ndarray, right: np.ndarray, largest_px: float) -> np.ndarray:
-        """Returns disparities, NaN where there is none."""
+        """Return disparities, NaN where there is none."""
         count = min(-(-int(np.ceil(largest_px)) // 16), max(1, (left.shape[1] - 1) // 16)) * 16
         step = self.smoothness * self.window_px**2
         matcher = cv2.StereoSGBM.create(
@@ -98,8 +99,8 @@ class Stereo:
             disp12MaxDiff=self.consistency_px, preFilterCap=31, uniquenessRatio=self.uniqueness,
             speckleWindowSize=self.speckle_px, speckleRange=self.speckle_range_px, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
         )  # fmt: skip
-        # the matcher leaves out a border as wide as the largest disparity; what the padding itself
-        # matches is thrown away
+        # The matcher leaves out a border as wide as the largest disparity: pad the pictures, and
+        # discard the matches of the padding.
         wide = [
             cv2.copyMakeBorder(picture, 0, 0, count, 0, cv2.BORDER_REPLICATE)
             for picture in (left, right)
@@ -111,7 +112,7 @@ class Stereo:
         )
 
     def _refined(self, left: np.ndarray, right: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Returns disparities that make the windows of both pictures agree best, whatever their brightness and contrast."""
+        """Return disparities refined by registration of windows, free in brightness and contrast."""
         one, other = (
             cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX)
             for picture in (left, right)

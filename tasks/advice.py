@@ -13,6 +13,11 @@ from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
+MIN_LAG_PERIODS = 1e-6
+"""Floor of the hand's lag, in control periods: no lag would divide by zero."""
+ROUNDING = 5e-7
+"""Tolerance, in control periods, by which a delay of whole periods counts as whole."""
+
 Expected = float | tuple[float, float]
 """A number, or the range [low, high] in which it lies."""
 
@@ -24,7 +29,7 @@ class AdviceConfig:
     Attributes:
         delay_s: Reaction delay, from the display to the hand.
         lag_s: Time constant of the hand.
-        dead_zone: Deflection below which a lever commands nothing: what is to have an effect is
+        dead_zone: Deflection below which a lever commands nothing: an effective proposal is
             proposed larger.
         joints_at_once: Levers that the person can move at the same time, of a range the fewest: no
             more are proposed. `null`: all.
@@ -112,22 +117,18 @@ def _predict_levers(advice: AdviceConfig, machine: Machine) -> torch.Tensor:
     Columns: `H` proposals, oldest first, and the present position of the hand.
     """
     num, period_s = machine.num_history, machine.period_s
-    delay, lag = (
-        _take_middle(advice.delay_s) / period_s,
-        max(_take_middle(advice.lag_s) / period_s, 1e-6),
-    )
+    delay = _take_middle(advice.delay_s) / period_s
+    lag = max(_take_middle(advice.lag_s) / period_s, MIN_LAG_PERIODS)
     steps = round((_take_middle(advice.delay_s) + advice.settle_s) / period_s) + 1
-    whole = int(delay + 5e-7)
+    whole = int(delay + ROUNDING)
     part = max(0.0, delay - whole)
     stay = float(torch.exp(torch.tensor(-1.0 / lag)))
     rows, hand = [], torch.zeros(num + 1)
     hand[num] = 1.0
     for step in range(steps):
         target = torch.zeros(num + 1)
-        for back, weight in (
-            (whole, 1.0 - part),
-            (whole + 1, part),
-        ):  # the proposal of so many periods ago
+        # the hand follows the proposal of `delay` periods ago, between two samples
+        for back, weight in ((whole, 1.0 - part), (whole + 1, part)):
             place = num + step - back
             if 0 <= place < num:
                 target[place] += weight

@@ -20,6 +20,12 @@ from brokk_rl.kinematics import Kinematics, ToolPose, multiply_small_matrices
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
+REACH_DAMPING = 0.05
+"""Damping of the exclusive joints' step towards the working range, m² per (rad or m)². Chosen by
+hand: bounds the step where a joint hardly changes the reach."""
+MIN_RADIUS_M = 1e-3
+"""Floor of horizontal distances by which the controller divides."""
+
 
 @spec
 class ClassicalConfig:
@@ -32,7 +38,7 @@ class ClassicalConfig:
         gain_1_s: Speed of approach per distance left.
         top_speed_m_s: Bound on the speed of the tool point.
         top_rate_rad_s: Bound on the rate of its pitch.
-        straight: Whether what one joint cannot do slows all of them alike, so that the tool goes
+        straight: Whether the slowest joint slows all of them alike, so that the tool goes
             straight; otherwise each goes as fast as it can.
         damping: Damping of the least squares, in the same unit as the Jacobian times joint speed
             (m/s at full command).
@@ -121,7 +127,7 @@ class ClassicalController:
         self._damping = config.damping**2 * torch.eye(4, device=device)
 
     def rate(self, u: torch.Tensor) -> torch.Tensor:
-        """Return the joint speed of the static valve map for commands `u`, `(…, J)`, rad/s or m/s."""
+        """Return joint speeds of the static valve map for commands `u`, `(…, J)`, rad/s or m/s."""
         band = self.config.dead_band
         return self.speed * u.sign() * (u.abs() - band).clamp(min=0.0) / (1.0 - band)
 
@@ -185,7 +191,11 @@ class ClassicalController:
         share = self.approach(jacobian.tip[0], jacobian.pitch[0], error, goal_up, pitch_error)
 
         reach, reach_slope, reach_3d = self._reach(both, target_m)
-        left = (sum(reach_m) / 2 - reach[0])[:, None] * reach_slope / (reach_slope.square() + 0.05)
+        left = (
+            (sum(reach_m) / 2 - reach[0])[:, None]
+            * reach_slope
+            / (reach_slope.square() + REACH_DAMPING)
+        )
         share = share + (config.gain_1_s * left * self._exclusive / self.speed).clamp(-1.0, 1.0)
         # each joint slows down before the place from which it must go no further
         down, up = (
@@ -194,7 +204,7 @@ class ClassicalController:
         )
         share = torch.maximum(torch.minimum(share, up), -down)
 
-        bearing = tip[:, :2] / tip[:, :2].norm(dim=1, keepdim=True).clamp(min=1e-3)
+        bearing = tip[:, :2] / tip[:, :2].norm(dim=1, keepdim=True).clamp(min=MIN_RADIUS_M)
         radial = (error[:, :2] * bearing).sum(1)
         tangential = bearing[:, 0] * error[:, 1] - bearing[:, 1] * error[:, 0]
         return ControllerGuidance(
@@ -247,13 +257,16 @@ class ClassicalController:
         )
 
     def _reach(self, pose: ToolPose, target_m: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return reach `(M, N)`, its slope `(N, J)` in the first row, and the distance in space `(M, N)`."""
+        """Return reach and distance in space, `(M, N)` each, and the slope of the reach, `(N, J)`.
+
+        The slope is that of the first row. Order: reach, slope, distance.
+        """
         origins = pose.joints_in_base_m
         joint = origins[:, :, self._reach_joint]
-        radius = joint[..., :2].norm(dim=-1).clamp(min=1e-3)
+        radius = joint[..., :2].norm(dim=-1).clamp(min=MIN_RADIUS_M)
         out = target_m[:, :2].norm(dim=1) - radius
         up = target_m[:, 2] - joint[..., 2]
-        reach = torch.sqrt(out.square() + up.square()).clamp(min=1e-3)
+        reach = torch.sqrt(out.square() + up.square()).clamp(min=MIN_RADIUS_M)
         motion = torch.linalg.cross(pose.axes_in_base[0], joint[0, :, None] - origins[0], dim=-1)
         outward = (motion[..., :2] * (joint[0, :, :2] / radius[0, :, None])[:, None]).sum(-1)
         slope = -(out[0, :, None] * outward + up[0, :, None] * motion[..., 2]) / reach[0, :, None]

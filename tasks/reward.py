@@ -84,7 +84,8 @@ class RewardTerm:
             found = resolve_name(self.function)
         except (ImportError, AttributeError, ValueError) as error:
             raise ConfigError(
-                f"reward term '{self.function}' cannot be found ({error}); expected package.module:function"
+                f"reward term '{self.function}' cannot be found ({error}); expected "
+                "package.module:function"
             ) from error
         if not callable(found):
             raise ConfigError(
@@ -168,8 +169,8 @@ def contact(state: ToolState) -> torch.Tensor:
 def peak_contact(state: ToolState) -> torch.Tensor:
     """Growth of the episode's peak contact force in kN, up to 10 kN.
 
-    An episode pays for its hardest blow, not for the time it leans on the rim: a penalty of every step
-    in contact teaches a beginner to stay away from the hole.
+    An episode pays for its hardest blow, not for the time it leans on the rim: a penalty of every
+    step in contact teaches a beginner to stay away from the hole.
     """
     peak_n = torch.maximum(state.peak_force_n, state.contact_force_n)
     return (peak_n.clamp(max=10_000.0) - state.peak_force_n.clamp(max=10_000.0)) / 1000.0

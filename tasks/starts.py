@@ -13,7 +13,21 @@ import torch
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from tasks.classical import ClassicalController
+from tasks.classical import REACH_DAMPING, ClassicalController
+
+BATCH_FACTOR, MIN_BATCH, MAX_BATCHES = 4, 256, 64
+"""Candidates per batch for each start asked for, least batch, and batches until `draw_starts` gives
+up. Chosen by hand."""
+
+REACH_STEPS, REACH_MAX_STEP = 40, 0.1
+"""Damped Newton steps of the exclusive joints towards the working range, and their largest step (rad
+or m). Chosen by hand."""
+POSE_STEPS, POSE_STEP_S = 120, 0.2
+"""Steps of the classical controller's approach, and the time of each, s. Chosen by hand: 24 s,
+longer than an episode of `borehole_insertion`."""
+POSE_TOLERANCE_M, POSE_TOLERANCE_RAD = 0.01, 0.03
+"""Errors up to which a pose counts as reached. Chosen by hand: the clearance of the hole, and a
+fraction of the tolerance of `goal_pose`."""
 
 
 @spec
@@ -83,13 +97,13 @@ def draw_starts(
         `q`, `scene`, `target_m`, `target_pitch_rad`.
     """
     generator = torch.Generator().manual_seed(seed)
-    batch = max(4 * count, 256)
+    batch = max(BATCH_FACTOR * count, MIN_BATCH)
 
     def uniform(bounds: tuple[float, float]) -> torch.Tensor:
         return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
 
     drawn = []
-    for _ in range(64):
+    for _ in range(MAX_BATCHES):
         targets = draw(uniform)
         q, free = draw_arms(arms, machine, controller, targets.object_z_m, generator)
         rows = {
@@ -153,24 +167,26 @@ def check_reachable(
     upper = torch.as_tensor(machine.upper, dtype=torch.float32) - margin_rad
     inner = 0.25 * (reach_m[1] - reach_m[0])
     q = q.clone()
-    for _ in range(40):
+    for _ in range(REACH_STEPS):
         reach, slope = controller.reach(q, target_m)
         wanted = reach.clamp(reach_m[0] + inner, reach_m[1] - inner)
         inside = (reach >= reach_m[0]) & (reach <= reach_m[1])
-        step = ((wanted - reach)[:, None] * slope / (slope.square() + 0.05)).clamp(-0.1, 0.1)
+        step = ((wanted - reach)[:, None] * slope / (slope.square() + REACH_DAMPING)).clamp(
+            -REACH_MAX_STEP, REACH_MAX_STEP
+        )
         q = torch.where(exclusive & ~inside[:, None], (q + step).clamp(lower, upper), q)
     reach, _ = controller.reach(q, target_m)
     good = (reach > reach_m[0]) & (reach < reach_m[1])
-    for _ in range(120):
+    for _ in range(POSE_STEPS):
         pose, jacobian = controller.kinematics.pose_and_jacobian(q)
         error = target_m - pose.tip_in_base_m
         share = controller.approach(
             jacobian.tip, jacobian.pitch, error, error[:, 2], pitch_rad - pose.pitch_rad
         )
-        q = (q + 0.2 * share * controller.speed).clamp(lower, upper)
+        q = (q + POSE_STEP_S * share * controller.speed).clamp(lower, upper)
     pose = controller.kinematics.pose(q)
-    near = (target_m - pose.tip_in_base_m).norm(dim=1) < 0.01
-    return good & near & ((pitch_rad - pose.pitch_rad).abs() < 0.03)
+    near = (target_m - pose.tip_in_base_m).norm(dim=1) < POSE_TOLERANCE_M
+    return good & near & ((pitch_rad - pose.pitch_rad).abs() < POSE_TOLERANCE_RAD)
 
 
 def join_starts(
@@ -185,6 +201,7 @@ def join_starts(
     found = len(joined["q"])
     if found < count:
         raise ConfigError(
-            f"{task_name}: only {found} of {count} starts were reachable; widen the joint limits or narrow the ranges of the task"
+            f"{task_name}: only {found} of {count} starts were reachable; "
+            "widen the joint limits or narrow the ranges of the task"
         )
     return {key: value[:count] for key, value in joined.items()}

@@ -161,7 +161,8 @@ class Benchmark:
         steps = {"physics_env_steps_per_s": physics, "env_steps_per_s": lambda: loop.step(action)}
         if bare := getattr(loop.world, "bare_step", None):
             steps["batch_env_steps_per_s"] = bare
-        group.wait()  # those of one computer share its processors and its power: measure them at the same time
+        # processes of one computer share its cores and power: measure at the same time
+        group.wait()
         seconds = self._in_turn(steps, loop, device)
         runner_steps = int(self.rl.runner["num_steps_per_env"])
         book = TrainingLogger(
@@ -194,8 +195,9 @@ class Benchmark:
     ) -> dict[str, float]:
         """Return the seconds of one call of each, the median over at least `bench.seconds`.
 
-        A few calls of each at a time, so that other load of the computer meets all alike. Calls that are no
-        control step move arms at rest at their starts; the control loop finds its worlds as it left them.
+        A few calls of each at a time, so that other load of the computer meets all alike. Calls
+        that are no control step move arms at rest at their starts; the control loop finds its
+        worlds as it left them.
         """
         rest = loop.world.state_dict()
         spent: dict[str, list[float]] = {name: [] for name in steps}
@@ -243,7 +245,8 @@ def _read_single_process(sizes: BenchmarkSizes) -> dict[int, dict[str, Any]]:
     missing = [num for num in sizes.num_envs if num not in rows]
     if found.get("ranks") != 1 or missing:
         raise ConfigError(
-            f"bench.against: expected {sizes.against} to be of one process, with rows for {list(sizes.num_envs)} environments, "
+            f"bench.against: expected {sizes.against} to be of one process, with rows for "
+            f"{list(sizes.num_envs)} environments, "
             f"got {found.get('ranks')} processes and {sorted(rows)}"
         )
     return rows

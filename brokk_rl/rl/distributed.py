@@ -23,7 +23,7 @@ class TrainingGroup:
     """Process group of a training, a context manager; without effect for a single process.
 
     Args:
-        device: Where this process computes: NCCL between GPUs, gloo between CPUs and for what lies
+        device: Where this process computes: NCCL between GPUs, gloo between CPUs and for data
             on the host.
     """
 
@@ -62,7 +62,8 @@ class TrainingGroup:
             # between GPUs nothing is destroyed after an error: NCCL would wait for those that are
             # gone
             raise DistributedError(
-                f"rank {self.rank.index}: another process of this training has ended; its own message says why "
+                f"rank {self.rank.index}: another process of this training has ended; its own "
+                "message says why "
                 f"({str(error).splitlines()[0]})"
             ) from error
 
@@ -127,8 +128,10 @@ class TrainingGroup:
         other = [index for index, value in enumerate(found) if value != found[0]]
         if other:
             raise DistributedError(
-                f"the policy of rank {', '.join(map(str, other))} is no longer that of rank 0: parameters or normalisers differ. "
-                "Look for randomness or data-dependent code that runs on some ranks only, and for GPUs of different kinds."
+                f"the policy of rank {', '.join(map(str, other))} is no longer that of rank 0: "
+                "parameters or normalisers differ. "
+                "Look for randomness or data-dependent code that runs on some ranks only, and "
+                "for GPUs of different kinds."
             )
 
 

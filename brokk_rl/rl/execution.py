@@ -21,8 +21,8 @@ def capture_graph(
     """Return a CUDA graph of `step`.
 
     Args:
-        step: The step; called `WARM_UP` times before. It must not synchronise with the host, and its
-            tensors must keep their addresses.
+        step: The step; called `WARM_UP` times before. It must not synchronise with the host, and
+            its tensors must keep their addresses.
         device: A CUDA device.
         gradients: Whether `step` differentiates.
     """
@@ -52,7 +52,8 @@ def report_compile_errors() -> Iterator[None]:
         yield
     except BackendCompilerFailed as error:
         raise ConfigError(
-            f"rl.fuse: cannot compile the control step ({str(error).splitlines()[0]}); install a C++ compiler (g++), or give "
+            f"rl.fuse: cannot compile the control step ({str(error).splitlines()[0]}); install a "
+            "C++ compiler (g++), or give "
             "rl.fuse=false"
         ) from error
 

@@ -34,7 +34,8 @@ GOLDEN, NUM_GOLDEN = "golden.json", 16
 """Observations and the network's own commands: whoever runs the file elsewhere compares with them
 first."""
 NOT_DEPLOYABLE = (
-    "the task ({task}) cannot be deployed, so there is no policy.onnx: it has no methods `describe` "
+    "the task ({task}) cannot be deployed, so there is no policy.onnx: it has no methods "
+    "`describe` "
     "and `deployable` (brokk_rl.contracts.task.DeployableTask); policy=trained can evaluate the "
     "policy of a run folder without them"
 )

@@ -205,7 +205,8 @@ def locate_bundle(folder: str) -> Path:
         return Path(str(resources.files(package))) / inside
     except (ModuleNotFoundError, ValueError, TypeError) as error:
         raise CheckpointError(
-            f"policy.folder={folder}: there is no package '{package}' ({error}); give a run folder, "
+            f"policy.folder={folder}: there is no package '{package}' ({error}); give a run "
+            "folder, "
             "or package:path"
         ) from error
 

@@ -165,11 +165,11 @@ class DevicePPO(PPO):
             self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
 
     def update(self) -> dict[str, float]:
-        """Learn from the stored steps and return mean losses; see `rsl_rl.algorithms.PPO.update`."""
+        """Learn from the stored steps; return mean losses (`rsl_rl.algorithms.PPO.update`)."""
         return self.update_on_device() if self._on_device else super().update()
 
     def update_on_device(self) -> dict[str, float]:
-        """Learn as `update` does, with one read-back at the end; the same numbers up to rounding."""
+        """Learn as `update` does, with one read-back; the same numbers up to rounding."""
         storage = self.storage
         used = self._batch_size() * self.num_mini_batches
         order = torch.randperm(used, device=self.device)
@@ -220,7 +220,10 @@ class DevicePPO(PPO):
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
 
     def _prepare(self) -> None:
-        """Make the tensors that graphs read and write; the optimiser reads its rate from one of them."""
+        """Make the tensors that graphs read and write.
+
+        The optimiser reads its rate from one of them.
+        """
         self._rows = torch.zeros(self._batch_size(), dtype=torch.int64, device=self.device)
         self._advantages = torch.zeros_like(self.storage.values)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
@@ -374,7 +377,10 @@ class DevicePPO(PPO):
         return self.desired_kl is not None and self.schedule == "adaptive"
 
     def _adapt_rate(self, divergence: torch.Tensor) -> None:
-        """Adapt the learning rate: up where the policy moves less than `desired_kl`, down where more."""
+        """Raise the learning rate where the policy moves too little, lower it where too much.
+
+        `desired_kl` is the divergence of an update to aim at.
+        """
         lower, higher = (
             (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE),
             (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE),

@@ -27,6 +27,11 @@ ITERATIONS_PER_ROUND = 10
 agree on it."""
 
 
+SETTLED_PART = 0.9
+"""Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
+`TrainingConfig.settling`."""
+
+
 @spec
 class TrainingBudget:
     """When training ends: with the first of these that is spent; `null` for no bound.
@@ -42,7 +47,8 @@ class TrainingBudget:
     def check(self) -> None:
         if self.max_env_steps is None and self.max_seconds is None:
             raise ConfigError(
-                "rl.budget: give max_env_steps, max_seconds or both; training without an end is not possible"
+                "rl.budget: give max_env_steps, max_seconds or both; "
+                "training without an end is not possible"
             )
 
     def share_spent(self, env_steps: int, seconds: float) -> float:
@@ -58,8 +64,8 @@ class TrainingConfig:
     """Numbers of a training with rsl-rl's PPO.
 
     Attributes:
-        num_envs: Environments, of each process where several train together; `null` for what the
-            simulator's configuration says.
+        num_envs: Environments, of each process where several train together; `null` for the number
+            of the simulator's configuration.
         num_starts: Number of valid starts from which resets draw.
         budget: When training ends.
         save_interval: Iterations between checkpoints; a killed run loses no more. As often several
@@ -100,7 +106,9 @@ class TrainingConfig:
         desired = self.runner["algorithm"].get("desired_kl")
         if desired is None or share_spent <= 1.0 - self.settling:
             return desired
-        return desired * (1.0 - 0.9 * min(1.0, (share_spent - 1.0 + self.settling) / self.settling))
+        return desired * (
+            1.0 - SETTLED_PART * min(1.0, (share_spent - 1.0 + self.settling) / self.settling)
+        )
 
     def runner_config(self) -> dict[str, Any]:
         """Return a copy for rsl-rl, which writes into it, without keys whose value is `null`."""
@@ -113,10 +121,10 @@ class TrainingConfig:
 class TrainingRunner(OnPolicyRunner):
     """Runner of a training; see `TrainingConfig`.
 
-    rsl-rl's own checkpoint lacks the environment, the random generators and the step count. This one
-    holds all of them: a resumed run on a CPU goes on bit for bit. It is read with `weights_only=True`,
-    so that a checkpoint from a stranger cannot run code. Of several processes the first writes it,
-    including the state of the others.
+    rsl-rl's own checkpoint lacks the environment, the random generators and the step count. This
+    one holds all of them: a resumed run on a CPU goes on bit for bit. It is read with
+    `weights_only=True`, so that a checkpoint from a stranger cannot run code. Of several processes
+    the first writes it, including the state of the others.
 
     Args:
         env: The control loop; a checkpoint of another machine than its own is refused.
@@ -135,7 +143,7 @@ class TrainingRunner(OnPolicyRunner):
         training: TrainingConfig,
         folder: Path,
         device: torch.device,
-        logbook: TrainingLogger,
+        logger: TrainingLogger,
         group: TrainingGroup | None = None,
     ) -> None:
         self.group = group or TrainingGroup(device)
@@ -144,45 +152,52 @@ class TrainingRunner(OnPolicyRunner):
             super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
-        self.logger = logbook  # type: ignore[assignment]
+        self.logger = logger  # type: ignore[assignment]
 
     def run(self) -> None:
-        """Train until the budget is spent; save a checkpoint every `save_interval` and at the end."""
-        book: TrainingLogger = self.logger  # type: ignore[assignment]
+        """Train until the budget is spent; save a checkpoint every `save_interval`."""
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
-        while rounds := self.group.broadcast_first(self._rounds(book, steps)):
+        while num := self.group.broadcast_first(self._count_iterations(steps)):
             if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
                 share = self.group.broadcast_first(
-                    self.training.budget.share_spent(book.env_steps, book.seconds)
+                    self.training.budget.share_spent(self._book.env_steps, self._book.seconds)
                 )
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
             with contextlib.redirect_stdout(io.StringIO()):
                 self.learn(
-                    rounds, init_at_random_ep_len=first and self.training.random_episode_lengths
+                    num, init_at_random_ep_len=first and self.training.random_episode_lengths
                 )
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
-            over = self.group.broadcast_first(self._rounds(book, steps)) == 0
+            over = self.group.broadcast_first(self._count_iterations(steps)) == 0
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
 
-    def _rounds(self, book: TrainingLogger, steps: int) -> int:
+    @property
+    def _book(self) -> TrainingLogger:
+        return self.logger  # type: ignore[return-value]
+
+    def _count_iterations(self, steps: int) -> int:
         """Return the number of iterations until the next checkpoint or change of `desired_kl`.
 
         0 when the budget is spent.
+
+        Args:
+            steps: Control steps of one iteration.
         """
+        book = self._book
         budget, interval = self.training.budget, self.training.save_interval
-        rounds = min(
+        num = min(
             part - self.current_learning_iteration % part
             for part in (ITERATIONS_PER_ROUND, interval)
         )
         if budget.share_spent(book.env_steps, book.seconds) >= 1.0:
             return 0
         if budget.max_env_steps:
-            rounds = min(rounds, max(1, -(-(budget.max_env_steps - book.env_steps) // steps)))
+            num = min(num, max(1, -(-(budget.max_env_steps - book.env_steps) // steps)))
         if budget.max_seconds:
             # the first round is short and shows how long one takes
             left = (
@@ -190,8 +205,8 @@ class TrainingRunner(OnPolicyRunner):
                 if book.env_steps
                 else 1
             )
-            rounds = min(rounds, max(1, round(left)))
-        return rounds
+            num = min(num, max(1, round(left)))
+        return num
 
     def _policy_state(self) -> dict[str, torch.Tensor]:
         """Return parameters and normalisers of actor and critic by name."""
@@ -235,15 +250,14 @@ class TrainingRunner(OnPolicyRunner):
         parts = self.group.gather_on_first(own)
         if not self.group.rank.first:
             return
-        book: TrainingLogger = self.logger  # type: ignore[assignment]
-        book.flush()
+        self._book.flush()
         content = self.alg.save() | {
             "iter": self.current_learning_iteration,
             "learning_rate": self.alg.learning_rate,
             "desired_kl": self.alg.desired_kl,
             **own,
             "others": parts[1:],
-            "book": book.state_dict(),
+            "book": self._book.state_dict(),
             "fingerprint": self.env.machine.fingerprint(),
         }
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
@@ -259,7 +273,8 @@ class TrainingRunner(OnPolicyRunner):
         ) as error:  # torch's writer reports a full disk as a RuntimeError
             part.unlink(missing_ok=True)
             raise StorageError(
-                f"cannot write the checkpoint {path}: {error}. The checkpoint before it is untouched; make room and resume."
+                f"cannot write the checkpoint {path}: {error}. The checkpoint before it is "
+                "untouched; make room and resume."
             ) from error
         for old in list_checkpoints(self.folder)[: -self.training.keep_checkpoints]:
             old.unlink()
@@ -293,11 +308,11 @@ class TrainingRunner(OnPolicyRunner):
             self.alg.learning_rate = content["learning_rate"]
             self.alg.desired_kl = content["desired_kl"]
             self.current_learning_iteration = content["iter"]
-            book: TrainingLogger = self.logger  # type: ignore[assignment]
-            book.load_state_dict(content["book"])  # last: it rewrites progress.csv
+            self._book.load_state_dict(content["book"])  # last: it rewrites progress.csv
         except (KeyError, RuntimeError) as error:
             raise CheckpointError(
-                f"{path} does not fit this configuration: {str(error).splitlines()[0]}. Resume with the run's own resolved.yaml."
+                f"{path} does not fit this configuration: {str(error).splitlines()[0]}. "
+                "Resume with the run's own resolved.yaml."
             ) from error
         return {}
 
@@ -335,14 +350,16 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
         raise CheckpointError(f"there is no checkpoint {path}") from error
     except Exception as error:  # torch raises many kinds: pickle, zip, runtime, end of file
         raise CheckpointError(
-            f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an older one"
+            f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an "
+            "older one"
         ) from error
     bad = [
         name for state in states for name, value in state.items() if not torch.isfinite(value).all()
     ]
     if bad:
         raise CheckpointError(
-            f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older checkpoint"
+            f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older "
+            "checkpoint"
         )
     return content
 

@@ -28,7 +28,7 @@ class SimulatedTrials:
 
     Attributes:
         sim: Physics.
-        task: What the policy advises for; holes and starts are the study's.
+        task: The task that the policy advises for; holes and starts are the study's.
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
         policy: Who advises, a spec of `conf/policy`.
@@ -71,7 +71,13 @@ class SimulatedTrials:
         )
         if task.max_episode_steps * machine.period_s < trials.limit_s:
             raise ConfigError(
-                f"ground.task.episode_s: expected at least the trials' limit of {trials.limit_s:g} s"
+                "ground.task.episode_s: expected at least the trials' limit of "
+                f"{trials.limit_s:g} s"
+            )
+        if "start.target_m" not in task.state:
+            raise ConfigError(
+                f"ground.task: operators steer to a target, but {type(self.task).__name__} has no "
+                "state 'start.target_m'; choose task=borehole_insertion"
             )
         levers.loop = loop
         return self._drive(loop, levers, session, trials)

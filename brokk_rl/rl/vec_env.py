@@ -24,7 +24,7 @@ from brokk_rl.contracts.actuator import (
     FollowerModel,
     SensingModel,
 )
-from brokk_rl.contracts.task import Task, TaskProcess
+from brokk_rl.contracts.task import FAULT, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -60,7 +60,8 @@ class ControlLoopConfig:
 
         Args:
             device: Where to simulate.
-            num_envs: Number of environments; `None` for the number of the simulator's configuration.
+            num_envs: Number of environments; `None` for the number of the simulator's
+                configuration.
             pool: Number of valid starts from which resets draw.
             seed: Seed of the starts.
         """
@@ -99,13 +100,8 @@ class ControlLoop(VecEnv):
         task: TaskProcess,
         starts: Starts,
     ) -> None:
-        self.machine, self.world, self.actuator, self.follower, self.task = (
-            machine,
-            world,
-            actuator,
-            follower,
-            task,
-        )
+        self.machine, self.world, self.task = machine, world, task
+        self.actuator, self.follower = actuator, follower
         self.num_envs = world.num_worlds
         self.device: torch.device = world.device
         self.num_actions = task.num_actions
@@ -116,7 +112,7 @@ class ControlLoop(VecEnv):
         self.history = History(
             q=torch.zeros(shape, device=self.device), u=torch.zeros(shape, device=self.device)
         )
-        """What the controller sees."""
+        """History that the controller sees."""
         sides = getattr(actuator, "sides", frozenset())
         self._sensing = cast(SensingModel, actuator) if "measurement" in sides else None
         self._misplacing = cast(SensingModel, actuator) if "kinematics" in sides else None
@@ -125,7 +121,7 @@ class ControlLoop(VecEnv):
             if self._sensing
             else self.history
         )
-        """What the machine does; the same object where sensors are true."""
+        """History of the machine itself; the same object where sensors are true."""
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
         self.timed_out = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
@@ -163,11 +159,11 @@ class ControlLoop(VecEnv):
 
         rsl-rl may set it to put episodes out of step.
         """
-        return self.task.state["steps"].long()
+        return self.task.state[STEPS].long()
 
     @episode_length_buf.setter
     def episode_length_buf(self, value: torch.Tensor) -> None:
-        self.task.state["steps"].copy_(value)
+        self.task.state[STEPS].copy_(value)
 
     def begin(self, starts: Starts | None = None) -> None:
         """Start a new episode everywhere.
@@ -236,7 +232,7 @@ class ControlLoop(VecEnv):
         values = dict(zip(self._total_names, self._totals.tolist(), strict=True))
         endings = {name: value for name, value in values.items() if name.startswith("end/")}
         episodes = sum(endings.values())
-        fault_rate = values["end/fault"] / max(1, self._steps * self.num_envs)
+        fault_rate = values[f"end/{FAULT}"] / max(1, self._steps * self.num_envs)
         self._totals.zero_()
         self._steps = 0
         return {name: value / max(1.0, episodes) for name, value in values.items()} | {
@@ -283,8 +279,8 @@ class ControlLoop(VecEnv):
     def _always_alike(self) -> Iterator[None]:
         """Make torch's modes the same for every caller.
 
-        rsl-rl calls in and outside of its inference mode, and at any number of threads. For each of them
-        torch would compile the fused parts anew.
+        rsl-rl calls in and outside of its inference mode, and at any number of threads. For each of
+        them torch would compile the fused parts anew.
         """
         with limit_to_one_thread(self.device), torch.inference_mode(False), torch.no_grad():
             yield

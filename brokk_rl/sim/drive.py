@@ -84,8 +84,8 @@ class DriveReferences:
     ) -> None:
         """Move the references on by one control period.
 
-        The reference never leads the joint by more than the lead that opens the relief valve. So a blocked
-        joint does not wind up.
+        The reference never leads the joint by more than the lead that opens the relief valve. So a
+        blocked joint does not wind up.
 
         Args:
             q: Present positions, `(N, J)`.
@@ -100,7 +100,7 @@ class DriveReferences:
         reference.add_(increment)
 
     def diverged(self, qvel: torch.Tensor) -> torch.Tensor:
-        """Return the diverged worlds, `(N,)` bool: joint speeds absurd or NaN, or references infinite.
+        """Return diverged worlds, `(N,)` bool: absurd or NaN joint speeds, infinite references.
 
         Args:
             qvel: Joint speeds, `(N, J)`.

@@ -28,8 +28,8 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
     Args:
         machine: The machine.
         timestep_s: Length of a substep.
-        visual: Keep geoms, cameras and lights that only pictures need. The physics is the same without
-            them, and faster.
+        visual: Keep geoms, cameras and lights that only pictures need. The physics is the same
+            without them, and faster.
 
     Raises:
         ConfigError: The MJCF is missing or its joints are not those of the machine.
@@ -58,7 +58,8 @@ def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
 def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
     if machine.mjcf is None:
         raise ConfigError(
-            f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose another machine=…"
+            f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose "
+            "another machine=…"
         )
     path = ASSETS / resolve_package_path(machine.mjcf)
     if not path.exists():
@@ -77,8 +78,10 @@ def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
         missing = [name for name in machine.joint_names if name not in found]
         extra = [name for name in found if name not in machine.joint_names]
         raise ConfigError(
-            f"machine {machine.name}: the joints of {path.name} ({', '.join(found)}) are not those of the machine "
-            f"({', '.join(machine.joint_names)}); missing: {', '.join(missing) or 'none'}, unknown: {', '.join(extra) or 'none'}"
+            f"machine {machine.name}: the joints of {path.name} ({', '.join(found)}) are not "
+            "those of the machine "
+            f"({', '.join(machine.joint_names)}); missing: {', '.join(missing) or 'none'}, "
+            f"unknown: {', '.join(extra) or 'none'}"
         )
     if spec.site("tip") is None:
         raise ConfigError(
@@ -147,7 +150,8 @@ def _write_inertia(
     body = drawn.body(link.name)
     if body.mass[0] <= 0.0:
         raise ConfigError(
-            f"link '{link.name}' of the MJCF has no mass: give it an <inertial> or a geom with density"
+            f"link '{link.name}' of the MJCF has no mass: give it an <inertial> or a geom with "
+            "density"
         )
     link.explicitinertial = True
     link.mass, link.ipos, link.iquat = mass_kg, com_m, body.iquat

@@ -71,7 +71,10 @@ class NativeWorld:
         )
 
     def bare_step(self) -> None:
-        """Run the substeps of `mujoco.batch` alone, without drive and read-out; `step` compares with it."""
+        """Run the substeps of `mujoco.batch` alone, without drive and read-out.
+
+        Benchmarks compare `step` with it.
+        """
         self._batch.step(nstep=self._substeps)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:

@@ -47,7 +47,8 @@ SIZE = (1200, 540)
 CLOSE_WIDTH = 380
 """Width of the close-up at the right, pixels."""
 FAR_M = 10.0
-"""Horizontal distance beyond which a block is not part of the task (goal_pose puts it 20 m away)."""
+"""Horizontal distance beyond which a block is not part of the task (goal_pose puts it 20 m
+away)."""
 NUM_STILLS = 3
 RENDER_TIMEOUT_S = 600
 """Bound on the rendering process; 200 frames take about 40 s on a CPU."""

@@ -34,9 +34,10 @@ class JointAlgebra(NamedTuple):
     Attributes:
         Vector: A number a degree of freedom.
         Matrix: A square matrix.
-        inertia_at: `(elements, element, world)` -> the mass matrix of a world, from the lower half that
-            `mujoco_warp` keeps.
-        solved: `(A, b)` -> the solution of A x = b for a positive definite A, which needs no pivots.
+        inertia_at: `(elements, element, world)` -> the mass matrix of a world, from the lower half
+            that `mujoco_warp` keeps.
+        solved: `(A, b)` -> the solution of A x = b for a positive definite A, which needs no
+            pivots.
     """
 
     Vector: Any
@@ -91,7 +92,7 @@ _BLOCK = 32  # small blocks, so that some thousand worlds spread over all of a G
 
 @wp.struct
 class _Arm:
-    """Constants of the arm: joints, their servos, and bodies ordered by the last joint that moves them."""
+    """Constants of the arm: joints, servos, and bodies by the last joint that moves them."""
 
     joint_kind: wp.array[int]
     armature: wp.array2d[float]
@@ -310,7 +311,7 @@ class ArmDynamics:
         self._kernels, self._num_worlds = _compile_kernels(model.nv), data.nworld
 
     def before_contacts(self) -> None:
-        """Compute `cdof`, `M` and `qfrc_smooth`, which collisions and solver need, from the kinematics."""
+        """Compute `cdof`, `M` and `qfrc_smooth` for collisions and solver."""
         wp.launch(self._kernels[0], self._num_worlds, self._before, block_dim=_BLOCK)
 
     def after_contacts(self) -> None:

@@ -320,7 +320,9 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
 
 
 class ContactSolver:
-    """Solver for joint limits and contacts without torsional friction; replaces `mujoco_warp.solve`.
+    """Solver for joint limits and contacts without torsional friction.
+
+    Replaces `mujoco_warp.solve`.
 
     Args:
         model: Gives the degrees of freedom and the options `iterations`, `ls_iterations` and

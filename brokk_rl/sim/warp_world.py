@@ -80,7 +80,8 @@ def check_supported(compiled: mujoco.MjModel, machine: Machine, is_fused: bool) 
     ]:
         instead = "sim.fused=false or sim=native" if is_fused else "sim=native"
         raise ConfigError(
-            f"machine {machine.name}: sim=warp simulates arms that are one chain of links, but its MJCF has {', '.join(found)}; "
+            f"machine {machine.name}: sim=warp simulates arms that are one chain of links, but "
+            f"its MJCF has {', '.join(found)}; "
             f"remove them, or choose {instead}"
         )
 

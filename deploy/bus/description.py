@@ -142,11 +142,11 @@ class BusDescription:
         return self._messages[message].get_signal_by_name(signal).unit or ""
 
     def sent_by(self, node: str) -> list[MessageLayout]:
-        """Return what `node` sends."""
+        """Return the messages of `node`."""
         return [layout for layout in self.layouts.values() if layout.sender == node]
 
     def encode(self, name: str, values: Mapping[str, float], counter: int) -> bytes:
-        """Return the data of message `name`; signals that `values` leaves out are 0. Counter and CRC are put in here."""
+        """Return the data of message `name`, with counter and CRC; missing signals are 0."""
         layout, message = self.layouts[name], self._messages[name]
         data = {signal.name: values.get(signal.name, 0) for signal in message.signals}
         if layout.data_id is None:
@@ -156,7 +156,7 @@ class BusDescription:
         return bytes(encoded)
 
     def decode(self, layout: MessageLayout, data: bytes) -> dict[str, float] | MessageFault:
-        """Return the signals of a message, its counter among them, or what is wrong with it."""
+        """Return the signals of a message, its counter among them, or its fault."""
         if len(data) != layout.length:
             return MessageFault.LENGTH
         if layout.data_id is not None:

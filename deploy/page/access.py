@@ -42,7 +42,7 @@ def is_same_origin(origin: str | None, host: str | None, mine: frozenset[str]) -
     return host in mine and (origin is None or origin == f"http://{host}")
 
 
-def matches_token(given: object, token: str) -> bool:
+def compare_tokens(given: object, token: str) -> bool:
     """Compare tokens in a time that does not depend on where they differ."""
     return isinstance(given, str) and hmac.compare_digest(given.encode(), token.encode())
 

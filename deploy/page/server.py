@@ -413,7 +413,7 @@ class PageServer:
         except (ValueError, TimeoutError):
             given = None
         token = given.get("token") if isinstance(given, dict) else None
-        if not access.matches_token(token, self._token):
+        if not access.compare_tokens(token, self._token):
             async with self._guess:  # one guess at a time, whoever guesses
                 await asyncio.sleep(WRONG_TOKEN_S)
             log.warning("refused a page with a wrong token")

@@ -232,6 +232,6 @@ class BusProcess:
         header = FRAME.pack(now_s, frame.frame_id, sent, len(frame.data))
         self._log.append(header + frame.data)
 
-    def _log_text(self, topic: str, now_s: float, values: dict[str, object]) -> None:
+    def _log_text(self, topic: str, now_s: float, values: Mapping[str, object]) -> None:
         text = json.dumps({"topic": topic, "t_s": now_s, **values})
         self._memory.bus_log.put(TEXT + text.encode())

@@ -1,4 +1,4 @@
-"""Where the borehole is said to be: by a file, by numbers in the configuration, by perception, or by a person at the page."""
+"""Target of the loop: the borehole named by configuration, a file, perception or a person."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from brokk_rl.spec import spec
 from deploy.runtime.shared_memory import Slot
 
 NEAR_M = 0.1
-"""Boreholes that are nearer to each other than this are one: two drillings are further apart."""
+"""Distance below which two boreholes are the same: holes of 0.1 m are drilled further apart."""
 
 
 @dataclass(frozen=True)
 class TargetPosition:
-    """Where a borehole is said to be.
+    """Position of a borehole.
 
     Attributes:
         center_in_base_m: Centre of the rim, `(3,)`.
-        std_m: Standard deviation of that; 0 where nobody has said.
-        t_s: When it was found, monotonic; `None`: it stays where it is, and never grows old.
+        std_m: Standard deviation of each coordinate; 0 for unknown.
+        t_s: Time of detection, monotonic; `None` for a fixed one that never grows old.
     """
 
     center_in_base_m: np.ndarray
@@ -33,7 +33,7 @@ class TargetPosition:
     t_s: float | None
 
     def write(self, slot: Slot) -> None:
-        """Makes it the loop's target."""
+        """Publish it as the target of the loop."""
         record = slot.new()
         record["t_s"] = time.monotonic() if self.t_s is None else self.t_s
         record["center_in_base_m"], record["std_m"] = self.center_in_base_m, self.std_m
@@ -41,16 +41,16 @@ class TargetPosition:
 
 
 class TargetProvider(Protocol):
-    """Knows the borehole."""
+    """Reports the configured borehole."""
 
     def news(self, holes: list[Any]) -> TargetPosition | None:
-        """Returns the borehole where there is news of it, else `None`; called several times a second.
+        """Return the borehole if it is new, else `None`; called several times a second.
 
         Args:
-            holes: What perception knows, records of `deploy.runtime.shm_layout.HOLE`.
+            holes: Boreholes from perception, records of `deploy.runtime.shm_layout.HOLE`.
 
         Raises:
-            ConfigError: it makes no sense.
+            ConfigError: its source is invalid.
         """
         ...
 
@@ -59,13 +59,13 @@ class TargetSpec(Protocol):
     """A spec in `conf/target`."""
 
     def build(self) -> TargetProvider:
-        """Returns it at work."""
+        """Return it at work."""
         ...
 
 
 @spec
 class GivenTarget:
-    """A borehole that does not move, given by its centre.
+    """Take a borehole given by its centre.
 
     Attributes:
         center_in_base_m: Centre of the rim in the base frame.
@@ -74,13 +74,13 @@ class GivenTarget:
     center_in_base_m: tuple[float, float, float]
 
     def build(self) -> TargetProvider:
-        """Returns it at work; see `TargetSource`."""
+        """Return it at work; see `TargetSource`."""
         return _FixedTarget(TargetPosition(np.array(self.center_in_base_m), 0.0, None))
 
 
 @spec
 class FileTarget:
-    """A JSON file with `center_in_base_m`, read again whenever it changes; its age counts from then on.
+    """Read a JSON file with `center_in_base_m` whenever it changes; its age counts from then on.
 
     Attributes:
         path: The file; need not exist yet.
@@ -89,34 +89,34 @@ class FileTarget:
     path: str
 
     def build(self) -> TargetProvider:
-        """Returns it at work; see `TargetSource`."""
+        """Return it at work; see `TargetSource`."""
         return _WatchedFile(Path(self.path))
 
 
 @spec
 class DetectedTarget:
-    """The surest borehole that the camera shows (`camera=…`), until a person chooses another at the page.
+    """Take the surest borehole of the camera (`camera=…`), until a person chooses another one.
 
     Attributes:
-        score: How sure it must be, in [0, 1].
+        score: Least score, in [0, 1].
     """
 
     score: float
 
     def build(self) -> TargetProvider:
-        """Returns it at work; see `TargetSource`."""
+        """Return it at work; see `TargetSource`."""
         return _SurestHole(self.score)
 
 
 class TargetSelector:
-    """The borehole that the advice is for: that of whoever spoke last, configuration, file, perception or a person.
+    """Select the target: the latest word of configuration, file, perception or a person counts.
 
-    What the camera then sees of it keeps it fresh.
+    Detections of the same borehole keep it fresh.
 
     Args:
-        target: What the configuration says.
-        slot: Where the loop reads it.
-        holes: What perception knows.
+        target: Configured source.
+        slot: Shared record of the target.
+        holes: Shared record of the boreholes from perception.
     """
 
     def __init__(self, target: TargetProvider, slot: Slot, holes: Slot) -> None:
@@ -124,10 +124,10 @@ class TargetSelector:
         self._place: TargetPosition | None = None
 
     def refresh(self) -> None:
-        """Takes over news.
+        """Publish a new target, or a new detection of the present one.
 
         Raises:
-            ConfigError: the configured source makes no sense now.
+            ConfigError: the configured source is invalid now.
         """
         before, known = self._place, read_holes(self._holes)
         news = self._target.news(known)
@@ -136,12 +136,12 @@ class TargetSelector:
             self._place.write(self._slot)
 
     def choose(self, place: TargetPosition) -> None:
-        """Takes what a person has chosen."""
+        """Publish the choice of a person."""
         self._place = place
         place.write(self._slot)
 
     def _seen(self, known: list[Any]) -> TargetPosition | None:
-        """Returns what the camera says of the borehole since the last time."""
+        """Return a new detection of the present target, `None` without one."""
         place = self._place
         if place is None:
             return None
@@ -152,13 +152,13 @@ class TargetSelector:
 
 
 def read_holes(slot: Slot) -> list[Any]:
-    """Returns the boreholes that perception knows, records of `HOLE`."""
+    """Return the boreholes from perception, records of `HOLE`."""
     record = slot.read()
     return [] if record is None else list(record["holes"][: int(record["count"])])
 
 
 def find_nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
-    """Returns that of `holes` which is the borehole at `center_m`, if any."""
+    """Return the one of `holes` at `center_m`, `None` for none."""
     one = min(
         holes,
         key=lambda hole: float(np.linalg.norm(hole["center_in_base_m"] - center_m)),
@@ -172,7 +172,7 @@ def find_nearest(holes: list[Any], center_m: np.ndarray) -> Any | None:
 
 
 def locate_hole(hole: Any) -> TargetPosition:
-    """Returns where a borehole is that perception knows."""
+    """Return the position of a borehole from perception."""
     return TargetPosition(
         np.array(hole["center_in_base_m"]), float(hole["std_m"]), float(hole["t_s"])
     )
@@ -195,9 +195,8 @@ class _SurestHole:
         sure = max(holes, key=lambda hole: float(hole["score"]), default=None)
         if self._said or sure is None or float(sure["score"]) < self._score:
             return None
-        self._said = (
-            True  # from now on it is followed; a surer one next to it is the operator's choice
-        )
+        # From now on this one is followed; only the operator changes to a surer one.
+        self._said = True
         return locate_hole(sure)
 
 
@@ -223,8 +222,10 @@ class _WatchedFile:
             ) from error
         if center_m.shape != (3,) or not np.isfinite(center_m).all():
             raise ConfigError(
-                f"target.path={self._path}: center_in_base_m is {center_m.tolist()}, expected three numbers"
+                f"target.path={self._path}: center_in_base_m is {center_m.tolist()}, expected three "
+                "numbers"
             )
-        # only a file that lay there before goes by the wall clock, which may be set at any time
+        # A file that was there before has its age by the wall clock, which may be set at any time:
+        # later changes are timed by the monotonic clock.
         age_s = max(0.0, time.time() - changed / 1e9) if before is None else 0.0
         return TargetPosition(center_m, std_m, time.monotonic() - age_s)

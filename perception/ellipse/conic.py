@@ -1,7 +1,7 @@
 """Conics, many at a time: ellipses by centre, semi-axes and direction, and as quadratic forms.
 
-Axes: `C` conics, `P` points. An ellipse is a row `(x, y, a, b, theta_rad)` with `a >= b`; rows of
-NaN are no ellipses. A quadratic form `Q`, `(3, 3)`, holds the points with `(x, y, 1) Q (x, y, 1)^T
+Axes: `C` conics, `P` points. An ellipse is a row `(x, y, a, b, theta_rad)` with `a >= b`; a row of
+NaN stands for none. A quadratic form `Q`, `(3, 3)`, holds the points with `(x, y, 1) Q (x, y, 1)^T
 = 0`.
 """
 
@@ -11,14 +11,14 @@ import numpy as np
 
 
 def fit_ellipses(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Returns the ellipses that fit weighted points best, `(C, 5)`, rows of NaN where they determine none.
+    """Fit ellipses to weighted points, `(C, 5)`; a row of NaN where the points determine none.
 
     Halir and Flusser (1998), the numerically stable form of Fitzgibbon's direct fit, on points
     moved and scaled to unit size.
 
     Args:
         points: `(C, P, 2)`.
-        weights: `(C, P)`, 0 for points that do not count.
+        weights: `(C, P)`, 0 for points that are left out.
     """
     total = np.maximum(weights.sum(1), 1e-12)
     center = (weights[:, None] @ points)[:, 0] / total[:, None]
@@ -50,10 +50,10 @@ def fit_ellipses(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def _find_dominant_eigenvectors(m: np.ndarray) -> np.ndarray:
-    """Returns the eigenvectors to the largest eigenvalues of matrices `(C, 3, 3)` whose eigenvalues are real, `(3, C)`.
+    """Return the eigenvectors to the largest eigenvalues of matrices `(C, 3, 3)`, `(3, C)`.
 
-    Of a direct fit it is the only positive one, which belongs to the ellipse. By the cubic's roots:
-    a thousand at once.
+    All eigenvalues must be real. In a direct fit only one is positive, that of the ellipse. Closed
+    form by the roots of the cubic, refined by a Newton step: much faster than `eig` for thousands.
     """
     m = np.ascontiguousarray(
         (m / np.maximum(np.abs(m).max((1, 2), keepdims=True), 1e-300)).transpose(1, 2, 0)
@@ -86,7 +86,10 @@ def _find_dominant_eigenvectors(m: np.ndarray) -> np.ndarray:
 
 
 def build_quadratic_forms(ellipses: np.ndarray) -> np.ndarray:
-    """Returns the forms `(C, 3, 3)` of ellipses `(C, 5)`, negative inside, with `F = (distance / axis)² - 1` along the axes."""
+    """Return the forms `(C, 3, 3)` of ellipses `(C, 5)`, negative inside.
+
+    Along an axis the form is `(distance / semi-axis)² - 1`.
+    """
     x, y, a, b, theta = np.moveaxis(np.asarray(ellipses, dtype=float), -1, 0)
     u = np.stack([np.cos(theta), np.sin(theta)], -1) / a[..., None]
     v = np.stack([-np.sin(theta), np.cos(theta)], -1) / b[..., None]
@@ -99,7 +102,7 @@ def build_quadratic_forms(ellipses: np.ndarray) -> np.ndarray:
 
 
 def convert_forms_to_ellipses(forms: np.ndarray) -> np.ndarray:
-    """Returns the ellipses `(C, 5)` of forms `(C, 3, 3)`, rows of NaN where a form is no ellipse."""
+    """Return the ellipses `(C, 5)` of forms `(C, 3, 3)`, a row of NaN where a form is none."""
     return _convert_coefficients(
         forms[:, 0, 0],
         forms[:, 0, 1],
@@ -113,7 +116,7 @@ def convert_forms_to_ellipses(forms: np.ndarray) -> np.ndarray:
 def _convert_coefficients(
     a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray, e: np.ndarray, last: np.ndarray
 ) -> np.ndarray:
-    """Returns the ellipses `(C, 5)` of `a x² + 2 b xy + c y² + 2 d x + 2 e y + last`, rows of NaN where that is none."""
+    """Return the ellipses `(C, 5)` of `a x² + 2 b xy + c y² + 2 d x + 2 e y + last`, NaN for none."""
     result = np.empty((len(a), 5))
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         det = a * c - b * b
@@ -122,9 +125,8 @@ def _convert_coefficients(
         mean, half, skew = (a + c) / 2 / level, (a - c) / 2 / level, b / level
         apart = np.hypot(half, skew)
         flat = mean - apart
-        flat = np.where(
-            flat < 0.5 * mean, det / level**2 / (mean + apart), flat
-        )  # their product, where they cancel
+        # The difference cancels for flat ellipses; there the product of both eigenvalues is used.
+        flat = np.where(flat < 0.5 * mean, det / level**2 / (mean + apart), flat)
         result[:, 0], result[:, 1], result[:, 2], result[:, 3] = (
             x,
             y,
@@ -141,9 +143,9 @@ def _convert_coefficients(
 def measure_sampson_distance(
     ellipses: np.ndarray, points: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns Sampson's distance of points `(C, P, 2)` from their ellipses `(C, 5)`, negative inside, `(C, P)`.
+    """Return Sampson's distance of points `(C, P, 2)` from ellipses `(C, 5)`, negative inside.
 
-    With it, the outward unit normals of the ellipses there, `(C, P, 2)`.
+    Also return the outward unit normals of the ellipses there, `(C, P, 2)`.
     """
     value, slope = _evaluate_forms(ellipses, points)
     length = np.maximum(np.sqrt(sum_products(slope, slope)), 1e-12)
@@ -151,20 +153,26 @@ def measure_sampson_distance(
 
 
 def measure_form_gradients(ellipses: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns the length of the gradient of each ellipse's form at its points, `(C, P)`: turns algebraic into geometric error."""
+    """Return the length of the gradient of each form at its points, `(C, P)`.
+
+    Divided by it, the algebraic error is a distance to first order.
+    """
     slope = _evaluate_forms(ellipses, points)[1]
     return np.sqrt(sum_products(slope, slope))
 
 
 def sum_products(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Returns the products of vectors of the picture, `(…, 2)`; much faster than a sum over so short an axis."""
+    """Return scalar products over the last axis of length 2; much faster than `sum(-1)`."""
     return one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1]
 
 
 def sample_ellipses(
     ellipses: np.ndarray, angles_rad: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns points, outward unit normals, `(C, P, 2)` each, and the arc length per radian `(C, P)` at eccentric angles `(P,)`."""
+    """Return points, outward normals `(C, P, 2)` and arc length per radian `(C, P)` at `angles_rad`.
+
+    Eccentric angles, `(P,)`; the normals have unit length.
+    """
     x, y, a, b, theta = (column[:, None] for column in ellipses.T)
     cos, sin, c, s = np.cos(angles_rad), np.sin(angles_rad), np.cos(theta), np.sin(theta)
     u, v = a * cos, b * sin
@@ -178,14 +186,17 @@ def sample_ellipses(
 
 
 def measure_radii(ellipse: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """Returns how far places lie from an ellipse's centre in its own radii: 1 on it; shapes of `x` and `y`, which may differ."""
+    """Return the distance of places from an ellipse's centre in its own radii: 1 on it.
+
+    `x` and `y` are broadcast against each other.
+    """
     c, s = np.cos(ellipse[4]), np.sin(ellipse[4])
     dx, dy = x - ellipse[0], y - ellipse[1]
     return np.hypot((c * dx + s * dy) / ellipse[2], (c * dy - s * dx) / ellipse[3])
 
 
 def compute_perimeter(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Returns the circumference by Ramanujan's first formula."""
+    """Return the circumference by Ramanujan's first approximation (1914)."""
     return np.pi * (3 * (a + b) - np.sqrt((3 * a + b) * (a + 3 * b)))
 
 
@@ -203,7 +214,7 @@ def _evaluate_forms(ellipses: np.ndarray, points: np.ndarray) -> tuple[np.ndarra
 def project_onto_plane(
     ellipse: np.ndarray, camera_matrix: np.ndarray, m: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the curve on the plane `m · P = 1` that a camera sees as an ellipse, exactly.
+    """Return the curve on the plane `m · P = 1` that a camera sees as an ellipse.
 
     Args:
         ellipse: In the picture, `(5,)`.
@@ -230,7 +241,7 @@ def project_onto_plane(
 def solve_circle_poses(
     ellipse: np.ndarray, camera_matrix: np.ndarray, radius_m: float
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Returns the circles of a known radius that a camera sees as an ellipse: two of them, told apart by something else.
+    """Return the two circles of a known radius that a camera sees as the same ellipse.
 
     From the eigenvectors of the cone through the circle (Forsyth et al. 1991).
 
@@ -243,9 +254,8 @@ def solve_circle_poses(
         Centre `(3,)` m and unit normal towards the camera `(3,)` of each.
     """
     cone = camera_matrix.T @ build_quadratic_forms(ellipse) @ camera_matrix
-    values, vectors = np.linalg.eigh(
-        cone if np.linalg.det(cone) < 0 else -cone
-    )  # one negative value: the cone's axis
+    # The sign with one negative eigenvalue: its eigenvector is the axis of the cone.
+    values, vectors = np.linalg.eigh(cone if np.linalg.det(cone) < 0 else -cone)
     order = [2, 1, 0]
     (l1, l2, l3), v = values[order], vectors[:, order]
     along = np.sqrt(max((l1 - l2) / (l1 - l3), 0.0))

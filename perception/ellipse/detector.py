@@ -1,9 +1,9 @@
-"""Ellipses from edges: convex arcs, grouped where they lie on one conic, judged by what supports them all around."""
+"""Ellipse detector: convex arcs of edges, grouped on one conic, judged by their support."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -20,59 +20,45 @@ from perception.ellipse.support import ANGLES, NUM_SAMPLES, STROKE_PX, EllipseCa
 
 @spec
 class ContourArcs:
-    """Ellipses by arc grouping on plain OpenCV: percentile Canny, convex arcs, co-conic groups, support by gradient direction.
+    """Find ellipses by grouping convex arcs of edges, judged by the edge points all around.
+
+    Percentile Canny, convex arcs, groups of arcs on one conic, support by gradient direction. The
+    sensitivity to each number is in `benchmarks/perception/gates.json`.
 
     Attributes:
         sigma_px: Blur before the gradient.
-        percentile: Of the gradient's magnitude, the upper threshold of the edges.
-        noise: Least upper threshold in standard deviations of noise.
-        low: Lower threshold as a part of the upper one.
-        arc_tolerance_px: Polygon that finds where arcs bend back.
+        arc_tolerance_px: Tolerance of the polygon that finds corners and bends.
         corner_rad: Turn of that polygon at which an arc ends.
         arc_points: Least number of points of an arc.
-        reach_px: How far from an ellipse its edge points may lie, per px of the geometric mean of
-            the semi-axes `reach_relative`, at least this.
-        reach_relative: See `reach_px`.
+        reach_px: Least reach of an ellipse: how far from it its edge points may lie.
         angle_rad: Largest angle between the gradient at a supporting point and the ellipse's
             normal.
         coverage: Least part of the circumference with support.
-        gap: Largest part of the circumference without any.
-        rms_px: Largest standard deviation of the support's distances, plus `rms_relative` per px of
-            the geometric mean semi-axis; for an ellipse seen in part, as large a part of that.
-        rms_relative: See `rms_px`.
-        wave_px: Deviation of the support's distances in the mean over an eighth of a turn, which
-            noise leaves no trace in; together with that of its angles, over this and `wave_rad`, at
-            most 1 where half is seen, 2 where all is.
-        wave_rad: See `wave_px`; plus `wave_small` over the geometric mean semi-axis in px.
-        wave_small: See `wave_rad`.
-        angle_rms_rad: Largest standard deviation of the support's angles, plus `angle_rms_small`
-            over the geometric mean semi-axis in px; for an ellipse seen in part, as large a part of
-            that.
-        angle_rms_small: See `angle_rms_rad`.
-        purity: Least part of the supporting edges, from corner to corner, that lies on the ellipse.
-        departure: Largest part of the circumference where the supporting edges run on beside the
-            ellipse, up to their corners (spirals, hearts).
-        evidence: Least decimal exponent by which the support is no accident.
-        score: Least score of an ellipse that is seen nearly all around; of half of one less than
-            half of it will do.
-        prior_slack: By how much wider the limits of residual, angle and departure are, and the one
-            of purity lower, where a size is
-            given: it shuts out most of what else they do, and rims are chipped.
+        gap: Largest unsupported stretch, as a part of the circumference.
+        rms_px: Largest standard deviation of the support's distances, times the coverage.
+        rms_relative: Addition to it per px of the geometric mean semi-axis of a whole ellipse.
+        wave_px: Largest waviness of the support in distance, plus `rms_relative` as above. Both
+            wavinesses together, each over its limit, may reach 1 where half is seen and 2 where
+            all is.
+        wave_rad: Largest waviness in angle.
+        wave_small: Addition to it, over the geometric mean semi-axis in px.
+        angle_rms_rad: Largest standard deviation of the support's angles; less for a part.
+        angle_rms_small: Addition to it, over the geometric mean semi-axis in px.
+        purity: Least part of the supporting edges, corner to corner, that lies on the ellipse.
+        evidence: Least decimal exponent of the odds against accidental support.
+        score: Least score at full coverage; it falls with the coverage, half of it at one half.
+        prior_slack: Factor on the limits of distance and angle, and divisor of purity, where the
+            size is known: it excludes most shapes that they are for, and rims are chipped.
         smallest_px: Least minor semi-axis.
-        flattest: Least ratio of the semi-axes.
-        prior_flattest: The same where a size is given: what has a known size lies on a face that is
-            seen.
+        prior_flattest: Least ratio of the semi-axes where the size is known: the tilt of the face
+            is limited then.
     """
 
     sigma_px: float
-    percentile: float
-    noise: float
-    low: float
     arc_tolerance_px: float
     corner_rad: float
     arc_points: int
     reach_px: float
-    reach_relative: float
     angle_rad: float
     coverage: float
     gap: float
@@ -84,67 +70,104 @@ class ContourArcs:
     angle_rms_rad: float
     angle_rms_small: float
     purity: float
-    departure: float
     evidence: float
     score: float
     prior_slack: float
     smallest_px: float
-    flattest: float
     prior_flattest: float
 
     def check(self) -> None:
-        if not 0 < self.percentile < 100 or not 0 < self.low <= 1 or self.sigma_px <= 0:
-            raise ConfigError(
-                "perception.ellipse: expected 0 < percentile < 100, 0 < low <= 1 and sigma_px > 0, got "
-                f"{self.percentile}, {self.low} and {self.sigma_px}"
-            )
+        if self.sigma_px <= 0:
+            raise ConfigError(f"perception.ellipse: expected sigma_px > 0, got {self.sigma_px}")
         if not 0 < self.coverage <= 1 or self.arc_points < 6:
             raise ConfigError(
-                f"perception.ellipse: expected 0 < coverage <= 1 and arc_points >= 6, got {self.coverage} and {self.arc_points}"
+                "perception.ellipse: expected 0 < coverage <= 1 and arc_points >= 6, got "
+                f"{self.coverage} and {self.arc_points}"
             )
 
     def build(self) -> ArcDetector:
-        """Returns a detector."""
+        """Return a detector."""
         return ArcDetector(self)
 
 
-NUM_SEEDS = 28
-"""Points that stand for an arc in its first fit."""
-NOTHING = np.empty((0, 5))
-PART = 0.6
-"""Coverage below which the limit of angles no longer shrinks: what is left is told by how they
-change along the arc."""
+# A change of these by 20 % changes no count of the benchmark (benchmarks/perception/gates.json).
+PERCENTILE, NOISE, LOW = 85.0, 4.0, 0.4
+"""Upper threshold of edges: percentile of the gradient, and least value in standard deviations of
+noise; lower threshold as a part of the upper one."""
+REACH_RELATIVE = 0.03
+"""Reach of an ellipse per px of its geometric mean semi-axis."""
+FLATTEST = 0.18
+"""Least ratio of the semi-axes where the size is unknown."""
+# Chosen by hand, unless a comment says otherwise.
+NO_ELLIPSES = np.empty((0, 5))
+SMALLEST_PICTURE_PX = 8
+"""Smallest side of a picture that can hold an ellipse with its edges."""
+FULL_ANGLE_COVERAGE = 0.6
+"""Coverage below which the limit of the angles no longer shrinks: there the waviness decides."""
 FAINT, SMALL_PX = 0.12, 6.0
-"""Of the strongest edges: so strong that of an ellipse of this size must be, of a larger one less;
-faint stains are all round."""
-BESIDE_PX = 2
-"""By how much farther than within reach the nearest edge is known."""
-PIECE = 0.6
-"""Of an arc, that may be an ellipse's where not all of it is."""
+"""Least strength of an ellipse of that size, as a part of the strongest edges; it falls with the
+size. Faint stains are round all over."""
+ROUNDING_PX = 2
+"""Addition to the reach within which the nearest edge is looked up, for rounding to pixels."""
 SAME_AREA = 0.6
-"""Two ellipses that differ by no more than a line is wide, and in area by no more than this part,
-are its two edges."""
+"""Least ratio of areas of the two edges of one thin line."""
 LEAST_ARC, HALFWAY = 0.2, 0.3
-"""Part of an ellipse from which the rest of it can be told; part that must support it once it was
-refined."""
-ROUNDS_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
-"""Rounds of refinement: the distance at which a point counts a quarter; the rougher ones where the
-size is known beforehand."""
+"""Part of an ellipse from which the rest can be told, and part with support after refinement."""
+PRECISE_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
+"""Rounds of refinement: the distance at which a point counts a quarter. The rougher ones serve
+where the size is known."""
+ANGLE_WEIGHT = 0.05
+"""Departure of the cosine between gradient and normal at which a point counts a quarter."""
 TAIL = 1.6
-"""Of the limit of what is typical, which holds for the residuals of all the support."""
+"""Limit of the root mean square over that of the robust standard deviation of the distances."""
 TIGHT = 0.7
-"""Of the reach, once the ellipse is refined."""
+"""Part of the reach that counts once the ellipse is refined."""
+SHARED = 0.4
+"""Part of its support that an ellipse may share with better ones."""
+SEARCH_SLACK = 1.5
+"""Factor on the size limits before refinement."""
 
 
 @dataclass(frozen=True)
-class JudgedEllipses:
-    """Candidates that passed, with the figures of `Ellipse` and the edge points behind each, `(C, NUM_SAMPLES)`, -1 for none."""
+class _Fit:
+    """Quality of fit of `C` candidates.
+
+    Attributes:
+        candidates: Ellipses and polarity.
+        support: Number of the edge point at each place, `(C, NUM_SAMPLES)`, -1 for none.
+        length: Arc length per radian at each place, `(C, NUM_SAMPLES)`.
+        coverage: Part of the circumference with support, `(C,)`.
+        off_px: Distance of the support at each place, `(C, NUM_SAMPLES)`.
+        rms_px: Root mean square of these distances.
+        spread_px: Robust standard deviation of these distances.
+        spread_limit_px: Its limit.
+        angle_rad: Robust standard deviation of the angles between gradient and normal.
+        angle_limit_rad: Its limit.
+    """
 
     candidates: EllipseCandidates
     support: np.ndarray
-    rms_px: np.ndarray
+    length: np.ndarray
     coverage: np.ndarray
-    score: np.ndarray
+    off_px: np.ndarray
+    rms_px: np.ndarray
+    spread_px: np.ndarray
+    spread_limit_px: np.ndarray
+    angle_rad: np.ndarray
+    angle_limit_rad: np.ndarray
+
+    def __getitem__(self, keep: np.ndarray) -> _Fit:
+        return _Fit(*(getattr(self, field.name)[keep] for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class FoundEllipse:
+    """An accepted ellipse: its row `(5,)` and the figures of `Ellipse`."""
+
+    row: np.ndarray
+    rms_px: float
+    coverage: float
+    score: float
 
 
 class ArcDetector:
@@ -152,7 +175,7 @@ class ArcDetector:
 
     Args:
         settings: The spec.
-        propose: Gives further ellipses `(C, 5)` of a picture `(h, w)`, refined and judged like
+        propose: Returns further ellipses `(C, 5)` of a picture `(h, w)`, refined and judged like
             those of the arcs; `None` for none.
     """
 
@@ -165,234 +188,240 @@ class ArcDetector:
     def detect(
         self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
     ) -> list[Ellipse]:
-        """Returns ellipses, the best first; see `EllipseDetector`."""
+        """Return ellipses, the best first; see `EllipseDetector`."""
         s = self.settings
         left, top, width, height = (
             (0, 0, *gray.shape[::-1]) if roi is None else cv2.boundingRect(roi.view(np.uint8))
         )
         bottom, right = top + height, left + width
         part = gray[top:bottom, left:right]
-        if min(part.shape) < 8:
+        if min(part.shape) < SMALLEST_PICTURE_PX:
             return []
         limits = prior or SizePrior(0.0, float(max(part.shape)))
         where = None if roi is None else roi[top:bottom, left:right]
+        near_px = int(np.ceil(self._limit_reach(limits.highest_px))) + ROUNDING_PX
         edges = ellipse_edges.detect_edges(
-            part, where, s.sigma_px, s.percentile, s.noise, s.low, s.arc_points, self._near(limits)
+            part, where, s.sigma_px, PERCENTILE, NOISE, LOW, s.arc_points, near_px
         )
         if not len(edges.points):
             return []
-        edges = edges.cut(
-            s.arc_tolerance_px, s.corner_rad, max(s.arc_points, int(0.5 * limits.lowest_px))
-        )
-        found = self.on(edges, limits, self._propose(part) if self._propose else NOTHING)
+        least = max(s.arc_points, int(0.5 * limits.lowest_px))
+        edges = edges.cut(s.arc_tolerance_px, s.corner_rad, least)
+        proposals = self._propose(part) if self._propose else NO_ELLIPSES
         shift = np.array([left, top, 0.0, 0.0, 0.0])
         return [
             Ellipse(
-                *map(float, row + shift),
-                rms_px=float(rms),
-                coverage=float(cover),
-                score=float(score),
+                *map(float, one.row + shift),
+                rms_px=float(one.rms_px),
+                coverage=float(one.coverage),
+                score=float(one.score),
             )
-            for row, rms, cover, score in found
+            for one in self._find_on(edges, limits, proposals)
         ]
 
-    def on(
-        self, edges: Edges, limits: SizePrior, further: np.ndarray
-    ) -> list[tuple[np.ndarray, float, float, float]]:
-        """Returns ellipses with residual, coverage and score: of whole contours, single arcs and groups of arcs, the best first.
+    def _find_on(
+        self, edges: Edges, limits: SizePrior, proposals: np.ndarray
+    ) -> list[FoundEllipse]:
+        """Return the ellipses of whole contours, single arcs and groups of arcs, the best first.
 
         Args:
             edges: Edges with their arcs.
-            limits: How large ellipses may be.
-            further: Ellipses from elsewhere, `(C, 5)`, that are judged as well.
+            limits: Range of the size.
+            proposals: Ellipses from elsewhere, `(C, 5)`, that are judged as well.
         """
-        spans = self._compact(edges.spans, edges, limits)
-        arcs = self._compact(edges.arcs, edges, limits)
-        whole = set(map(tuple, spans.tolist()))
-        parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int).reshape(
-            -1, 2
-        )
-        groups = [arcs[group] for group in ellipse_edges.group_arcs(arcs, edges, (4, 3, 2))]
-        if limits.lowest_px == 0:
-            parts = np.concatenate([parts, _split_arcs(arcs, self.settings.arc_points)])
-        kinds = (spans[:, None], parts[:, None], *groups)
-        seeds = np.concatenate([_select_seed_points(some) for some in kinds])
-        lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
-        first = self.first(seeds, lengths, edges, limits)
-        known = np.repeat(
-            further[self._sized(further, limits, 1.5)], 2, 0
-        )  # dark inside, and bright inside
+        seeds, lengths = self._collect_seeds(edges, limits)
+        first = self._fit_first(seeds, lengths, edges, limits)
+        # Proposals have no polarity: each is tried dark inside and bright inside.
+        sized = self._is_sized(proposals, limits, SEARCH_SLACK)
+        known = np.repeat(proposals[sized], 2, 0)
         first = EllipseCandidates(
             np.concatenate([first.ellipses, known]),
             np.concatenate([first.polarity, np.tile([1.0, -1.0], len(known) // 2)]),
         )
-        refined = self.refine(first, edges, ROUGH_PX if limits.lowest_px > 0 else ROUNDS_PX)
-        return sorted(
-            self._chosen(self.judge(refined, edges, limits), edges), key=lambda one: -one[3]
-        )
+        rounds_px = ROUGH_PX if limits.lowest_px > 0 else PRECISE_PX
+        refined = self._refine(first, edges, rounds_px)
+        return sorted(self._judge(refined, edges, limits), key=lambda one: -one.score)
 
-    def _chosen(
-        self, judged: JudgedEllipses, edges: Edges
-    ) -> list[tuple[np.ndarray, float, float, float]]:
-        """Returns the candidates that share their support with no better one."""
-        claimed = np.zeros(len(edges.points), bool)
-        found = []
-        for k in np.argsort(-judged.score, kind="stable"):
-            mine = judged.support[k][judged.support[k] >= 0]
-            one = judged.candidates[k : k + 1]
-            if claimed[mine].mean() > 0.4 or _is_other_side_of_line(
-                one.ellipses[0], [row for row, *_ in found]
-            ):
-                continue
-            claimed[mine] = True
-            number = max(NUM_SAMPLES, int(conic.compute_perimeter(*one.ellipses[0, 2:4])) * 2)
-            dense = self._gather(one, edges, np.arange(number) * (2 * np.pi / number))[0][0]
-            claimed[dense[dense >= 0]] = True
-            found.append((one.ellipses[0], judged.rms_px[k], judged.coverage[k], judged.score[k]))
-        return found
+    def _collect_seeds(self, edges: Edges, limits: SizePrior) -> tuple[np.ndarray, np.ndarray]:
+        """Return seed points `(C, NUM_SEEDS)` of spans, arcs and groups, and their lengths `(C,)`."""
+        spans = self._select_compact(edges.spans, edges, limits)
+        arcs = self._select_compact(edges.arcs, edges, limits)
+        whole = set(map(tuple, spans.tolist()))
+        parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int)
+        parts = parts.reshape(-1, 2)
+        groups = [arcs[group] for group in ellipse_edges.group_arcs(arcs, edges, (4, 3, 2))]
+        if limits.lowest_px == 0:
+            parts = np.concatenate(
+                [parts, ellipse_edges.split_arcs(arcs, self.settings.arc_points)]
+            )
+        kinds = (spans[:, None], parts[:, None], *groups)
+        seeds = np.concatenate([ellipse_edges.select_seed_points(some) for some in kinds])
+        lengths = np.concatenate([(some[..., 1] - some[..., 0]).sum(1) for some in kinds])
+        return seeds, lengths
 
-    def first(
+    def _fit_first(
         self, seeds: np.ndarray, lengths: np.ndarray, edges: Edges, limits: SizePrior
     ) -> EllipseCandidates:
-        """Returns the candidates of seed points `(C, P)` that lie on an ellipse of a possible size, their gradients all one way.
+        """Return candidates of seed points `(C, P)`: of a possible size, with one polarity.
 
-        The arcs that the seeds stand for have `lengths`, `(C,)` points, which must be a good part
-        of the circumference.
+        The arcs behind the seeds have `lengths`, `(C,)` points; they must be a good part of the
+        circumference.
         """
-        smallest = conic.compute_perimeter(
-            np.array(limits.lowest_px / 1.5),
-            np.array(limits.lowest_px / 1.5 * self._flattest(limits)),
-        )
-        seeds, lengths = (some[lengths >= LEAST_ARC * smallest] for some in (seeds, lengths))
+        least_px = limits.lowest_px / SEARCH_SLACK
+        flat_px = least_px * self._choose_flattest(limits)
+        smallest = conic.compute_perimeter(np.array(least_px), np.array(flat_px))
+        is_long = lengths >= LEAST_ARC * smallest
+        seeds, lengths = seeds[is_long], lengths[is_long]
         if not len(seeds):
-            return EllipseCandidates(np.empty((0, 5)), np.empty(0))
+            return EllipseCandidates(NO_ELLIPSES, np.empty(0))
         points = edges.points[seeds]
         ellipses = conic.fit_ellipses(points, np.ones(seeds.shape))
-        ellipses = ellipses.copy()
-        possible = self._sized(ellipses, limits, 1.5)
-        possible &= lengths >= LEAST_ARC * np.nan_to_num(
-            conic.compute_perimeter(ellipses[:, 2], ellipses[:, 3])
-        )
+        possible = self._is_sized(ellipses, limits, SEARCH_SLACK)
+        perimeter = conic.compute_perimeter(ellipses[:, 2], ellipses[:, 3])
+        possible &= lengths >= LEAST_ARC * np.nan_to_num(perimeter)
         ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
         off, outward = conic.measure_sampson_distance(ellipses, points)
-        outward = conic.sum_products(outward, edges.directions[seeds])
-        reach = self._reach(ellipses)
-        near = (np.abs(off) < reach[:, None]).mean(1) > 0.5
-        keep = near & (np.abs(outward.mean(1)) > 0.5)
-        return EllipseCandidates(ellipses[keep], np.sign(outward.mean(1))[keep])
+        along = conic.sum_products(outward, edges.directions[seeds])
+        near = (np.abs(off) < self._reach(ellipses)[:, None]).mean(1) > 0.5
+        keep = near & (np.abs(along.mean(1)) > 0.5)
+        return EllipseCandidates(ellipses[keep], np.sign(along.mean(1))[keep])
 
-    def refine(
+    def _refine(
         self, candidates: EllipseCandidates, edges: Edges, rounds_px: tuple[float, ...]
     ) -> EllipseCandidates:
-        """Returns the candidates fitted again to the edge points that support them.
+        """Return the candidates fitted again to the edge points that support them.
 
-        Points are weighted so that distances count, not form values, and so that those beside the
-        ellipse, where the edge of something else meets it, count less from round to round.
+        Weights turn algebraic errors into distances. From round to round they count less those
+        points that lie beside the ellipse, where another edge meets it.
         """
         for number, scale_px in enumerate(rounds_px):
             if not len(candidates.ellipses):
                 break
             e = candidates.ellipses
-            support, off, along = self._gather(
-                candidates, edges, ANGLES[:: 1 if scale_px == ROUNDS_PX[-1] else 2]
-            )
+            # All places in the last precise round only; every second one is enough before.
+            angles = ANGLES[:: 1 if scale_px == PRECISE_PX[-1] else 2]
+            support, off, along = self._gather(candidates, edges, angles)
             size = np.sqrt(e[:, 2] * e[:, 3])
             slope = conic.measure_form_gradients(e, edges.points[support]) * size[:, None]
-            robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / 0.05) ** 2) ** 2
+            robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / ANGLE_WEIGHT) ** 2) ** 2
             weights = np.where(support >= 0, robust / np.maximum(slope, 1e-3) ** 2, 0.0)
             ellipses = conic.fit_ellipses(edges.points[support], weights)
-            keep = np.isfinite(ellipses).all(1) & (
-                (support >= 0).mean(1) >= (HALFWAY if number else LEAST_ARC)
-            )
+            least = HALFWAY if number else LEAST_ARC
+            keep = np.isfinite(ellipses).all(1) & ((support >= 0).mean(1) >= least)
             candidates = EllipseCandidates(ellipses[keep], candidates.polarity[keep])
         return candidates
 
-    def judge(
+    def _judge(
         self, candidates: EllipseCandidates, edges: Edges, limits: SizePrior
-    ) -> JudgedEllipses:
-        """Returns the candidates with enough support of the right kind."""
-        s = self.settings
-        candidates = candidates[
-            self._sized(candidates.ellipses, limits, 1.0) & self._inside(candidates.ellipses, edges)
-        ]
-        e = candidates.ellipses
-        if not len(e):
-            return JudgedEllipses(
-                candidates, np.empty((0, NUM_SAMPLES), int), np.empty(0), np.empty(0), np.empty(0)
-            )
+    ) -> list[FoundEllipse]:
+        """Return the candidates with enough support of the right kind, each rim once."""
+        sized = self._is_sized(candidates.ellipses, limits, 1.0)
+        candidates = candidates[sized & _is_centre_inside(candidates.ellipses, edges)]
+        if not len(candidates.ellipses):
+            return []
+        s, slack = self.settings, self._choose_slack(limits)
+        fit = self._measure_fit(candidates, edges, slack)
+        good = self._has_good_shape(fit, edges, slack)
+        score = (
+            fit.coverage
+            * np.clip(1 - 0.5 * fit.spread_px / fit.spread_limit_px, 0, 1)
+            * np.clip(1 - 0.5 * fit.angle_rad / fit.angle_limit_rad, 0, 1)
+        )
+        fit, score = fit[good], score[good]
+        good = self._has_own_edges(fit, edges, limits, slack)
+        # A whole ellipse must fit well to count; of half of one its limits are nearly enough.
+        share = np.maximum(np.clip(3 * fit.coverage - 1.5, 0.0, 1.0), 0.9 * fit.coverage)
+        good &= score * slack**2 >= s.score * share
+        return self._choose(fit[good], score[good], edges)
+
+    def _measure_fit(self, candidates: EllipseCandidates, edges: Edges, slack: float) -> _Fit:
+        """Return how well the edges around the candidates fit, with the limits of that."""
+        s, e = self.settings, candidates.ellipses
         support, off, along = self._gather(candidates, edges, ANGLES, TIGHT)
         there = support >= 0
         length = conic.sample_ellipses(e, ANGLES)[2]
         coverage = (length * there).sum(1) / length.sum(1)
         count = np.maximum(there.sum(1), 1)
-        rms = np.sqrt((off**2 * there).sum(1) / count)
-        spread, angle = (
-            ellipse_support.estimate_spread(np.abs(off), there),
-            ellipse_support.estimate_spread(np.arccos(np.clip(along, -1, 1)), there),
+        size, whole = np.sqrt(e[:, 2] * e[:, 3]), _measure_wholeness(coverage)
+        seen = np.maximum(coverage, FULL_ANGLE_COVERAGE)
+        angles = np.arccos(np.clip(along, -1, 1))
+        return _Fit(
+            candidates=candidates,
+            support=support,
+            length=length,
+            coverage=coverage,
+            off_px=off,
+            rms_px=np.sqrt((off**2 * there).sum(1) / count),
+            spread_px=ellipse_support.estimate_spread(np.abs(off), there),
+            spread_limit_px=slack * (s.rms_px * coverage + s.rms_relative * size * whole),
+            angle_rad=ellipse_support.estimate_spread(angles, there),
+            angle_limit_rad=slack * (s.angle_rms_rad * seen**1.5 + s.angle_rms_small / size * seen),
         )
-        size = np.sqrt(e[:, 2] * e[:, 3])
-        whole = np.clip(
-            2 * coverage - 1, 0.0, 1.0
-        )  # what is seen in part must fit the better: a lobe of a heart nearly does
-        slack = s.prior_slack if limits.lowest_px > 0 else 1.0
-        seen = np.maximum(coverage, PART)
-        rms_limit = slack * (s.rms_px * coverage + s.rms_relative * size * whole)
-        angle_limit = slack * (s.angle_rms_rad * seen**1.5 + s.angle_rms_small / size * seen)
-        good = (
-            (coverage >= s.coverage)
-            & (spread <= rms_limit)
-            & (rms <= TAIL * rms_limit)
-            & (angle <= angle_limit)
+
+    def _has_good_shape(self, fit: _Fit, edges: Edges, slack: float) -> np.ndarray:
+        """Find candidates whose support is long and close enough, and no accident, `(C,)`."""
+        s, e = self.settings, fit.candidates.ellipses
+        size, whole = np.sqrt(e[:, 2] * e[:, 3]), _measure_wholeness(fit.coverage)
+        good = fit.coverage >= s.coverage
+        good &= fit.spread_px <= fit.spread_limit_px
+        good &= fit.rms_px <= TAIL * fit.spread_limit_px
+        good &= fit.angle_rad <= fit.angle_limit_rad
+        wave_px, wave_rad = ellipse_support.measure_waviness(
+            fit.candidates, edges, fit.support, fit.off_px
         )
-        wave_px, wave_rad = ellipse_support.measure_waviness(candidates, edges, support, off)
-        form = np.hypot(
+        waviness = np.hypot(
             wave_px / (s.wave_px + s.rms_relative * size * whole),
             wave_rad / (s.wave_rad + s.wave_small / size),
         )
-        good &= form <= slack * (1 + whole)
-        good &= (
-            ellipse_support.compute_evidence(
-                coverage, angle, conic.compute_perimeter(e[:, 2], e[:, 3]), s.angle_rad
-            )
-            >= s.evidence
+        good &= waviness <= slack * (1 + whole)
+        perimeter = conic.compute_perimeter(e[:, 2], e[:, 3])
+        evidence = ellipse_support.compute_evidence(
+            fit.coverage, fit.angle_rad, perimeter, s.angle_rad
         )
-        candidates, support, length = candidates[good], support[good], length[good]
-        rms, spread, coverage, angle = (v[good] for v in (rms, spread, coverage, angle))
-        rms_limit, angle_limit = rms_limit[good], angle_limit[good]
+        return good & (evidence >= s.evidence)
+
+    def _has_own_edges(
+        self, fit: _Fit, edges: Edges, limits: SizePrior, slack: float
+    ) -> np.ndarray:
+        """Find candidates whose edges are theirs alone: those of no spiral, heart or stain, `(C,)`."""
+        s, candidates, support, length = self.settings, fit.candidates, fit.support, fit.length
         good = ellipse_support.measure_largest_gap(support >= 0, length) <= s.gap
-        screened = ellipse_support.find_occluded(candidates, edges, support, length)
-        good &= screened | (
-            ellipse_support.measure_purity(edges, support, length) >= s.purity / slack
-        )
+        occluded = ellipse_support.find_occluded(candidates, edges, support, length)
+        purity = ellipse_support.measure_purity(edges, support, length)
+        good &= occluded | (purity >= s.purity / slack)
         if limits.lowest_px == 0:
-            good &= ellipse_support.measure_strength(edges, support) >= FAINT * np.percentile(
-                edges.strength, 95.0
-            ) * np.minimum(
-                SMALL_PX / np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3]), 1.0
+            # A known size excludes the shapes that these three gates are for.
+            size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
+            faintest = (
+                FAINT * np.percentile(edges.strength, 95.0) * np.minimum(SMALL_PX / size, 1.0)
             )
+            good &= ellipse_support.measure_strength(edges, support) >= faintest
             good[good] &= ~ellipse_support.find_smooth_continuations(
                 candidates[good], edges, support[good], length[good]
             )
-            good[good] &= screened[good] | ~ellipse_support.find_inward_outlines(
+            good[good] &= occluded[good] | ~ellipse_support.find_inward_outlines(
                 candidates[good], edges, support[good], length[good]
             )
-        departure = ellipse_support.measure_departure(
-            candidates, edges, support, length, self._reach(candidates.ellipses)
-        )
-        good &= screened | (departure <= s.departure * slack)
-        score = (
-            coverage
-            * np.clip(1 - 0.5 * spread / rms_limit, 0, 1)
-            * np.clip(1 - 0.5 * angle / angle_limit, 0, 1)
-        )
-        # what is seen all around must fit well to count; of half of one little more is asked than
-        # its limits ask
-        good &= score * slack**2 >= s.score * np.maximum(
-            np.clip(3 * coverage - 1.5, 0.0, 1.0), 0.9 * coverage
-        )
-        return JudgedEllipses(
-            candidates[good], support[good], rms[good], coverage[good], score[good]
-        )
+        return good
+
+    def _choose(self, fit: _Fit, score: np.ndarray, edges: Edges) -> list[FoundEllipse]:
+        """Return the candidates that share little support with better ones."""
+        claimed = np.zeros(len(edges.points), bool)
+        found: list[FoundEllipse] = []
+        for k in np.argsort(-score, kind="stable"):
+            own = fit.support[k][fit.support[k] >= 0]
+            candidate = fit.candidates[k : k + 1]
+            row = candidate.ellipses[0]
+            if claimed[own].mean() > SHARED or _is_other_side_of_line(row, found):
+                continue
+            claimed[own] = True
+            # Twice as many places as pixels claim all edge points along the ellipse.
+            number = max(NUM_SAMPLES, int(conic.compute_perimeter(*row[2:4])) * 2)
+            angles = np.arange(number) * (2 * np.pi / number)
+            dense = self._gather(candidate, edges, angles)[0][0]
+            claimed[dense[dense >= 0]] = True
+            found.append(FoundEllipse(row, fit.rms_px[k], fit.coverage[k], score[k]))
+        return found
 
     def _gather(
         self,
@@ -401,93 +430,70 @@ class ArcDetector:
         angles_rad: np.ndarray,
         tight: float = 1.0,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the support within reach; see `gather_support`."""
+        reach_px = tight * self._reach(candidates.ellipses)
         return ellipse_support.gather_support(
-            candidates,
-            edges,
-            angles_rad,
-            tight * self._reach(candidates.ellipses),
-            self.settings.angle_rad,
+            candidates, edges, angles_rad, reach_px, self.settings.angle_rad
         )
 
-    def _sized(self, ellipses: np.ndarray, limits: SizePrior, slack: float) -> np.ndarray:
+    def _is_sized(self, ellipses: np.ndarray, limits: SizePrior, slack: float) -> np.ndarray:
+        """Find ellipses of a possible size and flatness, `(C,)`."""
         a, b = ellipses[:, 2], ellipses[:, 3]
         with np.errstate(invalid="ignore"):
             return (
                 (a * slack >= limits.lowest_px)
                 & (a <= limits.highest_px * slack)
                 & (b * slack >= self.settings.smallest_px)
-                & (b * slack >= a * self._flattest(limits))
+                & (b * slack >= a * self._choose_flattest(limits))
             )
 
-    def _flattest(self, limits: SizePrior) -> float:
-        return self.settings.prior_flattest if limits.lowest_px > 0 else self.settings.flattest
+    def _choose_flattest(self, limits: SizePrior) -> float:
+        return self.settings.prior_flattest if limits.lowest_px > 0 else FLATTEST
 
-    def _inside(self, ellipses: np.ndarray, edges: Edges) -> np.ndarray:
-        """Says which centres lie in the picture."""
-        height, width = edges.nearest.shape
-        x, y = ellipses[:, 0], ellipses[:, 1]
-        return (x >= 0) & (y >= 0) & (x < width) & (y < height)
+    def _choose_slack(self, limits: SizePrior) -> float:
+        return self.settings.prior_slack if limits.lowest_px > 0 else 1.0
 
-    def _compact(self, spans: np.ndarray, edges: Edges, limits: SizePrior) -> np.ndarray:
-        """Returns the spans that are neither larger nor smaller than a good part of an ellipse can be."""
+    def _select_compact(self, spans: np.ndarray, edges: Edges, limits: SizePrior) -> np.ndarray:
+        """Return the spans that are neither larger nor smaller than a good part of an ellipse."""
         if not len(spans):
             return spans
-        places = edges.points[
-            (spans[:, :1] + np.linspace(0, 1, 9) * (spans[:, 1:] - 1 - spans[:, :1])).astype(int)
-        ]
+        # Nine points of a span tell its extent well enough.
+        steps = np.linspace(0, 1, 9) * (spans[:, 1:] - 1 - spans[:, :1])
+        places = edges.points[(spans[:, :1] + steps).astype(int)]
         extent = np.ptp(places, axis=1)
-        return spans[
-            (extent.max(1) <= 2.2 * limits.highest_px)
-            & (np.hypot(*extent.T) >= 0.5 * limits.lowest_px)
-        ]
+        fits = extent.max(1) <= 2.2 * limits.highest_px
+        return spans[fits & (np.hypot(*extent.T) >= 0.5 * limits.lowest_px)]
 
     def _reach(self, ellipses: np.ndarray) -> np.ndarray:
-        return self._within_reach(np.sqrt(ellipses[:, 2] * ellipses[:, 3]))
+        return self._limit_reach(np.sqrt(ellipses[:, 2] * ellipses[:, 3]))
 
-    def _within_reach(self, size_px: np.ndarray | float) -> np.ndarray:
-        return np.clip(
-            self.settings.reach_relative * size_px,
-            self.settings.reach_px,
-            4.0 * self.settings.reach_px,
-        )
-
-    def _near(self, limits: SizePrior) -> int:
-        """Returns how far from an edge an ellipse is asked for it: its reach, and what rounding to pixels takes off."""
-        return int(np.ceil(self._within_reach(limits.highest_px))) + BESIDE_PX
+    def _limit_reach(self, size_px: np.ndarray | float) -> np.ndarray:
+        """Return the reach of ellipses of a geometric mean semi-axis, px."""
+        least_px = self.settings.reach_px
+        return np.clip(REACH_RELATIVE * size_px, least_px, 4.0 * least_px)
 
 
-def _is_other_side_of_line(ellipse: np.ndarray, others: list[np.ndarray]) -> bool:
-    """Says whether an ellipse is one edge of a thin line and another one, found before, the other edge."""
-    apart = np.abs(np.array(others).reshape(-1, 5) - ellipse)[:, :4]
-    area = ellipse[2] * ellipse[3]
-    alike = [min(area, a * b) > SAME_AREA * max(area, a * b) for _, _, a, b, _ in others]
-    return bool(
-        (
-            (apart[:, :2].max(1) < 0.5 * STROKE_PX)
-            & (apart[:, 2:].max(1) < STROKE_PX)
-            & np.array(alike, bool)
-        ).any()
-    )
+def _measure_wholeness(coverage: np.ndarray) -> np.ndarray:
+    """Return 1 at full coverage, falling to 0 at one half.
+
+    A part of an ellipse must fit better than a whole one: the lobe of a heart nearly fits.
+    """
+    return np.clip(2 * coverage - 1, 0.0, 1.0)
 
 
-def _split_arcs(arcs: np.ndarray, least: int) -> np.ndarray:
-    """Returns first, middle and last piece of each arc, of `least` points or more: its ends may belong to something else."""
-    start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
-    part = np.maximum((PIECE * length).astype(int), least)
-    start, part, left = (some[length > part + 2] for some in (start, part, length - part))
-    return np.concatenate(
-        [
-            np.column_stack([start + shift, start + shift + part])
-            for shift in (0 * part, left // 2, left)
-        ]
-    )
+def _is_centre_inside(ellipses: np.ndarray, edges: Edges) -> np.ndarray:
+    """Find ellipses with their centre in the picture, `(C,)`."""
+    height, width = edges.nearest.shape
+    x, y = ellipses[:, 0], ellipses[:, 1]
+    return (x >= 0) & (y >= 0) & (x < width) & (y < height)
 
 
-def _select_seed_points(groups: np.ndarray) -> np.ndarray:
-    """Returns evenly spread points of each group of spans `(C, G, 2)`, of each span as many as it is long, `(C, NUM_SEEDS)`."""
-    ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
-    place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]
-    number = (place[..., None] >= ends[:, None]).sum(-1)
-    rows = np.arange(len(groups))[:, None]
-    before = np.concatenate([np.zeros((len(ends), 1), int), ends], 1)[rows, number]
-    return (groups[rows, number, 0] + place - before).astype(int)
+def _is_other_side_of_line(row: np.ndarray, others: list[FoundEllipse]) -> bool:
+    """Return whether an ellipse and one of the others are the two edges of a thin line."""
+    for other in others:
+        apart = np.abs(other.row - row)
+        areas = row[2] * row[3], other.row[2] * other.row[3]
+        is_near = apart[:2].max() < 0.5 * STROKE_PX and apart[2:4].max() < STROKE_PX
+        if is_near and min(areas) > SAME_AREA * max(areas):
+            return True
+    return False

@@ -1,4 +1,4 @@
-"""Ellipses from Edge Drawing, which OpenCV's contrib modules have: beside those of the arcs, judged by the same support."""
+"""Ellipse proposals of Edge Drawing from OpenCV's contrib modules, judged like those of arcs."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from perception.ellipse.detector import ArcDetector, ContourArcs
 
 @spec
 class EdgeDrawing:
-    """Arcs, and what OpenCV's Edge Drawing (EDCircles, Akinlar and Topal 2013) proposes as well; needs OpenCV with contrib modules.
+    """Arcs, and the proposals of Edge Drawing; needs OpenCV with contrib modules.
 
-    Edge Drawing snaps small ellipses to circles, so what it proposes is fitted again and judged
-    like everything else.
+    Edge Drawing (EDCircles, Akinlar and Topal 2013) snaps small ellipses to circles, so its
+    proposals are fitted again and judged like all candidates.
 
     Attributes:
-        arcs: How arcs are found, and how all ellipses are judged.
-        gradient: Gradient from which a pixel is an edge.
-        anchor: By how much an anchor stands out from its neighbours.
-        sigma_px: Blur; below 1 the released library writes into the picture that it was given
-            (opencv_contrib issue 4203).
+        arcs: Search for arcs, and judgement of all ellipses.
+        gradient: Gradient from which a pixel is an edge, grey levels.
+        anchor: Least difference of an anchor from its neighbours, grey levels.
+        sigma_px: Blur; below 1 the released library writes into its input (opencv_contrib issue
+            4203).
     """
 
     arcs: ContourArcs
@@ -33,12 +33,13 @@ class EdgeDrawing:
     def check(self) -> None:
         if self.sigma_px < 1.0 or min(self.gradient, self.anchor) < 0:
             raise ConfigError(
-                "perception/ellipse=edge_drawing: expected sigma_px of 1 or more, gradient and anchor of 0 or more, got "
+                "perception/ellipse=edge_drawing: expected sigma_px of 1 or more, gradient and anchor of "
+                "0 or more, got "
                 f"{self.sigma_px}, {self.gradient} and {self.anchor}"
             )
 
     def build(self) -> ArcDetector:
-        """Returns a detector.
+        """Return a detector.
 
         Raises:
             ConfigError: this OpenCV has no Edge Drawing.
@@ -46,8 +47,9 @@ class EdgeDrawing:
         extra = getattr(cv2, "ximgproc", None)
         if extra is None or not hasattr(extra, "createEdgeDrawing"):
             raise ConfigError(
-                f"perception/ellipse=edge_drawing: OpenCV {cv2.__version__} is without contrib modules; put "
-                "opencv-contrib-python-headless in place of opencv-python-headless, or take perception/ellipse=contour_arcs"
+                f"perception/ellipse=edge_drawing: OpenCV {cv2.__version__} has no contrib modules; "
+                "install opencv-contrib-python-headless in place of opencv-python-headless, or "
+                "choose perception/ellipse=contour_arcs"
             )
         drawing, parameters = extra.createEdgeDrawing(), extra.EdgeDrawing.Params()
         parameters.GradientThresholdValue, parameters.AnchorThresholdValue = (
@@ -65,7 +67,10 @@ class EdgeDrawing:
 
 
 def convert_detections(found: np.ndarray | None) -> np.ndarray:
-    """Returns ellipses `(C, 5)` of what Edge Drawing answers, `(C, 1, 6)`: centre, radius of a circle, semi-axes, degrees."""
+    """Return the ellipses `(C, 5)` of Edge Drawing's answer `(C, 1, 6)`.
+
+    Its columns: centre, radius of a circle, semi-axes, direction in degrees.
+    """
     if found is None or not len(found):
         return np.empty((0, 5))
     x, y, radius, one, two, degrees = np.asarray(found, float).reshape(-1, 6).T

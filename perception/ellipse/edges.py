@@ -1,4 +1,4 @@
-"""Edges of a picture with sub-pixel places and directions, chained into convex arcs."""
+"""Edges of a picture at sub-pixel places, chained into convex arcs, and groups of these arcs."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ import numpy as np
 from scipy.spatial import KDTree
 
 SCALE = 16.0
-"""Gradients are given to Canny as whole numbers; in a dark picture they are a few grey levels a
-pixel."""
+"""Canny takes whole numbers: steps of 1/16 grey level a pixel, for pictures as dark as 2 of 255."""
 
 END_PX = 3.0
-"""Of each arc: where it ends the edges of two things meet and are bent by the blur."""
+"""Length at both ends of an arc that the blur bends towards the edge it meets, px."""
 BLUNT_PX = 5.0
-"""A side of a polygon shorter than this may be a corner that the blur has cut off."""
+"""A polygon side shorter than this may be a corner cut off by the blur, px. Chosen by hand."""
 MANY = 200_000
-"""Pixels of which a sixteenth tells the distribution of gradients well enough; of fewer a quarter
-does."""
+"""Pixels from which a sixteenth of them gives the quantiles of the gradient; below, a quarter."""
 WEAK = 2.5
-"""Standard deviations of noise below which an edge does not go on: chains of noise alone would."""
+"""Lower threshold of edges, in standard deviations of noise: below it noise forms chains."""
 LONG_PX, LONG = 25.0, 6.0
-"""A side longer than this, and so many times longer than the next, is a straight line that goes
-over into something else."""
+"""A side longer than this, px, and so many times longer than the next, is a straight line that
+continues as a curve: the arc ends there. Chosen by hand."""
 CLOSE = 4
-"""Points from the ends of a closed line at which its directions are compared."""
+"""Points from the ends of a closed line at which its directions are compared. Chosen by hand."""
 NO_SPANS = np.empty((0, 2), int)
+RAYLEIGH_MEDIAN = 1.18
+"""Median of a Rayleigh distribution, the magnitude of pure noise, over its scale: sqrt(2 ln 2)."""
 
 
 @dataclass(frozen=True)
 class Edges:
-    """Edge points, `E` of them, in the order in which chains run.
+    """Edge points, `E` of them, in the order of their chains.
 
     Attributes:
         points: Sub-pixel places `(E, 2)`.
         directions: Unit gradients `(E, 2)`, from dark to bright.
         strength: Length of the gradient `(E,)`, grey levels a pixel.
-        nearest: Number of the edge point nearest to each pixel, `(h, w)`, -1 where none is near.
+        nearest: Number of the edge point nearest to each pixel, `(h, w)`, -1 for none.
         spans: Pieces of chains without a branch, `(S, 2)`: first point and one past the last.
         arcs: Convex arcs, spans too, `(A, 2)`.
-        run: Number of the piece between two corners of each point, `(E,)`, -1 for a short one.
+        run: Number of the piece from corner to corner around each point, `(E,)`, -1 for a short one.
         run_length: Length of each such piece, px.
     """
 
@@ -55,21 +55,21 @@ class Edges:
     run_length: np.ndarray
 
     def cut(self, tolerance_px: float, corner_rad: float, least: int) -> Edges:
-        """Returns the same edges with their convex arcs and their runs from corner to corner; see `_pieces`."""
+        """Return the same edges with convex arcs and runs from corner to corner.
+
+        See `_split_chains` for the arguments.
+        """
         arcs, runs = _split_chains(self, tolerance_px, corner_rad, least)
         step = np.zeros(len(self.points))
-        step[2:-2] = (
-            np.linalg.norm(self.points[4:] - self.points[:-4], axis=1) / 4
-        )  # over four points: they scatter
+        # Over four points, since single ones scatter.
+        step[2:-2] = np.linalg.norm(self.points[4:] - self.points[:-4], axis=1) / 4
         way = np.cumsum(np.minimum(step, 1.5))
         run = np.full(len(self.points), -1)
         for number, (start, stop) in enumerate(runs.tolist()):
             run[start:stop] = number
         length = way[runs[:, 1] - 1] - way[runs[:, 0]] - END_PX
-        for (
-            start,
-            stop,
-        ) in self._closed().tolist():  # a closed line begins somewhere; that is no corner
+        # The point at which a closed line begins is no corner: both its runs are one.
+        for start, stop in self._find_closed_spans().tolist():
             first, last = run[start], run[stop - 1]
             if first != last and min(first, last) >= 0:
                 run[run == last] = first
@@ -77,17 +77,16 @@ class Edges:
         return replace(self, arcs=arcs, run=run, run_length=np.maximum(length, 1.0))
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """Returns the number of the edge point nearest to each place `(…, 2)`, -1 where none is near."""
+        """Return the number of the edge point nearest to each place `(…, 2)`, -1 where none is near."""
         height, width = self.nearest.shape
         x, y = np.rint(points[..., 0]), np.rint(points[..., 1])
         place = (y * width + x).astype(np.intp)
-        place[(x < 0) | (y < 0) | (x >= width) | (y >= height)] = (
-            0  # the picture's border has no edges
-        )
+        # Places outside get the corner pixel: the border of the picture has no edges.
+        place[(x < 0) | (y < 0) | (x >= width) | (y >= height)] = 0
         return self.nearest.ravel().take(place)
 
-    def _closed(self) -> np.ndarray:
-        """Returns the spans that end where they begin, without a corner there, `(S, 2)`."""
+    def _find_closed_spans(self) -> np.ndarray:
+        """Return the spans that end where they begin, without a corner there, `(S, 2)`."""
         start, stop = self.spans[self.spans[:, 1] - self.spans[:, 0] > 4 * CLOSE].T
         near = np.linalg.norm(self.points[start] - self.points[stop - 1], axis=1) < 3
         smooth = (self.directions[start + CLOSE] * self.directions[stop - 1 - CLOSE]).sum(1) > 0.8
@@ -104,22 +103,21 @@ def detect_edges(
     least: int,
     near_px: int,
 ) -> Edges:
-    """Returns the edges of a picture.
+    """Return the edges of a picture.
 
-    Thresholds follow the picture, so that dark and hazy ones have edges too: the upper one is the
-    given percentile of the gradient, at least `noise` times what the gradient of noise alone would
-    be, and at least a grey level a pixel.
+    The thresholds adapt to dark and hazy pictures. The upper one is the given percentile of the
+    gradient, at least `noise` times the gradient of noise, and at least 1 grey level a pixel.
 
     Args:
         gray: `(h, w)` uint8.
         roi: `(h, w)` bool, `None` for everywhere.
         sigma_px: Gaussian blur before the gradient.
         percentile: Of the gradient's magnitude, 0 to 100.
-        noise: Upper threshold in standard deviations of the gradient of noise, as the median
-            magnitude tells it.
+        noise: Least upper threshold, in standard deviations of the gradient of noise, estimated by
+            the median magnitude.
         low: Lower threshold as a part of the upper one.
-        least: Contours with fewer points are left out.
-        near_px: How far from its edge points a picture knows the nearest one.
+        least: Least number of points of a contour.
+        near_px: Largest distance at which `Edges.nearest` names an edge point.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
     gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
@@ -130,7 +128,7 @@ def detect_edges(
         return _make_empty_edges(gray.shape)
     ranks = [round(part / 100.0 * (looked.size - 1)) for part in (50.0, percentile)]
     median, upper = np.partition(looked, ranks)[ranks]
-    sigma = float(median) / 1.18  # of a Rayleigh distribution
+    sigma = float(median) / RAYLEIGH_MEDIAN
     upper = max(float(upper), noise * sigma, 1.0)
     weak = max(low * upper, WEAK * sigma)
     whole = [cv2.addWeighted(g, SCALE, g, 0.0, 0.0, dtype=cv2.CV_16S) for g in (gx, gy)]
@@ -159,17 +157,17 @@ def detect_edges(
 def _split_chains(
     edges: Edges, tolerance_px: float, corner_rad: float, least: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns convex arcs and runs as spans of edge points, `(A, 2)`: chains cut at corners, arcs also where they bend back.
+    """Return convex arcs and runs as spans of edge points, `(A, 2)` each.
 
-    A polygon that follows a circle within the tolerance turns by eight times it over the length of
-    its sides at each vertex; one that turns by more than that and `corner_rad` together has a
-    corner there.
+    Both are cut at corners, arcs also where they bend back. A polygon that follows a circle within
+    the tolerance turns by 8 tolerances per side length at each vertex. A turn larger than that by
+    `corner_rad` is a corner.
 
     Args:
         edges: Edges.
-        tolerance_px: How closely a polygon follows a piece; what bends less is straight.
-        corner_rad: See above.
-        least: Pieces with fewer points are left out.
+        tolerance_px: Tolerance of the polygon along a chain.
+        corner_rad: Turn in excess of a circle's at a corner.
+        least: Least number of points of a piece.
     """
     spans = edges.spans[edges.spans[:, 1] - edges.spans[:, 0] >= least]
     if not len(spans):
@@ -187,11 +185,11 @@ def _split_chains(
     )
     size = np.linalg.norm(steps, axis=1)
     inner = owner[2:] == owner[:-2]
-    half = (
-        4 * tolerance_px / np.maximum(size, 1.0)
-    )  # of the turn of a circle's chord of this length
+    # Half the turn of a circle at the ends of a chord of this length.
+    half = 4 * tolerance_px / np.maximum(size, 1.0)
     sharp = np.abs(turn) > corner_rad + half[1:] + half[:-1]
-    cut_off = (size[1:-1] < BLUNT_PX) & inner[1:] & inner[:-1]  # a corner that the blur has cut off
+    # A corner cut off by the blur: a short side with large turns at both ends.
+    cut_off = (size[1:-1] < BLUNT_PX) & inner[1:] & inner[:-1]
     cut_off &= np.abs(turn[1:] + turn[:-1]) > corner_rad + half[2:] + half[:-2]
     sharp[:-1] |= cut_off
     sharp[1:] |= cut_off
@@ -214,7 +212,7 @@ def _split_chains(
 def _locate_corners(
     fine: np.ndarray, spans: np.ndarray, corners: np.ndarray, owner: np.ndarray
 ) -> np.ndarray:
-    """Returns the number of the edge point at which each corner of the polygon of a span stands."""
+    """Return the number of the edge point at each corner of the polygons of spans."""
     member = np.concatenate([np.arange(start, stop) for start, stop in spans.tolist()])
     span = np.repeat(np.arange(len(spans)), spans[:, 1] - spans[:, 0])
 
@@ -232,11 +230,11 @@ def _locate_corners(
 
 
 def _chain_pixels(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns edge pixels `(E, 2)` in order, each once, and unbranched spans.
+    """Return edge pixels `(E, 2)` in order, each once, and unbranched spans.
 
     A contour runs around a line of edge pixels: along both sides of an open one, inside and outside
-    of a closed one. Taking each pixel where it comes first leaves the line, cut at its ends and
-    branches. An open line whose topmost pixel lies within it comes in two halves, which are joined.
+    of a closed one. Each pixel is kept where it comes first. This leaves the line, cut at its ends
+    and branches. An open line whose topmost pixel is no end comes in two halves, which are joined.
     """
     lengths = np.array([len(c) for c in contours])
     order = np.argsort(-lengths, kind="stable")
@@ -264,7 +262,7 @@ def _chain_pixels(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndar
     ends[:-1][halves] = pieces[1:, 1][halves]
     joined = np.column_stack([pieces[:, 0], ends])[np.append(True, ~halves)]
     length = joined[:, 1] - joined[:, 0]
-    long = length >= least  # what is left over beside a line two pixels wide is no edge of its own
+    long = length >= least  # the rest of a line two pixels wide is no edge
     pixels = pixels[place][np.repeat(long, length)]
     ends = np.cumsum(length[long])
     joined = np.column_stack([ends - length[long], ends])
@@ -274,7 +272,10 @@ def _chain_pixels(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndar
 def _refine_points(
     pixels: np.ndarray, gx: np.ndarray, gy: np.ndarray, magnitude: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns where along its gradient each edge pixel's gradient is strongest, by a parabola through three samples."""
+    """Return the place of the strongest gradient along each edge pixel's gradient, and its direction.
+
+    By a parabola through three samples, 1 px apart.
+    """
     x, y = pixels[:, 0], pixels[:, 1]
     here = np.maximum(magnitude[y, x], 1e-6)
     direction = np.column_stack([gx[y, x], gy[y, x]]) / here[:, None]
@@ -286,10 +287,10 @@ def _refine_points(
 
 
 def _map_nearest_edges(pixels: np.ndarray, shape: tuple, near_px: int) -> np.ndarray:
-    """Returns the number of the edge pixel nearest to each pixel not farther from one than that, `(h, w)`, -1 elsewhere.
+    """Return the number of the edge pixel nearest to each pixel within `near_px`, `(h, w)`, else -1.
 
-    Each edge pixel writes its number around itself, the farthest place first: a distance transform
-    costs by the picture, not by its edges.
+    Each edge pixel writes its number around itself, the farthest place first. This costs less than
+    a distance transform of the whole picture.
     """
     height, width = shape[0] + 2 * near_px, shape[1] + 2 * near_px
     number = np.full(height * width, -1, np.int32)
@@ -303,7 +304,7 @@ def _map_nearest_edges(pixels: np.ndarray, shape: tuple, near_px: int) -> np.nda
 
 
 def _interpolate(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Returns the picture between its pixels, at `(E, 2)` points away from its border."""
+    """Return the picture at `(E, 2)` points away from its border, bilinear."""
     height, width = picture.shape
     x0, y0 = (
         np.floor(points[:, k]).astype(np.intp).clip(0, size - 2)
@@ -331,20 +332,30 @@ def _make_empty_edges(shape: tuple) -> Edges:
     )
 
 
+NUM_SEEDS = 28
+"""Points that stand for an arc, or a group of arcs, in its first fit."""
+PIECE = 0.6
+"""Part of an arc that may be an ellipse's where not all of it is."""
 INSET = 3
-"""Points at the end of an arc that are bent by what it meets there."""
+"""Points at the ends of an arc that are left out: the blur bends them. Chosen by hand."""
 NEAREST = 16
-"""Arcs that are looked at as the next one."""
+"""Candidates for the next arc of a group. Chosen by hand."""
 STRAIGHT_PX = 0.35
-"""What deviates less from its chord bends nowhere."""
+"""Deviation from its chord below which an arc counts as straight, px. Chosen by hand."""
+# Limits for two arcs of one ellipse, all chosen by hand: wide, since the fit decides.
+UNEVEN_RAD, TOTAL_RAD, BACKWARD_RAD = 0.6, 2.6, -0.1
+"""Difference and sum of the angles between the chord and the two tangents, and least such angle."""
+BEND_RATIO, BEND_LOG = 5, 1.1
+"""Ratio of the curvatures of both arcs; logarithm of the ratio between the curvature of the circle
+through the gap and their mean."""
 
 
 def group_arcs(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[np.ndarray]:
-    """Returns groups of so many arcs each, `(M, number)`, numbers into `arcs`, each the likeliest next one of the one before.
+    """Return groups of arcs that may follow one another around an ellipse, `(M, number)` for each number.
 
-    Where a circle's arc ends and its next one begins, the chord between them halves the angle
-    between their tangents; of an ellipse nearly so. Both bend to the same side, with the bright on
-    the same side, about as strongly.
+    Rows index `arcs`; each arc is the likeliest successor of the one before. On a circle the chord
+    between two arcs halves the angle between their tangents; on an ellipse nearly so. Both arcs
+    bend to the same side, about as strongly, and are bright on the same side.
     """
     following = _find_successors(arcs, edges) if len(arcs) > 1 else np.full(len(arcs), -1)
     found = []
@@ -360,15 +371,40 @@ def group_arcs(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[n
     return found
 
 
+def split_arcs(arcs: np.ndarray, least: int) -> np.ndarray:
+    """Return first, middle and last piece of each arc, of `least` points or more.
+
+    The ends of an arc may belong to something else.
+    """
+    start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
+    part = np.maximum((PIECE * length).astype(int), least)
+    is_long = length > part + 2
+    start, part, left = start[is_long], part[is_long], (length - part)[is_long]
+    pieces = []
+    for shift in (0 * part, left // 2, left):
+        pieces.append(np.column_stack([start + shift, start + shift + part]))
+    return np.concatenate(pieces)
+
+
+def select_seed_points(groups: np.ndarray) -> np.ndarray:
+    """Return evenly spread points of each group of spans `(C, G, 2)`, `(C, NUM_SEEDS)`."""
+    ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
+    place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]
+    number = (place[..., None] >= ends[:, None]).sum(-1)
+    rows = np.arange(len(groups))[:, None]
+    before = np.concatenate([np.zeros((len(ends), 1), int), ends], 1)[rows, number]
+    return (groups[rows, number, 0] + place - before).astype(int)
+
+
 def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
-    """Returns the number of the arc that follows each one best, `(A,)`, -1 for none."""
+    """Return the number of the best successor of each arc, `(A,)`, -1 for none."""
     inset = np.minimum(INSET, (arcs[:, 1] - arcs[:, 0]) // 4)
     first, last, middle = arcs[:, 0] + inset, arcs[:, 1] - 1 - inset, arcs.sum(1) // 2
     start, stop = edges.points[first], edges.points[last]
     towards = (start + stop) / 2 - edges.points[middle]
     chord = stop - start
     side = chord[:, 0] * towards[:, 1] - chord[:, 1] * towards[:, 0]
-    turned = side < 0  # all run so that the inside is on the same hand
+    turned = side < 0  # all shall have their inside on the same hand
     start, stop = np.where(turned[:, None], stop, start), np.where(turned[:, None], start, stop)
     polarity = np.sign((edges.directions[middle] * towards).sum(1))
     depth, width = np.linalg.norm(towards, axis=1), np.linalg.norm(chord, axis=1)
@@ -397,10 +433,11 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     good = (
         (other != usable[:, None])
         & (polarity[other] == polarity[usable][:, None])
-        & (uneven < 0.6)
-        & (ratio < 5)
+        & (uneven < UNEVEN_RAD)
+        & (ratio < BEND_RATIO)
     )
-    good &= (leaving > -0.1) & (arriving > -0.1) & (total < 2.6) & (strength < 1.1)
+    good &= (leaving > BACKWARD_RAD) & (arriving > BACKWARD_RAD)
+    good &= (total < TOTAL_RAD) & (strength < BEND_LOG)
     cost = np.where(good, uneven + 0.5 * strength + 0.2 * np.log(ratio), np.inf)
     best = np.argmin(cost, 1)
     rows = np.arange(len(usable))
@@ -409,14 +446,14 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
 
 
 def _compute_tangents(edges: Edges, place: np.ndarray, polarity: np.ndarray) -> np.ndarray:
-    """Returns the direction in which an arc runs at a point, with its inside on the right hand of a picture, `(A, 2)`."""
+    """Return the direction of each arc at a point, with its inside on the right hand, `(A, 2)`."""
     near = np.clip(place[:, None] + np.array([-1, 0, 1]), 0, len(edges.directions) - 1)
     inward = edges.directions[near].sum(1) * polarity[:, None]
     return np.column_stack([inward[:, 1], -inward[:, 0]])
 
 
 def _measure_turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Returns the signed angle from one direction to another, rad."""
+    """Return the signed angle from one direction to another, rad."""
     return np.arctan2(
         first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0], (first * second).sum(-1)
     )

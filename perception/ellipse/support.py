@@ -1,4 +1,7 @@
-"""What supports an ellipse: edge points along it, and what speaks against it. Axes: `C` candidates, `P` places around each."""
+"""Support of an ellipse: the edge points along it, and how its arc ends where something hides it.
+
+Axes: `C` candidates, `P` places around each, `M` ends of arcs.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +13,15 @@ from perception.ellipse import conic
 from perception.ellipse.edges import Edges
 
 NUM_SAMPLES = 96
-"""Places around an ellipse at which its support is looked for."""
+"""Places around an ellipse at which its support is searched; 1 px apart on a rim of 15 px radius."""
 WINDOW = NUM_SAMPLES // 8
-"""Neighbouring places over which noise is averaged away."""
+"""Neighbouring places over which noise is averaged: an eighth of a turn."""
 ANGLES = np.arange(NUM_SAMPLES) * (2 * np.pi / NUM_SAMPLES)
 
 
 @dataclass(frozen=True)
 class EllipseCandidates:
-    """Ellipses that are judged, `C` of them.
+    """Ellipses to be judged, `C` of them.
 
     Attributes:
         ellipses: `(C, 5)`.
@@ -39,11 +42,14 @@ def gather_support(
     reach_px: np.ndarray,
     angle_rad: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns the edge points that support each candidate at each eccentric angle, `(C, P)` each.
+    """Return the edge points that support each candidate at each eccentric angle, `(C, P)` each.
 
     A supporting point lies within reach, and its gradient along the normal, with the candidate's
-    polarity. Returns the number of the point, -1 where there is none, its distance along the
-    normal, and the cosine between gradient and normal.
+    polarity.
+
+    Returns:
+        Number of the point, -1 where there is none; its distance along the normal, px; and the
+        cosine between gradient and normal.
     """
     points, outward, _ = conic.sample_ellipses(candidates.ellipses, angles_rad)
     found = edges.at(points)
@@ -57,16 +63,15 @@ def gather_support(
 
 
 def measure_strength(edges: Edges, support: np.ndarray) -> np.ndarray:
-    """Returns the mean gradient of the edges that support each candidate, grey levels a pixel, `(C,)`."""
+    """Return the mean gradient of each candidate's support, grey levels a pixel, `(C,)`."""
     there = support >= 0
     return (edges.strength[support] * there).sum(1) / np.maximum(there.sum(1), 1)
 
 
 def measure_purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Returns how much of the runs that support each candidate lies on it, in the mean over the support, `(C,)`.
+    """Return the part of the supporting edges, corner to corner, that lies on each candidate, `(C,)`.
 
-    The edge of an ellipse that something hides ends there with a corner; that of a spiral or a
-    heart goes on smoothly elsewhere.
+    The edge of an occluded ellipse ends in a corner; that of a spiral or a heart leaves smoothly.
     """
     there = support >= 0
     run = np.where(there, edges.run[support], -1)
@@ -81,52 +86,13 @@ def measure_purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.
     return np.minimum((each * ds * there).sum(1) / np.maximum((ds * there).sum(1), 1e-9), 1.0)
 
 
-def measure_departure(
-    candidates: EllipseCandidates,
-    edges: Edges,
-    support: np.ndarray,
-    length: np.ndarray,
-    reach_px: np.ndarray,
-) -> np.ndarray:
-    """Returns the part of the circumference without support where an edge that supports the rest runs on beside the ellipse.
-
-    Up to a corner: what hides a part of it has an edge that is connected to its own there.
-    """
-    e = candidates.ellipses
-    if not len(e):
-        return np.empty(0)
-    points, outward, _ = conic.sample_ellipses(e, ANGLES)
-    number = len(edges.run_length) + 1
-    rows = np.repeat(np.arange(len(e)), NUM_SAMPLES).reshape(support.shape)
-    mine = np.unique(
-        (rows * number + edges.run[support])[(support >= 0) & (edges.run[support] >= 0)]
-    )
-    reach, wide = reach_px[:, None], np.clip(0.3 * np.sqrt(e[:, 2] * e[:, 3]), 3.0, 12.0)[:, None]
-    beside = np.zeros(support.shape, bool)
-    for part in (-1.0, -0.6, -0.3, 0.0, 0.3, 0.6, 1.0):
-        found = edges.at(points + (part * wide)[..., None] * outward)
-        off = np.abs(conic.sum_products(edges.points[found] - points, outward))
-        along = conic.sum_products(edges.directions[found], outward) * candidates.polarity[:, None]
-        hit = (
-            (found >= 0)
-            & (edges.run[found] >= 0)
-            & (along > 0.85)
-            & (off > reach)
-            & (off <= wide)
-            & (support < 0)
-            & ~beside
-        )
-        beside[hit] = np.isin((rows * number + edges.run[found])[hit], mine)
-    return (length * beside).sum(1) / length.sum(1)
-
-
 def measure_waviness(
     candidates: EllipseCandidates, edges: Edges, support: np.ndarray, off: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns how far distance and angle of the support stray from 0 in the mean over an eighth of a turn, px and rad, `(C,)` each.
+    """Return the waviness of each support in distance, px, and in angle, rad, `(C,)` each.
 
-    Noise is gone from such a mean; what stays is that another curve than an ellipse was fitted by
-    one.
+    It is the root mean square of the means over an eighth of a turn. Noise averages out of these
+    means; the misfit of a curve that is no ellipse stays.
     """
     there = support >= 0
     outward = conic.sample_ellipses(candidates.ellipses, ANGLES)[1]
@@ -147,7 +113,7 @@ def measure_waviness(
 
 
 def _sum_windows(values: np.ndarray) -> np.ndarray:
-    """Returns the sum of `WINDOW` neighbours around an ellipse at each place, `(C, P)`."""
+    """Return the sum of `WINDOW` neighbours around each place, `(C, P)`."""
     half = WINDOW // 2
     total = np.cumsum(
         np.concatenate([values[:, -half:], values, values[:, :half]], axis=1, dtype=float), axis=1
@@ -156,7 +122,7 @@ def _sum_windows(values: np.ndarray) -> np.ndarray:
 
 
 def measure_largest_gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Returns the longest stretch without support as a part of the circumference, `(C,)`."""
+    """Return the longest stretch without support, as a part of the circumference, `(C,)`."""
     twice = np.concatenate([there, there], 1)  # around twice: a stretch may run over the end
     way = np.cumsum(np.concatenate([length, length], 1), 1)
     seen = np.maximum.accumulate(np.where(twice, way, 0.0), 1)
@@ -164,7 +130,7 @@ def measure_largest_gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:
 
 
 def estimate_spread(values: np.ndarray, there: np.ndarray) -> np.ndarray:
-    """Returns the standard deviation of each row's values `(C, P)` that the nearest 70 % tell, whatever the others are."""
+    """Return a robust standard deviation of each row of `(C, P)`, from its smallest 70 %."""
     ordered = np.sort(np.where(there, values, np.inf), 1)
     place = np.maximum((0.7 * there.sum(1)).astype(int) - 1, 0)
     return ordered[np.arange(len(values)), place] / 1.036
@@ -173,7 +139,10 @@ def estimate_spread(values: np.ndarray, there: np.ndarray) -> np.ndarray:
 def compute_evidence(
     coverage: np.ndarray, angle_rms_rad: np.ndarray, perimeter_px: np.ndarray, angle_rad: float
 ) -> np.ndarray:
-    """Returns the decimal exponent of the chance that so many gradients point so well along the normal by accident (Chernoff)."""
+    """Return the decimal exponent of the odds against accidental support, `(C,)`.
+
+    Chernoff's bound on the chance that so many random gradients point along the normal.
+    """
     chance = np.clip(2.0 * angle_rms_rad, 0.1, angle_rad) / np.pi
     with np.errstate(divide="ignore", invalid="ignore"):
         absent = np.where(
@@ -187,47 +156,46 @@ def compute_evidence(
 
 
 OPEN = 0.12
-"""Part of the circumference without support at whose ends one asks how the edge goes on."""
+"""Part of the circumference without support from which its ends are examined. Chosen by hand."""
 BACK_PX, STRIDE_PX = 4.0, 2.0
-"""How far before that end one begins to look, and how far apart the places are at which one
-does."""
+"""Start of the search before that end, and distance between its steps. Chosen by hand: beyond the
+blur of a corner."""
 NEAR_PX, LEAST_PX = 1.5, 0.5
-"""Of that stride; where an edge ends, nothing nearer lies ahead than its last point."""
+"""Largest distance of the next edge point from a step, and least advance: where an edge ends, its
+last point is found again. Chosen by hand."""
 ALIKE = 1.5
-"""Times as strong or as weak as an edge may be where it is followed to: what hides something has
-edges of its own."""
+"""Largest ratio of strengths along one edge: an occluder has edges of another strength. Chosen by
+hand."""
 KINK_PX, KINK_RAD = 4.5, 0.4
-"""Length of an edge over which it turns at a corner, and by how much more than the ellipse does."""
-CHORD, CHORD_PX, CHORD_COSINE, CHORD_PART, BOW_PX, STROKE_PX = (
-    np.linspace(0.15, 0.85, 8),
-    2.0,
-    0.85,
-    0.7,
-    0.6,
-    4.5,
-)
-"""Places between the ends of an arc; where an edge of what hides the rest must be, by so many of
-them; how much it may bend, and
-how deep within the ellipse it must get: the other edge of a line that is bent follows the arc."""
+"""Length over which an edge turns at a corner, and by how much more than the ellipse. Chosen by
+hand: a blurred corner is about 4 px long."""
+# The edge of an occluder, between the two ends of an arc. All chosen by hand.
+CHORD = np.linspace(0.15, 0.85, 8)
+"""Places on the chord, as parts of its length."""
+CHORD_PX, CHORD_COSINE, CHORD_PART = 2.0, 0.85, 0.7
+"""Largest distance of the edge from the chord, least cosine between its gradient and the chord's
+normal, and part of the places that need it."""
+BOW_PX, STROKE_PX = 0.6, 4.5
+"""Largest bow of the edge, and least depth within the ellipse: the second edge of a bent line
+follows the arc nearer than that."""
 SAME = 1.25
-"""The same of what is the edge of one thing."""
+"""The same ratio within the outline of one object. Chosen by hand."""
 CLOSED_PX, DIP_PX, BACK, AHEAD = 3.0, 1.0, 10, 60
-"""Distance of the ends of an outline that is closed; how far into an ellipse one turns; points
-before and beyond an arc's end."""
+"""Distance of the ends of a closed outline, depth of a turn into the ellipse, and points before and
+beyond the end of an arc. Chosen by hand."""
 
 
 def find_smooth_continuations(
     candidates: EllipseCandidates, edges: Edges, support: np.ndarray, length: np.ndarray
 ) -> np.ndarray:
-    """Says which candidates have support that goes on smoothly elsewhere, `(C,)`: lobes of hearts, round corners, spirals.
+    """Find candidates whose edge leaves them smoothly, `(C,)`: lobes of hearts, round corners, spirals.
 
-    Where something stands before an ellipse, its edge ends in a corner; where nothing does, in
-    nothing. What is as wide as it is may go on without a corner, but has an edge from one end of
-    the arc to the other.
+    The edge of an occluded ellipse ends in a corner. An occluder of the same width may go on
+    without a corner, but has an edge from one end of the arc to the other.
     """
     result = np.zeros(len(support), bool)
     ds = length * (2 * np.pi / support.shape[1])
-    for side in (1, -1):  # around one way, then the other
+    for side in (1, -1):  # by increasing and by decreasing angle
         row, end, other = _find_open_ends(support, length, side)
         hidden = _find_occluding_edges(
             candidates.ellipses[row], edges, support[row, end], support[row, other]
@@ -250,15 +218,13 @@ def find_smooth_continuations(
 def find_inward_outlines(
     candidates: EllipseCandidates, edges: Edges, support: np.ndarray, length: np.ndarray
 ) -> np.ndarray:
-    """Says into which candidates the outline that supports them turns where it leaves them, and out again, `(C,)`: hearts.
+    """Find candidates whose outline turns into them and out again where it leaves, `(C,)`: hearts.
 
-    Where something hides the rest of an ellipse, its edge runs within it from one end of the arc to
-    the other, and what runs on
-    outside has another contrast: only the edge of one thing is as strong, with the same side dark,
-    in both.
+    The edge of an occluder also runs within the ellipse, but the edge outside has another contrast.
+    Only the outline of one object has the same strength and dark side in both.
     """
     result, whole = np.zeros(len(support), bool), measure_strength(edges, support)
-    for side in (1, -1):  # around one way, then the other
+    for side in (1, -1):  # by increasing and by decreasing angle
         row, end, _ = _find_open_ends(support, length, side)
         e, last = candidates.ellipses[row], support[row, end]
         outward = conic.measure_sampson_distance(e, edges.points[last][:, None])[1][:, 0]
@@ -281,9 +247,10 @@ def find_inward_outlines(
 def _trace_outlines(
     edges: Edges, last: np.ndarray, onward: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns numbers of points along the outlines through some edge points `last` `(M,)`, which run on as `onward` `(M, 2)` says.
+    """Return the numbers of points along the outlines through the edge points `last`, `(M,)`.
 
-    With them whether each is there, as an outline may end, `(M, AHEAD)` both.
+    They run in the direction of `onward`, `(M, 2)`. Also return which of them exist, since an
+    outline may end; both `(M, BACK + AHEAD)`.
     """
     span = edges.spans[np.searchsorted(edges.spans[:, 0], last, side="right") - 1]
     number = (span[:, 1] - span[:, 0])[:, None]
@@ -301,7 +268,7 @@ def _trace_outlines(
 def find_occluded(
     candidates: EllipseCandidates, edges: Edges, support: np.ndarray, length: np.ndarray
 ) -> np.ndarray:
-    """Says which candidates have a straight edge from one end of their support to the other, of what hides the rest, `(C,)`."""
+    """Find candidates with the straight edge of an occluder between the ends of their arc, `(C,)`."""
     row, end, other = _find_open_ends(support, length, 1)
     result = np.zeros(len(support), bool)
     hidden = _find_occluding_edges(
@@ -314,10 +281,9 @@ def find_occluded(
 def _find_open_ends(
     support: np.ndarray, length: np.ndarray, side: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Returns each wide stretch without support: its candidate, the last place with support before it, and the first one after it.
+    """Return candidate, last supported place before and first one after each wide gap, `(M,)` each.
 
-    All are `(M,)`; before and after as one goes around by increasing angle for `side` 1, by
-    decreasing for -1.
+    Before and after are meant by increasing angle for `side` 1, by decreasing angle for -1.
     """
     there = support >= 0
     row, end = np.nonzero(there & ~np.roll(there, -side, 1))
@@ -330,10 +296,16 @@ def _find_open_ends(
 def _find_occluding_edges(
     ellipses: np.ndarray, edges: Edges, one: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """Says across which ellipses `(M, 5)` an edge runs straight between two edge points, numbers `(M,)` each, `(M,)`.
+    """Find ellipses `(M, 5)` that a straight edge crosses between two of their edge points, `(M,)`.
 
-    It must be fainter than the ellipse's: what hides the rest looks like it where its outline can
-    be taken for the ellipse's. As strong, it is the other side of something thin and bent.
+    It must be fainter than the ellipse's own edge: as strong, it is the second edge of a thin bent
+    object.
+
+    Args:
+        ellipses: `(M, 5)`.
+        edges: Edges.
+        one: Number of the first edge point, `(M,)`.
+        other: Number of the second one, `(M,)`.
     """
     usual = np.minimum(edges.strength[one], edges.strength[other])
     one, other = edges.points[one], edges.points[other]
@@ -346,7 +318,7 @@ def _find_occluding_edges(
     near = (number >= 0) & (np.abs(off) < CHORD_PX)
     near &= np.abs(conic.sum_products(edges.directions[number], normal)) > CHORD_COSINE
     deep = -conic.measure_sampson_distance(ellipses, edges.points[number])[0]
-    near &= deep > CHORD_PX  # else it may be the ellipse's own
+    near &= deep > CHORD_PX  # nearer it may be the ellipse's own edge
     middle, ends = (
         (off * near)[:, part].sum(1) / np.maximum(near[:, part].sum(1), 1)
         for part in (np.s_[2:-2], np.array([0, 1, -2, -1]))
@@ -362,21 +334,20 @@ def _find_occluding_edges(
 def _follow_edges(
     edges: Edges, start: np.ndarray, onward: np.ndarray, reach_px: np.ndarray, bend: np.ndarray
 ) -> np.ndarray:
-    """Says which edges can be followed so far without a corner, as strong as they were, `(M,)`.
+    """Find edges that go on without a corner and at the same strength, `(M,)`.
 
     Args:
         edges: Edges.
-        start: Number of the edge point where each begins, `(M,)`.
-        onward: Direction in which it runs, `(M, 2)`.
-        reach_px: How far, `(M,)`.
-        bend: How much the ellipse bends there, 1/px, `(M,)`; what turns more by `KINK_RAD` over
-            `KINK_PX` is a corner.
+        start: Number of the first edge point, `(M,)`.
+        onward: Direction of the edge there, `(M, 2)`.
+        reach_px: Distance to follow, `(M,)`.
+        bend: Curvature of the ellipse there, 1/px, `(M,)`; a turn by `KINK_RAD` more over `KINK_PX`
+            is a corner.
     """
     place, along = edges.points[start], onward
     first = edges.directions[start]
-    hand = np.sign(
-        along[:, 0] * first[:, 1] - along[:, 1] * first[:, 0]
-    )  # on which side it is bright
+    # On which hand the bright side is: it stays there along one edge.
+    hand = np.sign(along[:, 0] * first[:, 1] - along[:, 1] * first[:, 0])
     seen, alive = [first], np.ones(len(start), bool)
     strength = np.zeros(len(start))
     for step in range(int(np.ceil(reach_px.max(initial=0.0) / STRIDE_PX))):

@@ -1,9 +1,8 @@
-"""The face's plane from both pictures at once: the one by which the right picture, brought onto the left, agrees with it best.
+"""Direct stereo alignment of the face's plane: the warp by which both pictures agree best.
 
-A matcher answers for each pixel, by its neighbourhood, with whatever its sub-pixel step gets wrong;
-where all of a face is known to be one plane, three numbers are left to be found from all of its
-pixels, each of which counts as much as the picture is steep there (Lucas and Kanade 1981, with the
-plane's homography as the warp). What does not agree by that warp, inside a rim, lies deeper.
+A stereo matcher answers for each pixel with the bias of its sub-pixel step. Where a whole face is
+one plane, only three numbers are to be found from all its pixels (Lucas and Kanade 1981, with the
+plane's homography as the warp). Pixels inside a rim that disagree by that warp lie deeper.
 """
 
 from __future__ import annotations
@@ -25,40 +24,39 @@ from perception.pose.plane import (
 )
 
 SMOOTH_PX = 1.0
-"""Blur of both pictures: noise would shrink the slope."""
+"""Blur of both pictures, px: noise would bias the gradient."""
 WINDOW_PX = 31
-"""Of which the mean is taken off."""
+"""Side of the window whose mean is taken off: vignetting and dust vary slowly. Chosen by hand."""
 MOST = 30_000
-"""Pixels that are compared; of more, whole rows are left out."""
+"""Pixels compared, about; of more, rows are left out. Limits the time."""
 WIDE_PX = 1000
-"""A part of the picture that is wider than this is looked at in a coarser resolution."""
+"""Width of a part of the picture from which a coarser resolution serves, px. Limits the time."""
 ROUNDS, SETTLED_PX = 3, 0.004
-"""Steps at most, and the last one's length, px: each is a fifth of the one before."""
+"""Largest number of steps, and length of a last one, px: each is about a fifth of the one before."""
 TUKEY = 4.685
 MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
-"""Around what stands before the face, where a matcher bleeds; within its border, where blur mixes
-it with what lies behind; and the grey level from which a picture shows nothing."""
+"""Margin around occluders, where a matcher bleeds, px; margin within the border, where blur mixes
+the face with the background, px; grey level of saturation. Chosen by hand."""
 LEAST, LEAST_INSIDE = 200, 24
-"""Pixels in which a plane is aligned, and in which an inside is compared."""
+"""Least pixels for an alignment, and for the comparison of an inside. Chosen by hand."""
 ALIKE = 0.7
-"""Correlation of left and right below which they do not show the same; in haze and in the dark it
-is still 0.96."""
+"""Least correlation of left and right picture; in haze and in the dark it is still 0.96."""
 LARGEST_PX = 1.0
-"""Shift of the whole face beyond which the pictures agree on something else."""
+"""Largest shift of the whole face, px; beyond it the alignment has found something else."""
 
 
 @dataclass(frozen=True)
 class StereoPatch:
-    """A part of both pictures, smooth, in a resolution in which it is small.
+    """A part of both pictures, blurred and shrunk.
 
     Attributes:
-        left: `(h, w)` float32.
-        right: `(h, W)` float32, of the same rows.
+        left: Part of the left picture, `(h, w)` float32.
+        right: Part of the right one with the same rows, `(h, W)` float32.
         shrink: Pixels of the picture to one of these.
-        corner: Column and row of the picture at which `left` begins, `(2,)`.
-        right_column: Column at which `right` begins.
-        camera_matrix: `(3, 3)` of the whole picture.
-        pull_px: Focal length times baseline, px m: disparity for inverse depth.
+        corner: First column and row of `left` in the picture, `(2,)`.
+        right_column: First column of `right` in the picture.
+        camera_matrix: Camera matrix of the whole picture, `(3, 3)`.
+        pull_px: Focal length times baseline, px m: disparity per inverse depth.
     """
 
     left: np.ndarray
@@ -70,7 +68,7 @@ class StereoPatch:
     pull_px: float
 
     def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns columns `(1, w)` and rows `(h, 1)` in the picture of those of `left`, `(w,)` and `(h,)`."""
+        """Return columns `(1, w)` and rows `(h, 1)` of the picture for those of `left`."""
         u, v = (
             (some + 0.5) * self.shrink - 0.5 + corner
             for some, corner in zip((columns, rows), self.corner, strict=True)
@@ -78,7 +76,7 @@ class StereoPatch:
         return u[None, :], v[:, None]
 
     def on_plane(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
-        """Returns where `right` shows the points of a plane that the left one has at such places, columns `(h, w)`."""
+        """Return the columns of `right`, `(h, w)`, that show the points of a plane at `u`, `v` of the left."""
         return (
             u
             - self.pull_px * compute_inverse_depth(m, self.camera_matrix, u, v)
@@ -89,19 +87,19 @@ class StereoPatch:
     def seen(
         self, u: np.ndarray, v: np.ndarray, row: np.ndarray, m: np.ndarray, picture: np.ndarray
     ) -> np.ndarray:
-        """Returns what a picture like `right`, of one channel or more, shows of the points of a plane; `row` as `remap` has it."""
+        """Return a picture like `right`, warped by a plane onto the left one; `row` as `remap` needs it."""
         return cv2.remap(picture, self.on_plane(u, v, m).astype(np.float32), row, cv2.INTER_CUBIC)
 
     def column(self, u: float) -> float:
-        """Returns the column of `left` of a column of the picture."""
+        """Return the column of `left` for a column of the picture."""
         return (u - self.corner[0] + 0.5) / self.shrink - 0.5
 
     def row(self, v: float) -> float:
-        """Returns the row of `left` of a row of the picture."""
+        """Return the row of `left` for a row of the picture."""
         return (v - self.corner[1] + 0.5) / self.shrink - 0.5
 
     def inside(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
-        """Says which of these points the right one shows too, with room for the slope."""
+        """Find points of a plane that the right picture shows too, with room for its gradient."""
         x = self.on_plane(u, v, m)
         return (x > 3) & (x < self.right.shape[1] - 4)
 
@@ -109,7 +107,7 @@ class StereoPatch:
 def crop_pair(
     frame: Frame, gray: np.ndarray, m: np.ndarray, ellipse: np.ndarray, outer: float
 ) -> StereoPatch | None:
-    """Returns the surroundings of an ellipse `(5,)`, up to `outer` of its radii, in both pictures; `None` without a right one."""
+    """Return both pictures around an ellipse `(5,)`, to `outer` radii; `None` without a right one."""
     if frame.right is None or frame.baseline_m is None or frame.right.shape != frame.color.shape:
         return None
     height, width = gray.shape
@@ -154,24 +152,25 @@ def align_plane(
     cell_px: int,
     bias_per_m: float,
 ) -> FacePlane | None:
-    """Returns the plane by which the two pictures agree best on the face; `face` itself where too little of it is in sight.
+    """Return the plane by which both pictures agree best on the face.
 
-    `None` where they do not agree: the right picture is another's, or shifted.
+    Return `face` where too little of it is visible, `None` where the pictures disagree: the right
+    one belongs to another frame, or is shifted.
 
-    What dust, exposure and vignetting add to one of them varies slowly, so only what departs from
-    the mean of a window counts.
-    The slopes of a noisy picture are larger than those of what it shows: steps by them are too
-    short, and the plane would seem too sure. So differences are held against the slopes of the left
-    picture, whose noise is another (instrumental variables).
+    Dust, exposure and vignetting vary slowly, so only departures from a window's mean count. Noise
+    biases the gradient of a picture: steps by it are too short, and the covariance too small. So
+    the gradient of the left picture, whose noise is independent, serves as instrument
+    (instrumental variables).
 
     Args:
         both: The face in both pictures.
-        face: Where to begin.
-        frame: For depth.
+        face: Plane from depth, the start.
+        frame: Frame with depth.
         allowed: Pixels of the face, `(h, w)` bool.
-        ellipse: `(5,)`.
-        inner: In radii of it; nearer to it the rim is seen from two sides.
-        cell_px: Side of the squares within which errors may be alike.
+        ellipse: Rim, `(5,)`.
+        inner: Inner limit in radii: nearer, both cameras see different sides of the rim.
+        cell_px: Side of the squares within which errors may be correlated.
+        bias_per_m: Standard deviation of inverse depth that `face` may be off as a whole, 1/m.
     """
     height, width = both.left.shape
     stride = max(1, round(height * width / MOST))
@@ -208,7 +207,7 @@ def align_plane(
     weight, counted = weight[..., None], counted[..., None]
 
     def departing(values: np.ndarray) -> np.ndarray:
-        """Returns what two pictures `(h, w, 2)` show on the face, less the mean of a window, `(2, P)`."""
+        """Return two pictures `(h, w, 2)` on the face, less the mean of a window, `(2, P)`."""
         departs = values - cv2.boxFilter(values * weight, -1, window) / counted
         return departs.reshape(-1, 2)[at].T.astype(float)
 
@@ -252,7 +251,7 @@ def align_plane(
 
 
 def merge_planes(first: FacePlane, second: FacePlane, bias_per_m: float) -> FacePlane:
-    """Returns the plane between two, each weighted by what it knows best; the whole of the first may be off by a bias."""
+    """Return the mean of two planes, weighted by their covariances; the first one may have a bias."""
     doubt = first.cov + np.diag([0.0, 0.0, bias_per_m**2])
     weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
     cov = np.linalg.inv(weights[0] + weights[1])
@@ -267,19 +266,19 @@ def measure_parallax(
     inner: float,
     ring: tuple[float, float],
 ) -> tuple[float, float]:
-    """Returns how much the pictures differ inside an ellipse by the plane's warp, over how much they do on the face around it.
+    """Return the difference of both pictures inside an ellipse over that on the face around it.
 
-    A flat disc looks the same from both cameras, the inside of a hole does not. NaN where too
-    little of it can be seen. With it, the part of the inside that something hides from the right
-    camera alone.
+    Both are aligned by the face's plane. A flat disc looks the same from both cameras, the inside
+    of a hole does not. NaN where too little of it is visible. Also return the part of the inside
+    that an occluder hides from the right camera alone.
 
     Args:
-        both: The ellipse's surroundings in both pictures.
-        face: The plane of the face.
-        depth_m: `(h, w)`; what stands before the face is left out.
-        ellipse: `(5,)`.
-        inner: Radii within which it is the inside.
-        ring: Radii between which it is the face.
+        both: Surroundings of the ellipse in both pictures.
+        face: Plane of the face.
+        depth_m: Depth, `(h, w)`; occluders are left out.
+        ellipse: Rim, `(5,)`.
+        inner: Outer limit of the inside, radii.
+        ring: Limits of the ring on the face, radii.
     """
     reach = ring[1] * ellipse[2] / both.shrink
     across, down = (
@@ -311,9 +310,8 @@ def measure_parallax(
         return float("nan"), covered
     row = np.repeat(np.arange(*down, dtype=np.float32)[:, None], across[1] - across[0], 1)
     mine, seen = both.left[part], both.seen(u, v, row, face.m, both.right)
-    within &= seen < np.median(
-        seen[around]
-    )  # the right camera may see there what stands before a disc
+    # Brighter pixels may be an occluder that only the right camera sees there.
+    within &= seen < np.median(seen[around])
     if within.sum() < LEAST_INSIDE:
         return float("nan"), covered
     off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
@@ -324,11 +322,10 @@ def measure_parallax(
 def _find_hidden_from_right(
     both: StereoPatch, face: FacePlane, depth_m: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
-    """Says which points of a face, `(h, w)`, seen by the left camera, something nearer hides from the right one."""
+    """Find points of a face, `(h, w)`, that an occluder hides from the right camera alone."""
     rows = np.rint(v[:, 0]).astype(int).clip(0, len(depth_m) - 1)
-    columns = np.arange(
-        max(0, int(u[0, 0])), depth_m.shape[1]
-    )  # what hides them from the right camera lies to their right
+    # Such an occluder lies to their right in the left picture.
+    columns = np.arange(max(0, int(u[0, 0])), depth_m.shape[1])
     depth = depth_m[rows, columns[0] :]
     here = face.inverse_depth(both.camera_matrix, columns[None, :], rows[:, None]).astype(
         np.float32

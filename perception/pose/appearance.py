@@ -1,4 +1,4 @@
-"""What tells a hole from a flat dark disc: darkness, and how brightness and depth go on inside."""
+"""Appearance of a hole beside a flat dark disc: darkness, and brightness and depth inside."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from perception.ellipse import conic
 from perception.pose.plane import FacePlane
 
 INSIDE, RING = 0.8, (1.15, 1.8)
-"""Radii: the inside without the rim's blur, and the ring around that shows how bright the face
-is."""
+"""Radii of the inside without the rim's blur, and of the ring that shows the brightness of the
+face. Chosen by hand."""
 WIDE = 8.0
-"""Radii: its surroundings, in which something else is dark too, unless there is dust."""
+"""Radii of the surroundings, in which something else is dark too unless there is dust. Chosen by
+hand."""
 CLEARLY_M = 0.03
-"""How far behind the face depth must be to be taken for the inside of a hole, whatever the
-noise."""
+"""Least distance behind the face at which depth belongs to the inside of a hole, whatever the
+noise. Chosen by hand."""
 
 
 @dataclass(frozen=True)
 class Interior:
-    """What an ellipse looks like inside.
+    """Appearance of the inside of an ellipse.
 
     Attributes:
         darkness: Brightness of its darkest quarter over that of the face around it.
-        slope: Change of brightness over one radius in the direction in which the hole goes on
-            behind the face, over the contrast between face and darkest quarter. Of the wall the
-            camera sees the sunlit or sky-lit end near the rim on the far side of
-            the hole and the dark depth on the near side: clearly negative in a hole, about zero on
-                a disc.
+        slope: Change of brightness over one radius, over the contrast between face and darkest
+            quarter, in the direction in which the hole goes on behind the face. The camera sees
+            the lit end of the wall near the far rim and the dark depth at the near rim: clearly
+            negative in a hole, about zero on a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
         unknown: Part of the inside without depth.
-        around: Brightness of the darkest hundredth of what surrounds it, over that of the face;
-            before the face there is less dust, and what stands there does not count.
-        contrast: By how much its darkest quarter is darker than the darker part of the face, in
+        around: Brightness of the darkest hundredth of the surroundings over that of the face;
+            occluders are left out, since there is less dust before them.
+        contrast: Difference between the darker part of the face and the darkest quarter, in
             standard deviations of the grain.
     """
 
@@ -54,7 +54,7 @@ def measure_interior(
     camera_matrix: np.ndarray,
     plane: FacePlane | None,
 ) -> Interior:
-    """Returns what is seen inside an ellipse `(5,)`; slope and depth need the plane of the face."""
+    """Return the appearance inside an ellipse `(5,)`; slope and depth need the plane of the face."""
     x, y, a = ellipse[:3]
     reach = a * RING[1] + 2
     top, left = max(0, int(y - reach)), max(0, int(x - reach))
@@ -69,16 +69,16 @@ def measure_interior(
     smooth = cv2.GaussianBlur(
         part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6)
     )
-    inside &= smooth < face  # what is brighter is the lit arm before it, where it has no depth
+    # Brighter pixels without depth show a lit arm before the hole.
+    inside &= smooth < face
     depth = depth_m[top:bottom, left:right]
     known = np.isfinite(depth)
     if plane is not None:
         behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(
             known, depth, np.inf
         )
-        before = (known & (behind < -4 * plane.sigma)).astype(
-            np.uint8
-        )  # an arm that hides a part of it
+        # An occluder hides a part of the inside.
+        before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)
         inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
     if inside.sum() < 8:
         return Interior(*[np.nan] * 6)
@@ -93,9 +93,9 @@ def measure_interior(
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
         away = _list_pixels(inside, left, top) - (x, y)
         along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        drift = _fit_brightness_gradient(part[ring], _list_pixels(ring, left, top) - (x, y)) * min(
-            darkness, 1.0
-        )  # of dust, over hole and face alike
+        # Dust brightens hole and face by the same gradient: take the face's off.
+        drift = _fit_brightness_gradient(part[ring], _list_pixels(ring, left, top) - (x, y))
+        drift = drift * min(darkness, 1.0)
         values = values - away @ drift
         apart = along - along.mean()
         slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(
@@ -108,10 +108,10 @@ def measure_interior(
 
 
 def _measure_contrast(ring: np.ndarray, dark: float) -> float:
-    """Returns by how much `dark` is darker than a ring, in standard deviations of its grain.
+    """Return the difference between a ring and `dark`, in standard deviations of its grain.
 
-    The edge of a shadow across the ring is no grain: the darker of its two parts (Otsu 1979)
-    counts, by what varies within it.
+    The edge of a shadow across the ring is no grain: only the darker of its two parts (Otsu 1979)
+    counts.
     """
     limit = cv2.threshold(
         np.rint(ring).clip(0, 255).astype(np.uint8).reshape(-1, 1),
@@ -133,7 +133,10 @@ def _measure_darkest_around(
     camera_matrix: np.ndarray,
     plane: FacePlane | None,
 ) -> float:
-    """Returns the grey level of the darkest hundredth of what is on or behind the face around an ellipse; 0 where nothing is."""
+    """Return the grey level of the darkest hundredth of face and background around an ellipse.
+
+    0 where occluders hide all of it.
+    """
     x, y, wide = ellipse[0], ellipse[1], WIDE * ellipse[2]
     step = max(2, int(wide / 60))
     rows, columns = (
@@ -151,15 +154,15 @@ def _measure_darkest_around(
 
 
 def _list_pixels(there: np.ndarray, left: int, top: int) -> np.ndarray:
-    """Returns column and row of the pixels of a part of a picture, `(P, 2)`."""
+    """Return column and row of the marked pixels of a part of a picture, `(P, 2)`."""
     line, column = np.nonzero(there)
     return np.column_stack([column + left, line + top])
 
 
 def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Returns the mean slope of brightness `(P,)` over places of a ring `(P, 2)`, `(2,)` grey levels a pixel.
+    """Fit the gradient of brightness `(P,)` over places `(P, 2)`, `(2,)` grey levels a pixel.
 
-    What departs much from it does not count.
+    Robust: outliers count little (Cauchy weights).
     """
     away, values = np.column_stack([away, np.ones(len(away))]), values.astype(float)
     weight = np.ones(len(values))

@@ -1,4 +1,4 @@
-"""Poses as in the paper: depth at the ellipse's centre. Kept to be compared with."""
+"""Pose by the paper's method, depth at the ellipse's centre; the baseline of the benchmarks."""
 
 from __future__ import annotations
 
@@ -13,15 +13,14 @@ from perception.pose.plane_conic import as_row
 
 @spec
 class CentreDepth:
-    """The paper's: the depth at the ellipse's centre, and normals of the depth around it compared with one another.
+    """Pose by the paper's method: depth at the ellipse's centre, normals around it compared.
 
     Attributes:
-        radius_m: Radius that is reported; nothing is measured.
-        window_px: Side of the window around the centre whose median depth is taken; 1 for the pixel
-            itself.
+        radius_m: Reported radius; it is not measured.
+        window_px: Side of the window of the median depth at the centre; 1 for the pixel itself.
         ring_px: Distance from the rim at which local normals are taken.
         normal_rad: Largest angle between a local normal and their mean.
-        std_m: Standard deviation that is claimed for each coordinate.
+        std_m: Claimed standard deviation of each coordinate.
     """
 
     radius_m: float
@@ -31,7 +30,7 @@ class CentreDepth:
     std_m: float
 
     def build(self) -> CentreDepthEstimator:
-        """Returns an estimator."""
+        """Return an estimator."""
         return CentreDepthEstimator(self)
 
 
@@ -44,7 +43,7 @@ class CentreDepthEstimator:
         self.settings = settings
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Returns the point at the ellipse's centre with the mean normal around it; see `PoseEstimator`."""
+        """Return the point at the ellipse's centre with the mean normal; see `PoseEstimator`."""
         s = self.settings
         half = s.window_px // 2
         u, v = round(ellipse.x), round(ellipse.y)
@@ -76,7 +75,7 @@ class CentreDepthEstimator:
         )
 
     def _normals(self, frame: Frame, row: np.ndarray) -> np.ndarray:
-        """Returns unit normals of the depth beside the rim, `(K, 3)`, from differences over a few pixels."""
+        """Return unit normals of the depth beside the rim, `(K, 3)`, by finite differences."""
         wide = row + np.array([0, 0, self.settings.ring_px, self.settings.ring_px, 0])
         places = conic.sample_ellipses(
             wide[None], np.arange(self.NUM_NORMALS) * 2 * np.pi / self.NUM_NORMALS

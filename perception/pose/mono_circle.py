@@ -1,4 +1,4 @@
-"""Poses from one picture alone, by the known radius of the holes."""
+"""Pose from one picture alone, by the known radius of the holes."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from perception.pose.plane_conic import as_row, convert_to_gray
 
 @spec
 class MonoCircle:
-    """From the known radius alone, where depth fails: of the two circles that look like the ellipse, the one expected.
+    """Pose by the known radius, without depth: one of two circles that look like the ellipse.
 
     Attributes:
         radius_m: Radius of the holes.
-        normal_in_base: Where the face looks in the base frame; also tells the two solutions apart.
+        normal_in_base: Expected normal of the face in the base frame; selects one of two solutions.
         normal_rad: Largest angle to it.
-        ellipse_px: Least standard deviation of the ellipse's axes, px; decides the covariance.
-        darkness: Largest brightness of the darkest quarter inside over that of the face; nothing
-            else speaks for a hole here.
+        ellipse_px: Least standard deviation of the ellipse's axes, px; sets the covariance.
+        darkness: Largest brightness of the darkest quarter inside over that of the face, the only
+            test of the appearance.
     """
 
     radius_m: float
@@ -32,7 +32,7 @@ class MonoCircle:
     darkness: float
 
     def build(self) -> MonoCircleEstimator:
-        """Returns an estimator."""
+        """Return an estimator."""
         return MonoCircleEstimator(self)
 
 
@@ -43,7 +43,7 @@ class MonoCircleEstimator:
         self.settings = settings
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Returns the expected one of two circles; see `PoseEstimator`."""
+        """Return the circle nearer to the expected normal; see `PoseEstimator`."""
         s = self.settings
         if frame.base_from_camera is None:
             return Rejection("pose", "known pose of the camera", 0.0, 1.0, ellipse)

@@ -1,9 +1,8 @@
 """The block's face around a hole: a plane fitted to inverse depth.
 
 Inverse depth is linear in the picture on a plane, `1/z = m · (x, y, 1)` with `(x, y, 1)` the ray of
-a pixel, and a stereo matcher's
-noise in it is the same at every distance: least squares in it weigh depth by `1/z^4`, as they
-should. The plane's normal is `m` made a unit vector, and `1/|m|` its distance.
+a pixel. The noise of a stereo matcher in it is the same at every distance, so that ordinary least
+squares weigh all pixels rightly. The plane's normal is `m / |m|`, its distance `1 / |m|`.
 """
 
 from __future__ import annotations
@@ -15,20 +14,20 @@ import numpy as np
 from perception.ellipse import conic
 
 TUKEY = 4.685
-"""Residual, in standard deviations, from which a point counts nothing; 95 % efficient with Gaussian
-noise."""
+"""Tukey's biweight: residual in standard deviations from which a point counts nothing; 95 %
+efficient with Gaussian noise (Holland and Welsch 1977)."""
 
 GROWING = 3.0
-"""The same while the plane is grown: beyond an edge of the block another face begins at the same
-depth."""
+"""The same while the plane is grown. Chosen by hand: beyond an edge of the block another face
+begins at the same depth, and a wider limit would follow it."""
 NEARNESS, LEAN = 0.3, 0.4
-"""How far inverse depth may be off what a circle's size says, as a part of it; its slope, off what
-its shape says."""
+"""Allowed relative error of inverse depth beside that of a circle of the ellipse's size, and
+addition to the slope that its shape allows. Chosen by hand: occluders differ by more."""
 DEGENERATE = 1e12
-"""Condition of the sums of squares of a plane's fit from which on its points lie on a line."""
+"""Condition number of a plane's normal equations from which its points lie on a line."""
 LEAST, FEWEST = 60, 8
-"""Points in which a plane is looked for; cells from which its covariance is taken, of fewer ones
-bands of rows instead."""
+"""Least number of points of a plane; cells from which its covariance is estimated, below which
+bands of rows take their place. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +38,8 @@ class FacePlane:
         m: `(3,)` 1/m; the points `P` with `m · P = 1`.
         cov: Covariance of `m`, `(3, 3)`.
         sigma: Standard deviation of the residuals of inverse depth, 1/m.
-        num_points: Points that count.
-        extent: Of the support around the ellipse, in radii.
+        num_points: Points with a weight above 0.
+        extent: Extent of the support around the ellipse, in radii.
     """
 
     m: np.ndarray
@@ -55,31 +54,30 @@ class FacePlane:
         return -self.m / np.linalg.norm(self.m)
 
     def normal_cov_rad2(self) -> np.ndarray:
-        """Returns the covariance of the normal, `(3, 3)`, singular along it."""
+        """Return the covariance of the normal, `(3, 3)`, singular along it."""
         length = np.linalg.norm(self.m)
         project = (np.eye(3) - np.outer(self.normal, self.normal)) / length
         return project @ self.cov @ project
 
     def inverse_depth(self, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Returns its inverse depth at columns and rows of a picture, of broadcast shapes; see `inverse_depth`."""
+        """Return inverse depth at columns and rows of a picture, which are broadcast."""
         return compute_inverse_depth(self.m, camera_matrix, u, v)
 
     def point(self, ray: np.ndarray) -> np.ndarray:
-        """Returns where a ray `(3,)` with z = 1 meets it."""
+        """Return the point at which a ray `(3,)` with z = 1 meets the plane."""
         return ray / float(self.m @ ray)
 
 
 @dataclass(frozen=True)
 class FaceSupport:
-    """Pixels of the face around an ellipse, outwards.
+    """Pixels of the face around an ellipse, ordered outwards.
 
     Attributes:
         rays: `(P, 3)`, z = 1.
         inverse: Inverse depth, `(P,)` 1/m.
         radii: Distance from the ellipse's centre in its own radii, `(P,)`, increasing.
-        cell: Number of the square of the picture in which a pixel lies, `(P,)`; noise is alike
-            within one.
-        known: Part of the surroundings whose depth is known, whatever it is.
+        cell: Number of each pixel's square of the picture, `(P,)`; noise is correlated within one.
+        known: Part of the surroundings with known depth.
     """
 
     rays: np.ndarray
@@ -92,7 +90,7 @@ class FaceSupport:
 def compute_inverse_depth(
     m: np.ndarray, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
-    """Returns inverse depth on a plane `m · P = 1` at columns and rows of a picture: linear in both, so of whole rows at once."""
+    """Return inverse depth on the plane `m · P = 1` at columns and rows, which are broadcast."""
     across, down, middle = np.linalg.solve(camera_matrix.T, m)
     return across * u + (down * v + middle)
 
@@ -109,22 +107,22 @@ def collect_support(
     most: int,
     cell_px: int,
 ) -> FaceSupport:
-    """Returns the pixels with known depth between `inner` and `outer` radii of an ellipse `(5,)`.
+    """Return the pixels with known depth between `inner` and `outer` radii of an ellipse `(5,)`.
 
-    A circle of a known radius says itself about how far away it is and how its plane leans: what is
-    much nearer is something that stands before it, what is much farther lies behind the block.
+    An ellipse of a circle of known radius tells its distance and slope roughly. Pixels much nearer
+    belong to an occluder, much farther ones lie behind the block.
 
     Args:
         depth_m: `(h, w)`.
         allowed: Pixels of the face, `(h, w)` bool.
         camera_matrix: `(3, 3)`.
         ellipse: Centre, semi-axes, direction.
-        radius_m: Of the circle that it would be.
-        inner: In radii of the ellipse; keeps the rim's bleeding out.
-        certain: In radii; up to here the face goes on around a hole, whatever `allowed` says.
-        outer: In radii.
-        most: Pixels beyond so many are left out on a regular grid.
-        cell_px: Side of the squares in which noise is alike.
+        radius_m: Radius of the circle.
+        inner: Inner limit in radii of the ellipse; leaves out the bleeding of the rim.
+        certain: Radii up to which the face surely goes on, whatever `allowed` says.
+        outer: Outer limit in radii.
+        most: Largest number of pixels; of more, a regular grid is taken.
+        cell_px: Side of the squares within which noise is correlated.
     """
     height, width = depth_m.shape
     x, y, a = ellipse[0], ellipse[1], ellipse[2] * outer
@@ -160,21 +158,19 @@ def collect_support(
 def fit_plane(
     points: FaceSupport, rings: tuple[float, ...], floor: float, generator: np.random.Generator
 ) -> FacePlane | None:
-    """Returns the plane that the points around the ellipse lie on, grown from the ring near it outwards.
+    """Fit a plane to the points around an ellipse, grown outwards from the innermost ring.
 
-    `None` where they determine none: there are too few, they lie on a line, or nearly all that
-    agree in one cell.
+    Return `None` where they determine none: too few, on a line, or nearly all in one cell.
 
     Args:
         points: Support.
-        rings: Outer limits in radii, from the ring in which the plane is found to the last one
-            across which it is grown.
-        floor: Least standard deviation of inverse depth, 1/m: of a matcher that repeats itself.
+        rings: Outer limits of the rings in radii, the innermost first.
+        floor: Least standard deviation of inverse depth, 1/m: the residuals of a matcher that
+            smooths can be 0.
         generator: Draws the triples of the first guess.
     """
-    rings = tuple(
-        ring for ring in rings if np.searchsorted(points.radii, ring) >= LEAST
-    )  # near what hides it a matcher is blind
+    # Near an occluder a matcher is blind: the plane may begin in a later ring.
+    rings = tuple(ring for ring in rings if np.searchsorted(points.radii, ring) >= LEAST)
     if not rings:
         return None
     number = int(np.searchsorted(points.radii, rings[0]))
@@ -195,9 +191,8 @@ def fit_plane(
                 ),
                 floor,
             )
-            sigma = (
-                scale if ring == rings[0] else min(scale, 1.2 * first)
-            )  # what else comes into sight is no noise
+            # Other faces that come into reach are no noise.
+            sigma = scale if ring == rings[0] else min(scale, 1.2 * first)
             reach = (TUKEY if ring == rings[0] else GROWING) * sigma
             weight = np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2
             if np.count_nonzero(weight) < LEAST // 2:
@@ -222,7 +217,7 @@ def fit_plane(
 
 
 def compute_upper_median(values: np.ndarray) -> float:
-    """Returns the median of many values `(P,)`, of an even number the larger one in the middle."""
+    """Return the median of values `(P,)`, the upper one of an even number; faster than `np.median`."""
     half = len(values) // 2
     return float(np.partition(values, half)[half])
 
@@ -230,7 +225,7 @@ def compute_upper_median(values: np.ndarray) -> float:
 def _guess_plane(
     rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40
 ) -> np.ndarray:
-    """Returns the plane through three points that most points lie nearest to (least median of squares)."""
+    """Return the plane through three points with the least median residual (Rousseeuw 1984)."""
     judge = generator.integers(len(rays), size=min(len(rays), 400))
     triples = generator.integers(len(rays), size=(trials, 3))
     triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-9]
@@ -243,7 +238,7 @@ def _guess_plane(
 
 
 def number_cells(cell: np.ndarray) -> np.ndarray:
-    """Returns the numbers of cells `(P,)` from 0 on, of points row by row; where there are too few, of bands of rows instead."""
+    """Return consecutive numbers of cells, `(P,)`; of too few cells, bands of rows in their place."""
     cell = np.unique(cell, return_inverse=True)[1]
     return (
         cell
@@ -253,10 +248,11 @@ def number_cells(cell: np.ndarray) -> np.ndarray:
 
 
 def compute_psi_slope(off: np.ndarray) -> np.ndarray:
-    """Returns by how much of a residual, `off` in reaches of Tukey's biweight `(P,)`, its pull changes, over its weight.
+    """Return the derivative of Tukey's influence function over its weight, `(P,)`.
 
-    A residual that grows counts less and less: a fit gives way to noise further than its weights
-    alone say, by a fifth with a reach of 4.7 standard deviations, by a half with one of 3.
+    `off` is in units of the biweight's reach. The influence of a growing residual falls, so that a
+    fit varies more than its weights alone tell: by a fifth with a reach of 4.7 standard
+    deviations, by a half with one of 3.
     """
     square = np.minimum(off**2, 1.0 - 1e-9)
     return (1.0 - 5.0 * square) / (1.0 - square)
@@ -265,17 +261,14 @@ def compute_psi_slope(off: np.ndarray) -> np.ndarray:
 def estimate_sandwich_covariance(
     slopes: np.ndarray, heavy: np.ndarray, residual: np.ndarray, cell: np.ndarray
 ) -> np.ndarray | None:
-    """Returns the covariance of a fit of three numbers, `(3, 3)`, by how it changes without each cell, in which noise may be alike.
+    """Return the cluster-robust covariance of a fit of three parameters, `(3, 3)`.
 
-    `None` where it is none without one of them.
-
-    The jackknife over cells, or the sandwich estimate as CR3 (Bell and McCaffrey 2002): a cell that
-    decides much leaves a small residual, the more so the fewer there are.
+    The jackknife over cells, within which noise may be correlated: the sandwich estimate CR3 (Bell
+    and McCaffrey 2002). Return `None` where the fit is singular without one of the cells.
 
     Args:
-        slopes: Of the residuals for each number, times how far each one yields, `(P, 3)`.
-        heavy: What the residuals are held against to find them, `(P, 3)`: the weighted slopes, or
-            instruments in their place.
+        slopes: Derivatives of the residuals times `compute_psi_slope`, `(P, 3)`.
+        heavy: Weighted derivatives, or instruments in their place, `(P, 3)`.
         residual: `(P,)`.
         cell: Number of each point's cell, from 0 on, `(P,)`.
     """

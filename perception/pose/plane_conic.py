@@ -1,4 +1,4 @@
-"""Poses of holes from the plane of the block's face and the conic of the rim on it."""
+"""Pose of a hole from the plane of the block's face and the circle of the rim on it."""
 
 from __future__ import annotations
 
@@ -24,40 +24,37 @@ from perception.pose.appearance import Interior
 from perception.pose.plane import FacePlane
 from perception.pose.rim import RimCircle
 
-UNTOLD, UNTOLD_SCORE = 0.8, 0.5
-"""Part of an inside without depth, hidden from the right camera, from which on nobody can tell it
-from a flat disc; the score of what nobody can, for dust or for this."""
+# Chosen by hand on rendered scenes (benchmarks/perception/table.py).
+UNDECIDED, UNDECIDED_SCORE = 0.8, 0.5
+"""Part of the inside without depth, and hidden from the right camera, from which a hole cannot be
+told from a flat disc; factor on the score of such a hole, and of one in dust."""
 
 FORGIVEN, AT_FIRST = 0.55, 1.4
-"""Part of the circle that must show where its ellipse alone was too small or too long for one; and
-how many times as far off as the circle an ellipse may be, which follows the shade within a rim
-where that is the steeper edge."""
+"""Least visible part of a circle whose ellipse was too small or too long; and factor on the limits
+for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
 BESIDE = (1.15, 1.45)
-"""Radii of an ellipse at which what stands before the rest of a rim is seen."""
+"""Radii of an ellipse at which occluders of its rim are searched."""
 
 
 @spec
 class AppearanceGates:
-    """What a hole must look like inside; a flat dark disc of its size passes every test of geometry.
+    """Gates on the appearance inside a hole: a flat dark disc passes every test of geometry.
 
     Attributes:
         darkness: Largest brightness of the darkest quarter inside over that of the face.
-        veiled: From which on something lies over both: dust, behind which nobody sees how deep a
-            hole is; or it is a stain.
-        darker: If something near it is darker by more than this, over the brightness of the face,
-            it is no dust.
-        contrast: Least contrast, in standard deviations of the face's grain, of what is veiled: a
-            stain has less; unless both cameras see that it is deep.
-        mouth: Least mean probability of the mouth channel inside; asked where the segmenter gives
-            one.
-        sure_mouth: From which the mouth channel decides where nobody sees how deep it is; where
-            that is seen, it overrules nothing.
-        slope: Slope of brightness inside, see `Interior`, that alone would show a hole; less is as
-            much less evidence, and adds up.
-        deeper: Part of the depth inside that lies behind the face, likewise.
-        parallax: Difference of left and right picture inside over that on the face, likewise; 1 is
-            none.
-        parts: Radii of an ellipse: its inside for the parallax, and the ring of face around it.
+        veiled: Such a brightness from which it is a hole behind dust, or a stain.
+        darker: Surroundings darker by more than this, over the brightness of the face, exclude
+            dust.
+        contrast: Least contrast of a veiled hole in standard deviations of the face's grain; a
+            stain has less. Not asked where both cameras see that it is deep.
+        mouth: Least mean of the segmenter's hole mask inside, where there is one.
+        sure_mouth: Mean of the hole mask from which it decides where depth cannot be seen.
+        slope: Slope of brightness inside (`Interior`) that alone is evidence enough; evidence is
+            proportional, and adds up.
+        deeper: Part of the depth inside behind the face that alone is evidence enough.
+        parallax: Difference of left and right picture inside, over that on the face, that alone is
+            evidence enough; 1 is none.
+        parts: Radii of the inside for the parallax, and of the ring of face around it.
     """
 
     darkness: float
@@ -74,35 +71,34 @@ class AppearanceGates:
 
 @spec
 class PlaneConic:
-    """The face's plane from the whole mask, the conic solved on it exactly, gates of size, shape and looks, a covariance.
+    """Plane of the face, circle of the rim on it; gates of size, shape and appearance; covariance.
 
     Attributes:
-        radius_m: Radius of the holes that are looked for.
-        radius_tolerance: How far the measured radius may be off, as a part of it; in proportion
-            more at first, where something hides a part of the rim.
-        axis_ratio: Least ratio of the semi-axes on the plane; 1 is a circle; likewise.
-        coverage: Least part of the circle on the face whose rim is seen.
+        radius_m: Radius of the holes.
+        radius_tolerance: Allowed relative error of the measured radius; more for the first ellipse
+            where something hides a part of the rim.
+        axis_ratio: Least ratio of the semi-axes on the plane, 1 for a circle; likewise.
+        coverage: Least visible part of the circle.
         tilt_rad: Largest angle between the face's normal and the line of sight.
-        inner: Inner limit of the face's support in radii of the ellipse; keeps the rim's bleeding
-            out.
-        rings: Outer limits in radii: the ring in which the plane is found, and those across which
-            it is grown.
-        max_pixels: Pixels of the face that are used.
-        cell_px: Side of the squares within which depth noise is taken to be alike.
+        inner: Inner limit of the face's support in radii of the ellipse; leaves out the bleeding of
+            the rim.
+        rings: Outer limits in radii: of the ring in which the plane is fitted first, and of those
+            across which it is grown.
+        max_pixels: Largest number of pixels of the face.
+        cell_px: Side of the squares within which depth noise is correlated.
         noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
-        matcher_alike: By how much the covariance of the plane from depth alone is larger than its
-            residuals say: what a matcher gets wrong is alike over wide stretches.
-        matcher_bias_per_m: Standard deviation of inverse depth by which a matcher is off all over a
-            face, 1/m; with a right picture the face is aligned anew.
-        bias_per_m: Standard deviation of inverse depth that all of the face shares and no residual
-            shows, 1/m.
+        matcher_alike: Factor on the covariance of the plane from depth alone: errors of a matcher
+            are correlated over wide stretches.
+        matcher_bias_per_m: Standard deviation of a matcher's bias over a whole face in inverse
+            depth, 1/m; with a right picture the face is aligned directly.
+        bias_per_m: Standard deviation of the remaining bias that no residual shows, 1/m.
         center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
-        shape_px: Standard deviation by which a rim departs from a circle at each of its first
-            waves, px: it moves the centre of what is left of one.
-        looks: What it must look like.
-        without_depth: What is tried where the face has no depth; `null` for nothing.
-        blind: Part of the face around a hole with known depth below which it has none.
+        shape_px: Standard deviation of each of the first waves of a rim, px; they move the centre
+            of an incomplete one.
+        looks: Gates on the appearance.
+        without_depth: Estimator where the face has no depth; `null` for none.
+        blind: Part of the face around a hole with known depth below which `without_depth` serves.
     """
 
     radius_m: float
@@ -133,11 +129,12 @@ class PlaneConic:
             )
         if not self.rings or list(self.rings) != sorted(self.rings) or self.rings[0] <= self.inner:
             raise ConfigError(
-                f"perception.pose.rings: expected increasing limits above inner={self.inner}, got {list(self.rings)}"
+                f"perception.pose.rings: expected increasing limits above inner={self.inner}, got "
+                f"{list(self.rings)}"
             )
 
     def build(self) -> PlaneConicEstimator:
-        """Returns an estimator."""
+        """Return an estimator."""
         return PlaneConicEstimator(self)
 
 
@@ -152,10 +149,10 @@ class PlaneConicEstimator:
         self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Returns the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
+        """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s = self.settings
         row = as_row(ellipse)
-        gray, allowed = self._pictures(frame, masks)
+        gray, allowed = self._prepare(frame, masks)
         reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
         points = plane.collect_support(
             frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
@@ -180,7 +177,7 @@ class PlaneConicEstimator:
                 "pose", "depth noise on the face, 1/m", face.sigma, s.noise_limit_per_m, ellipse
             )
         face = replace(face, cov=face.cov * s.matcher_alike)
-        shape = self._shape(face, row, frame, ellipse)
+        shape = self._check_shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
@@ -189,7 +186,7 @@ class PlaneConicEstimator:
                 both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m
             )
             both, face = (None, face) if agreed is None else (both, agreed)
-            shape = self._shape(face, row, frame, ellipse)
+            shape = self._check_shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
         circle = rim.fit_rim_circle(
@@ -221,9 +218,11 @@ class PlaneConicEstimator:
             if both
             else (float("nan"), 0.0)
         )
-        # behind something that stands before it, or in dust, nobody can tell
-        untold = inside.darkness > s.looks.veiled or (covered > UNTOLD and inside.unknown > UNTOLD)
-        refused = self._looks(inside, parallax, masks, row, ellipse, untold)
+        # Behind an occluder, or in dust, hole and disc look the same.
+        undecided = inside.darkness > s.looks.veiled or (
+            covered > UNDECIDED and inside.unknown > UNDECIDED
+        )
+        refused = self._check_appearance(inside, parallax, masks, row, ellipse, undecided)
         if refused:
             return refused
         return HolePose(
@@ -234,12 +233,12 @@ class PlaneConicEstimator:
             axis_cov_rad2=face.normal_cov_rad2(),
             frame="camera",
             score=float(ellipse.score)
-            * (UNTOLD_SCORE if untold and masks.hole_mask is None else 1.0),
+            * (UNDECIDED_SCORE if undecided and masks.hole_mask is None else 1.0),
             t_s=frame.t_s,
         )
 
-    def _pictures(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the grey picture and the pixels of the face, which all ellipses of a frame share."""
+    def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray]:
+        """Return the grey picture and the pixels of the face, cached for all ellipses of a frame."""
         if self._seen is None or self._seen[0] is not frame or self._seen[1] is not masks:
             allowed = masks.block > 0.5
             if masks.hole_mask is not None:
@@ -247,10 +246,10 @@ class PlaneConicEstimator:
             self._seen = frame, masks, convert_to_gray(frame), allowed
         return self._seen[2:]
 
-    def _shape(
+    def _check_shape(
         self, face: FacePlane, row: np.ndarray, frame: Frame, ellipse: Ellipse
     ) -> bool | Rejection:
-        """Returns whether an ellipse has size and shape of a rim with nothing forgiven, or which gate it does not pass."""
+        """Return whether an ellipse has size and shape of a whole rim, or the gate that it misses."""
         s = self.settings
         ray = np.linalg.solve(frame.camera_matrix, np.array([row[0], row[1], 1.0]))
         cosine = -float(face.normal @ ray) / float(np.linalg.norm(ray))
@@ -261,9 +260,8 @@ class PlaneConicEstimator:
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
-        seen = max(
-            1.0 - measure_hidden_part(face, row, frame), s.coverage
-        )  # the less of a rim there is, the less it tells
+        # The less of a rim is visible, the less precise is its ellipse.
+        seen = max(1.0 - measure_hidden_part(face, row, frame), s.coverage)
         tolerance = AT_FIRST * s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
@@ -273,59 +271,52 @@ class PlaneConicEstimator:
             return Rejection("pose", "axis ratio on the face", ratio, least, ellipse)
         return abs(radius / s.radius_m - 1.0) <= s.radius_tolerance and ratio >= s.axis_ratio
 
-    def _looks(
+    def _check_appearance(
         self,
         inside: Interior,
         parallax: float,
         masks: Masks,
         row: np.ndarray,
         ellipse: Ellipse,
-        untold: bool,
+        undecided: bool,
     ) -> Rejection | None:
+        """Return the gate of the appearance that a hole misses, `None` where it passes all."""
         looks = self.settings.looks
+
+        def refuse(reason: str, value: float, limit: float) -> Rejection:
+            return Rejection("pose", reason, value, limit, ellipse)
+
         if not inside.darkness <= looks.darkness:
-            return Rejection(
-                "pose", "brightness inside over outside", inside.darkness, looks.darkness, ellipse
-            )
+            return refuse("brightness inside over outside", inside.darkness, looks.darkness)
+        has_mask = masks.hole_mask is not None
         mouth = 0.0 if masks.hole_mask is None else average_inside(masks.hole_mask, row)
-        if masks.hole_mask is not None and mouth < looks.mouth:
-            return Rejection("pose", "mouth probability inside", mouth, looks.mouth, ellipse)
-        sure = mouth >= looks.sure_mouth
-        shown = [
-            max(one, 0.0)
-            for one in (inside.slope / looks.slope, inside.deeper / looks.deeper)
-            if np.isfinite(one)
-        ]
-        # a dark disc is noisier nowhere than the face: below 1 it speaks against
-        against = (parallax - 1.0) / (looks.parallax - 1.0)
-        evidence = sum(shown) + (against if np.isfinite(against) else 0.0)
+        if has_mask and mouth < looks.mouth:
+            return refuse("mouth probability inside", mouth, looks.mouth)
+        is_sure = mouth >= looks.sure_mouth
+        evidence = 0.0
+        for value in (inside.slope / looks.slope, inside.deeper / looks.deeper):
+            if np.isfinite(value):
+                evidence += max(value, 0.0)
+        # A flat disc differs between the pictures as little as the face: below 1 the parallax is
+        # evidence against a hole.
+        from_parallax = (parallax - 1.0) / (looks.parallax - 1.0)
+        has_parallax = bool(np.isfinite(from_parallax))
+        evidence += from_parallax if has_parallax else 0.0
         if inside.darkness > looks.veiled:
-            if sure:
+            if is_sure:
                 return None
             if inside.around < inside.darkness - looks.darker:
-                return Rejection(
-                    "pose", "brightness inside over outside", inside.darkness, looks.veiled, ellipse
-                )
-            if inside.contrast >= looks.contrast or (np.isfinite(against) and evidence >= 1.0):
+                return refuse("brightness inside over outside", inside.darkness, looks.veiled)
+            if inside.contrast >= looks.contrast or (has_parallax and evidence >= 1.0):
                 return None
-            return Rejection(
-                "pose",
-                "contrast to the grain of the face",
-                inside.contrast,
-                looks.contrast,
-                ellipse,
-            )
-        if untold and not np.isfinite(against) and (sure or masks.hole_mask is None):
+            return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
+        if undecided and not has_parallax and (is_sure or not has_mask):
             return None
-        return (
-            None
-            if evidence >= 1.0
-            else Rejection("pose", "evidence of depth inside", evidence, 1.0, ellipse)
-        )
+        return None if evidence >= 1.0 else refuse("evidence of depth inside", evidence, 1.0)
 
 
 def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: float) -> np.ndarray:
-    """Returns the covariance of a centre, `(3, 3)` m²: along the ray by the plane's, on the plane by the circle's."""
+    """Return the covariance of a centre, `(3, 3)` m²: plane along the ray, circle on the plane."""
     center = circle.center_m
     ray = center / center[2]
     depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
@@ -333,9 +324,10 @@ def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: fl
 
 
 def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float:
-    """Returns the part of a rim on a face, about where an ellipse `(5,)` is, before which something nearer stands.
+    """Return the part of a rim on a face, near an ellipse `(5,)`, that an occluder hides.
 
-    It may be smaller than the rim; and where the nearer thing begins, its depth is often unknown.
+    Searched at two radii: the ellipse may be smaller than the rim, and depth is often unknown at
+    the edge of an occluder.
     """
     height, width = frame.depth_m.shape
     nearer = np.zeros(72, bool)
@@ -357,17 +349,17 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
 
 
 def as_row(ellipse: Ellipse) -> np.ndarray:
-    """Returns centre, semi-axes and direction, `(5,)`."""
+    """Return centre, semi-axes and direction of an ellipse, `(5,)`."""
     return np.array([ellipse.x, ellipse.y, ellipse.a, ellipse.b, ellipse.theta_rad])
 
 
 def convert_to_gray(frame: Frame) -> np.ndarray:
-    """Returns the frame's picture in grey, `(h, w)` uint8."""
+    """Return the frame's picture in grey, `(h, w)` uint8."""
     return cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
 
 
 def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
-    """Returns the mean of a picture within 0.8 of an ellipse."""
+    """Return the mean of a picture within 0.8 of an ellipse."""
     x, y, a = row[:3]
     top, left = max(0, int(y - a)), max(0, int(x - a))
     part = picture[top : int(y + a) + 2, left : int(x + a) + 2]

@@ -1,8 +1,7 @@
-"""The rim of a hole as a circle on the face's plane, placed where brightness rises most steeply across it.
+"""Rim of a hole: the circle on the face's plane along which brightness rises most steeply.
 
-With the plane known, three numbers are left, which a third of a rim determines well; an ellipse
-free in the picture has five, and closes the gap where an arm hides the rest of the rim with the
-arm's edge.
+With the plane known, three numbers are left, which a third of a rim determines well. A free
+ellipse in the picture has five, and would close the gap of an occluded rim along the occluder.
 """
 
 from __future__ import annotations
@@ -15,28 +14,32 @@ import numpy as np
 from perception.ellipse import conic
 
 SIGMA_PX, SIGMA_Y, STEP_PX = 0.5, 2.0, 0.5
-"""Blur along a profile before its slope is taken, across profiles (in profiles), and what lies
-between the samples of one."""
+"""Blur along a profile, px, and across profiles, in profiles; distance of samples, px. Chosen by
+hand."""
 PEAKS = 3
-"""Steepest places of a profile that are looked at: a rim, its far end, and the edge of what stands
-before it."""
+"""Edges kept of each profile: the rim, its far end, and the edge of an occluder."""
 FAINT = 0.25
-"""Part of the usual steepness below which a place is no edge."""
+"""Least steepness of an edge, as a part of the median one. Chosen by hand."""
 TRIPLES = 120
+"""Circles through three edges that are tried: with a third of the edges on the rim, four of them
+are expected to lie on it."""
 NEAR_PX, INLIER_PX = 0.7, 1.0
-"""A profile speaks for a circle that has an edge so near to it; of the final one."""
+"""Largest distance of an edge from its circle: in the vote, and in the final fit. Chosen by hand."""
 NARROW_PX = 2.0
-"""Reach of the profiles across a circle that is known already."""
+"""Reach of the profiles across a known circle. Chosen by hand."""
 ALIKE_PX, ALIKE_M = 8.0, 0.006
-"""Points of a rim are alike over both lengths together: that of blur and profiles, and that of
-chips and grain."""
+"""Correlation length of the errors along a rim, the sum of both: blur and profiles in px, chips
+and grain in m. Chosen by hand."""
 LEAST = 12
+"""Least number of edges of a circle. Chosen by hand: four for each of its three numbers."""
+DEGENERATE = 1e8
+"""Condition number of the normal equations from which the edges determine no circle."""
 WAVES = (2, 3, 4)
-"""Waves around a rim by which it is no circle, of light, chips and blur; they move the centre of
-one that is not whole."""
+"""Waves around a rim by which light, chips and blur deform it; they move the centre of an
+incomplete one."""
 GAP, BESIDE = 5, 5
-"""Profiles in a row without an edge of the circle that are a gap, where something stands before it;
-and beside one, those whose edge is drawn towards what stands there by the blur across profiles."""
+"""Profiles in a row without an edge that make a gap, hidden by an occluder; and profiles beside it
+that the blur draws towards the occluder. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,12 @@ class RimCircle:
     """A circle on a plane.
 
     Attributes:
-        center_m: In camera coordinates, `(3,)`.
+        center_m: Centre in camera coordinates, `(3,)`.
         radius_m: Radius.
         cov_m2: Covariance of the centre on the plane, `(3, 3)`, singular along its normal.
         rms_px: Root mean square distance of its edge points.
-        coverage: Part of it that has any.
-        ellipse: What it is in the picture, `(5,)`.
+        coverage: Part of it that has edge points.
+        ellipse: Its ellipse in the picture, `(5,)`.
     """
 
     center_m: np.ndarray
@@ -62,7 +65,7 @@ class RimCircle:
 
 @dataclass(frozen=True)
 class PlaneChart:
-    """Coordinates on a plane, m: the place `origin + x first + y second` for each `(x, y)`."""
+    """Coordinates `(x, y)` on a plane, m: the place `origin + x first + y second`."""
 
     origin: np.ndarray
     first: np.ndarray
@@ -71,7 +74,7 @@ class PlaneChart:
     camera_matrix: np.ndarray
 
     def flat(self, pixels: np.ndarray) -> np.ndarray:
-        """Returns the coordinates of what is seen at pixels, `(…, 2)`."""
+        """Return the coordinates on the plane seen at pixels, `(…, 2)`."""
         rays = (
             np.concatenate([pixels, np.ones_like(pixels[..., :1])], -1)
             @ np.linalg.inv(self.camera_matrix).T
@@ -80,7 +83,7 @@ class PlaneChart:
         return np.stack([away @ self.first, away @ self.second], -1)
 
     def seen(self, circle: np.ndarray) -> np.ndarray:
-        """Returns the ellipse `(5,)` that a circle `(x, y, radius)` is in the picture."""
+        """Return the ellipse `(5,)` in the picture of a circle `(x, y, radius)`."""
         x, y, radius = circle
         back = np.linalg.inv(
             self.camera_matrix @ np.column_stack([self.first, self.second, self.origin])
@@ -90,6 +93,23 @@ class PlaneChart:
                 None
             ]
         )[0]
+
+
+@dataclass(frozen=True)
+class _CircleFit:
+    """Result of `_fit_circle`.
+
+    Attributes:
+        circle: Centre and radius on the plane, m, `(3,)`.
+        cov_m2: Covariance of the centre, `(2, 2)`.
+        rms_px: Root mean square distance of the edges.
+        coverage: Part of the profiles with an edge.
+    """
+
+    circle: np.ndarray
+    cov_m2: np.ndarray
+    rms_px: float
+    coverage: float
 
 
 def fit_rim_circle(
@@ -102,18 +122,19 @@ def fit_rim_circle(
     center_px: float,
     shape_px: float,
 ) -> RimCircle | None:
-    """Returns the circle on the plane `m · P = 1` whose rim has the most edges of dark to bright; `None` where nothing agrees.
+    """Fit the circle on the plane `m · P = 1` along which most edges run from dark to bright.
+
+    Return `None` where no circle of a possible size has enough.
 
     Args:
         gray: Picture, `(h, w)` uint8.
-        ellipse: About where it is, `(5,)`.
-        camera_matrix: `(3, 3)`.
-        m: The plane, `(3,)`.
-        radius_m: About how large it is.
-        tolerance: By how much it may be larger or smaller, as a part of that.
+        ellipse: Start, `(5,)`.
+        camera_matrix: Camera matrix, `(3, 3)`.
+        m: Plane, `(3,)`.
+        radius_m: Expected radius.
+        tolerance: Allowed relative error of it.
         center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
-        shape_px: Standard deviation by which a rim departs from a circle at each of its `WAVES`,
-            px.
+        shape_px: Standard deviation of each of the `WAVES` of a rim, px.
     """
     ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
     normal = m / np.linalg.norm(m)
@@ -124,7 +145,7 @@ def fit_rim_circle(
     profiles = _find_profile_edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
     if profiles is None:
         return None
-    found = _vote_for_circle(*profiles, radius_m, tolerance)
+    found, fit = _vote_for_circle(*profiles, radius_m, tolerance), None
     for _ in range(2):
         if found is None:
             return None
@@ -134,18 +155,19 @@ def fit_rim_circle(
         )
         if profiles is None:
             return None
-        found, cov, rms_px, coverage = _fit_circle(found, *profiles, center_px, shape_px)
+        fit = _fit_circle(found, *profiles, center_px, shape_px)
+        found = None if fit is None else fit.circle
         if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
             return None
-    if found is None:
+    if fit is None or found is None:
         return None
     axes = np.column_stack([chart.first, chart.second])
     return RimCircle(
         chart.origin + axes @ found[:2],
         float(found[2]),
-        axes @ cov @ axes.T,
-        rms_px,
-        coverage,
+        axes @ fit.cov_m2 @ axes.T,
+        fit.rms_px,
+        fit.coverage,
         chart.seen(found),
     )
 
@@ -153,11 +175,11 @@ def fit_rim_circle(
 def _find_profile_edges(
     gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: PlaneChart
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns the steepest places of profiles across an ellipse on the plane, and how long a pixel is there.
+    """Find the steepest places of profiles across an ellipse, on the plane.
 
     Returns:
-        Places `(P, PEAKS, 2)` m, NaN where there are fewer, and the length on the plane of a pixel
-        along each profile `(P,)`.
+        Places, m, `(P, PEAKS, 2)`, NaN where there are fewer; and the length of a pixel on the
+        plane along each profile, `(P,)`.
     """
     number = int(np.clip(2 * conic.compute_perimeter(ellipse[2], ellipse[3]), 48, 144))
     points, outward, _ = (
@@ -208,10 +230,9 @@ def _find_profile_edges(
 def _vote_for_circle(
     edges: np.ndarray, pixel_m: np.ndarray, radius_m: float, tolerance: float
 ) -> np.ndarray | None:
-    """Returns the circle `(x, y, radius)` through three edges that most profiles speak for."""
-    places, owner = edges.reshape(-1, 2), np.repeat(np.arange(len(edges)), edges.shape[1])
-    known = np.isfinite(places[:, 0])
-    places, owner = places[known], owner[known]
+    """Return the circle `(x, y, radius)` through three edges that most profiles support."""
+    places = edges.reshape(-1, 2)
+    places = places[np.isfinite(places[:, 0])]
     if len(places) < LEAST:
         return None
     triples = places[np.random.default_rng(0).integers(len(places), size=(TRIPLES, 3))]
@@ -230,16 +251,15 @@ def _vote_for_circle(
         return None
     dx, dy = (edges[None, ..., k] - circles[:, k, None, None] for k in (0, 1))
     off = np.abs(np.sqrt(dx * dx + dy * dy) - circles[:, 2, None, None])
-    near = (
-        np.fmin.reduce(off, 2, initial=np.inf) / pixel_m
-    )  # where there are fewer edges, the others count
+    # `fmin` leaves out the NaN of profiles with fewer edges.
+    near = np.fmin.reduce(off, 2, initial=np.inf) / pixel_m
     return circles[np.argmax(np.maximum(1 - (near / NEAR_PX) ** 2, 0.0).sum(1))]
 
 
 def _fit_circle(
     start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float, shape_px: float
-) -> tuple[np.ndarray | None, np.ndarray, float, float]:
-    """Returns the circle that fits the edges nearest to one, the covariance of its centre, its residual in px and its coverage."""
+) -> _CircleFit | None:
+    """Fit a circle to the edges nearest to one; `None` where too few determine it."""
     found = start
     for scale_px in (NARROW_PX, INLIER_PX, 0.6 * INLIER_PX):
         away = edges - found[:2]
@@ -256,30 +276,29 @@ def _fit_circle(
             weight[beside] = 0.0
         on = weight > 0
         if on.sum() < LEAST:
-            return None, np.zeros((2, 2)), 0.0, 0.0
+            return None
         slope = np.column_stack([-away / distance[:, None], -np.ones(len(rows))]) / pixel_m[:, None]
         heavy = slope[on] * weight[on, None]
         normal = heavy.T @ slope[on]
-        if np.linalg.cond(normal) > 1e8:
-            return None, np.zeros((2, 2)), 0.0, 0.0
+        if np.linalg.cond(normal) > DEGENERATE:
+            return None
         found = found - np.linalg.solve(normal, heavy.T @ off[on])
     rms_px = float(np.sqrt(np.average(off[on] ** 2, weights=weight[on])))
     spacing_m = 2 * np.pi * float(found[2]) / len(rows)
     alike = max((ALIKE_PX * float(np.median(pixel_m)) + ALIKE_M) / spacing_m, 1.0)
     angle = np.arctan2(away[on, 1], away[on, 0])
-    waves = [(center_px, 1.0)] + [(shape_px, number) for number in WAVES]
-    moves = np.column_stack(
-        [size * wave(number * angle) for size, number in waves for wave in (np.cos, np.sin)]
-    )
-    moved = np.linalg.solve(normal, heavy.T @ moves)[:2]
+    # Systematic errors: the first wave moves the centre itself, the others deform the rim.
+    moves = [center_px * np.cos(angle), center_px * np.sin(angle)]
+    for number in WAVES:
+        moves += [shape_px * np.cos(number * angle), shape_px * np.sin(number * angle)]
+    moved = np.linalg.solve(normal, heavy.T @ np.column_stack(moves))[:2]
     cov = np.linalg.inv(normal)[:2, :2] * rms_px**2 * alike + moved @ moved.T
-    return found, cov, rms_px, coverage
+    return _CircleFit(found, cov, rms_px, coverage)
 
 
 def _find_profiles_beside_gaps(on: np.ndarray) -> np.ndarray:
-    """Says which of the profiles around a circle, `(P,)` bool, lie in gaps of it or beside one."""
+    """Find profiles around a circle, `(P,)` bool, that lie in a gap or beside one."""
     place = np.arange(len(on))[:, None]
-    gap = (
-        np.count_nonzero(on[(place - np.arange(GAP)) % len(on)], axis=1) == 0
-    )  # the last ones of as many without an edge
+    # True at the last profile of each `GAP` in a row without an edge.
+    gap = np.count_nonzero(on[(place - np.arange(GAP)) % len(on)], axis=1) == 0
     return np.count_nonzero(gap[(place + np.arange(-BESIDE, GAP + BESIDE)) % len(on)], axis=1) > 0

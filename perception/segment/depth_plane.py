@@ -1,4 +1,9 @@
-"""A coarse grid of pixels with their lines of sight, and sums over many of them by rows and columns."""
+"""Segmentation of the block by depth alone: bounded planes in front of their surroundings.
+
+Inverse depth is the natural coordinate. On a plane `n · P = d` it is linear in the picture,
+`1/z = (n / d) · (x, y, 1)` with `(x, y)` the pixel over the focal length, and the noise of a stereo
+matcher in it is the same at every distance.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +20,16 @@ from brokk_rl.spec import spec
 from perception.pose.plane import DEGENERATE
 
 ONE, X, Y, XX, XY, YY = (0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)
-"""Powers of y and x, in which sums over pixels are kept."""
+"""Powers of y and x: indices of the sums over pixels."""
 
 
 @dataclass(frozen=True)
 class SightGrid:
-    """The pixels that a coarse picture keeps: the line of sight `(x, y, 1)` at depth 1 of each, by column and by row.
+    """Lines of sight `(x, y, 1)` of the pixels of a coarse picture.
 
     Attributes:
-        x: `(w,)`.
-        y: `(h,)`.
+        x: First coordinate of each column, `(w,)`.
+        y: Second coordinate of each row, `(h,)`.
     """
 
     x: np.ndarray
@@ -32,7 +37,7 @@ class SightGrid:
 
     @staticmethod
     def of(camera_matrix: np.ndarray, shape: tuple[int, ...], step: int) -> SightGrid:
-        """Returns that of the middles of cells of `step` x `step` px."""
+        """Return the grid of the middles of cells of `step` x `step` px."""
         y, x = (
             (
                 (np.arange(count) * step + step // 2 - camera_matrix[k, 2]) / camera_matrix[k, k]
@@ -42,30 +47,30 @@ class SightGrid:
         return SightGrid(x, y)
 
     def sight(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """Returns the lines of sight of some of them, `(…, 3)`."""
+        """Return lines of sight, `(…, 3)`."""
         return np.stack([self.x[columns], self.y[rows], np.ones(rows.shape, np.float32)], -1)
 
     @cached_property
     def half(self) -> SightGrid:
-        """Returns every second of them, in double precision."""
+        """Grid of every second row and column, in double precision."""
         return SightGrid(self.x[::2].astype(float), self.y[::2].astype(float))
 
     @cached_property
     def powers(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns 1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: what sums over pixels are made of, by rows and columns."""
+        """1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: sums over pixels are products with both."""
         across, down = (
             np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y)
         )
         return across, down
 
     def inverse(self, plane: np.ndarray) -> np.ndarray:
-        """Returns inverse depth on a plane, `(h, w)`."""
+        """Return inverse depth on a plane, `(h, w)`."""
         plane = plane.astype(self.x.dtype)
         return plane[0] * self.x + (plane[1] * self.y + plane[2])[:, None]
 
 
 def arrange_squares(sums: np.ndarray) -> np.ndarray:
-    """Returns the sums of the products of x, y and 1 with each other, `(3, 3)`, among those of `x^i y^j`, `[j, i]`."""
+    """Return the sums of products of x, y and 1, `(3, 3)`, from sums of `x^i y^j`, `[j, i]`."""
     return np.array(
         [[sums[j, i] for j, i in row] for row in ((XX, XY, X), (XY, YY, Y), (X, Y, ONE))]
     )
@@ -73,25 +78,25 @@ def arrange_squares(sums: np.ndarray) -> np.ndarray:
 
 @spec
 class DepthPlane:
-    """Takes planes that stand in front of their surroundings for the block; needs depth and no training.
+    """Take planes in front of their surroundings for the block; needs depth, no training.
 
     Attributes:
         width_px: Width of the picture in which planes are looked for.
         min_known: Part of the pixels whose depth must be known; a frame with less is refused.
         noise_per_m: Standard deviation of inverse depth, 1/m: disparity noise in px over focal
             length in px and baseline in m.
-        num_sigma: A pixel belongs to a plane within so many standard deviations.
-        num_trials: Planes through three pixels that are tried for each plane that is kept.
+        num_sigma: Tolerance of a plane in standard deviations.
+        num_trials: Planes through three pixels that are tried for each plane kept.
         num_samples: Pixels that judge a trial.
-        num_planes: Planes that are kept at most.
+        num_planes: Largest number of planes.
         neighbourhood: Width of the window from which the three pixels are drawn, as a part of the
             picture's width.
         min_area: Smallest face, as a part of the picture.
         min_extent_m: Smallest extent of a face.
-        max_extent_m: Largest extent of a face; what is larger is ground or wall.
+        max_extent_m: Largest extent of a face; larger planes are ground or wall.
         max_tilt_rad: Largest angle between the face's normal and the line of sight.
-        min_front: Of the surroundings that are not in the plane, at least this part must lie behind
-            it where the plane also holds something wider than a face.
+        min_front: Least part of the surroundings behind a piece of a plane that also holds a piece
+            larger than a face.
         edge_px: Radius of the filter that moves the mask's edge onto the picture's edge, in px of
             the small picture.
         edge_contrast: Grey step, of 1, below which the picture does not move the mask's edge.
@@ -126,11 +131,12 @@ class DepthPlane:
             )
         if not 0 < self.min_extent_m < self.max_extent_m:
             raise ConfigError(
-                f"segmenter: expected 0 < min_extent_m < max_extent_m, got {self.min_extent_m} and {self.max_extent_m}"
+                "segmenter: expected 0 < min_extent_m < max_extent_m, got "
+                f"{self.min_extent_m} and {self.max_extent_m}"
             )
 
     def build(self) -> PlaneSegmenter:
-        """Returns the segmenter."""
+        """Return the segmenter."""
         return PlaneSegmenter(self)
 
 
@@ -142,7 +148,7 @@ class PlaneSegmenter:
         self._tolerance = settings.num_sigma * settings.noise_per_m
 
     def segment(self, frame: Frame) -> Masks:
-        """Returns the block's mask; nobody has looked for mouths.
+        """Return the mask of the block; there is no hole mask.
 
         Raises:
             FrameError: too little depth is known.
@@ -152,8 +158,9 @@ class PlaneSegmenter:
         inverse, known = _shrink_depth(frame.depth_m, step)
         if known.mean() < self._settings.min_known:
             raise FrameError(
-                f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, depth_plane needs "
-                f"{self._settings.min_known:.0%}; check the depth camera, or segment by colour (perception/segmenter=onnx)"
+                f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, "
+                f"depth_plane needs {self._settings.min_known:.0%}; check the depth camera, or segment "
+                "by colour (perception/segmenter=onnx)"
             )
         grid = SightGrid.of(frame.camera_matrix, inverse.shape, step)
         face = np.zeros(inverse.shape, np.uint8)
@@ -181,7 +188,7 @@ class PlaneSegmenter:
         return Masks(mask, None)
 
     def _planes(self, grid: SightGrid, inverse: np.ndarray, known: np.ndarray) -> list[np.ndarray]:
-        """Returns planes `n / d`, `(3,)`, the best supported first: each explains pixels that those before it do not."""
+        """Return planes `n / d`, `(3,)`, the best supported first, each of pixels left by those before."""
         settings, generator = self._settings, np.random.default_rng(self._settings.seed)
         found, rest = [], known.copy()
         for _ in range(settings.num_planes):
@@ -214,7 +221,7 @@ class PlaneSegmenter:
         there: np.ndarray,
         generator: np.random.Generator,
     ) -> np.ndarray:
-        """Returns planes through three pixels of `rest` that lie near each other, at many scales, `(trials, 3)`."""
+        """Return planes through three neighbouring pixels of `rest`, at many scales, `(trials, 3)`."""
         count, (height, width) = self._settings.num_trials, inverse.shape
         row, column = np.divmod(there[generator.integers(len(there), size=count)], width)
         reach = width * self._settings.neighbourhood * generator.uniform(0.2, 1.0, count)
@@ -241,7 +248,7 @@ class PlaneSegmenter:
     def _refined(
         self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
-        """Returns the least-squares plane of the pixels that agree with `plane`."""
+        """Return the least-squares plane of the pixels that agree with `plane`."""
         grid, inverse, known = grid.half, inverse[::2, ::2], known[::2, ::2]
         across, down = grid.powers
         for _ in range(2):
@@ -258,7 +265,7 @@ class PlaneSegmenter:
     def _faces(
         self, plane: np.ndarray, grid: SightGrid, inverse: np.ndarray, known: np.ndarray
     ) -> np.ndarray:
-        """Returns where connected pieces of a plane look like a face of a block, `(h, w)` uint8 of 0 and 1."""
+        """Return the connected pieces of a plane that can be faces of a block, `(h, w)` uint8."""
         settings = self._settings
         excess = inverse - grid.inverse(plane)  # > 0: nearer than the plane
         support = (known & (np.abs(excess) < self._tolerance)).astype(np.uint8)
@@ -275,8 +282,8 @@ class PlaneSegmenter:
         pieces = [_fill_holes((labels == label).astype(np.uint8), nearer) for label in large]
         pieces = [piece for piece in pieces if piece[::2, ::2].any()]
         faces = np.zeros_like(support)
-        # ground or wall? so are the pieces of it that something before them cuts off; of a face
-        # that may hide all surroundings
+        # Ground and wall are too large for a face. Pieces that an occluder cuts off from them must
+        # also stand in front of their surroundings; a face by itself may have none in sight.
         extents_m = [_measure_extents(piece, plane, grid) for piece in pieces]
         wide = any(extent.prod() > settings.max_extent_m**2 for extent in extents_m)
         for piece, extent in zip(pieces, extents_m, strict=True):
@@ -284,8 +291,7 @@ class PlaneSegmenter:
                 not wide or self._front(piece, excess, known) >= settings.min_front
             ):
                 faces |= piece
-        # an arm before a face cuts it in pieces, of which the smaller ones have little but the arm
-        # around them
+        # An arm cuts a face into pieces; the smaller ones have hardly any surroundings but the arm.
         for piece in pieces if faces.any() else ():
             if _measure_extents(faces | piece, plane, grid).max() <= settings.max_extent_m:
                 faces |= piece
@@ -294,7 +300,7 @@ class PlaneSegmenter:
     def _fits(
         self, piece: np.ndarray, extents_m: np.ndarray, plane: np.ndarray, grid: SightGrid
     ) -> bool:
-        """Says whether a piece of a plane has the size of a face and looks at the camera."""
+        """Return whether a piece of a plane has the size of a face and is turned to the camera."""
         if (
             extents_m.min() < self._settings.min_extent_m
             or extents_m.max() > self._settings.max_extent_m
@@ -310,7 +316,7 @@ class PlaneSegmenter:
         return bool(tilt_rad <= self._settings.max_tilt_rad)
 
     def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
-        """Returns which part of what surrounds a piece lies behind its plane, a half where nothing speaks for either side."""
+        """Return the part of a piece's surroundings behind its plane, one half without evidence."""
         near, far = (cv2.dilate(piece, np.ones((size, size), np.uint8)) for size in (5, 9))
         ring = (far > near) & known
         behind = np.count_nonzero(excess[ring] < -self._tolerance)
@@ -322,7 +328,7 @@ class PlaneSegmenter:
 def snap_to_edges(
     mask: np.ndarray, gray: np.ndarray, radius_px: int, contrast: float
 ) -> np.ndarray:
-    """Moves the edges of a small mask onto those of a larger picture by a guided filter (He and Sun, Fast Guided Filter, 2015).
+    """Move the edges of a small mask onto those of a picture (fast guided filter, He and Sun 2015).
 
     Args:
         mask: `(h, w)` float32 in [0, 1].
@@ -354,21 +360,21 @@ def snap_to_edges(
 
 
 def _shrink_depth(depth_m: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns inverse depth in 1/m at the middle of each `step` x `step` cell, `(h, w)` float32, and where it is known."""
+    """Return inverse depth at the middle of each cell, 1/m, `(h, w)` float32, and its known mask."""
     depth = depth_m[step // 2 :: step, step // 2 :: step]
     known = np.isfinite(depth) & (depth > 0)
     return np.divide(1.0, depth, out=np.zeros(depth.shape, np.float32), where=known), known
 
 
 def _fill_holes(piece: np.ndarray, nearer: np.ndarray) -> np.ndarray:
-    """Fills a piece's holes (a mouth, lost depth), except where something stands in front of it."""
+    """Fill the gaps of a piece (a hole, lost depth), except where an occluder is."""
     outlines, _ = cv2.findContours(piece, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     whole = cv2.drawContours(np.zeros_like(piece), outlines, -1, 1, cv2.FILLED)
     return np.where(nearer > 0, np.uint8(0), np.asarray(whole, np.uint8))
 
 
 def _measure_extents(piece: np.ndarray, plane: np.ndarray, grid: SightGrid) -> np.ndarray:
-    """Returns the two extents in m that a rectangle with the piece's second moments would have."""
+    """Return the two extents in m that a rectangle with the piece's second moments would have."""
     depth = piece[::2, ::2] / np.maximum(grid.half.inverse(plane), 1e-6)
     across, down = grid.half.powers
     first, second = (

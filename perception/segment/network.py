@@ -1,8 +1,8 @@
-"""The block and the mouths of its holes by a network: in onnxruntime as shipped, or in torch as trained.
+"""Segmentation by a network: in onnxruntime as shipped, or in torch as trained.
 
-The network looks twice: at the whole picture for the block, then at the block alone, where a mouth
-has several times the pixels; once more if more of the block came to light then, and at parts of the
-picture where it saw none in the whole.
+The network runs on the whole picture for the block, then on the block alone, where a hole has
+several times the pixels. It runs once more where the block has grown, and on parts of the picture
+where the first run found no block.
 """
 
 from __future__ import annotations
@@ -24,29 +24,29 @@ SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the networks that come with the package."""
 SCHEMA = 1
 PREFIX = "brokk."
-"""Of our entries among the metadata of an ONNX file; each is JSON."""
+"""Prefix of our entries in the metadata of an ONNX file; each is JSON."""
 THRESHOLD = 0.5
+"""Probability from which a pixel belongs to a mask."""
 SMALLEST_PIECE = 0.2
-"""Of the pieces of a block that something hides in part, those below this share of the largest do
-not move the second look."""
-CLOSER_LOOKS, STAYS = 2, 0.1
-"""Looks at the block alone, at most; and by how much of its size its box changes if there is to be
-another one."""
+"""Least piece of a partly hidden block, as a part of the largest one, that the second run must show.
+Chosen by hand."""
+MAX_CLOSE_RUNS, STABLE = 2, 0.1
+"""Largest number of runs on the block alone; change of its box, as a part of its size, below which
+no other one follows. Chosen by hand."""
 
 Infer = Callable[[np.ndarray], np.ndarray]
-"""From a picture `(3, h, w)` float32 in [0, 1] to the probabilities of block and mouth, `(2, h,
+"""From a picture `(3, h, w)` float32 in [0, 1] to the probabilities of block and hole, `(2, h,
 w)`."""
 
 
 @spec
 class Onnx:
-    """Runs an exported network in onnxruntime; needs no torch.
+    """Run an exported network in onnxruntime; needs no torch.
 
     Attributes:
         weights: An ONNX file of `mode=train_perception`: a path, or the name of one that ships with
             the package.
-        margin: Room around the block at the second look, as a part of its box; `null`: no second
-            look.
+        margin: Room around the block in the second run, as a part of its box; `null`: one run.
         threads: CPU threads.
     """
 
@@ -60,7 +60,7 @@ class Onnx:
             raise ConfigError(f"segmenter.threads: expected 1 or more, got {self.threads}")
 
     def build(self) -> NetworkSegmenter:
-        """Returns the segmenter.
+        """Return the segmenter.
 
         Raises:
             CheckpointError: there is no such network, or it is none of ours.
@@ -100,13 +100,12 @@ class Onnx:
 
 @spec
 class Unet:
-    """Runs the network of a checkpoint in torch, on a GPU where there is one.
+    """Run the network of a checkpoint in torch, on a CPU or a GPU.
 
     Attributes:
         weights: A safetensors file of `mode=train_perception`: a path, or the name of one that
             ships with the package.
-        margin: Room around the block at the second look, as a part of its box; `null`: no second
-            look.
+        margin: Room around the block in the second run, as a part of its box; `null`: one run.
         device: `cpu`, `cuda` or `cuda:<index>`.
     """
 
@@ -118,7 +117,7 @@ class Unet:
         _check_margin(self.margin)
 
     def build(self) -> NetworkSegmenter:
-        """Returns the segmenter.
+        """Return the segmenter.
 
         Raises:
             CheckpointError: there is no such network, or it is none of ours.
@@ -136,56 +135,60 @@ class Unet:
 
 
 class NetworkSegmenter:
-    """A network at work on frames of any size.
+    """Apply a network to frames of any size.
 
     Args:
         infer: The network.
-        size_px: Width and height of its picture.
-        margin: Room around the block at the second look; `None` for one look.
+        size_px: Width and height of its input.
+        margin: Room around the block in the second run; `None` for one run.
     """
 
     def __init__(self, infer: Infer, size_px: tuple[int, int], margin: float | None) -> None:
         self._infer, self._size_px, self._margin = infer, size_px, margin
 
     def segment(self, frame: Frame) -> Masks:
-        """Returns both masks."""
+        """Return both masks."""
         window = cover_picture(frame.color.shape, self._size_px)
-        block, mouth = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
-        self._look(frame, window, block, mouth)
+        block, holes = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
+        self._write_masks(frame, window, block, holes)
         if self._margin is None:
-            return Masks(block, mouth)
+            return Masks(block, holes)
         box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
         if box is None:
             part = np.zeros_like(block)
             for half in tile_halves(block.shape, self._size_px):
-                self._look(frame, half, part, np.zeros_like(part))
+                self._write_masks(frame, half, part, np.zeros_like(part))
                 np.maximum(block, part, out=block)
             box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
-        for _ in range(CLOSER_LOOKS):
+        for _ in range(MAX_CLOSE_RUNS):
             closer = window if box is None else center_window(box, self._size_px, self._margin)
             if box is None or closer.width >= window.width:
                 break
-            mouth[:] = 0.0
-            self._look(frame, closer, block, mouth)
+            holes[:] = 0.0
+            self._write_masks(frame, closer, block, holes)
             before, box = box, bound_block(block, THRESHOLD, SMALLEST_PIECE)
-            if box is not None and np.abs(np.subtract(box, before)).max() < STAYS * max(before[2:]):
+            if box is not None and np.abs(np.subtract(box, before)).max() < STABLE * max(
+                before[2:]
+            ):
                 break
-        return Masks(block, mouth)
+        return Masks(block, holes)
 
-    def _look(self, frame: Frame, window: Window, block: np.ndarray, mouth: np.ndarray) -> None:
-        """Writes what the network says of a window where it belongs in both masks."""
+    def _write_masks(
+        self, frame: Frame, window: Window, block: np.ndarray, holes: np.ndarray
+    ) -> None:
+        """Write the network's answer for a window into both masks."""
         seen = self._infer(as_input(window.take(frame.color, self._size_px)))
         window.put(seen[0], block)
-        window.put(seen[1], mouth)
+        window.put(seen[1], holes)
 
 
 def as_input(picture: np.ndarray) -> np.ndarray:
-    """Returns what a network takes, `(3, h, w)` float32 in [0, 1], of a picture `(h, w, 3)` uint8."""
+    """Return the input of a network, `(3, h, w)` float32 in [0, 1], from `(h, w, 3)` uint8."""
     return np.ascontiguousarray(picture.transpose(2, 0, 1)).astype(np.float32) / np.float32(255.0)
 
 
 def find_weights(weights: str) -> Path:
-    """Returns the path of a network: as given if it exists, else the one of that name that ships with the package.
+    """Return the path of a network: the given file, or a shipped one of that name.
 
     Raises:
         CheckpointError: there is neither.
@@ -195,13 +198,14 @@ def find_weights(weights: str) -> Path:
             return path
     shipped = ", ".join(sorted(path.name for path in SHIPPED.glob("*.*"))) or "none"
     raise CheckpointError(
-        f"segmenter.weights: there is no file '{weights}' (seen from {Path.cwd()}), nor one of that name in the package "
-        f"({shipped}). `brokk mode=train_perception` makes one; perception/segmenter=depth_plane needs none."
+        f"segmenter.weights: there is no file '{weights}' (seen from {Path.cwd()}), nor one of that "
+        f"name in the package ({shipped}). `brokk mode=train_perception` makes one; "
+        "perception/segmenter=depth_plane needs none."
     )
 
 
 def check_size(path: Path, header: dict) -> tuple[int, int]:
-    """Returns width and height of a network's picture from the header of its file.
+    """Return width and height of a network's picture from the header of its file.
 
     Raises:
         CheckpointError: the header is not that of a segmenter that we can run.
@@ -212,8 +216,9 @@ def check_size(path: Path, header: dict) -> tuple[int, int]:
         or len(header.get("size_px", ())) != 2
     ):
         raise CheckpointError(
-            f"{path}: no segmenter of ours: expected schema {SCHEMA} and channels block, mouth, got schema "
-            f"{header.get('schema')} and {header.get('channels')}; train one with `brokk mode=train_perception`"
+            f"{path}: no segmenter of ours: expected schema {SCHEMA} and channels block, mouth, got "
+            f"schema {header.get('schema')} and {header.get('channels')}; train one with "
+            "`brokk mode=train_perception`"
         )
     width, height = header["size_px"]
     return int(width), int(height)

@@ -1,4 +1,4 @@
-"""What the renderer knows: the mask that lies beside a rendered or labelled frame."""
+"""Segmenter that reads the masks beside a rendered or labelled frame."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from perception import dataset
 
 @spec
 class TruthMasks:
-    """Reads the masks that lie beside a rendered or labelled frame; what a perfect segmenter would say."""
+    """Read the true masks beside a rendered or labelled frame; a perfect segmenter."""
 
     def build(self) -> TruthSegmenter:
-        """Returns the segmenter."""
+        """Return the segmenter."""
         return TruthSegmenter()
 
 
@@ -26,18 +26,20 @@ class TruthSegmenter:
     """A segmenter that has the answer."""
 
     def segment(self, frame: Frame) -> Masks:
-        """Returns the masks beside the frame.
+        """Return the masks beside the frame.
 
         Raises:
             FrameError: there are none, or they are of another size.
         """
         if not frame.name:
             raise FrameError(
-                "segmenter=truth reads the mask beside a frame on disk; this frame comes from a live source"
+                "segmenter=truth reads the mask beside a frame on disk; this frame comes from a live "
+                "source"
             )
         label = dataset.read_label(Path(frame.name))
         if label.block.shape != frame.color.shape[:2]:
             raise FrameError(
-                f"{frame.name}{dataset.MASK}: {label.block.shape[::-1]} px, the frame has {frame.color.shape[1::-1]}"
+                f"{frame.name}{dataset.MASK}: {label.block.shape[::-1]} px, the frame has "
+                f"{frame.color.shape[1::-1]}"
             )
         return Masks(label.block.astype(np.float32), label.hole_mask.astype(np.float32))

@@ -1,4 +1,4 @@
-"""The network: a small U-Net (Ronneberger et al., 2015) from a colour picture to the block and the mouths of its holes."""
+"""Small U-Net (Ronneberger et al., 2015): masks of block and holes from a colour picture."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from torch.nn import functional
 from brokk_rl.errors import CheckpointError
 
 CHANNELS = ("block", "mouth")
-"""What the network tells apart; channels overlap: a mouth lies in its block."""
+"""Channels of the output; they overlap, since a hole lies in its block."""
 DARKEST = 0.01
-"""Contrast below which a picture is not stretched any more: a few grey levels of 255."""
+"""Contrast added to a picture's own, so that noise is not stretched: a few grey levels of 255."""
 BRIGHTEST = 2.0
-"""Standard deviations from the mean beyond which nothing is any brighter or darker: a lit block on
-black ground is one of many."""
+"""Standard deviations from the mean at which brightness is clipped, so that a lit block on black
+ground is no special case."""
 
 
 class UNet(nn.Module):
@@ -39,8 +39,7 @@ class UNet(nn.Module):
             for before, after in zip((3, *widths[:-1]), widths, strict=True)
         )
         back = list(widths[::-1])
-        # each step up takes what came from below beside the bridge and leaves half as many, as the
-        # size above has
+        # Each step up joins its input and the bridge, and leaves the channels of the size above.
         below, steps = back[0], []
         for here, above in zip(back[1:], [*back[2:], back[-1]], strict=True):
             steps.append(_ConvolutionPair(below + here, above))
@@ -55,11 +54,9 @@ class UNet(nn.Module):
         return 2 ** (len(self.widths) - 1)
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
-        """Returns logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
-        # of the root, in which the noise of light is alike at every brightness, and what is in the
-        # shade is not all black; each picture by its own brightness and contrast: dusk and dust are
-        # the same picture then, but
-        # for the noise
+        """Return logits, `(B, 2, h, w)`, of RGB pictures `(B, 3, h, w)` in [0, 1]."""
+        # In the square root photon noise is the same at every brightness, and shade is not black.
+        # Each picture is normalised by its own brightness and contrast against dusk and dust.
         picture = picture.sqrt()
         mean = average_picture(picture)
         spread = average_picture((picture - mean).square()).sqrt()
@@ -82,7 +79,7 @@ class Probabilities(nn.Module):
         self.network = network
 
     def forward(self, picture: torch.Tensor) -> torch.Tensor:
-        """Returns probabilities, `(B, 2, h, w)`."""
+        """Return probabilities, `(B, 2, h, w)`."""
         return torch.sigmoid(self.network(picture))
 
 
@@ -100,7 +97,8 @@ def read_checkpoint(path: Path) -> tuple[UNet, dict[str, Any]]:
         network.load_state_dict(tensors)
     except (SafetensorError, OSError, KeyError, ValueError, RuntimeError) as error:
         raise CheckpointError(
-            f"{path}: corrupt or no segmenter of ours ({error}); `brokk mode=train_perception` makes one"
+            f"{path}: corrupt or no segmenter of ours ({error}); `brokk mode=train_perception` makes "
+            "one"
         ) from error
     return network.eval().requires_grad_(False), header
 
@@ -117,21 +115,21 @@ def build_inference(network: UNet, device: torch.device) -> Callable[[np.ndarray
 
 
 def average_picture(values: torch.Tensor) -> torch.Tensor:
-    """Returns the mean of each picture, `(B, 1, 1, 1)`."""
-    # of means of rows: ONNX Runtime would add all 184,320 numbers of a picture one after the other
+    """Return the mean of each picture, `(B, 1, 1, 1)`."""
+    # Rows first: ONNX Runtime adds all 184,320 numbers of a picture in sequence, with rounding errors.
     return values.mean(3, keepdim=True).mean((1, 2), keepdim=True)
 
 
 def compute_loss(logits: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-    """Returns binary cross-entropy plus Dice (Milletari et al., 2016), both averaged over the channels.
+    """Return binary cross-entropy plus Dice (Milletari et al., 2016), both averaged over the channels.
 
     Args:
         logits: `(B, 2, h, w)`.
-        target: Share of each pixel that shows the channel, same shape, in [0, 1].
+        target: Part of each pixel that shows the channel, same shape, in [0, 1].
     """
     entropy = functional.binary_cross_entropy_with_logits(logits, target)
     probability = torch.sigmoid(logits)
-    # over the whole batch: a picture without a hole has no overlap of its own to speak of
+    # Over the whole batch: the overlap of a picture without a hole is undefined.
     shared, both = (probability * target).sum((0, 2, 3)), (probability + target).sum((0, 2, 3))
     return entropy + (1.0 - (2.0 * shared + 1.0) / (both + 1.0)).mean()
 

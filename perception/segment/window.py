@@ -1,4 +1,4 @@
-"""Windows: the part of a picture that a network looks at, brought to the network's size and back without changing its shape."""
+"""Windows: parts of a picture, brought to the network's size and back at a fixed aspect ratio."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Window:
-    """A rectangle of a picture, in px of the picture; it may reach beyond the picture, where all is black.
+    """A rectangle of a picture, px; it may reach beyond the picture, where all is black.
 
     Attributes:
         left: First column.
@@ -25,11 +25,11 @@ class Window:
     height: int
 
     def take(self, picture: np.ndarray, size_px: tuple[int, int]) -> np.ndarray:
-        """Returns what the window shows, `(h, w)` or `(h, w, c)` of the picture's type.
+        """Return the picture in the window, `(h, w)` or `(h, w, c)` of the picture's type.
 
         Args:
             picture: `(H, W)` or `(H, W, c)`.
-            size_px: Width and height to return, of the window's shape.
+            size_px: Width and height of the result, of the window's aspect ratio.
         """
         source, target = self._shared(picture.shape, size_px)
         out = np.zeros((size_px[1], size_px[0], *picture.shape[2:]), picture.dtype)
@@ -42,7 +42,7 @@ class Window:
         return out
 
     def put(self, values: np.ndarray, into: np.ndarray) -> None:
-        """Writes what was found in the window, `(h, w)`, where it belongs in `into`, `(H, W)` float32."""
+        """Write values of the window, `(h, w)`, to their place in `into`, `(H, W)` float32."""
         source, target = self._shared(into.shape, (values.shape[1], values.shape[0]))
         if target is not None:
             place = into[source]
@@ -53,7 +53,7 @@ class Window:
     def _shared(
         self, shape: tuple[int, ...], size_px: tuple[int, int]
     ) -> tuple[tuple[slice, slice], tuple[slice, slice] | None]:
-        """Returns rows and columns of the picture that lie in the window, and where in `size_px` they go; `None`: nowhere."""
+        """Return the part of the picture in the window, and its place in `size_px`; `None` for nowhere."""
         source, target = [], []
         for begin, length, limit, size in (
             (self.top, self.height, shape[0], size_px[1]),
@@ -70,12 +70,12 @@ class Window:
 
 
 def cover_picture(shape: tuple[int, ...], size_px: tuple[int, int]) -> Window:
-    """Returns the smallest window of the shape of `size_px` (width, height) that holds a picture `(H, W)`, in its middle."""
+    """Return the smallest window of the aspect ratio of `size_px` around a whole picture `(H, W)`."""
     return center_window((0, 0, shape[1], shape[0]), size_px, 0.0)
 
 
 def tile_halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window]:
-    """Returns six windows of half the size of a picture `(H, W)` that overlap and together hold nearly all of it."""
+    """Return six overlapping windows of half the size of a picture `(H, W)` that cover most of it."""
     height, width = shape[:2]
     corners = [
         (across * width, down * height) for down in (0.05, 0.45) for across in (0.0, 0.25, 0.5)
@@ -86,7 +86,7 @@ def tile_halves(shape: tuple[int, ...], size_px: tuple[int, int]) -> list[Window
 def center_window(
     box: tuple[float, float, float, float], size_px: tuple[int, int], margin: float
 ) -> Window:
-    """Returns the window of the shape of `size_px` in whose middle a box lies.
+    """Return the window of the aspect ratio of `size_px` around the middle of a box.
 
     Args:
         box: Left, top, width and height, px.
@@ -107,12 +107,12 @@ def center_window(
 def bound_block(
     block: np.ndarray, threshold: float, smallest: float
 ) -> tuple[int, int, int, int] | None:
-    """Returns the box (left, top, width, height) around the block, px; `None` where there is none.
+    """Return the box (left, top, width, height) around the block, px; `None` where there is none.
 
     Args:
         block: Probability of the block, `(h, w)`.
-        threshold: From which on a pixel counts.
-        smallest: Pieces below this part of the largest one do not count.
+        threshold: Probability from which a pixel is block.
+        smallest: Least size of a piece, as a part of the largest one.
     """
     count, _, stats, _ = cv2.connectedComponentsWithStats((block > threshold).astype(np.uint8))
     if count < 2:

@@ -1,4 +1,4 @@
-"""Frames of a folder, one after the other."""
+"""Frames of a folder, in the order of their names."""
 
 from __future__ import annotations
 
@@ -24,19 +24,17 @@ _PNG_HEAD = b"\x89PNG\r\n\x1a\n"
 
 @spec
 class FrameFolder:
-    """Replays the frames of a folder; `camera.yaml` holds for all of them.
+    """Replay the frames of a folder; `camera.yaml` holds for all of them.
 
     Attributes:
-        folder: Where they lie.
-        rate_hz: How fast they followed each other; gives frame `k` the time k / rate_hz.
-        least_known: Part of the picture whose depth must be known.
-        needs: What a frame must have. `depth`: all of it. `camera`: `camera.yaml`; depth may be
-            missing, which is enough for a
-            board or a network. `nothing`: photographs, grey ones too, are enough to look for
-                ellipses in.
+        folder: The folder.
+        rate_hz: Frame rate; gives frame `k` the time k / rate_hz.
+        least_known: Least part of the picture with known depth.
+        needs: Required files of a frame. `depth`: all. `camera`: `camera.yaml`, but no depth: for
+            boards and networks. `nothing`: any photographs, grey ones too, for ellipses alone.
         base_from_camera: Pose of the camera in the base frame: `calibration.yaml` of
             `mode=calibrate`, or `(4, 4)`; `null` takes `T_base_cam` of `camera.yaml`.
-        stereo: Makes the depth of a frame that has a right picture and no depth.
+        stereo: Computes the depth of a frame that has a right picture and no depth.
     """
 
     folder: str
@@ -49,17 +47,18 @@ class FrameFolder:
     def check(self) -> None:
         if self.rate_hz <= 0 or not 0 <= self.least_known <= 1:
             raise ConfigError(
-                f"source: expected rate_hz above 0 and least_known from 0 to 1, got {self.rate_hz} and {self.least_known}"
+                "source: expected rate_hz above 0 and least_known from 0 to 1, got "
+                f"{self.rate_hz} and {self.least_known}"
             )
 
     def build(self) -> FolderSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         return FolderSource(self)
 
 
 @dataclass(frozen=True)
 class CameraModel:
-    """What `camera.yaml` says; see `brokk_rl.signals.Frame`."""
+    """Content of `camera.yaml`; see `brokk_rl.signals.Frame`."""
 
     matrix: np.ndarray
     distortion: np.ndarray | None
@@ -69,10 +68,10 @@ class CameraModel:
 
 
 def read_camera(path: Path) -> CameraModel:
-    """Reads `camera.yaml`.
+    """Read `camera.yaml`.
 
     Raises:
-        FrameError: it is missing, is no YAML, or says what cannot be.
+        FrameError: it is missing, is no YAML, or holds impossible values.
     """
     try:
         told = yaml.safe_load(path.read_text())
@@ -101,7 +100,7 @@ def read_camera(path: Path) -> CameraModel:
 
 
 def read_picture(path: Path) -> np.ndarray:
-    """Returns a picture as it stands in the file, blue first.
+    """Return a picture as OpenCV reads it, blue first.
 
     Raises:
         FrameError: it is missing, truncated, or no picture.
@@ -131,7 +130,7 @@ class FolderSource:
 
     @property
     def num_frames(self) -> int:
-        """How many frames there are."""
+        """Number of frames."""
         return len(self._stems) or len(dataset.list_stems(self._place))
 
     def __enter__(self) -> FolderSource:
@@ -151,7 +150,7 @@ class FolderSource:
         self._stems = []
 
     def read_latest(self) -> Frame | None:
-        """Returns the next frame, `None` after the last.
+        """Return the next frame, `None` after the last.
 
         Raises:
             FrameError: it cannot be used; the next call goes on with the one after it.
@@ -190,7 +189,7 @@ class FolderSource:
     def _depth(
         self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
     ) -> np.ndarray:
-        """Returns the depth of a frame: what is stored, else what its two pictures tell."""
+        """Return the stored depth of a frame, else that of its two pictures."""
         stored, millimetres = (
             stem.with_name(stem.name + ending) for ending in (dataset.DEPTH, dataset.DEPTH_MM)
         )
@@ -209,11 +208,13 @@ class FolderSource:
             return np.full(color.shape[:2], np.nan, np.float32)
         if right is None:
             raise FrameError(
-                f"{stem}: no depth; expected {stored.name}, {millimetres.name}, or {stem.name}{dataset.RIGHT} to match with"
+                f"{stem}: no depth; expected {stored.name}, {millimetres.name}, or "
+                f"{stem.name}{dataset.RIGHT} to match with"
             )
         if camera.baseline_m is None or camera.distortion is not None:
             raise FrameError(
-                f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in {dataset.CAMERA}"
+                f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in "
+                f"{dataset.CAMERA}"
             )
         matched = self._settings.stereo.depth_m(
             color, right, float(camera.matrix[0, 0]), camera.baseline_m
@@ -229,14 +230,17 @@ def _load_array(path: Path) -> np.ndarray:
 
 
 def _guess_camera_matrix(height: int, width: int) -> np.ndarray:
-    """Returns the camera matrix of an ordinary lens, for pictures of which nothing is known."""
+    """Return the camera matrix of a lens of 53 degrees, for pictures of unknown cameras."""
     return np.array(
         [[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]]
     )
 
 
 def _is_whole_png(data: bytes) -> bool:
-    """Says whether all chunks of a PNG are there with the right check sums; OpenCV fills what is missing with black."""
+    """Return whether all chunks of a PNG are there with the right check sums.
+
+    OpenCV fills a truncated picture with black and reports nothing.
+    """
     place = len(_PNG_HEAD)
     while place + 12 <= len(data):
         length = int.from_bytes(data[place : place + 4], "big")

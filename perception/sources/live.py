@@ -1,4 +1,4 @@
-"""What live cameras share: fresh frames only, a time limit, and depth without invented values."""
+"""Live cameras: fresh frames only, a time limit, and depth without invented values."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from perception.sources import validation
 
 @dataclass(frozen=True)
 class LensCalibration:
-    """What a camera says of itself: camera matrix `(3, 3)`, distortion or `None`, baseline in m or `None`."""
+    """Calibration of a camera: matrix `(3, 3)`, distortion or `None`, baseline in m or `None`."""
 
     matrix: np.ndarray
     distortion: np.ndarray | None
@@ -25,7 +25,7 @@ class LensCalibration:
 
 @dataclass(frozen=True)
 class RawCapture:
-    """One capture: RGB, depth in m as the camera tells it (0, NaN and infinite where unknown), time it was taken, right picture."""
+    """One capture: RGB, raw depth in m (0, NaN or infinite where unknown), time, right picture."""
 
     color: np.ndarray
     depth_m: np.ndarray
@@ -37,35 +37,35 @@ class CameraDevice(Protocol):
     """A camera's own library, behind three methods."""
 
     def open(self) -> LensCalibration:
-        """Opens the camera; raises a `FrameError` when that fails."""
+        """Open the camera; raises a `FrameError` when that fails."""
         ...
 
     def capture(self, timeout_s: float) -> RawCapture | None:
-        """Waits for a new capture; `None` when there is none within the time."""
+        """Wait for a new capture; `None` when there is none within the time."""
         ...
 
     @property
     def has_ended(self) -> bool:
-        """Whether no capture will come any more: a recording is at its end."""
+        """True once no capture will come any more: a recording is at its end."""
         ...
 
     def now_s(self) -> float:
-        """Returns the time on the clock by which captures are stamped."""
+        """Return the time on the clock by which captures are stamped."""
         ...
 
     def close(self) -> None:
-        """Closes the camera; may be called twice."""
+        """Close the camera; may be called twice."""
         ...
 
 
 @spec
 class Freshness:
-    """What counts as a frame that one may act on.
+    """Limits of frames to act on.
 
     Attributes:
-        timeout_s: How long `read_latest` waits for a frame.
-        max_age_s: Older frames are dropped; a camera that only delivers such is as good as silent.
-        least_known: Part of the picture whose depth must be known.
+        timeout_s: Longest wait of `read_latest` for a frame.
+        max_age_s: Largest age of a frame; older ones are dropped.
+        least_known: Least part of the picture with known depth.
     """
 
     timeout_s: float
@@ -75,8 +75,8 @@ class Freshness:
     def check(self) -> None:
         if min(self.timeout_s, self.max_age_s) <= 0 or not 0 <= self.least_known <= 1:
             raise ConfigError(
-                f"source.fresh: expected timeout_s and max_age_s above 0, least_known from 0 to 1, got {self.timeout_s}, "
-                f"{self.max_age_s} and {self.least_known}"
+                "source.fresh: expected timeout_s and max_age_s above 0, least_known from 0 to 1, got "
+                f"{self.timeout_s}, {self.max_age_s} and {self.least_known}"
             )
 
 
@@ -84,12 +84,11 @@ class LiveSource:
     """An open camera; see `brokk_rl.contracts.vision.FrameSource`. Each frame is returned once.
 
     Args:
-        device: The camera's library.
-        name: What it is called in messages.
-        fresh: Which frames are too old, and how long to wait.
-        base_from_camera: Where the camera is in the base frame, `(4, 4)`; `None` where nobody
-            knows.
-        camera_cov: How uncertain that is, see `Frame`.
+        device: Library of the camera.
+        name: Name of the camera in messages.
+        fresh: Limits of age and waiting time.
+        base_from_camera: Pose of the camera in the base frame, `(4, 4)`; `None` for unknown.
+        camera_cov: Covariance of that pose, see `Frame`.
     """
 
     num_frames = None
@@ -123,7 +122,7 @@ class LiveSource:
         self._device.close()
 
     def read_latest(self) -> Frame | None:
-        """Returns the newest frame, waiting for one that has not been returned yet and is not too old; `None` after a recording.
+        """Return the newest fresh frame not returned yet, waiting for it; `None` after a recording.
 
         Raises:
             FrameError: no such frame came in time, or it cannot be used.
@@ -146,7 +145,8 @@ class LiveSource:
         stale = (
             ""
             if oldest_s is None
-            else f"; the frames that came were up to {oldest_s:.2f} s old, {self._fresh.max_age_s:g} allowed"
+            else f"; the frames that came were up to {oldest_s:.2f} s old, "
+            f"{self._fresh.max_age_s:g} allowed"
         )
         raise FrameError(
             f"{self._name}: no new frame for {self._fresh.timeout_s:g} s{stale}. Is it plugged in?"

@@ -1,4 +1,4 @@
-"""Pictures of a folder, whatever they are called: enough to look for ellipses."""
+"""All pictures of a folder, for the detection of ellipses."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from brokk_rl.spec import spec
 
 ENDINGS = {".png", ".jpg", ".jpeg", ".bmp", ".pgm", ".ppm", ".tif", ".tiff", ".webp"}
 BESIDE = (".depth.png", ".right.png", ".mask.png")
-"""What lies beside the colour picture of a frame."""
+"""Endings of files beside the colour picture of a frame."""
 
 
 @spec
 class PictureFolder:
-    """Every picture of a folder, coloured or grey, without depth and without a camera.
+    """Read every picture of a folder, coloured or grey, without depth and camera.
 
     Attributes:
-        folder: Where they lie, or one picture.
+        folder: The folder, or one picture.
     """
 
     folder: str
 
     def build(self) -> PictureSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         return PictureSource(Path(self.folder))
 
 
@@ -42,7 +42,7 @@ class PictureSource:
 
     @property
     def num_frames(self) -> int:
-        """How many pictures there are."""
+        """Number of pictures."""
         return len(self._paths)
 
     def __enter__(self) -> PictureSource:
@@ -68,7 +68,7 @@ class PictureSource:
         self._paths = []
 
     def read_latest(self) -> Frame | None:
-        """Returns the next picture, `None` after the last.
+        """Return the next picture, `None` after the last.
 
         Raises:
             FrameError: it cannot be read; the next call goes on with the one after it.

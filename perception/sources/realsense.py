@@ -1,4 +1,4 @@
-"""A RealSense camera through its own library (`pyrealsense2`), which is imported only when the camera is opened."""
+"""RealSense cameras through `pyrealsense2`, which is imported when the camera is opened."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from perception.sources.live import Freshness, LensCalibration, LiveSource, RawC
 
 @spec
 class RealSense:
-    """A RealSense camera: colour, and depth aligned to it; its own hole filling is left off.
+    """Read a RealSense camera: colour, and depth aligned to it, without hole filling.
 
     Attributes:
-        serial: Which camera, by serial number; `null` for the only one.
+        serial: Serial number of the camera; `null` for the only one.
         width: Pixels.
         height: Pixels.
         rate_hz: Pictures a second.
         base_from_camera: Pose of the colour camera in the base frame: `calibration.yaml` of
             `mode=calibrate`, or `(4, 4)`; `null` where unknown.
-        fresh: Which frames are too old, and how long to wait.
+        fresh: Limits of age and waiting time.
     """
 
     serial: str | None
@@ -37,7 +37,7 @@ class RealSense:
     fresh: Freshness
 
     def build(self) -> LiveSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         place = load_extrinsics(self.base_from_camera, "source.base_from_camera")
         return LiveSource(
             RealSenseDevice(self), "RealSense camera", self.fresh, place.base_from_camera, place.cov
@@ -55,7 +55,7 @@ class RealSenseDevice:
         self._started = False
 
     def open(self) -> LensCalibration:
-        """Opens the camera.
+        """Open the camera.
 
         Raises:
             FrameError: there is no library, no camera, or it cannot do what is asked of it.
@@ -78,7 +78,8 @@ class RealSenseDevice:
             profile = self._pipeline.start(config)
         except RuntimeError as error:
             raise FrameError(
-                f"RealSense camera: cannot be opened at {size[0]} x {size[1]}, {settings.rate_hz} Hz ({error})"
+                f"RealSense camera: cannot be opened at {size[0]} x {size[1]}, {settings.rate_hz} Hz "
+                f"({error})"
             ) from error
         self._started = True
         self._scale_m = float(profile.get_device().first_depth_sensor().get_depth_scale())
@@ -92,7 +93,7 @@ class RealSenseDevice:
         )
 
     def capture(self, timeout_s: float) -> RawCapture | None:
-        """Returns the next capture, `None` when there is none in time."""
+        """Return the next capture, `None` when there is none in time."""
         try:
             frames = self._align.process(
                 self._pipeline.wait_for_frames(max(1, int(1000 * timeout_s)))
@@ -104,28 +105,28 @@ class RealSenseDevice:
             return None
         # copies: the library reuses its memory
         values = np.asanyarray(depth.get_data()).astype(np.float32) * np.float32(self._scale_m)
-        # without its global time the library stamps by the camera's own clock, which nobody else
-        # knows: the time of arrival, then
+        # Without its global time the library stamps by the camera's own clock, whose offset is
+        # unknown: the time of arrival serves then.
         own_clock = color.get_frame_timestamp_domain() == self._rs.timestamp_domain.hardware_clock
         t_s = time.time() if own_clock else float(color.get_timestamp()) * 1e-3
         return RawCapture(np.array(color.get_data(), np.uint8), values, t_s)
 
     def now_s(self) -> float:
-        """Returns the host's time: captures are stamped by it."""
+        """Return the host's time: captures are stamped by it."""
         return time.time()
 
     def close(self) -> None:
-        """Closes the camera."""
+        """Close the camera."""
         if self._started:
             self._started = False
             self._pipeline.stop()
 
 
 def invert_distortion(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Returns OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens of which the inverse is told, `(5,)`.
+    """Return OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens given by the inverse ones, `(5,)`.
 
-    OpenCV's polynomial says where a ray is seen, RealSense's inverse one, the same in form, which
-    ray is seen; the nearest of the first kind is found on a grid over the picture.
+    OpenCV's polynomial maps rays to pixels, RealSense's inverse one of the same form pixels to rays.
+    Fitted by least squares on a grid over the picture.
 
     Args:
         inverse: Coefficients of the inverse.
@@ -145,7 +146,7 @@ def invert_distortion(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, 
 
 
 def _tabulate_distortion(point: np.ndarray) -> np.ndarray:
-    """Returns by how much each coefficient moves points `(2, M)` of the plane z = 1, `(2, M, 5)`."""
+    """Return the displacement of points `(2, M)` at z = 1 per coefficient, `(2, M, 5)`."""
     x, y = point
     r2 = x * x + y * y
     along_x = np.stack([x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3], -1)

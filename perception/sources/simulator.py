@@ -24,21 +24,20 @@ from perception.stereo import Stereo
 
 @spec
 class SimulatedCamera:
-    """A rendered camera that looks at the scene of the borehole task.
+    """Render the scene of the borehole task.
 
     Attributes:
-        rig: The camera pair.
-        surroundings: Gives concrete, light, dust and ground; the block itself is the task's.
-        stereo: Makes the depth.
-        task_scene: What is seen until somebody shows something else: `hole_x_m hole_y_m rim_z_m
-            yaw_rad block_scale hole_radius_m`, as the task's scenes are told.
+        rig: Camera pair.
+        surroundings: Concrete, light, dust and ground; the block itself is that of the task.
+        stereo: Computes the depth.
+        task_scene: Scene before the first `show`: `hole_x_m hole_y_m rim_z_m yaw_rad block_scale
+            hole_radius_m`, as in the task.
         block_m: Length, width and height of a block of scale 1.
-        hole_depth_m: Of the hole.
+        hole_depth_m: Depth of the hole.
         arm_m: Radius of the arm's links and of the tool.
-        num_frames: Frames until the source is at its end.
-        rate_hz: Gives frame `k` the time k / rate_hz.
-        seed: Of stains, light and noise; these stay the same as long as the scene does, but for the
-            noise.
+        num_frames: Number of frames.
+        rate_hz: Frame rate; gives frame `k` the time k / rate_hz.
+        seed: Seed of stains and light, which stay the same, and of noise, which does not.
     """
 
     rig: StereoRig
@@ -64,18 +63,19 @@ class SimulatedCamera:
             )
         if not 0 < self.hole_depth_m < self.block_m[2]:
             raise ConfigError(
-                f"source: a hole of {self.hole_depth_m} m does not fit into a block {self.block_m[2]} m high"
+                f"source: a hole of {self.hole_depth_m} m does not fit into a block "
+                f"{self.block_m[2]} m high"
             )
 
     def build(self) -> SimulatedSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         return SimulatedSource(self)
 
 
 class SimulatedSource:
     """An open simulated camera; see `brokk_rl.contracts.vision.FrameSource`.
 
-    Whoever runs the simulation calls `show` before each `read_latest`.
+    The simulation calls `show` before each `read_latest`.
     """
 
     def __init__(self, settings: SimulatedCamera) -> None:
@@ -93,7 +93,7 @@ class SimulatedSource:
 
     @property
     def num_frames(self) -> int:
-        """How many frames there are."""
+        """Number of frames."""
         return self._settings.num_frames
 
     def __enter__(self) -> SimulatedSource:
@@ -104,7 +104,7 @@ class SimulatedSource:
         self._count = -1
 
     def show(self, task_scene: Sequence[float], chain_in_base_m: np.ndarray) -> None:
-        """Sets what is seen.
+        """Set the scene.
 
         Args:
             task_scene: See `Simulated.task_scene`.
@@ -117,7 +117,7 @@ class SimulatedSource:
         )
 
     def read_latest(self) -> Frame | None:
-        """Returns a frame of what is shown now, `None` after `num_frames`.
+        """Return a frame of the present scene, `None` after `num_frames`.
 
         Raises:
             FrameError: the source is not open, or the hole is behind the camera.
@@ -135,7 +135,7 @@ class SimulatedSource:
         )  # fmt: skip
 
     def shot(self, noise: np.random.Generator) -> RenderedFrame:
-        """Returns what is shown now, with its truth."""
+        """Return what is shown now, with its truth."""
         settings, kind = self._settings, self._settings.surroundings
         chance = np.random.default_rng(settings.seed)  # the same stains and light for every frame
         x, y, z, yaw, scale, radius_m = self._scene
@@ -143,7 +143,8 @@ class SimulatedSource:
         target = from_base[:3, :3] @ [x, y, z] + from_base[:3, 3]
         if target[2] < 0.2:
             raise FrameError(
-                f"simulated camera: the hole at {self._scene[:3]} m in the base frame is behind the camera"
+                f"simulated camera: the hole at {self._scene[:3]} m in the base frame is behind the "
+                "camera"
             )
         half = np.array(settings.block_m) / 2 * [scale, scale, 1.0]
         turn = np.array(
@@ -171,7 +172,7 @@ class SimulatedSource:
         return self._studio.shot(scene, noise)
 
     def _arm(self, from_base: np.ndarray) -> list[Solid]:
-        """Returns the links as cylinders from point to point, in camera coordinates."""
+        """Return the links as cylinders from point to point, in camera coordinates."""
         points = self._chain @ from_base[:3, :3].T + from_base[:3, 3]
         parts: list[Solid] = []
         for number, (start, end) in enumerate(pairwise(points)):

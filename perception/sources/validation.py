@@ -1,4 +1,4 @@
-"""What a frame must be like before anything is made of it; every refusal says what was expected and what came."""
+"""Validation of frames and calibrations; a refusal names the expected and the given value."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ from brokk_rl.errors import FrameError
 
 _NUM_DISTORTION = (0, 4, 5, 8, 12, 14)
 _FIELD_RATIO = (0.25, 12.0)
-"""Focal length over the picture's width: from a fisheye of 127 degrees to a telescope of 5."""
+"""Range of focal length over width: from a fisheye of 127 degrees to a telescope of 5."""
 _ASPECT = (0.8, 1.25)
 _CENTER = 0.25
-"""The principal point is no farther from the middle than this part of the picture's size."""
+"""Largest distance of the principal point from the middle, as a part of the picture's size."""
 _FARTHEST_M = 200.0
-"""A median depth beyond this is one in millimetres."""
+"""Median depth beyond which the unit must be mm."""
 _RIGID = 1e-3
+"""Largest departure of a rotation from orthonormality: of matrices written with three digits."""
 
 
 def check_matrix(value: Any, where: str) -> np.ndarray:
-    """Returns a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
+    """Return a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
     found = _parse_numbers(value, (3, 3), f"{where}: K")
     if found[0, 0] <= 0 or found[1, 1] <= 0:
         raise FrameError(
@@ -42,7 +43,7 @@ def check_matrix(value: Any, where: str) -> np.ndarray:
 
 
 def check_matrix_fits(camera_matrix: np.ndarray, height: int, width: int, where: str) -> None:
-    """Refuses a camera matrix that cannot be that of a picture of this size."""
+    """Refuse a camera matrix that cannot be that of a picture of this size."""
     ratio = camera_matrix[0, 0] / width
     if not _FIELD_RATIO[0] <= ratio <= _FIELD_RATIO[1]:
         raise FrameError(
@@ -61,7 +62,7 @@ def check_matrix_fits(camera_matrix: np.ndarray, height: int, width: int, where:
 
 
 def check_distortion(value: Any, where: str) -> np.ndarray | None:
-    """Returns distortion coefficients, `None` where all of them are 0."""
+    """Return distortion coefficients, `None` where all of them are 0."""
     found = np.asarray(
         _parse_numbers([] if value is None else value, None, f"{where}: dist")
     ).reshape(-1)
@@ -75,7 +76,7 @@ def check_distortion(value: Any, where: str) -> np.ndarray | None:
 
 
 def check_pose(value: Any, where: str) -> np.ndarray:
-    """Returns a pose, `(4, 4)`, or raises a `FrameError` where it is none."""
+    """Return a pose, `(4, 4)`, or raises a `FrameError` where it is none."""
     found = _parse_numbers(value, (4, 4), f"{where}: T_base_cam")
     turn = found[:3, :3]
     if (
@@ -90,7 +91,7 @@ def check_pose(value: Any, where: str) -> np.ndarray:
 
 
 def check_baseline(value: Any, where: str) -> float:
-    """Returns a baseline in m, or raises a `FrameError` where it is none."""
+    """Return a baseline in m, or raises a `FrameError` where it is none."""
     found = float(_parse_numbers(value, (), f"{where}: baseline_m"))
     if not 1e-3 <= found <= 3.0:
         raise FrameError(f"{where}: baseline_m is {found:g}, expected 0.001 to 3 m; is it in mm?")
@@ -98,7 +99,7 @@ def check_baseline(value: Any, where: str) -> float:
 
 
 def convert_color(picture: np.ndarray, where: str) -> np.ndarray:
-    """Returns a picture as RGB, `(h, w, 3)` uint8; it comes as OpenCV reads it, blue first."""
+    """Return a picture as RGB, `(h, w, 3)` uint8; it comes as OpenCV reads it, blue first."""
     if picture.ndim != 3 or picture.shape[2] not in (3, 4):
         raise FrameError(f"{where}: a grey picture, expected colour (3 channels of 8 bits)")
     if picture.dtype != np.uint8:
@@ -107,7 +108,7 @@ def convert_color(picture: np.ndarray, where: str) -> np.ndarray:
 
 
 def convert_png_depth(picture: np.ndarray, where: str) -> np.ndarray:
-    """Returns depth in m, `(h, w)` float32 with NaN, of a picture in mm."""
+    """Return depth in m, `(h, w)` float32 with NaN, of a picture in mm."""
     if picture.ndim != 2:
         raise FrameError(
             f"{where}: {picture.shape[2]} channels, expected one of 16 bits (depth in mm)"
@@ -120,7 +121,7 @@ def convert_png_depth(picture: np.ndarray, where: str) -> np.ndarray:
 
 
 def check_depth(values: np.ndarray, where: str, least_known: float) -> np.ndarray:
-    """Returns depth in m, `(h, w)` float32, NaN where it was 0, negative or infinite: none of these is a depth."""
+    """Return depth in m, `(h, w)` float32, NaN in place of 0, negative and infinite values."""
     if values.ndim != 2:
         raise FrameError(f"{where}: depth of shape {values.shape}, expected (height, width)")
     if not np.issubdtype(values.dtype, np.floating):
@@ -138,7 +139,7 @@ def check_depth(values: np.ndarray, where: str, least_known: float) -> np.ndarra
 
 
 def check_same_size(one: np.ndarray, other: np.ndarray, where: str, what: str) -> None:
-    """Refuses two pictures of one frame that differ in size."""
+    """Refuse two pictures of one frame that differ in size."""
     if one.shape[:2] != other.shape[:2]:
         raise FrameError(
             f"{where}: {what} has {other.shape[1]} x {other.shape[0]} pixels, the colour picture {one.shape[1]} x {one.shape[0]}; "

@@ -1,4 +1,4 @@
-"""A ZED stereo camera through its own SDK (`pyzed`), which is imported only when the camera is opened."""
+"""ZED stereo cameras through their SDK (`pyzed`), which is imported when the camera is opened."""
 
 from __future__ import annotations
 
@@ -14,27 +14,27 @@ from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.sources import validation
 from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
 
-_TRIES_S = 0.005
+_RETRY_S = 0.005
+"""Pause between two attempts to grab a frame."""
 
 
 @spec
 class Zed:
-    """A ZED camera: rectified left picture and its depth, both from the SDK.
+    """Read a ZED camera: rectified left picture and its depth, both from the SDK.
 
     Attributes:
-        serial: Which camera, by serial number; `null` for the only one.
+        serial: Serial number of the camera; `null` for the only one.
         recording: SVO file to replay instead of a camera, `null` for none.
-        resolution: The SDK's name of it; at `HD1080` depth is half as uncertain as at `HD720`.
+        resolution: The SDK's name; at `HD1080` depth is half as uncertain as at `HD720`.
         rate_hz: Pictures a second.
-        depth_mode: The SDK's name of the way depth is made.
-        sensing: `standard` leaves unknown what is not seen. `fill` invents it and is refused.
-        confidence: Depth that the SDK trusts less than this, in percent of its own scale, is
-            unknown.
+        depth_mode: The SDK's name of the matcher.
+        sensing: `standard` leaves unseen depth unknown. `fill` invents it and is refused.
+        confidence: Least confidence of depth, percent of the SDK's scale.
         nearest_m: Range of depth.
         farthest_m: Range of depth.
         base_from_camera: Pose of the left camera in the base frame: `calibration.yaml` of
             `mode=calibrate`, or `(4, 4)`; `null` where unknown.
-        fresh: Which frames are too old, and how long to wait.
+        fresh: Limits of age and waiting time.
     """
 
     serial: int | None
@@ -52,17 +52,19 @@ class Zed:
     def check(self) -> None:
         if self.sensing == "fill":
             raise ConfigError(
-                "source.sensing=fill: it invents depth where nothing was seen, also across boreholes; use standard"
+                "source.sensing=fill: it invents depth where nothing was seen, also across boreholes; "
+                "use standard"
             )
         if not 0 < self.nearest_m < self.farthest_m:
             raise ConfigError(
-                f"source: expected 0 < nearest_m < farthest_m, got {self.nearest_m} and {self.farthest_m}"
+                "source: expected 0 < nearest_m < farthest_m, got "
+                f"{self.nearest_m} and {self.farthest_m}"
             )
         if not 1 <= self.confidence <= 100:
             raise ConfigError(f"source.confidence: expected 1 to 100, got {self.confidence}")
 
     def build(self) -> LiveSource:
-        """Returns the source, not yet opened."""
+        """Return the source, not yet opened."""
         place = load_extrinsics(self.base_from_camera, "source.base_from_camera")
         return LiveSource(
             ZedDevice(self), "ZED camera", self.fresh, place.base_from_camera, place.cov
@@ -79,17 +81,17 @@ class ZedDevice:
         self.has_ended = False
 
     def open(self) -> LensCalibration:
-        """Opens the camera.
+        """Open the camera.
 
         Raises:
-            FrameError: there is no SDK, no camera, or it cannot do what is asked of it.
+            FrameError: there is no SDK, no camera, or it cannot do what is configured.
         """
         try:
             sl = importlib.import_module("pyzed.sl")
         except ImportError as error:
             raise FrameError(
-                "ZED camera: the Python package `pyzed` is not installed; it comes with the ZED SDK (get_python_api.py). "
-                "Frames that were recorded replay without it: perception/source=folder"
+                "ZED camera: the Python package `pyzed` is not installed; it comes with the ZED SDK "
+                "(get_python_api.py). Recorded frames replay without it: perception/source=folder"
             ) from error
         settings, init = self._settings, sl.InitParameters()
         init.camera_resolution = getattr(sl.RESOLUTION, settings.resolution)
@@ -108,7 +110,8 @@ class ZedDevice:
         self._sl, self._camera = sl, sl.Camera()
         if (status := self._camera.open(init)) != sl.ERROR_CODE.SUCCESS:
             raise FrameError(
-                f"ZED camera: cannot be opened ({status}). Is it plugged in, and free of other programs?"
+                f"ZED camera: cannot be opened ({status}). Is it plugged in, and free of other "
+                "programs?"
             )
         self._picture, self._right, self._depth = sl.Mat(), sl.Mat(), sl.Mat()
         self._runtime = sl.RuntimeParameters()
@@ -122,14 +125,13 @@ class ZedDevice:
         calibration = getattr(
             information, "camera_configuration", information
         ).calibration_parameters
-        left = (
-            calibration.left_cam
-        )  # rectified: its distortion is that of the raw picture, which is not used
+        # Rectified pictures: the distortion in it is that of the raw ones.
+        left = calibration.left_cam
         matrix = np.array([[left.fx, 0.0, left.cx], [0.0, left.fy, left.cy], [0.0, 0.0, 1.0]])
         return LensCalibration(matrix, None, abs(float(calibration.get_camera_baseline())))
 
     def capture(self, timeout_s: float) -> RawCapture | None:
-        """Returns the next capture, `None` when there is none in time or the recording has ended."""
+        """Return the next capture, `None` when there is none in time or the recording has ended."""
         sl, until = self._sl, time.monotonic() + timeout_s
         while (status := self._camera.grab(self._runtime)) != sl.ERROR_CODE.SUCCESS:
             self.has_ended = (
@@ -138,7 +140,7 @@ class ZedDevice:
             )
             if self.has_ended or time.monotonic() > until:
                 return None
-            time.sleep(_TRIES_S)
+            time.sleep(_RETRY_S)
         self._camera.retrieve_image(self._picture, sl.VIEW.LEFT)
         self._camera.retrieve_image(self._right, sl.VIEW.RIGHT)
         self._camera.retrieve_measure(self._depth, sl.MEASURE.DEPTH)
@@ -152,7 +154,7 @@ class ZedDevice:
         )  # the SDK reuses its memory
 
     def now_s(self) -> float:
-        """Returns the time on the SDK's clock; that of a recording stands at its pictures."""
+        """Return the time on the SDK's clock; that of a recording stands at its pictures."""
         reference = (
             self._sl.TIME_REFERENCE.IMAGE
             if self._settings.recording
@@ -161,7 +163,7 @@ class ZedDevice:
         return self._camera.get_timestamp(reference).get_nanoseconds() * 1e-9
 
     def close(self) -> None:
-        """Closes the camera."""
+        """Close the camera."""
         camera, self._camera = self._camera, None
         if camera is not None:
             camera.close()

@@ -79,7 +79,7 @@ class BoreholeInsertion:
             of them.
         advice: How to propose to a person who moves the levers; `null` where the policy's commands
             are given as they are.
-        noise: What the policy is told is wrong by.
+        noise: Errors of the observation.
         switch: When only q2 moves.
         action: How the policy's output becomes commands.
         scaling: Normalisation of the hole position.
@@ -118,7 +118,7 @@ class InsertionGoal:
         self._machine = machine
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """See `tasks.process.ToolPoseGoal`."""
+        """Draw valid starts; see `tasks.process.ToolPoseGoal`."""
         task, hole = self._task, self._task.hole
 
         def draw(uniform: Uniform) -> CandidateTargets:
@@ -157,7 +157,7 @@ class InsertionGoal:
     def judge(
         self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
     ) -> dict[str, torch.Tensor]:
-        """See `tasks.process.ToolPoseGoal`."""
+        """Judge tool poses; see `tasks.process.ToolPoseGoal`."""
         rules, rim = self._task.success, start["target_m"]
         lateral = (tip_m - rim)[:, :2].norm(dim=1)
         below = rim[:, 2] - tip_m[:, 2]

@@ -76,7 +76,7 @@ class GoalPose:
             of them.
         advice: How to propose to a person who moves the levers; `null` where the policy's commands
             are given as they are.
-        noise: What the policy is told is wrong by.
+        noise: Errors of the observation.
         switch: When only q2 moves.
         action: How the policy's output becomes commands.
         scaling: Normalisation of target point and pitch.
@@ -102,7 +102,9 @@ class GoalPose:
     def check(self) -> None:
         if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:
             raise ConfigError(
-                "task.scaling.pitch_rad: the wanted pitch differs between episodes, so the policy must be told: give [mean, std]"
+                "task.scaling.pitch_rad: the wanted pitch differs between episodes, so the "
+                "policy must "
+                "observe it: give [mean, std]"
             )
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
@@ -124,7 +126,7 @@ class ReachingGoal:
         self._machine = machine
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """See `tasks.process.ToolPoseGoal`."""
+        """Draw valid starts; see `tasks.process.ToolPoseGoal`."""
         task, pose = self._task, self._task.pose
 
         def draw(uniform: Uniform) -> CandidateTargets:
@@ -156,7 +158,7 @@ class ReachingGoal:
     def judge(
         self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
     ) -> dict[str, torch.Tensor]:
-        """See `tasks.process.ToolPoseGoal`."""
+        """Judge tool poses; see `tasks.process.ToolPoseGoal`."""
         rules = self._task.tolerance
         distance = (start["target_m"] - tip_m).norm(dim=1)
         turn = (start["target_pitch_rad"] - pitch_rad).abs()

@@ -62,9 +62,9 @@ def test_in_a_network_the_names_are_those_of_the_configuration() -> None:
 
 
 def test_only_the_whole_token_fits() -> None:
-    assert access.matches_token(TOKEN, TOKEN)
+    assert access.compare_tokens(TOKEN, TOKEN)
     assert not any(
-        access.matches_token(given, TOKEN)
+        access.compare_tokens(given, TOKEN)
         for given in (None, 7, "", TOKEN[:-1], TOKEN + " ", [TOKEN], "ключ")
     )
 

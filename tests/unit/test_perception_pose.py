@@ -181,7 +181,8 @@ def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it
         (replace(faint, deeper=0.0, contrast=3.0), 1.0, True),
     ):
         assert (
-            estimator._looks(inside, parallax, masks, pose_row(ellipse), ellipse, True) is None
+            estimator._check_appearance(inside, parallax, masks, pose_row(ellipse), ellipse, True)
+            is None
         ) == passes
 
 
@@ -237,7 +238,7 @@ def test_what_only_one_camera_sees_beside_an_arm_nobody_can_tell_from_a_disc(
     else:
         assert isinstance(found, Rejection) and found.reason == "evidence of depth inside"
         learned = estimator.estimate(
-            frame, replace(masks, mouth=np.ones_like(masks.block)), ellipse
+            frame, replace(masks, hole_mask=np.ones_like(masks.block)), ellipse
         )
         assert isinstance(learned, Rejection) and learned.reason == found.reason, (
             "no network overrules two cameras"
@@ -272,14 +273,11 @@ def test_a_rim_knows_its_centre_by_what_is_seen_of_it(seen_rad: float) -> None:
     edges = np.full((72, rim.PEAKS, 2), np.nan)
     on = np.abs(angles) <= seen_rad
     edges[on, 0] = 0.05 * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    found, cov, rms_px, coverage = rim._fit_circle(
-        np.array([0.0, 0.0, 0.05]), edges, np.full(72, 0.002), 0.03, 0.06
-    )
-    assert (
-        found is not None
-        and rms_px == pytest.approx(0.0, abs=1e-6)
-        and coverage == pytest.approx(on.mean())
-    )
+    fit = rim._fit_circle(np.array([0.0, 0.0, 0.05]), edges, np.full(72, 0.002), 0.03, 0.06)
+    assert fit is not None
+    assert fit.rms_px == pytest.approx(0.0, abs=1e-6)
+    assert fit.coverage == pytest.approx(on.mean())
+    cov = fit.cov_m2
     if on.all():
         # a pixel is 2 mm long: 0.03 px are 60 um, in every direction; no other wave than the first
         # moves the centre of a whole rim
@@ -300,18 +298,18 @@ def test_edges_beside_what_hides_the_rest_of_a_rim_do_not_draw_its_circle() -> N
     beside = np.minimum(np.arange(on.sum()), np.arange(on.sum())[::-1])
     radius = 0.05 - 0.002 * inward_px[beside]
     edges[on, 0] = radius[:, None] * np.column_stack([np.cos(angles), np.sin(angles)])[on]
-    found, _, rms_px, coverage = rim._fit_circle(
-        np.array([0.0, 0.0, 0.05]), edges, np.full(144, 0.002), 0.03, 0.06
-    )
-    assert found is not None and coverage == pytest.approx(on.mean())
-    assert np.hypot(*found[:2]) < 0.02 * 0.002 and rms_px < 0.02, (
+    fit = rim._fit_circle(np.array([0.0, 0.0, 0.05]), edges, np.full(144, 0.002), 0.03, 0.06)
+    assert fit is not None and fit.coverage == pytest.approx(on.mean())
+    assert np.hypot(*fit.circle[:2]) < 0.02 * 0.002 and fit.rms_px < 0.02, (
         "a fiftieth of a pixel; the end profiles are off by half of one"
     )
 
 
 def test_the_mouth_channel_is_believed(estimator) -> None:
     frame, masks, ellipse = drawn()
-    refused = estimator.estimate(frame, replace(masks, mouth=np.zeros_like(masks.block)), ellipse)
+    refused = estimator.estimate(
+        frame, replace(masks, hole_mask=np.zeros_like(masks.block)), ellipse
+    )
     assert isinstance(refused, Rejection) and refused.reason == "mouth probability inside"
 
 

@@ -106,7 +106,7 @@ def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
 
 def test_a_pitch_that_varies_must_be_told_to_the_policy() -> None:
     task = option("task", "goal_pose")
-    with pytest.raises(ConfigError, match="policy must be told"):
+    with pytest.raises(ConfigError, match="policy must observe it"):
         replace(task, scaling=replace(task.scaling, pitch_rad=None))
 
 
