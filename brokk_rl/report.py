@@ -1,4 +1,4 @@
-"""One self-contained HTML report: text, tables and figures in one file that opens without a network.
+"""One self-contained HTML report: text, tables and figures in one file that needs no network.
 
     report = Report("Identification of brokk170", "The network beats the linear model.", "good")
     report.add_heading("Errors")

@@ -1,7 +1,7 @@
-"""The answer of a diagnosis (`diagnosis.json`) and the free runs that its report draws (`diagnosis.npz`).
+"""The answer of a diagnosis (`diagnosis.json`) and the free runs of its report (`diagnosis.npz`).
 
-Effects, joints and parameters have the names of the effect registry. A reader may rely on the fields
-of `Answer`; `Answer.more` holds further plain JSON.
+Effects, joints and parameters have the names of the effect registry. A reader may rely on the
+fields of `Answer`; `Answer.more` holds further plain JSON.
 Axes: `W` windows, `K` steps, `J` joints.
 """
 

@@ -130,8 +130,19 @@ MIN_SIZE = 0.3
 below the accuracy of any drawing or zero."""
 
 
-SetFit = tuple[float, np.ndarray, np.ndarray]
-"""Gain of a set of errors in log likelihood, their sizes, and the covariance of the sizes."""
+@dataclass(frozen=True)
+class SetFit:
+    """Least-squares fit of a set of errors.
+
+    Attributes:
+        gain: Gain in log likelihood.
+        sizes: Size of each parameter, as a difference from neutral, `(P,)`.
+        covariance: Of the sizes, `(P, P)`.
+    """
+
+    gain: float
+    sizes: np.ndarray
+    covariance: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -213,17 +224,17 @@ def find_geometry_errors(
         before, chosen = chosen, max(worth, key=worth.__getitem__)
         if chosen in ((), before):
             break
-        values = _split(causes, chosen, fits[chosen][1])
+        values = _split(causes, chosen, fits[chosen].sizes)
         bent = [
             _compute_nonlinearity(causes[c], own, q, machine)
             for c, own in zip(chosen, values, strict=True)
         ]
         straight = off - _remove_timing(np.sum(bent, 0), ways)
-    sizes = zip(chosen, _split(causes, chosen, fits[chosen][1]), strict=False)
+    sizes = zip(chosen, _split(causes, chosen, fits[chosen].sizes), strict=False)
     large = tuple(c for c, own in sizes if _measure_size(causes[c], own) >= MIN_SIZE)
     names = dict.fromkeys(causes[c].kind.name for c in large)
     left = (
-        straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen][1]
+        straight - np.concatenate([causes[c].columns for c in chosen], 1) @ fits[chosen].sizes
         if chosen
         else straight
     )
@@ -241,13 +252,13 @@ def _score_sets(
     name_price: float,
 ) -> tuple[dict[tuple[int, ...], SetFit], dict[tuple[int, ...], float]]:
     """Return the fits of all sets of errors, and their gains less the penalties."""
-    fits: dict[tuple[int, ...], SetFit] = {(): (0.0, np.zeros(0), np.zeros((0, 0)))}
+    fits: dict[tuple[int, ...], SetFit] = {(): SetFit(0.0, np.zeros(0), np.zeros((0, 0)))}
     worth: dict[tuple[int, ...], float] = {(): 0.0}
     for count in range(1, MAX_ERRORS + 1):
         for chosen in combinations(range(len(causes)), count):
             fits[chosen] = _fit([causes[c] for c in chosen], off, size_m)
             names = {causes[c].kind.name for c in chosen}
-            worth[chosen] = fits[chosen][0] - price * count - name_price * len(names)
+            worth[chosen] = fits[chosen].gain - price * count - name_price * len(names)
     return fits, worth
 
 
@@ -259,7 +270,7 @@ def _describe_effect(
     worth: Mapping[tuple[int, ...], float],
     machine: Machine,
 ) -> DetectedEffect:
-    gain, values, covariance = fits[best]
+    gain, values, covariance = fits[best].gain, fits[best].sizes, fits[best].covariance
     deviation, parameters, mask, place = (
         np.sqrt(np.diag(covariance)),
         {},
@@ -279,13 +290,13 @@ def _describe_effect(
             place += 1
     mine = tuple(c for c in best if causes[c].kind is kind)
     rest = tuple(c for c in best if c not in mine)
-    own = gain - fits[rest][0]
+    own = gain - fits[rest].gain
     rivals = {}
     for c, cause in enumerate(causes):
         swapped = tuple(sorted({*rest, c}))
         if cause.kind is not kind and swapped in fits:
             rivals[cause.kind.name] = max(
-                rivals.get(cause.kind.name, -np.inf), fits[swapped][0] - fits[rest][0]
+                rivals.get(cause.kind.name, -np.inf), fits[swapped].gain - fits[rest].gain
             )
     without = max(
         value for chosen, value in worth.items() if not any(causes[c].kind is kind for c in chosen)
@@ -383,7 +394,8 @@ def _fit(causes: Sequence[_GeometryError], off: np.ndarray, size_m: float) -> Se
     covariance = np.linalg.inv(normal)
     values = covariance @ (x.T @ off) / size_m**2 / 3.0
     left = off - x @ values
-    return float((off @ off - left @ left) / 2.0 / size_m**2 / 3.0), values, covariance
+    gain = float((off @ off - left @ left) / 2.0 / size_m**2 / 3.0)
+    return SetFit(gain, values, covariance)
 
 
 def _split(

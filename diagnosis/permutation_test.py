@@ -1,8 +1,8 @@
-"""Permutation tests of the field's error against the reference's, with a bound on false discoveries.
+"""Permutation tests of the field's error against the reference's, with bounded false discoveries.
 
 Samples of one recording are dependent, so whole recordings change sides, never samples. With too
-few recordings for a small p, recordings are cut into parts of `PART_S`; their dependence (pose, oil)
-is small against that within a window.
+few recordings for a small p, recordings are cut into parts of `PART_S`; their dependence (pose,
+oil) is small against that within a window.
 Axes: `W` windows, `B` blocks, `C` cells.
 """
 

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_joint_panels, remove_frame
+from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, make_joint_panels, remove_frame
 from brokk_rl.split import COMMANDED
 from diagnosis.answer import Answer, Outcome, format_error
 from diagnosis.error_growth import READINGS, compute_rmse_curve
@@ -37,7 +37,7 @@ def draw_gap_bars(answer: Answer) -> Figure | None:
     gap = answer.gap
     if gap is None or not max(gap.before, gap.floor or 0.0):
         return None
-    figure = Figure(figsize=(9.5, 2.0), layout="constrained")
+    figure = make_figure(9.5, 2.0)
     axis = figure.add_subplot()
     rows = [("before", gap.before, BEFORE)]
     rows += [("after", gap.after, AFTER)] if answer.selected else []
@@ -79,7 +79,7 @@ def draw_gap_map(answer: Answer, before: WindowedRuns, machine: Machine) -> Figu
     share = np.array(
         [[_find_part(parts, joint, regime)["gap"] for regime in regimes] for joint in joints]
     )
-    figure = Figure(figsize=(12.0, 1.5 + 0.52 * len(joints)), layout="constrained")
+    figure = make_figure(12.0, 1.5 + 0.52 * len(joints))
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1.0])
     left.imshow(
         100.0 * share, cmap=HEAT, vmin=0.0, vmax=max(30.0, 100.0 * share.max()), aspect="auto"
@@ -204,7 +204,7 @@ def draw_rivals(evidence: Mapping[str, Any]) -> Figure | None:
     if not rows:
         return None
     null, threshold = evidence.get("null") or [], evidence.get("threshold")
-    figure = Figure(figsize=(9.5, 1.2 + 0.3 * len(rows)), layout="constrained")
+    figure = make_figure(9.5, 1.2 + 0.3 * len(rows))
     axis = figure.add_subplot()
     for place, row in enumerate(rows):
         axis.barh(place, row["score"], color=BLUE if row.get("selected") else IDLE, height=0.7)
@@ -237,7 +237,7 @@ def draw_tip_budget(budget: Mapping[str, Any]) -> Figure:
     before, after, floor = (budget[name] for name in ("before", "after", "floor"))
     parts = sorted(before["joint_part"].items(), key=lambda pair: -pair[1])
     whole = before["tip_rms_mm"]
-    figure = Figure(figsize=(9.5, 3.3), layout="constrained")
+    figure = make_figure(9.5, 3.3)
     axis = figure.add_subplot()
     level, names = 0.0, []
     for place, (joint, part) in enumerate(parts):

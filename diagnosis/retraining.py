@@ -1,8 +1,8 @@
-"""Success of a policy before and after retraining, in the simulator, the repaired one, on the machine.
+"""Success of a policy before and after retraining, in the simulators and on the machine.
 
 `compare_policies` returns the content of `close_gap.json`. Policies are `before` (as it was),
-`after` (retrained), and any others beside them. Plants are `simulator` (as it was), `repaired` (with
-the effects of the diagnosis) and `machine` (or its stand-in).
+`after` (retrained), and any others beside them. Plants are `simulator` (as it was), `repaired`
+(with the effects of the diagnosis) and `machine` (or its stand-in).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from scipy import stats
 
 from brokk_rl.intervals import compute_wilson_interval
-from brokk_rl.plot import BLUE, GREY, RED, remove_frame
+from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, remove_frame
 from brokk_rl.report import Cell, Report, Tone
 
 COMPARISON_FILE = "close_gap.json"
@@ -236,7 +236,7 @@ def add_success_table(page: Report, found: Mapping[str, Any]) -> None:
 
 def draw_success(found: Mapping[str, Any]) -> Figure:
     """Draw success of each policy on each plant."""
-    figure = Figure(figsize=(9.5, 3.8), layout="constrained")
+    figure = make_figure(9.5, 3.8)
     axis = figure.add_subplot()
     policies = list(found["success"])
     width = 0.8 / len(policies)
@@ -272,12 +272,7 @@ def draw_success(found: Mapping[str, Any]) -> Figure:
     axis.set_yticks(range(0, 101, 20))
     axis.tick_params(axis="x", length=0)
     remove_frame(axis)
-    figure.legend(
-        *axis.get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=len(policies),
-        frameon=False,
-    )
+    add_legend(figure, axis)
     return figure
 
 

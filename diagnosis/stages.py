@@ -1,4 +1,4 @@
-"""Survey of a gap before any effect is fitted: tip error, stages of the chain, recordings, location.
+"""Survey of a gap before any effect is fitted: tip error, stages, recordings, location.
 
 The stages are timing, actuation, sensing, kinematics, perception and contact. Timing, actuation and
 sensing share the error of the joints. Kinematics and perception are errors of their own, in metres

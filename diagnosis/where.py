@@ -1,4 +1,4 @@
-"""Location of the gap: error beyond the floor by joint, regime, direction, load, frequency and time.
+"""Location of the gap by joint, regime, direction, load, frequency and running time.
 
 The floor is the error of the same simulator on reference recordings that it was not fitted to. The
 gap is the error beyond the floor and beyond one standard error. Each grouping splits error and gap

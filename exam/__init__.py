@@ -1,4 +1,4 @@
-"""Blind exam of a diagnosis: sealed cases, answers by processes that cannot read the labels, metrics.
+"""Blind exam of a diagnosis: sealed cases, answers without a way to the labels, metrics.
 
 case_distribution  kinds, effects, joints, sizes of cases; the protocol of a plant family
 generate           plans and recordings of reference and field

@@ -1,4 +1,4 @@
-"""Recordings of cases: a plan for each run, machines of one make side by side, files of measurements."""
+"""Recordings of cases: a plan for each run, machines of one make side by side, the files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The report of an exam: table of all candidates, confusion, reliability, detection; and the ledger."""
+"""The report of an exam: table of all candidates, confusion, reliability, detection; the ledger."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.study import design, folder
+from deploy.study import design, study_folder
 from deploy.study.conductor import Conductor, Words
 from deploy.study.trial import Times
 from deploy.study.twin_control import Sight
@@ -38,8 +38,8 @@ def plan(
         practice_trials=practice, practice_minutes=10.0, limit_s=20.0,
         success=design.Success(depth_m=0.1, clearance_m=0.013), primary="time_s", alpha=0.05,
     )  # fmt: skip
-    planned = design.trials(what, np.random.default_rng(0))
-    write_json(place / folder.PLAN, design.as_json(what, machine, 0, planned))
+    planned = design.plan_trials(what, np.random.default_rng(0))
+    write_json(place / study_folder.PLAN, design.format_plan(what, machine, 0, planned))
     return planned
 
 

@@ -6,7 +6,7 @@ from brokk_rl.contracts.operator import Operator, TrialGround
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.study.study import Steps
+from deploy.study.study_steps import Steps
 
 
 @spec

@@ -18,11 +18,11 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from deploy.study import exact, tlx
-from deploy.study.crossover import Effect, effect
+from deploy.study import permutation_tests, tlx
+from deploy.study.crossover_analysis import GuidanceEffect, estimate_effect
 from deploy.study.design import CONDITIONS, PERIODS, Hole, Success
-from deploy.study.folder import Remark, StudyData
 from deploy.study.measures import GUIDED_ONLY, MEASURES, measure
+from deploy.study.study_folder import Remark, StudyData
 
 FEW_TRIALS = 2
 """Trials of a condition below which a participant's mean is pointed out."""
@@ -48,7 +48,7 @@ class MeasuredTrial:
 
 @dataclass
 class Analysis:
-    """What a study says.
+    """Results of a study.
 
     Attributes:
         participants: Pseudonyms, `P` of them.
@@ -71,13 +71,13 @@ class Analysis:
     loads: dict[str, dict[str, np.ndarray]]
     primary: str
     alpha: float
-    effects: dict[str, Effect] = field(default_factory=dict)
+    effects: dict[str, GuidanceEffect] = field(default_factory=dict)
     holm: dict[str, float] = field(default_factory=dict)
     remarks: list[Remark] = field(default_factory=list)
 
 
 def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] = iter) -> Analysis:
-    """Returns what the study says.
+    """Return what the study says.
 
     Args:
         data: What is there.
@@ -108,30 +108,32 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
         )
     success = Success(**design["success"])
     for trial, counts in progress(everything):
-        found.trials.append(_measured(data.folder, trial, counts, machine, success, found.remarks))
+        found.trials.append(
+            _measure_trial(data.folder, trial, counts, machine, success, found.remarks)
+        )
     found.means = {
-        each.name: {which: _means(found, each.name, which) for which in CONDITIONS}
+        each.name: {which: _average_participants(found, each.name, which) for which in CONDITIONS}
         for each in MEASURES
     }
     _note_few(found)
-    _loads(found, data)
+    _add_loads(found, data)
     for name, by_condition in (
         *found.means.items(),
         *((f"tlx_{scale}", value) for scale, value in found.loads.items()),
     ):
         if name not in GUIDED_ONLY:
-            found.effects[name] = effect(
+            found.effects[name] = estimate_effect(
                 by_condition["guided"], by_condition["unguided"], found.guided_first
             )
     secondary = [
         each.name for each in MEASURES if each.name in found.effects and each.name != found.primary
     ]
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
-        p = [deciding_p(found.effects[name]) for name in family]
+        p = [get_deciding_p(found.effects[name]) for name in family]
         found.holm |= dict(
             zip(
                 family,
-                exact.holm(
+                permutation_tests.adjust_by_holm(
                     np.array([math.nan if value is None else value for value in p])
                 ).tolist(),
                 strict=True,
@@ -140,12 +142,12 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
     return found
 
 
-def deciding_p(found: Effect) -> float | None:
-    """Returns the p that counts: of the test with the period in the model; `None` where sequences do not allow it."""
+def get_deciding_p(found: GuidanceEffect) -> float | None:
+    """Return the p that counts: of the test with the period in the model; `None` where sequences do not allow it."""
     return found.p
 
 
-def _measured(
+def _measure_trial(
     folder: Path,
     trial: dict[str, Any],
     counts: bool,
@@ -161,7 +163,7 @@ def _measured(
     if not trial.get("recording") or not isinstance(where, dict):
         why = f" ({trial['recording_problem']})" if trial.get("recording_problem") else ""
         remarks.append(Remark(name, f"names no recording{why}; only its outcome is known"))
-        return _outcome_only(empty)
+        return _keep_outcome(empty)
     if trial.get("recording_problem"):
         remarks.append(Remark(name, f"{trial['recording_problem']}; it counts"))
     try:
@@ -173,7 +175,7 @@ def _measured(
         remarks.append(
             Remark(name, f"its recording cannot be used ({error}); only its outcome is known")
         )
-        return _outcome_only(empty)
+        return _keep_outcome(empty)
     values = measure(recording, machine, hole, success, float(trial["limit_s"]))
     said = trial.get("outcome")
     if said in ("inserted", "time limit") and (said == "inserted") != bool(values["success"]):
@@ -190,8 +192,8 @@ def _measured(
     )
 
 
-def _outcome_only(trial: MeasuredTrial) -> MeasuredTrial:
-    """Returns a trial without a recording as its outcome tells: inserted or not; not inserted counts with the limit."""
+def _keep_outcome(trial: MeasuredTrial) -> MeasuredTrial:
+    """Return a trial without a recording as its outcome tells: inserted or not; not inserted counts with the limit."""
     outcome = trial.facts.get("outcome")
     if outcome not in ("inserted", "time limit", "stopped"):
         return trial
@@ -201,8 +203,8 @@ def _outcome_only(trial: MeasuredTrial) -> MeasuredTrial:
     return MeasuredTrial(trial.facts, trial.values | known, trial.tip_in_base_m, trial.counts)
 
 
-def _means(found: Analysis, measure_name: str, condition: str) -> np.ndarray:
-    """Returns each participant's mean over the trials that tell, `(P,)`."""
+def _average_participants(found: Analysis, measure_name: str, condition: str) -> np.ndarray:
+    """Return each participant's mean over the trials that tell, `(P,)`."""
     means = np.full(len(found.participants), np.nan)
     for index, name in enumerate(found.participants):
         values = np.array(
@@ -230,7 +232,7 @@ def _note_few(found: Analysis) -> None:
                 found.remarks.append(Remark(name, f"{num} trials {condition}: {what}"))
 
 
-def _loads(found: Analysis, data: StudyData) -> None:
+def _add_loads(found: Analysis, data: StudyData) -> None:
     keys = (*tlx.SCALES, "raw", "weighted")
     found.loads = {
         key: {which: np.full(len(found.participants), np.nan) for which in CONDITIONS}
@@ -240,7 +242,10 @@ def _loads(found: Analysis, data: StudyData) -> None:
         if name not in found.participants:
             continue
         condition = data.plan["participants"][name][PERIODS.index(period)]
-        values = tlx.ratings(answers) | {"raw": tlx.raw(answers), "weighted": tlx.weighted(answers)}
+        values = tlx.read_ratings(answers) | {
+            "raw": tlx.compute_raw_tlx(answers),
+            "weighted": tlx.compute_weighted_tlx(answers),
+        }
         for key, value in values.items():
             found.loads[key][condition][found.participants.index(name)] = value
         found.remarks += [

@@ -1,6 +1,6 @@
 """Leads a participant through a sitting: takes what is said on the page, watches the machine, writes everything down at once.
 
-What was done stands in the study's folder (`deploy.study.folder`) before the next thing begins, so
+What was done stands in the study's folder (`deploy.study.study_folder`) before the next thing begins, so
 that an interruption at any time costs at most the trial that was under way; that one is kept as
 aborted, and done again.
 """
@@ -20,10 +20,10 @@ import numpy as np
 
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.machine import Machine
-from deploy.study import folder as folders
-from deploy.study.folder import StudyData
+from deploy.study import study_folder as folders
 from deploy.study.form import Form
-from deploy.study.steps import Step, next_step, progress
+from deploy.study.steps import Step, find_next_step, progress
+from deploy.study.study_folder import StudyData
 from deploy.study.trial import Attempt, Times, keep
 from deploy.study.twin_control import Stage
 
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Words:
-    """What a lab says to its participants, by language.
+    """Texts of a lab for its participants, by language.
 
     Attributes:
         version: Of the text, kept with each consent.
@@ -83,17 +83,17 @@ class Conductor:
         ):  # what an interruption left half saved
             with suppress(ValueError):  # a file that cannot be read is said in the report
                 keep(folder, path, machine, stage)
-        self._data: StudyData = folders.read(folder)
+        self._data: StudyData = folders.read_study(folder)
         self._who: str | None = None
         self._step: Step | None = None
         self._attempt: Attempt | None = None
         self._form: Form | None = None
         self.problem = ""
-        """What went wrong last, for who leads the sitting; empty where nothing did."""
+        """Last error, for the leader of the sitting; empty without one."""
 
     @property
     def shows_advice(self) -> bool:
-        """Whether a guided trial is under way."""
+        """True during a guided trial."""
         return (
             self._attempt is not None
             and self._attempt.running
@@ -102,11 +102,11 @@ class Conductor:
 
     @property
     def running(self) -> bool:
-        """Whether a trial is under way."""
+        """True during a trial."""
         return self._attempt is not None and self._attempt.running
 
     def choose(self, who: str | None) -> None:
-        """Begins, or goes on with, the sitting of a participant; `None` leaves it.
+        """Begin, or goes on with, the sitting of a participant; `None` leaves it.
 
         Raises:
             ConfigError: the plan knows no such participant, or they were erased.
@@ -123,7 +123,7 @@ class Conductor:
         self._go_on()
 
     def tick(self) -> None:
-        """Looks at the machine; called some twenty times a second."""
+        """Look at the machine; called some twenty times a second."""
         try:
             if self._attempt is not None:
                 self._attempt.tick()
@@ -131,7 +131,7 @@ class Conductor:
             self._fall_back(error)
 
     def take(self, said: dict[str, Any]) -> str:
-        """Takes what a page says; returns why it was not taken, empty where it was."""
+        """Take what a page says; returns why it was not taken, empty where it was."""
         do, step = said.get("do"), self._step
         try:
             if do == "choose" and isinstance(said.get("who"), str) and not self.running:
@@ -143,7 +143,7 @@ class Conductor:
             elif do == "stop_sitting":
                 self._stop(str(said.get("reason", ""))[:200])
             elif do == "go_on" and step.kind == "stopped":
-                self._note({"stopped": False, "went_on": _now()})
+                self._note({"stopped": False, "went_on": _format_now()})
             elif do == "consent" and step.kind == "consent":
                 self._consent(said)
             elif (
@@ -169,7 +169,7 @@ class Conductor:
         return ""
 
     def view(self) -> dict[str, Any]:
-        """Returns what pages show, as plain data."""
+        """Return what pages show, as plain data."""
         found: dict[str, Any] = {
             "kind": "choose",
             "who": self._who,
@@ -193,12 +193,12 @@ class Conductor:
         return found | (self._form.view() if self._form is not None else {})
 
     def close(self) -> None:
-        """Ends what is under way, at once."""
+        """End what is under way, at once."""
         if self._attempt is not None:
             self._attempt.leave()
 
     def _fall_back(self, error: BrokkError) -> None:
-        """Goes back to the list of participants, and says what went wrong there; what stands on the disk is gone on with later."""
+        """Go back to the list of participants, and says what went wrong there; what stands on the disk is gone on with later."""
         log.error("%s", error)
         self._stage.record(None)
         self._who, self._step, self._attempt, self._form, self.problem = (
@@ -221,12 +221,12 @@ class Conductor:
         return "not now"
 
     def _go_on(self) -> None:
-        """Reads the folder again, and begins what comes next."""
-        self._data, self._step, self._form = folders.read(self._folder), None, None
+        """Read the folder again, and begins what comes next."""
+        self._data, self._step, self._form = folders.read_study(self._folder), None, None
         self.problem = ""
         if self._who is None:
             return
-        step = self._step = next_step(self._data, self._who)
+        step = self._step = find_next_step(self._data, self._who)
         log.info(
             "%s: %s %s", self._who, step.kind, step.trial.name if step.trial else step.period or ""
         )
@@ -257,7 +257,7 @@ class Conductor:
             "agreed": agreed,
             "version": self._words.version,
             "language": str(said.get("language", ""))[:5],
-            "at": _now(),
+            "at": _format_now(),
         }
         self._note(
             {"consent": consent}
@@ -269,7 +269,9 @@ class Conductor:
         if self._attempt is not None:
             self._attempt.stop()
             self._close_attempt()
-        self._note({"stopped": True, "reason": reason or "no reason given", "stopped_at": _now()})
+        self._note(
+            {"stopped": True, "reason": reason or "no reason given", "stopped_at": _format_now()}
+        )
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
@@ -284,5 +286,5 @@ class Conductor:
         self._go_on()
 
 
-def _now() -> str:
+def _format_now() -> str:
     return datetime.now().astimezone().isoformat(timespec="seconds")

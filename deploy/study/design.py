@@ -52,7 +52,7 @@ class Success:
 
 @spec
 class Design:
-    """What a study is planned with.
+    """Design of a study.
 
     Attributes:
         num_participants: Participants to invite.
@@ -96,7 +96,7 @@ class Design:
             )
 
     def check_machine(self, machine: Machine) -> None:
-        """Raises a `ConfigError` that names the start which the machine cannot take."""
+        """Raise a `ConfigError` that names the start which the machine cannot take."""
         for name, q in self.starts.items():
             if len(q) != machine.num_joints:
                 raise ConfigError(
@@ -136,14 +136,14 @@ class Trial:
         return f"{self.participant}_{self.period}_{self.number:02d}"
 
 
-def pseudonyms(count: int) -> list[str]:
-    """Returns `P01`, `P02`, …: the only names that a study knows."""
+def make_pseudonyms(count: int) -> list[str]:
+    """Return `P01`, `P02`, …: the only names that a study knows."""
     width = max(2, len(str(count)))
     return [f"P{number:0{width}d}" for number in range(1, count + 1)]
 
 
-def sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple[str, str]]:
-    """Returns the two conditions of each participant in order, drawn in blocks of two."""
+def draw_sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple[str, str]]:
+    """Return the two conditions of each participant in order, drawn in blocks of two."""
     drawn: list[tuple[str, str]] = []
     for _ in range(math.ceil(design.num_participants / 2)):
         guided_first = bool(generator.integers(2)) or design.order == "fixed"
@@ -152,11 +152,11 @@ def sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple
             CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0])
             for first in (guided_first, second_first)
         ]
-    return dict(zip(pseudonyms(design.num_participants), drawn, strict=False))
+    return dict(zip(make_pseudonyms(design.num_participants), drawn, strict=False))
 
 
-def squares(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Returns two Latin squares, `(K, K)` each: row `i` is an order of holes and one of starts.
+def make_latin_squares(size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return two Latin squares, `(K, K)` each: row `i` is an order of holes and one of starts.
 
     In each, every entry stands once in every row and column. For odd `K` without divisor 3, and 3
     itself, they are orthogonal (every pair of hole and start occurs once over the rows); for even
@@ -169,15 +169,15 @@ def squares(size: int) -> tuple[np.ndarray, np.ndarray]:
     return (row + place) % size, (row + factor * place) % size
 
 
-def trials(design: Design, generator: np.random.Generator) -> list[Trial]:
-    """Returns every trial in the order in which it is to be done, practice first."""
+def plan_trials(design: Design, generator: np.random.Generator) -> list[Trial]:
+    """Return every trial in the order in which it is to be done, practice first."""
     holes, starts = list(design.holes), list(design.starts)
-    hole_square, start_square = squares(len(holes))
+    hole_square, start_square = make_latin_squares(len(holes))
     shuffle = [
         generator.permutation(len(holes)) for _ in range(2)
     ]  # which name stands for which letter of the squares
     found = []
-    for index, (participant, conditions) in enumerate(sequences(design, generator).items()):
+    for index, (participant, conditions) in enumerate(draw_sequences(design, generator).items()):
         for number in range(design.practice_trials):
             condition = CONDITIONS[number % 2]
             place = (index + number) % len(holes)
@@ -206,8 +206,10 @@ def trials(design: Design, generator: np.random.Generator) -> list[Trial]:
     return found
 
 
-def as_json(design: Design, machine: Machine, seed: int, planned: list[Trial]) -> dict[str, Any]:
-    """Returns the plan as it stands in `plan.json`."""
+def format_plan(
+    design: Design, machine: Machine, seed: int, planned: list[Trial]
+) -> dict[str, Any]:
+    """Return the plan as it stands in `plan.json`."""
     conditions = {trial.participant: {} for trial in planned}
     for trial in planned:
         if trial.period:

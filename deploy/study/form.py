@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from deploy.study import folder as folders
+from deploy.study import study_folder as folders
 from deploy.study import tlx
 
 NUM_RATINGS, NUM_PAIRS = len(tlx.SCALES), len(tlx.PAIRS)
@@ -32,7 +32,7 @@ class Form:
     ) -> None:
         path = folder / folders.QUESTIONNAIRES / f"{who}_{period}.json"
         if not path.exists():
-            shown = [list(pair) for pair in tlx.pairs(np.random.default_rng(seed))]
+            shown = [list(pair) for pair in tlx.list_pairs(np.random.default_rng(seed))]
             begun = {"ratings": {}, "pairs": [], "shown_pairs": shown, "finished": False}
             folders.write_questionnaire(folder, who, period, begun | facts)
         entry = json.loads(path.read_text())
@@ -48,7 +48,7 @@ class Form:
         self._at = min([*self._missing(), LAST])
 
     def take(self, said: dict[str, Any]) -> str:
-        """Takes an answer, or a step to another screen; returns why not, where it makes no sense."""
+        """Take an answer, or a step to another screen; returns why not, where it makes no sense."""
         do, at = said.get("do"), said.get("to")
         if do == "rate" and self._fits(said):
             self._ratings[said["scale"]] = said["value"]
@@ -70,7 +70,7 @@ class Form:
         return ""
 
     def view(self) -> dict[str, Any]:
-        """Returns what pages show of it."""
+        """Return what pages show of it."""
         chosen = [self._chosen.get(frozenset(pair)) for pair in self._shown]
         return {
             "at": self._at, "last": LAST, "scales": list(tlx.SCALES), "step": tlx.STEP, "ratings": self._ratings,
@@ -87,7 +87,7 @@ class Form:
         )
 
     def _missing(self) -> list[int]:
-        """Returns the screens that have no answer."""
+        """Return the screens that have no answer."""
         scales = [
             index for index, scale in enumerate(tlx.SCALES) if self._ratings.get(scale) is None
         ]

@@ -1,4 +1,4 @@
-"""What a trial's recording says about how a person worked; one number each, NaN where the recording does not tell.
+"""Measures of a trial's recording, one number each; NaN where the recording does not show it.
 
 Everything is counted from the start of the recording to the insertion, or to the limit where there
 was none.
@@ -16,7 +16,6 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from deploy.study.design import Hole, Success
-from deploy.study.smoothness import sparc
 
 PIECE_S = 0.5
 """A path is measured between means over so long: shorter pieces would add up the encoders' noise,
@@ -35,7 +34,7 @@ machine."""
 
 @dataclass(frozen=True)
 class Measure:
-    """What is measured.
+    """One measure.
 
     Attributes:
         name: In tables.
@@ -73,7 +72,7 @@ GUIDED_ONLY = ("advice_error", "advice_lag_s")
 def measure(
     recording: Recording, machine: Machine, hole: Hole, success: Success, limit_s: float
 ) -> dict[str, float]:
-    """Returns every measure of `MEASURES` of one trial.
+    """Return every measure of `MEASURES` of one trial.
 
     Args:
         recording: From the start of the trial.
@@ -84,7 +83,7 @@ def measure(
     """
     tip = compute_tool_kinematics(machine, recording.q).tip_in_base_m
     t_s = recording.t_s - recording.t_s[0]
-    last = insertion(tip, hole, success)
+    last = find_insertion(tip, hole, success)
     within = t_s <= limit_s
     inserted = last is not None and bool(within[last])
     num = last + 1 if inserted and last is not None else int(within.sum())
@@ -95,9 +94,9 @@ def measure(
         tip[:num],
         t_s[:num],
     )
-    path_m = length(tip, period_s)
+    path_m = measure_path_length(tip, period_s)
     goal = np.array(hole.center_in_base_m) - [0.0, 0.0, success.depth_m]
-    onsets = movements(u)
+    onsets = detect_lever_movements(u)
     found = {
         "time_s": float(t_s[-1]) if inserted else limit_s,
         "success": float(inserted),
@@ -105,14 +104,14 @@ def measure(
         "efficiency": min(1.0, float(np.linalg.norm(goal - tip[0])) / path_m)
         if inserted and path_m
         else math.nan,
-        "several_joints": float((moving(q, machine, period_s).sum(1) >= 2).mean()),
+        "several_joints": float((detect_motion(q, machine, period_s).sum(1) >= 2).mean()),
         "lever_movements": float(len(onsets)),
         "joint_switches": float(np.count_nonzero(np.diff(onsets[:, 1]))),
         "exclusive_share": float((np.abs(u[:, machine.is_exclusive]) > LEVER_OFF).any(1).mean())
         if machine.exclusive
         else math.nan,
-        "smoothness": sparc(
-            np.linalg.norm(np.diff(averaged(tip, 5), axis=0), axis=1), recording.rate_hz
+        "smoothness": compute_sparc(
+            np.linalg.norm(np.diff(average_windows(tip, 5), axis=0), axis=1), recording.rate_hz
         ),
         "control_effort": float(np.abs(np.diff(u, axis=0)).sum() / (period_s * max(1, num - 1))),
         "advice_error": math.nan,
@@ -123,7 +122,7 @@ def measure(
     names = [f"advice_{joint}" for joint in recording.joints]
     if all(name in recording.extra for name in names):
         advice = np.stack([recording.extra[name][:num] for name in names], 1).astype(float)
-        found |= tracking(u, advice, period_s)
+        found |= measure_tracking(u, advice, period_s)
     if "force_n" in recording.extra:
         touching = recording.extra["force_n"][:num] > CONTACT_N
         found["contacts"] = float(np.count_nonzero(np.diff(touching.astype(int), prepend=0) > 0))
@@ -131,8 +130,8 @@ def measure(
     return found
 
 
-def insertion(tip_in_base_m: np.ndarray, hole: Hole, success: Success) -> int | None:
-    """Returns the first sample at which the tip, `(T, 3)`, is in the hole, `None` where it never is."""
+def find_insertion(tip_in_base_m: np.ndarray, hole: Hole, success: Success) -> int | None:
+    """Return the first sample at which the tip, `(T, 3)`, is in the hole, `None` where it never is."""
     away = tip_in_base_m - np.array(hole.center_in_base_m)
     inside = (np.hypot(away[:, 0], away[:, 1]) <= success.clearance_m) & (
         away[:, 2] <= -success.depth_m
@@ -140,8 +139,8 @@ def insertion(tip_in_base_m: np.ndarray, hole: Hole, success: Success) -> int | 
     return int(inside.argmax()) if inside.any() else None
 
 
-def length(tip_in_base_m: np.ndarray, period_s: float) -> float:
-    """Returns the length of a path, `(T, 3)`, between means over pieces of `PIECE_S`, m; first and last sample are its ends."""
+def measure_path_length(tip_in_base_m: np.ndarray, period_s: float) -> float:
+    """Return the length of a path, `(T, 3)`, between means over pieces of `PIECE_S`, m; first and last sample are its ends."""
     size = max(1, round(PIECE_S / period_s))
     inner = len(tip_in_base_m) // size * size
     corners = tip_in_base_m[:inner].reshape(-1, size, 3).mean(1)
@@ -149,16 +148,16 @@ def length(tip_in_base_m: np.ndarray, period_s: float) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def moving(q: np.ndarray, machine: Machine, period_s: float) -> np.ndarray:
-    """Returns which joints move, `(T, J)` bool, by the slope over a quarter of a second."""
+def detect_motion(q: np.ndarray, machine: Machine, period_s: float) -> np.ndarray:
+    """Return which joints move, `(T, J)` bool, by the slope over a quarter of a second."""
     if len(q) < 2:
         return np.zeros(q.shape, bool)
-    speed = np.gradient(averaged(q, 5), period_s, axis=0)
+    speed = np.gradient(average_windows(q, 5), period_s, axis=0)
     return np.abs(speed) > MOVING * machine.max_speed
 
 
-def movements(u: np.ndarray) -> np.ndarray:
-    """Returns when and which lever axis began to move, `(M, 2)` of sample and joint, in order; commands `u`, `(T, J)`."""
+def detect_lever_movements(u: np.ndarray) -> np.ndarray:
+    """Return when and which lever axis began to move, `(M, 2)` of sample and joint, in order; commands `u`, `(T, J)`."""
     on, off = np.abs(u) >= LEVER_ON, np.abs(u) < LEVER_OFF
     # the state after the newest sample that says anything: on, off, or at the start off
     told = np.where(on, 1, np.where(off, 0, -1))
@@ -168,8 +167,8 @@ def movements(u: np.ndarray) -> np.ndarray:
     return np.argwhere(np.diff(held.astype(int), axis=0, prepend=0) > 0)
 
 
-def tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict[str, float]:
-    """Returns root mean square distance of commands from the advice, and the lag at which both agree best; `(T, J)` each.
+def measure_tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict[str, float]:
+    """Return root mean square distance of commands from the advice, and the lag at which both agree best; `(T, J)` each.
 
     Advice that is NaN was not shown.
     """
@@ -187,9 +186,40 @@ def tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict[str, fl
     }
 
 
-def averaged(values: np.ndarray, size: int) -> np.ndarray:
-    """Returns centred moving means over `size` samples, `(T, …)`, over fewer at the ends."""
+def average_windows(values: np.ndarray, size: int) -> np.ndarray:
+    """Return centred moving means over `size` samples, `(T, …)`, over fewer at the ends."""
     total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, 0)))
     index = np.arange(len(values))
     low, high = np.maximum(index - size // 2, 0), np.minimum(index + size // 2 + 1, len(values))
     return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (values.ndim - 1))
+
+
+CUT_OFF_HZ = 10.0
+THRESHOLD = 0.05
+PADDING = 4
+
+
+def compute_sparc(speed: np.ndarray, rate_hz: float) -> float:
+    """Return minus the length of the spectrum's outline: near -1.4 for one smooth stroke, lower with every stop and start.
+
+    Args:
+        speed: Speed over time, `(T,)`, any unit.
+        rate_hz: Samples a second.
+
+    Returns:
+        NaN where nothing moved.
+    """
+    if len(speed) < 2 or not np.any(speed):
+        return math.nan
+    size = 2 ** (math.ceil(math.log2(len(speed))) + PADDING)
+    frequency = np.arange(size) * rate_hz / size
+    spectrum = np.abs(np.fft.fft(speed, size))
+    spectrum = spectrum / spectrum.max()
+    within = frequency <= CUT_OFF_HZ
+    frequency, spectrum = frequency[within], spectrum[within]
+    above = np.flatnonzero(spectrum >= THRESHOLD)
+    frequency, spectrum = frequency[above[0] : above[-1] + 1], spectrum[above[0] : above[-1] + 1]
+    if len(frequency) < 2:
+        return math.nan
+    across = np.diff(frequency) / (frequency[-1] - frequency[0])
+    return -float(np.hypot(across, np.diff(spectrum)).sum())

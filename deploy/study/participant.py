@@ -33,14 +33,14 @@ from deploy.page.settings import LINK
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.supervisor import CompanionProcess
-from deploy.study.simulation import answered
+from deploy.study.simulation import answer_questionnaire
 from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 log = logging.getLogger(__name__)
 
 STARTING_S = 60.0
-"""How long the page may take to be there."""
+"""Longest wait for the page, s."""
 AGAIN_S = 2.0
 """Time after which what was pressed without effect is pressed again."""
 
@@ -75,7 +75,7 @@ class Participant:
         }
 
     def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
-        """Returns the processes to run beside the loop."""
+        """Return the processes to run beside the loop."""
         person = Person(
             self, machine, session.folder.resolve() / LINK, session.stream("study operators")
         )
@@ -94,7 +94,7 @@ class Participant:
 
 @dataclass(frozen=True)
 class Person:
-    """What a participant's process is to do.
+    """Settings of the process of a simulated participant.
 
     Attributes:
         bench: Who it is.
@@ -110,7 +110,7 @@ class Person:
 
 
 def take_part(stop: Stop, person: Person, memory: LoopMemory) -> None:
-    """Takes part until it is asked to stop; asks its parent to stop once all sittings are done."""
+    """Take part until it is asked to stop; asks its parent to stop once all sittings are done."""
     asyncio.run(_Taking(person).run(stop))
 
 
@@ -165,14 +165,14 @@ class _Taking:
         return host, token
 
     async def _look(self, state: ClientConnection) -> None:
-        """Sees what the page is sent, and says that it is drawn."""
+        """See what the page is sent, and says that it is drawn."""
         async for text in state:
             said, now_ms = json.loads(text), 1000 * time.monotonic()
             self._shown = said["shown"]
             await state.send(json.dumps([said["number"], now_ms, now_ms, now_ms]))
 
     async def _press(self, study: ClientConnection) -> None:
-        """Presses what a person would press next."""
+        """Press what a person would press next."""
         pressed, pressed_s = list[Any](), 0.0
         async for text in study:
             said = json.loads(text)
@@ -219,9 +219,9 @@ class _Taking:
         return there and (study["condition"] == "unguided" or study["advised"] == "valid")
 
     def _answers(self, study: dict[str, Any]) -> list[dict[str, Any]]:
-        """Returns a whole questionnaire, made up from how long the trials took."""
+        """Return a whole questionnaire, made up from how long the trials took."""
         generator = np.random.default_rng((self._person.seed, self._number, study["period"]))
-        made = answered(float(np.mean(self._took_s or [0.0])) / 100.0, 0.0, generator)
+        made = answer_questionnaire(float(np.mean(self._took_s or [0.0])) / 100.0, 0.0, generator)
         chosen = {frozenset(answer["pair"]): answer["chosen"] for answer in made["pairs"]}
         self._took_s.clear()
         found = [
@@ -240,7 +240,7 @@ class _Taking:
         return int("".join(filter(str.isdigit, self._study.get("who") or "0")))
 
     async def _hold(self, stop: Stop, wire: CanBus, tasks: list[asyncio.Task[None]]) -> None:
-        """Holds the remote, dead-man pressed."""
+        """Hold the remote, dead-man pressed."""
         remote = RadioRemote(BusDescription(self._bench.twin.dbc, self._machine))
         remote.deadman = True
         every, pace, cycle, full_rad = (
@@ -260,7 +260,7 @@ class _Taking:
                 bus.send(remote.build_frame())
 
     def _given(self) -> np.ndarray:
-        """Returns what the hands give in the coming period, `(J,)`; nothing but in a trial."""
+        """Return what the hands give in the coming period, `(J,)`; nothing but in a trial."""
         shown, study, num = self._shown, self._study, self._machine.num_joints
         if study.get("phase") != "running" or shown.get("q") is None or not shown.get("targets"):
             self._model = None

@@ -19,7 +19,7 @@ RULES = (
 )
 
 
-def page(
+def build_plan_page(
     design: Design,
     machine: str,
     seed: int,
@@ -27,20 +27,20 @@ def page(
     errors: dict[str, Any],
     notice: str = "",
 ) -> Report:
-    """Returns the page.
+    """Return the page.
 
     Args:
         design: What was planned with.
         machine: Name of the machine.
         seed: Seed of the draw.
         planned: All trials.
-        errors: How often simulated studies of this plan err; see `deploy.study.study`.
+        errors: How often simulated studies of this plan err; see `deploy.study.study_steps`.
         notice: Said on top.
     """
     num, num_trials, inside = design.num_participants, len(design.holes), design.success
-    can = sample_size.size(num, design.alpha)
-    paired_least, sequence_least = sample_size.least(design.alpha)
-    wanted = sample_size.enough(design.alpha)
+    can = sample_size.evaluate_size(num, design.alpha)
+    paired_least, sequence_least = sample_size.find_smallest_sizes(design.alpha)
+    wanted = sample_size.find_sufficient_size(design.alpha)
     if design.order == "fixed":
         summary, tone = (
             "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.",
@@ -69,8 +69,8 @@ def page(
             "seed of the draw": seed,
         }
     )
-    _numbers(found, design, paired_least, sequence_least)
-    _errors(found, errors)
+    _add_sample_sizes(found, design, paired_least, sequence_least)
+    _add_error_rates(found, errors)
     found.add_heading("Rules")
     found.add_list(RULES)
     found.add_heading("Places")
@@ -86,11 +86,13 @@ def page(
     found.add_text(
         "A hole and a start a trial, in this order; tick what is done, write down what went otherwise."
     )
-    _sheets(found, planned)
+    _add_schedule(found, planned)
     return found
 
 
-def _numbers(found: Report, design: Design, paired_least: int, sequence_least: int) -> None:
+def _add_sample_sizes(
+    found: Report, design: Design, paired_least: int, sequence_least: int
+) -> None:
     found.add_heading("How many participants")
     found.add_text(
         "An exact paired test cannot go below p = 0.0625 with five participants: such a study can never be significant at 0.05. "
@@ -106,7 +108,7 @@ def _numbers(found: Report, design: Design, paired_least: int, sequence_least: i
     ]
     sizes = sorted({*sample_size.SIZES, design.num_participants})
     rows = []
-    for size in (sample_size.size(num, design.alpha) for num in sizes):
+    for size in (sample_size.evaluate_size(num, design.alpha) for num in sizes):
         here = size.num_participants == design.num_participants
         name = Cell(str(size.num_participants), note="this plan" if here else "")
         rows.append(
@@ -122,7 +124,7 @@ def _numbers(found: Report, design: Design, paired_least: int, sequence_least: i
     )
 
 
-def _errors(found: Report, errors: dict[str, Any]) -> None:
+def _add_error_rates(found: Report, errors: dict[str, Any]) -> None:
     found.add_heading("How such a study errs")
     found.add_text(
         "Studies drawn from a fast model of people at work (skill, practice by the power law, holes, chance; no machine), "
@@ -146,7 +148,7 @@ def _errors(found: Report, errors: dict[str, Any]) -> None:
     )
 
 
-def _sheets(found: Report, planned: list[Trial]) -> None:
+def _add_schedule(found: Report, planned: list[Trial]) -> None:
     for participant in dict.fromkeys(trial.participant for trial in planned):
         mine = [trial for trial in planned if trial.participant == participant]
         found.add_heading(participant, 3)

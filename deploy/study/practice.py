@@ -16,7 +16,7 @@ from scipy import optimize
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.spec import spec
-from deploy.study import exact
+from deploy.study import permutation_tests
 
 LARGE = 20_000
 """Persons from whose times the size of an effect is worked out."""
@@ -26,7 +26,7 @@ STRONGEST = -5.0
 
 @spec
 class Practice:
-    """How long simulated persons take for a trial; standard deviations are of the logarithm.
+    """Model of trial times of simulated persons; standard deviations are of the logarithm.
 
     Attributes:
         base_s: Typical time of the very first trial.
@@ -62,7 +62,7 @@ class Practice:
         seed: int,
         studies: int = 1,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns mean times with and without guidance, `(S, P)` each, s.
+        """Return mean times with and without guidance, `(S, P)` each, s.
 
         Args:
             guided_first: Who has guidance in the first period, `(P,)` bool.
@@ -92,7 +92,7 @@ class Practice:
         return first, np.where(guided_first, period[..., 1], period[..., 0])
 
     def effect_of(self, dz: float, num_trials: int, practised: int, limit_s: float) -> float:
-        """Returns the effect with which guidance shortens times by `dz` standard deviations of a person's difference.
+        """Return the effect with which guidance shortens times by `dz` standard deviations of a person's difference.
 
         The standard deviation is that within sequences, without what practice does to all.
 
@@ -131,7 +131,7 @@ def share_significant(
     seed: int,
     fixed: bool = False,
 ) -> dict[str, float | list[float]]:
-    """Returns in how many of many studies guidance would be called a help or a harm, with its 95 % interval.
+    """Return in how many of many studies guidance would be called a help or a harm, with its 95 % interval.
 
     Args:
         practice: How persons work.
@@ -150,9 +150,11 @@ def share_significant(
     effect = practice.effect_of(dz, num_trials, practised, limit_s) if dz else 0.0
     guided, unguided = practice.draw(first, num_trials, practised, limit_s, effect, seed, studies)
     if fixed:
-        p = exact.paired_p(guided - unguided)
+        p = permutation_tests.compute_paired_p(guided - unguided)
     else:
-        p = exact.sequence_p(np.where(first, guided - unguided, unguided - guided), first)
+        p = permutation_tests.compute_sequence_p(
+            np.where(first, guided - unguided, unguided - guided), first
+        )
     hits = int((p <= alpha).sum())
     return {
         "share": hits / studies,

@@ -13,13 +13,13 @@ from typing import Any
 from brokk_rl.errors import StorageError
 from brokk_rl.report import Cell, Report
 from brokk_rl.session import write_json, write_text
-from deploy.study import pictures, tlx
+from deploy.study import plots, tlx
 from deploy.study.analysis import Analysis
-from deploy.study.crossover import Effect
-from deploy.study.exact import smallest_paired_p, smallest_sequence_p
-from deploy.study.folder import StudyData
+from deploy.study.crossover_analysis import GuidanceEffect
 from deploy.study.measures import GUIDED_ONLY, MEASURES
+from deploy.study.permutation_tests import get_smallest_paired_p, get_smallest_sequence_p
 from deploy.study.simulation import NOTICE
+from deploy.study.study_folder import StudyData
 
 COMPARED = tuple(each.name for each in MEASURES if each.name not in GUIDED_ONLY)
 LOADS = tuple(f"tlx_{scale}" for scale in (*tlx.SCALES, "raw", "weighted"))
@@ -27,17 +27,17 @@ SHOWN = ("time_s", "path_m", "efficiency", "several_joints", "joint_switches", "
 """Measures of which each participant's line is drawn."""
 
 
-def write(folder: Path, data: StudyData, found: Analysis) -> Path:
-    """Writes `report.html`, four pictures, `trials.csv`, `means.csv`, `effects.csv` and `report.json`; returns the page's path.
+def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
+    """Write `report.html`, four pictures, `trials.csv`, `means.csv`, `effects.csv` and `report.json`; returns the page's path.
 
     Raises:
         StorageError: a file could not be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        write_text(folder / "trials.csv", _trials(found))
-        write_text(folder / "means.csv", _means(found, data.is_simulated))
-        write_text(folder / "effects.csv", _effects(found, data.is_simulated))
+        write_text(folder / "trials.csv", _format_trials(found))
+        write_text(folder / "means.csv", _format_means(found, data.is_simulated))
+        write_text(folder / "effects.csv", _format_effects(found, data.is_simulated))
         effects = {name: asdict(effect) for name, effect in found.effects.items()}
         remarks = [asdict(remark) for remark in found.remarks]
         facts = {
@@ -48,15 +48,15 @@ def write(folder: Path, data: StudyData, found: Analysis) -> Path:
         }
         write_json(
             folder / "report.json",
-            _plain(
+            _convert_plain(
                 {"schema": 1, **facts, "effects": effects, "holm": found.holm, "remarks": remarks}
             ),
         )
         drawn = {
-            "paths": pictures.paths(found),
-            "tlx": pictures.radar(found),
-            "pairs": pictures.pairs(found, (*SHOWN, "tlx_raw", "tlx_weighted")),
-            "effects": pictures.effects(found, (*COMPARED, *LOADS)),
+            "paths": plots.draw_paths(found),
+            "tlx": plots.draw_radar(found),
+            "pairs": plots.draw_pairs(found, (*SHOWN, "tlx_raw", "tlx_weighted")),
+            "effects": plots.draw_effects(found, (*COMPARED, *LOADS)),
         }
         for name, figure in drawn.items():
             if data.is_simulated:
@@ -69,13 +69,13 @@ def write(folder: Path, data: StudyData, found: Analysis) -> Path:
             f"cannot write the report into {folder}: {error.strerror or error}"
         ) from error
     path = folder / "report.html"
-    _page(folder, data, found).write(path)
+    _build_page(folder, data, found).write(path)
     return path
 
 
-def verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
-    """Returns what the primary measure says, in words, and whether that is good, bad or no news."""
-    effect, title = found.effects[found.primary], pictures.title_of(found.primary)
+def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
+    """Return what the primary measure says, in words, and whether that is good, bad or no news."""
+    effect, title = found.effects[found.primary], plots.get_title(found.primary)
     better = next(each.better for each in MEASURES if each.name == found.primary)
     if effect.adjusted is None or effect.p is None or effect.adjusted_ci95 is None:
         why = (
@@ -99,15 +99,16 @@ def verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
     )
 
 
-def _page(folder: Path, data: StudyData, found: Analysis) -> Report:
-    summary, tone = verdict(found, data.is_simulated)
+def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
+    summary, tone = state_verdict(found, data.is_simulated)
     title = "Does guidance help?" + (" (simulated operators)" if data.is_simulated else "")
     page = Report(title, summary, tone)  # type: ignore[arg-type]
     if data.is_simulated:
         page.add_text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
     num, num_first = len(found.participants), int(found.guided_first.sum())
     least = max(
-        smallest_paired_p(num), smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0
+        get_smallest_paired_p(num),
+        get_smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0,
     )
     if least > found.alpha:
         page.add_text(
@@ -120,7 +121,7 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Report:
             "participants": f"{num}, {num_first} of them guided first",
             "trials that count": f"{len(counted)}, {sum(trial.values['success'] > 0 for trial in counted)} inserted",
             "trials kept that do not count": len(found.trials) - len(counted),
-            "primary measure": pictures.title_of(found.primary),
+            "primary measure": plots.get_title(found.primary),
             "level": found.alpha,
         }
     )
@@ -132,7 +133,9 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Report:
         "deviations of a person's difference. Means of a participant are over trials; a trial without insertion has the limit as "
         "its time and no efficiency."
     )
-    page.add_table(*_table(found, COMPARED), "of recordings; below each figure its 95 % interval")
+    page.add_table(
+        *_build_table(found, COMPARED), "of recordings; below each figure its 95 % interval"
+    )
     page.add_picture(
         folder / "effects.png", "Effect of guidance on every measure, with 95 % intervals"
     )
@@ -144,7 +147,8 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Report:
     )
     page.add_heading("Workload (NASA-TLX)")
     page.add_table(
-        *_table(found, LOADS), "0 to 100, more is more load; below each figure its 95 % interval"
+        *_build_table(found, LOADS),
+        "0 to 100, more is more load; below each figure its 95 % interval",
     )
     page.add_picture(folder / "tlx.png", "Means of the six scales with 95 % intervals")
     page.add_heading("Without the period in the model")
@@ -153,13 +157,13 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Report:
         "had one order as the other."
     )
     page.add_table(
-        *_paired_table(found),
+        *_build_paired_table(found),
         "guided minus unguided; period: second minus first, with guidance in the model",
     )
     page.add_heading("How the advice was followed")
     page.add_table(
         ["measure", "mean, guided"],
-        [[pictures.title_of(name), _mean(found, name)] for name in GUIDED_ONLY],
+        [[plots.get_title(name), _format_mean(found, name)] for name in GUIDED_ONLY],
     )
     page.add_heading("What to beware of")
     if found.remarks:
@@ -169,22 +173,33 @@ def _page(folder: Path, data: StudyData, found: Analysis) -> Report:
     return page
 
 
-def _table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[str | Cell]]]:
+def _build_table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[str | Cell]]]:
     columns = ["measure", "guided", "unguided", "difference", "dz", "p", "p, Holm"]
     rows: list[list[str | Cell]] = []
     for name in names:
         e, is_primary = found.effects[name], name == found.primary
         note = f"{e.num_persons} people" + ", the primary measure" * is_primary
-        means = [Cell(pictures.title_of(name), note), _number(e.guided), _number(e.unguided)]
-        size = [
-            Cell(_number(e.adjusted), _interval(e.adjusted_ci95)),
-            Cell(_number(e.dz), _interval(e.dz_ci95)),
+        means = [
+            Cell(plots.get_title(name), note),
+            _format_number(e.guided),
+            _format_number(e.unguided),
         ]
-        rows.append([*means, *size, _p(e.p), "decides" if is_primary else _p(found.holm.get(name))])
+        size = [
+            Cell(_format_number(e.adjusted), _format_interval(e.adjusted_ci95)),
+            Cell(_format_number(e.dz), _format_interval(e.dz_ci95)),
+        ]
+        rows.append(
+            [
+                *means,
+                *size,
+                _format_p(e.p),
+                "decides" if is_primary else _format_p(found.holm.get(name)),
+            ]
+        )
     return columns, rows
 
 
-def _paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cell]]]:
+def _build_paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cell]]]:
     columns = [
         "measure",
         "difference",
@@ -199,28 +214,34 @@ def _paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cell]]]:
     for name in (*COMPARED, *LOADS):
         e = found.effects[name]
         mean, middle = (
-            Cell(_number(e.difference), _interval(e.paired_ci95)),
-            _interval(e.hodges_lehmann_ci95),
+            Cell(_format_number(e.difference), _format_interval(e.paired_ci95)),
+            _format_interval(e.hodges_lehmann_ci95),
         )
-        dz = Cell(_number(e.paired_dz), _interval(e.paired_dz_ci95))
+        dz = Cell(_format_number(e.paired_dz), _format_interval(e.paired_dz_ci95))
         tests = [
-            _p(e.paired_p),
-            _p(e.wilcoxon_p),
-            Cell(_number(e.period), f"p {_p(e.period_p)}"),
-            _p(e.carry_over_p),
+            _format_p(e.paired_p),
+            _format_p(e.wilcoxon_p),
+            Cell(_format_number(e.period), f"p {_format_p(e.period_p)}"),
+            _format_p(e.carry_over_p),
         ]
         rows.append(
-            [pictures.title_of(name), mean, Cell(_number(e.hodges_lehmann), middle), dz, *tests]
+            [
+                plots.get_title(name),
+                mean,
+                Cell(_format_number(e.hodges_lehmann), middle),
+                dz,
+                *tests,
+            ]
         )
     return columns, rows
 
 
-def _mean(found: Analysis, name: str) -> str:
+def _format_mean(found: Analysis, name: str) -> str:
     values = [value for value in found.means[name]["guided"] if not math.isnan(value)]
-    return _number(sum(values) / len(values) if values else None)
+    return _format_number(sum(values) / len(values) if values else None)
 
 
-def _number(value: float | None) -> str:
+def _format_number(value: float | None) -> str:
     return (
         "–"
         if value is None or math.isnan(value)
@@ -230,7 +251,7 @@ def _number(value: float | None) -> str:
     )
 
 
-def _p(value: float | None) -> str:
+def _format_p(value: float | None) -> str:
     return (
         "–"
         if value is None or math.isnan(value)
@@ -240,11 +261,11 @@ def _p(value: float | None) -> str:
     )
 
 
-def _interval(value: tuple[float, float] | None) -> str:
-    return "" if value is None else f"{_number(value[0])} to {_number(value[1])}"
+def _format_interval(value: tuple[float, float] | None) -> str:
+    return "" if value is None else f"{_format_number(value[0])} to {_format_number(value[1])}"
 
 
-def _trials(found: Analysis) -> str:
+def _format_trials(found: Analysis) -> str:
     keys = ("participant", "period", "condition", "number", "outcome", "simulated", "operator")
     head = [*keys, "hole", "start", "counts", *(each.name for each in MEASURES)]
     rows = [
@@ -257,10 +278,10 @@ def _trials(found: Analysis) -> str:
         ]
         for trial in found.trials
     ]
-    return _csv(head, rows)
+    return _format_csv(head, rows)
 
 
-def _means(found: Analysis, is_simulated: bool) -> str:
+def _format_means(found: Analysis, is_simulated: bool) -> str:
     columns = found.means | {f"tlx_{name}": values for name, values in found.loads.items()}
     rows = [
         [
@@ -273,12 +294,12 @@ def _means(found: Analysis, is_simulated: bool) -> str:
         for i, (name, first) in enumerate(zip(found.participants, found.guided_first, strict=True))
         for condition in ("guided", "unguided")
     ]
-    return _csv(["participant", "simulated", "condition", "period", *columns], rows)
+    return _format_csv(["participant", "simulated", "condition", "period", *columns], rows)
 
 
-def _effects(found: Analysis, is_simulated: bool) -> str:
+def _format_effects(found: Analysis, is_simulated: bool) -> str:
     head: list[str] = []
-    for key in asdict(Effect(num_persons=0, num_guided_first=0)):
+    for key in asdict(GuidanceEffect(num_persons=0, num_guided_first=0)):
         head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
     rows = []
     for name, effect in found.effects.items():
@@ -286,12 +307,12 @@ def _effects(found: Analysis, is_simulated: bool) -> str:
             (None, None) if value is None and key.endswith("_ci95") else value
             for key, value in asdict(effect).items()
         ]
-        rows.append([name, is_simulated, *_flat(values), _blank(found.holm.get(name, math.nan))])
-    return _csv(["measure", "simulated", *head, "p_holm"], rows)
+        rows.append([name, is_simulated, *_flatten(values), _blank(found.holm.get(name, math.nan))])
+    return _format_csv(["measure", "simulated", *head, "p_holm"], rows)
 
 
-def _flat(values: Iterable) -> list:
-    """Returns numbers and the ends of intervals in one row; '' for what there is none of."""
+def _flatten(values: Iterable) -> list:
+    """Return numbers and the ends of intervals in one row; '' for what there is none of."""
     row = [part for value in values for part in (value if isinstance(value, tuple) else (value,))]
     return ["" if part is None else part for part in row]
 
@@ -300,16 +321,16 @@ def _blank(value: float) -> float | str:
     return "" if math.isnan(value) else value
 
 
-def _csv(head: Sequence[str], rows: Sequence[Sequence]) -> str:
+def _format_csv(head: Sequence[str], rows: Sequence[Sequence]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([head, *rows])
     return text.getvalue()
 
 
-def _plain(value: Any) -> Any:
-    """Returns the same with `None` for NaN, which JSON does not know."""
+def _convert_plain(value: Any) -> Any:
+    """Return the same with `None` for NaN, which JSON does not know."""
     if isinstance(value, dict):
-        return {key: _plain(part) for key, part in value.items()}
+        return {key: _convert_plain(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(part) for part in value]
+        return [_convert_plain(part) for part in value]
     return None if isinstance(value, float) and math.isnan(value) else value

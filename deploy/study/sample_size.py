@@ -1,4 +1,4 @@
-"""How many participants: what a number of them can show at all, and how likely it does."""
+"""Sample size: smallest attainable p and power by number of participants."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from deploy.study import exact
+from deploy.study import permutation_tests
 
 SIZES = (5, 6, 8, 10, 12, 14, 16, 20, 24)
 EFFECTS_DZ = (0.5, 0.8, 1.2)
@@ -18,8 +18,8 @@ STUDIES, MOST_COUNTED = 1000, 60_000_000
 
 
 @dataclass(frozen=True)
-class Size:
-    """What a number of participants can show.
+class SampleSize:
+    """Power of one number of participants.
 
     Attributes:
         num_participants: The number.
@@ -36,39 +36,51 @@ class Size:
 
 
 @cache
-def table(alpha: float, sizes: Sequence[int] = SIZES) -> list[Size]:
-    """Returns what each size can show, by simulated studies with normal differences."""
-    return [size(num, alpha) for num in sizes]
+def tabulate_sizes(alpha: float, sizes: Sequence[int] = SIZES) -> list[SampleSize]:
+    """Return the power of each size, by simulated studies with normal differences."""
+    return [evaluate_size(num, alpha) for num in sizes]
 
 
 @cache
-def size(num: int, alpha: float) -> Size:
-    """Returns what `num` participants can show."""
+def evaluate_size(num: int, alpha: float) -> SampleSize:
+    """Return smallest p and power of `num` participants."""
     num_first = (num + 1) // 2
     first = np.arange(num) < num_first
-    smallest = exact.smallest_sequence_p(num_first, num)
-    ways = exact.num_sequences(num_first, num)
-    studies = min(STUDIES, MOST_COUNTED // ways) if ways <= exact.MOST_WAYS else STUDIES
+    smallest = permutation_tests.get_smallest_sequence_p(num_first, num)
+    ways = permutation_tests.count_sequences(num_first, num)
+    studies = min(STUDIES, MOST_COUNTED // ways) if ways <= permutation_tests.MOST_WAYS else STUDIES
     chance = np.random.default_rng(num).standard_normal((studies, num))
     power = [
-        float((exact.sequence_p(chance + np.where(first, dz, -dz), first) <= alpha).mean())
+        float(
+            (
+                permutation_tests.compute_sequence_p(chance + np.where(first, dz, -dz), first)
+                <= alpha
+            ).mean()
+        )
         if smallest <= alpha
         else 0.0
         for dz in EFFECTS_DZ
     ]
-    return Size(num, exact.smallest_paired_p(num), smallest, tuple(power))
+    return SampleSize(num, permutation_tests.get_smallest_paired_p(num), smallest, tuple(power))
 
 
-def enough(alpha: float, power: float = 0.8, effect: int = 1, most: int = 40) -> int | None:
-    """Returns the least even number of participants that finds an effect of `EFFECTS_DZ[effect]` with `power`."""
+def find_sufficient_size(
+    alpha: float, power: float = 0.8, effect: int = 1, most: int = 40
+) -> int | None:
+    """Return the smallest even number of participants that reaches `power`, or `None`."""
     return next(
-        (num for num in range(6, most + 1, 2) if size(num, alpha).power[effect] >= power), None
+        (num for num in range(6, most + 1, 2) if evaluate_size(num, alpha).power[effect] >= power),
+        None,
     )
 
 
-def least(alpha: float) -> tuple[int, int]:
-    """Returns the least numbers with which a paired test, and the test over sequences, can reach `alpha` at all."""
-    paired = next(num for num in range(1, 100) if exact.smallest_paired_p(num) <= alpha)
+def find_smallest_sizes(alpha: float) -> tuple[int, int]:
+    """Return the smallest sizes at which the paired test and the sequence test can reach `alpha`."""
+    paired = next(
+        num for num in range(1, 100) if permutation_tests.get_smallest_paired_p(num) <= alpha
+    )
     return paired, next(
-        num for num in range(2, 100) if exact.smallest_sequence_p((num + 1) // 2, num) <= alpha
+        num
+        for num in range(2, 100)
+        if permutation_tests.get_smallest_sequence_p((num + 1) // 2, num) <= alpha
     )

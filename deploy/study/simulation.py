@@ -20,7 +20,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.study import folder as folders
+from deploy.study import study_folder as folders
 from deploy.study import tlx
 from deploy.study.design import Design, Trial
 from deploy.study.measures import measure
@@ -49,7 +49,7 @@ def simulate(
     guided: Operator,
     unguided: Operator,
 ) -> None:
-    """Does every trial that counts, and writes recordings, trials and questionnaires into a study's folder.
+    """Do every trial that counts, and writes recordings, trials and questionnaires into a study's folder.
 
     Args:
         folder: The study's folder, with its plan.
@@ -105,12 +105,14 @@ def simulate(
     generator = session.generator("study questionnaires")
     own = {name: generator.normal(0.0, 10.0) for name in names}
     for (participant, period), load in loads.items():
-        answers = answered(float(np.mean(load)), own[participant], generator)
+        answers = answer_questionnaire(float(np.mean(load)), own[participant], generator)
         folders.write_questionnaire(folder, participant, period, {**answers, "simulated": True})
 
 
-def answered(load: float, habit: float, generator: np.random.Generator) -> dict[str, Any]:
-    """Returns a questionnaire as made up from how long and busy the trials were; it has the form of answers, no more."""
+def answer_questionnaire(
+    load: float, habit: float, generator: np.random.Generator
+) -> dict[str, Any]:
+    """Return a questionnaire as made up from how long and busy the trials were; it has the form of answers, no more."""
     middle = 25.0 + 60.0 * load + habit
     ratings = {
         scale: int(
@@ -120,7 +122,7 @@ def answered(load: float, habit: float, generator: np.random.Generator) -> dict[
     }
     chosen = [
         {"pair": list(pair), "chosen": pair[int(generator.integers(2))]}
-        for pair in tlx.pairs(generator)
+        for pair in tlx.list_pairs(generator)
     ]
     return {"ratings": ratings, "pairs": chosen, "note": NOTICE}
 

@@ -15,7 +15,7 @@ from brokk_rl.spec import spec
 from deploy.page.settings import PageSettings
 from deploy.runtime.supervisor import CompanionProcess, DeploymentLoop
 from deploy.runtime.target import FileTarget
-from deploy.study import folder as folders
+from deploy.study import study_folder as folders
 from deploy.study.conductor import Words
 from deploy.study.participant import Participant
 from deploy.study.study_server import StudyServerConfig
@@ -29,7 +29,7 @@ the loop where the hole is."""
 
 @spec
 class Consent:
-    """What participants agree to; a lab puts its own in its place.
+    """Consent text for participants; a lab replaces it with its own.
 
     Attributes:
         version: Kept with each consent.
@@ -48,7 +48,7 @@ class Consent:
 
 @spec
 class Sitting:
-    """How participants are led through a study.
+    """Settings of a sitting.
 
     Attributes:
         loop: The loop on the machine's computer; listens, shows, records.
@@ -78,13 +78,13 @@ class Sitting:
     def run(
         self, machine: Machine, session: Session, folder: Path, participant: str | None
     ) -> None:
-        """Leads sittings until a person stops the program.
+        """Lead sittings until a person stops the program.
 
         Raises:
             ConfigError: the folder holds no study of this machine, the plan has no such
                 participant, or another program leads sittings of this study.
         """
-        data = folders.read(folder)
+        data = folders.read_study(folder)
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {folder}")
         there = [who for who in data.plan["participants"] if who not in data.plan.get("erased", {})]
         if participant is not None and participant not in there:
@@ -108,7 +108,7 @@ class Sitting:
             port=self.bench.twin.fault_port if self.bench else None,
         )  # fmt: skip
         beside = self.bench.companions(machine, session) if self.bench else []
-        with alone(folder):
+        with reserve_study(folder):
             loop.run(
                 machine,
                 session,
@@ -120,8 +120,8 @@ class Sitting:
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Keeps others from leading sittings of the same study, as long as this process lives."""
+def reserve_study(folder: Path) -> Iterator[None]:
+    """Keep others from leading sittings of the same study, as long as this process lives."""
     with (folder / LOCK).open("w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from deploy.study.design import PERIODS, Trial
-from deploy.study.folder import StudyData
+from deploy.study.study_folder import StudyData
 
 ENOUGH = 2
 """Practice trials in a row that have to succeed for practice to be over."""
@@ -18,7 +18,7 @@ ENOUGH = 2
 
 @dataclass(frozen=True)
 class Step:
-    """What comes next.
+    """Next step of a sitting.
 
     Attributes:
         kind: Consent, a trial, a questionnaire, nothing more, or nothing because the participant
@@ -38,8 +38,8 @@ class Step:
     of: int = 0
 
 
-def next_step(data: StudyData, who: str) -> Step:
-    """Returns what a participant, known to the plan, has to do next."""
+def find_next_step(data: StudyData, who: str) -> Step:
+    """Return what a participant, known to the plan, has to do next."""
     known = data.participants.get(who, {})
     if known.get("stopped"):
         return Step("stopped")
@@ -52,7 +52,7 @@ def next_step(data: StudyData, who: str) -> Step:
             if trial["participant"] == who and trial["period"] == period
         ]
         lacking = [trial for trial in planned if (who, period, trial.number) not in data.trials]
-        if lacking and not (period == 0 and practised(data, who)):
+        if lacking and not (period == 0 and is_practised(data, who)):
             return Step(
                 "trial",
                 lacking[0],
@@ -68,8 +68,8 @@ def next_step(data: StudyData, who: str) -> Step:
     return Step("done")
 
 
-def practised(data: StudyData, who: str) -> bool:
-    """Says whether practice is over before all of it was done: by success, by time, or because the experimenter said so."""
+def is_practised(data: StudyData, who: str) -> bool:
+    """Return whether practice is over before all of it was done: by success, by time, or because the experimenter said so."""
     done = [
         trial
         for (name, period, _), trial in sorted(data.trials.items())
@@ -82,14 +82,14 @@ def practised(data: StudyData, who: str) -> bool:
 
 
 def progress(data: StudyData) -> list[dict[str, Any]]:
-    """Returns how far each participant is, for who chooses one."""
+    """Return how far each participant is, for who chooses one."""
     found = []
     for who in data.plan["participants"]:
         done = sum(name == who and period > 0 for name, period, _ in data.trials)
         of = sum(
             trial["participant"] == who and trial["period"] > 0 for trial in data.plan["trials"]
         )
-        step = next_step(data, who).kind
+        step = find_next_step(data, who).kind
         state = (
             "erased"
             if who in data.plan.get("erased", {})

@@ -66,7 +66,7 @@ class StudyServerConfig:
 
 
 def run(stop: Stop, config: StudyServerConfig, memory: LoopMemory) -> None:
-    """Leads sittings until it is asked to stop.
+    """Lead sittings until it is asked to stop.
 
     Raises:
         LinkError: the page's address is taken.
@@ -164,7 +164,7 @@ class StudyPages:
             await asyncio.sleep(TICK_S)
 
     async def talk(self, connection: ServerConnection) -> None:
-        """Sends what is to be shown whenever that changes, and takes what is said; see `PageExtension`."""
+        """Send what is to be shown whenever that changes, and takes what is said; see `PageExtension`."""
         speaking = asyncio.create_task(self._speak(connection))
         try:
             async for text in connection:

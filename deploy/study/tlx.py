@@ -28,14 +28,14 @@ STEP = 5
 PAIRS = tuple(combinations(SCALES, 2))
 
 
-def pairs(generator: np.random.Generator) -> list[tuple[str, str]]:
-    """Returns the 15 pairs in random order, each in random order, as they are to be shown."""
+def list_pairs(generator: np.random.Generator) -> list[tuple[str, str]]:
+    """Return the 15 pairs in random order, each in random order, as they are to be shown."""
     shuffled = [PAIRS[index] for index in generator.permutation(len(PAIRS))]
     return [pair if generator.integers(2) else pair[::-1] for pair in shuffled]
 
 
 def check(answers: Mapping) -> list[str]:
-    """Returns what is missing or wrong in a questionnaire, in words; empty where it is whole."""
+    """Return what is missing or wrong in a questionnaire, in words; empty where it is whole."""
     found = []
     ratings, chosen = answers.get("ratings") or {}, answers.get("pairs") or []
     lacking = [scale for scale in SCALES if ratings.get(scale) is None]
@@ -46,13 +46,13 @@ def check(answers: Mapping) -> list[str]:
             found.append(f"unknown scale '{scale}'; {list_choices(scale, SCALES)}")
         elif value is not None and not (isinstance(value, (int, float)) and 0 <= value <= 100):
             found.append(f"{scale} is {value!r}, expected 0 to 100: not counted")
-    if chosen and _weights(chosen) is None:
+    if chosen and _count_weights(chosen) is None:
         found.append(f"{len(chosen)} of 15 pairs answered as they should be: no weighted score")
     return found
 
 
-def ratings(answers: Mapping) -> dict[str, float]:
-    """Returns the rating of each scale, NaN where there is none that makes sense."""
+def read_ratings(answers: Mapping) -> dict[str, float]:
+    """Return the rating of each scale, NaN where there is none that makes sense."""
     given = answers.get("ratings") or {}
     values = {scale: given.get(scale) for scale in SCALES}
     return {
@@ -61,22 +61,22 @@ def ratings(answers: Mapping) -> dict[str, float]:
     }
 
 
-def raw(answers: Mapping) -> float:
-    """Returns the mean of the six scales, NaN where one is missing."""
-    return float(np.mean(list(ratings(answers).values())))
+def compute_raw_tlx(answers: Mapping) -> float:
+    """Return the mean of the six scales, NaN where one is missing."""
+    return float(np.mean(list(read_ratings(answers).values())))
 
 
-def weighted(answers: Mapping) -> float:
-    """Returns the sum of ratings times weights over 15, NaN where a pair, or a scale that was ever chosen, is missing."""
-    weights = _weights(answers.get("pairs") or [])
+def compute_weighted_tlx(answers: Mapping) -> float:
+    """Return the sum of ratings times weights over 15, NaN where a pair, or a scale that was ever chosen, is missing."""
+    weights = _count_weights(answers.get("pairs") or [])
     if weights is None:
         return math.nan
-    given = ratings(answers)
+    given = read_ratings(answers)
     return sum(weights[scale] * given[scale] for scale in SCALES if weights[scale]) / len(PAIRS)
 
 
-def _weights(chosen: Sequence[Mapping]) -> dict[str, int] | None:
-    """Returns how often each scale was chosen; `None` unless each of the 15 pairs was answered once.
+def _count_weights(chosen: Sequence[Mapping]) -> dict[str, int] | None:
+    """Return how often each scale was chosen; `None` unless each of the 15 pairs was answered once.
 
     Each answer is `{"pair": [a, b], "chosen": a}`.
     """

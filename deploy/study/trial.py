@@ -17,9 +17,9 @@ from brokk_rl.errors import BrokkError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from deploy.study import folder as folders
+from deploy.study import study_folder as folders
 from deploy.study.design import Hole, Success, Trial
-from deploy.study.measures import insertion
+from deploy.study.measures import find_insertion
 from deploy.study.twin_control import FILLED, Stage
 
 log = logging.getLogger(__name__)
@@ -28,12 +28,12 @@ Phase = Literal["ready", "starting", "countdown", "running", "settling", "saving
 LOST_S = 1.0
 """Time without positions after which a trial is aborted."""
 STARTING_S = 10.0
-"""How long a recording may take to begin."""
+"""Longest wait for a recording to begin, s."""
 
 
 @spec
 class Times:
-    """How a trial begins and ends.
+    """Times of a trial.
 
     Attributes:
         countdown_s: From the press on the page to the beginning.
@@ -99,16 +99,16 @@ class Attempt:
 
     @property
     def running(self) -> bool:
-        """Whether it is under way."""
+        """True while the trial runs."""
         return self._phase == "running"
 
     @property
     def over(self) -> bool:
-        """Whether it was saved."""
+        """True once the trial is saved."""
         return self._phase == "over"
 
     def begin(self) -> str:
-        """Begins the recording, then the countdown; returns why not, where it cannot."""
+        """Begin the recording, then the countdown; returns why not, where it cannot."""
         if self._phase != "ready":
             return "not now"
         if self._stage.sight().q is None:
@@ -131,7 +131,7 @@ class Attempt:
         return ""
 
     def stop(self) -> str:
-        """Ends it for the participant; one that has not begun is left as it is."""
+        """End it for the participant; one that has not begun is left as it is."""
         return (
             self._end("stopped", "")
             if self._phase == "running"
@@ -139,13 +139,13 @@ class Attempt:
         )
 
     def abort(self, reason: str) -> str:
-        """Ends it for a fault: it is kept, does not count, and is done again."""
+        """End it for a fault: it is kept, does not count, and is done again."""
         if self._phase in ("starting", "countdown", "running"):
             return self._end("aborted", reason)
         return "not now"
 
     def tick(self) -> None:
-        """Lets it go on."""
+        """Let it go on."""
         now_s, sight = self._clock(), self._stage.sight()
         in_phase_s = now_s - self._since_s
         self._seen_s = now_s if sight.q is not None else self._seen_s
@@ -164,7 +164,7 @@ class Attempt:
             self._enter("running")
         elif self._phase == "running" and sight.q is not None:
             inside = (
-                insertion(
+                find_insertion(
                     compute_tool_kinematics(self._machine, sight.q).tip_in_base_m[None],
                     self._hole,
                     self._success,
@@ -179,7 +179,7 @@ class Attempt:
             self._enter("over")
 
     def view(self) -> dict[str, Any]:
-        """Returns what pages show of it, as plain data."""
+        """Return what pages show of it, as plain data."""
         now_s, sight = self._clock(), self._stage.sight()
         away = None if sight.q is None else sight.q - self._start
         joints = [] if away is None else [
@@ -196,13 +196,13 @@ class Attempt:
         }  # fmt: skip
 
     def close(self) -> None:
-        """Waits until everything is on the disk."""
+        """Wait until everything is on the disk."""
         if self._phase == "settling":
             self._save()
         self._worker.shutdown(wait=True)
 
     def leave(self) -> None:
-        """Ends it now; what is not on the disk yet is made of the capture the next time."""
+        """End it now; what is not on the disk yet is made of the capture the next time."""
         self.abort("the program ended")
         self._worker.shutdown(wait=False, cancel_futures=True)
 
@@ -244,7 +244,7 @@ class Attempt:
 
 
 def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
-    """Makes a recording of what was captured of the trial in the file `path`; what cannot be used is said in that file.
+    """Make a recording of what was captured of the trial in the file `path`; what cannot be used is said in that file.
 
     A trial that began has a `window_s`, so that this can be done again where it was interrupted:
     the clock is that of the capture.
@@ -256,7 +256,7 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
     try:
         found = stage.keep(folder.resolve() / trial["capture"], *trial["window_s"])
         name = f"{folders.RECORDINGS}/{path.stem}.parquet"
-        record.write_recording(_told(found, trial), folder / name)
+        record.write_recording(_describe_target(found, trial), folder / name)
         changes["recording"] = name
         if FILLED in found.metadata:
             changes["recording_problem"] = found.metadata[FILLED]
@@ -266,8 +266,8 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
     folders.rewrite(path, changes)
 
 
-def _told(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
-    """Returns the recording with the hole, and without advice that was not shown."""
+def _describe_target(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
+    """Return the recording with the hole, and without advice that was not shown."""
     guided = trial["condition"] == "guided"
     extra = {
         name: values

@@ -1,4 +1,4 @@
-"""What a sitting needs of the loop: see the machine, say where the hole is, put the twin, record."""
+"""Control of the loop during a sitting: machine state, hole, pose of the twin, recording."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from deploy.twin.faults import request_fault
 FRESH_S = 0.3
 """Age of positions and advice from which they are not there."""
 CLOSING_S = 15.0
-"""How long a capture may take to be closed before what is there is read."""
+"""Longest wait for a capture to close before its content is read, s."""
 GAP_S, LONGEST_GAP_S = 0.2, 1.0
 """Silence of the bus in a trial from which it is said, and the longest that is filled in between
 its ends."""
@@ -35,7 +35,7 @@ FILLED = "filled"
 
 @dataclass(frozen=True)
 class Sight:
-    """What is known of the machine now.
+    """Present state of the machine.
 
     Attributes:
         q: Joint positions, `(J,)`; `None` where nothing fresh is known.
@@ -52,19 +52,19 @@ class Stage(Protocol):
     """Where trials take place."""
 
     def sight(self) -> Sight:
-        """Returns what is known now."""
+        """Return what is known now."""
         ...
 
     def prepare(self, hole: Hole, start: np.ndarray) -> None:
-        """Makes the hole known to the policy; a twin is put to the start, a machine has to be driven there."""
+        """Make the hole known to the policy; a twin is put to the start, a machine has to be driven there."""
         ...
 
     def record(self, folder: Path | None) -> None:
-        """Begins a recording in `folder`, or ends it."""
+        """Begin a recording in `folder`, or ends it."""
         ...
 
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
-        """Returns what was recorded in `folder` between two times, once the recording has been closed.
+        """Return what was recorded in `folder` between two times, once the recording has been closed.
 
         Where the bus was silent for a moment, positions go straight from one end of it to the
         other; the metadata `filled` says so.

@@ -58,7 +58,7 @@ class Crew:
     def ask(
         self, method: str, running: np.ndarray, values: np.ndarray | None = None
     ) -> dict[int, Any]:
-        """Calls a method of the desks of all running trials, `(N,)` bool, each with its row of `values`; returns answers by trial.
+        """Call a method of the desks of all running trials, `(N,)` bool, each with its row of `values`; returns answers by trial.
 
         Raises:
             BrokkError: a process has died.
@@ -76,8 +76,8 @@ class Crew:
         return found
 
 
-def work(stop: Stop, file: int, build: str, part: tuple[Any, ...]) -> None:
-    """Does what the crew is asked, until nobody asks any more."""
+def run_worker(stop: Stop, file: int, build: str, part: tuple[Any, ...]) -> None:
+    """Do what the crew is asked, until nobody asks any more."""
     from pkgutil import resolve_name
 
     channel, desks = Channel(file), resolve_name(build)(*part)
@@ -94,6 +94,6 @@ def work(stop: Stop, file: int, build: str, part: tuple[Any, ...]) -> None:
             return
 
 
-def cores() -> int:
-    """Returns the cores that this process may use."""
+def count_cores() -> int:
+    """Return the cores that this process may use."""
     return len(os.sched_getaffinity(0))

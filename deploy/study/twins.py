@@ -33,13 +33,13 @@ from deploy.guidance import LeverGuidance, LeverMap, find_full_angles_rad
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
 from deploy.runtime.receiver import BusReceiver
-from deploy.study.twin_pool import Crew, cores
+from deploy.study.twin_pool import Crew, count_cores
 from deploy.twin.faults import FaultPort
 from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import CYCLE_S, RunningTwin, Twin
 
 BEGIN_S = 1000.0
-"""Of the clock; nothing in the loop may take a small number for a time."""
+"""Start of the simulated clock, s; large, so that no small number passes for a time."""
 BEFORE_S = 1.0
 """For which everything runs before a trial begins: the policy's history is full then."""
 NO_BUS = CanBus(interface="virtual", channel="none", bitrate=None, port=None)
@@ -86,7 +86,7 @@ class Twins:
             )
             for n in range(num)
         ]
-        processes = min(self.num_processes or cores(), num)
+        processes = min(self.num_processes or count_cores(), num)
         rows = [np.arange(first, num, processes) for first in range(processes)]
         parts = [(self, machine, session, [places[n] for n in mine]) for mine in rows]
         steps, left = (
@@ -103,7 +103,7 @@ class Twins:
                     OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice)
                 )
                 now |= crew.ask("period", running, given)
-                left -= _inserted(machine, q, trials) & running
+                left -= _detect_insertion(machine, q, trials) & running
                 found |= crew.ask("end", running & (left <= 0))
                 running &= left > 0
                 if not running.any():
@@ -112,13 +112,13 @@ class Twins:
         return [found[n] for n in range(num)]
 
 
-def desks(
+def make_desks(
     ground: Twins,
     machine: Machine,
     session: Session,
     places: list[tuple[int, np.ndarray, np.ndarray, bool]],
 ) -> list[_Desk]:
-    """Returns a desk for each of `places`: seed, start, rim, and whether advice is shown there."""
+    """Return a desk for each of `places`: seed, start, rim, and whether advice is shown there."""
     bundle, description = PolicyBundle(ground.policy, machine), BusDescription(ground.dbc, machine)
     made = [
         _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided)
@@ -129,7 +129,7 @@ def desks(
     return made
 
 
-def _inserted(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
+def _detect_insertion(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
     away = compute_tool_kinematics(machine, q).tip_in_base_m - trials.rim_in_base_m
     return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (
         away[:, 2] <= -trials.depth_m
@@ -156,7 +156,7 @@ class _NoLog:
 
 @dataclass
 class _Shared:
-    """What an adviser reads and writes of the shared memory."""
+    """Shared memory that an adviser reads and writes."""
 
     state: _Newest
     advice: _Newest
@@ -225,17 +225,17 @@ class _Desk:
         self._shown = np.zeros(machine.num_joints)
 
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the arm as a person beside it sees it, and the commands that the levers shown now stand for, `(J,)` each."""
+        """Return the arm as a person beside it sees it, and the commands that the levers shown now stand for, `(J,)` each."""
         return np.asarray(self._link.read().q, float), self._shown
 
     def wait(self, seconds: float) -> None:
-        """Lets time go by before the trial, levers in neutral."""
+        """Let time go by before the trial, levers in neutral."""
         for _ in range(round(seconds / self._machine.period_s)):
             self.period(np.zeros(self._machine.num_joints))
         self._rows.clear()
 
     def period(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lets a control period go by in which the levers stand as `given`, `(J,)`, wants them; returns what is `seen` then."""
+        """Let a control period go by in which the levers stand as `given`, `(J,)`, wants them; returns what is `seen` then."""
         receiver, before = self._receiver, (self._receiver.flow_sum, self._receiver.flow_number)
         q = receiver.q.copy() if receiver.frames else self.seen()[0]
         force = getattr(self._link, "extra", dict)().get("force_n", np.zeros(1))
@@ -265,7 +265,7 @@ class _Desk:
         self._air.frames.clear()
 
     def _advise(self) -> None:
-        """Publishes what is known, as the bus process does, and lets the policy speak."""
+        """Publish what is known, as the bus process does, and lets the policy speak."""
         now_s = self._now_s
         state = self._receiver.build_state(now_s, bus_up=True, decision=self._silent, missed=0)
         self._shared.state.write(state)
@@ -274,13 +274,13 @@ class _Desk:
         self._shown = self._display.command(advice.lever_rad, advice.button_right)
 
     def end(self) -> Recording:
-        """Returns the recording, and lets go of the twin: its memory is wanted for nothing any more."""
+        """Return the recording, and lets go of the twin: its memory is wanted for nothing any more."""
         found = self.recording()
         del self._twin, self._link
         return found
 
     def recording(self) -> Recording:
-        """Returns the trial at the control rate, commands as the valves got them."""
+        """Return the trial at the control rate, commands as the valves got them."""
         machine = self._machine
         q, u, advice = (
             np.stack([row[i] for row in self._rows]).astype(np.float32) for i in range(3)

@@ -1,4 +1,4 @@
-"""`brokk mode=close_gap`: success of a policy before and after retraining with diagnosed effects."""
+"""`brokk mode=close_gap`: success of a policy before and after retraining with effects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`brokk mode=exam`: makes sealed cases, has each diagnosed by a process that cannot read the labels, and marks the answers."""
+"""`brokk mode=exam`: make sealed cases, have them diagnosed blindly, and score the answers."""
 
 from __future__ import annotations
 

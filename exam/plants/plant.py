@@ -40,9 +40,9 @@ class ExamPlant:
 
     Args:
         machine: Geometry, masses, limits.
-        make: See `anatomy.MAKES`.
-        anatomies: Numbers of each run's machine.
-        outside_faults: Kind of the fault outside the library of each run, or `None`; its severity is the
+        make: See `plant_parameters.MAKES`.
+        parameters: Of each run's machine.
+        outside_faults: Fault outside the library of each run, or `None`; its severity is the
             parameter `outside_severity`.
         seeds: Chance of each run.
         elapsed_s: How long each machine has run before.
@@ -54,7 +54,7 @@ class ExamPlant:
         self,
         machine: Machine,
         make: str,
-        anatomies: Sequence[PlantParameters],
+        parameters: Sequence[PlantParameters],
         outside_faults: Sequence[str | None],
         seeds: Sequence[int],
         elapsed_s: np.ndarray,
@@ -63,12 +63,12 @@ class ExamPlant:
     ) -> None:
         self._machine, self._n = (
             machine,
-            {name: np.stack([a[name] for a in anatomies]) for name in anatomies[0]},
+            {name: np.stack([one[name] for one in parameters]) for name in parameters[0]},
         )
-        n, count, joints = self._n, len(anatomies), machine.num_joints
+        n, count, joints = self._n, len(parameters), machine.num_joints
         self._chance = [
-            _RunNoise(seed, anatomy, steps, machine)
-            for seed, anatomy in zip(seeds, anatomies, strict=True)
+            _RunNoise(seed, one, steps, machine)
+            for seed, one in zip(seeds, parameters, strict=True)
         ]
         self._wander = np.stack([chance.wander for chance in self._chance], 1)
         self._noise = np.stack([chance.noise for chance in self._chance], 1)
@@ -184,10 +184,10 @@ class ExamPlant:
 class _RunNoise:
     """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours."""
 
-    def __init__(self, seed: int, anatomy: PlantParameters, steps: int, machine: Machine) -> None:
+    def __init__(self, seed: int, one: PlantParameters, steps: int, machine: Machine) -> None:
         generator = np.random.default_rng(seed)
         shape = (steps + 1, machine.num_joints)
-        keep = np.exp(-machine.period_s / anatomy["wander_s"])
+        keep = np.exp(-machine.period_s / one["wander_s"])
         white, first = (
             generator.standard_normal(shape),
             generator.standard_normal(machine.num_joints),
@@ -196,7 +196,7 @@ class _RunNoise:
             lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white[:, j], zi=[a * first[j]])[0]
             for j, a in enumerate(keep.tolist())
         ]
-        self.wander = (np.stack(wander, 1) * anatomy["wander"]).astype(np.float32)
+        self.wander = (np.stack(wander, 1) * one["wander"]).astype(np.float32)
         self.noise = generator.standard_normal(shape, dtype=np.float32)
         self.luck = generator.random((steps + 1, 3), dtype=np.float32)
         self.tool = generator.standard_normal((steps + 1, 4), dtype=np.float32)
@@ -223,43 +223,38 @@ class HydraulicPlants:
         """Names of the faults outside the library that its plants can have."""
         return out_of_library_faults.KINDS
 
-    def makes(self, machine: Machine, specimens: Sequence[PlantRun]) -> list[str]:
-        """Return the make of each specimen."""
-        return [
-            plant_parameters.draw_plant(machine, specimen.seed, 1.0)[0] for specimen in specimens
-        ]
+    def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
+        """Return the make of each run."""
+        return [plant_parameters.draw_plant(machine, run.seed, 1.0)[0] for run in runs]
 
-    def build(self, machine: Machine, specimens: Sequence[PlantRun], run_s: float) -> ExamPlant:
-        """Return specimens of one make, side by side.
+    def build(self, machine: Machine, runs: Sequence[PlantRun], run_s: float) -> ExamPlant:
+        """Return runs of one make, side by side.
 
         Raises:
             ConfigError: an effect, an outside_fault or a roughness is unknown.
         """
         found = []
-        for specimen in specimens:
-            if specimen.roughness not in self.roughness:
+        for run in runs:
+            if run.roughness not in self.roughness:
                 raise ConfigError(
-                    f"exam: no roughness '{specimen.roughness}' in exam.plants.roughness; "
-                    f"{list_choices(specimen.roughness, self.roughness)}"
+                    f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
+                    f"{list_choices(run.roughness, self.roughness)}"
                 )
             make, numbers = plant_parameters.draw_plant(
-                machine, specimen.seed, self.roughness[specimen.roughness]
+                machine, run.seed, self.roughness[run.roughness]
             )
-            numbers = apply_faults(numbers, specimen.faults)
-            if specimen.outside_fault is not None:
-                numbers["outside_severity"] = specimen.outside_fault.severity
+            numbers = apply_faults(numbers, run.faults)
+            if run.outside_fault is not None:
+                numbers["outside_severity"] = run.outside_fault.severity
             found.append((make, numbers))
         (make,) = {make for make, _ in found}
         return ExamPlant(
             machine,
             make,
             [numbers for _, numbers in found],
-            [
-                specimen.outside_fault.kind if specimen.outside_fault else None
-                for specimen in specimens
-            ],
-            [specimen.chance for specimen in specimens],
-            np.array([specimen.elapsed_s for specimen in specimens]),
-            [specimen.tracked for specimen in specimens],
+            [run.outside_fault.kind if run.outside_fault else None for run in runs],
+            [run.chance for run in runs],
+            np.array([run.elapsed_s for run in runs]),
+            [run.tracked for run in runs],
             round(run_s / machine.period_s),
         )

@@ -21,7 +21,7 @@ class SpoolValve:
     """Spools of all joints.
 
     Args:
-        numbers: The machine's; see `anatomy`.
+        numbers: The machine's; see `plant_parameters`.
     """
 
     def __init__(self, numbers: PlantParameters) -> None:

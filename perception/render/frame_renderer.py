@@ -131,8 +131,11 @@ class FrameRenderer:
             )
             for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True)
         )
-        place = {name: np.asarray(value).tolist() for name, value in
-                 (("center_m", block.pose.center_m), ("rotation", block.pose.rotation), ("half_m", block.half_m))}  # fmt: skip
+        place = {
+            "center_m": np.asarray(block.pose.center_m).tolist(),
+            "rotation": np.asarray(block.pose.rotation).tolist(),
+            "half_m": np.asarray(block.half_m).tolist(),
+        }
         return SceneTruth(self.scene.name, scene.conditions, holes, decoys, place)
 
     def _circle(
@@ -151,6 +154,12 @@ class FrameRenderer:
                 and (pixel.max(0) <= [self.rig.width - 1, self.rig.height - 1]).all()
             )
         return TrueCircle(
-            tuple(center.tolist()), tuple(axis.tolist()), tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
-            tuple((base[:3, :3] @ axis).tolist()), float(radius_m), float(depth_m), float(hidden), in_view,
-        )  # fmt: skip
+            center_m=tuple(center.tolist()),
+            axis=tuple(axis.tolist()),
+            center_in_base_m=tuple((base[:3, :3] @ center + base[:3, 3]).tolist()),
+            axis_in_base=tuple((base[:3, :3] @ axis).tolist()),
+            radius_m=float(radius_m),
+            depth_m=float(depth_m),
+            hidden=float(hidden),
+            in_view=in_view,
+        )

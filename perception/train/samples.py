@@ -200,7 +200,8 @@ def list_frames(folders: str | Sequence[str]) -> list[Path]:
         ]
         if not here:
             raise FrameError(
-                f"training.frames: no *{dataset.MASK} in '{folder}' (seen from {Path.cwd()}); `brokk mode=render` and "
+                f"training.frames: no *{dataset.MASK} in '{folder}' (seen from {Path.cwd()}); "
+                "`brokk mode=render` and "
                 "`brokk mode=label` make frames with masks"
             )
         stems += here

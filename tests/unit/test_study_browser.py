@@ -165,7 +165,7 @@ def test_the_whole_questionnaire_by_click(
     until(page, "() => window.sitting().kind === 'trial'")
     found = answers(tmp_path)
     assert found["ratings"] == given and found["finished"] and tlx.check(found) == []
-    assert tlx.weighted(found) == pytest.approx(
+    assert tlx.compute_weighted_tlx(found) == pytest.approx(
         sum(weights[scale] * given[scale] for scale in given) / 15
     )
 
@@ -198,7 +198,10 @@ def test_the_whole_questionnaire_by_key_in_german(
     page.keyboard.press("Enter")
     until(page, "() => window.sitting().kind === 'trial'")
     found = answers(tmp_path)
-    assert list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70] and tlx.raw(found) == 57.5
+    assert (
+        list(found["ratings"].values()) == [45, 50, 55, 60, 65, 70]
+        and tlx.compute_raw_tlx(found) == 57.5
+    )
     assert [answer["chosen"] for answer in found["pairs"]] == [
         pair[0] for pair in found["shown_pairs"]
     ]

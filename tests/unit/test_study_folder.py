@@ -17,7 +17,7 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.study import analysis, design, folder, report, tlx
+from deploy.study import analysis, design, report, study_folder, tlx
 
 RATE_HZ = 20.0
 
@@ -37,13 +37,13 @@ def study(
 ) -> list[design.Trial]:
     """Writes a whole study in which guided trials last 4 s and others 8 s, the second period 1 s less, and persons differ."""
     what = made(machine, order, count)
-    planned = design.trials(what, np.random.default_rng(0))
-    write_json(folder_ / folder.PLAN, design.as_json(what, machine, 0, planned))
+    planned = design.plan_trials(what, np.random.default_rng(0))
+    write_json(folder_ / study_folder.PLAN, design.format_plan(what, machine, 0, planned))
     hole = what.holes["A"]
     for trial in planned:
         person = int(trial.participant[1:])
         time_s = (4.0 if trial.condition == "guided" else 8.0) - (trial.period == 2) + 0.1 * person
-        name = f"{folder.RECORDINGS}/{trial.name}.parquet"
+        name = f"{study_folder.RECORDINGS}/{trial.name}.parquet"
         record.write_recording(trial_of(machine, time_s), folder_ / name)
         facts = {
             "participant": trial.participant,
@@ -56,7 +56,7 @@ def study(
             "center_in_base_m": list(hole.center_in_base_m),
             "radius_m": 0.05,
         }
-        folder.write_trial(
+        study_folder.write_trial(
             folder_,
             trial.name,
             facts
@@ -68,11 +68,13 @@ def study(
                 "start": "1",
             },
         )
-    for who, conditions in folder.read_plan(folder_)["participants"].items():
+    for who, conditions in study_folder.read_plan(folder_)["participants"].items():
         for period, condition in zip((1, 2), conditions, strict=True):
             ratings = dict.fromkeys(tlx.SCALES, 30 if condition == "guided" else 50)
             answers = [{"pair": list(pair), "chosen": pair[0]} for pair in tlx.PAIRS]
-            folder.write_questionnaire(folder_, who, period, {"ratings": ratings, "pairs": answers})
+            study_folder.write_questionnaire(
+                folder_, who, period, {"ratings": ratings, "pairs": answers}
+            )
     return planned
 
 
@@ -92,7 +94,7 @@ def said(data: Any) -> str:
 
 def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) -> None:
     study(tmp_path, machine, count=8)
-    data = folder.read(tmp_path)
+    data = study_folder.read_study(tmp_path)
     found = analysis.analyse(data, machine)
     effect = found.effects["time_s"]
     assert not found.remarks and len(found.trials) == 8 * 8  # practice is there, too …
@@ -105,7 +107,7 @@ def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) ->
     assert found.loads["weighted"]["guided"].tolist() == [30.0] * 8
     assert found.holm["tlx_mental"] == pytest.approx(6 * 2 / 70)
     assert "time_s" not in found.holm  # the primary measure stands alone
-    path = report.write(tmp_path / "out", data, found)
+    path = report.write_report(tmp_path / "out", data, found)
     page = path.read_text()
     assert "Guidance helps" in page and "imulated" not in page
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {
@@ -119,36 +121,36 @@ def test_with_the_papers_order_the_report_says_that_nothing_can_be_said(
     machine: Machine, tmp_path: Path
 ) -> None:
     study(tmp_path, machine, count=5, order="fixed")
-    found = analysis.analyse(folder.read(tmp_path), machine)
-    text, tone = report.verdict(found)
+    found = analysis.analyse(study_folder.read_study(tmp_path), machine)
+    text, tone = report.state_verdict(found)
     assert tone == "bad" and "order cannot be told apart" in text
     assert found.effects["time_s"].paired_p == 0.0625 and found.effects["time_s"].p is None
 
 
 def test_what_went_wrong_is_kept_and_said(machine: Machine, tmp_path: Path) -> None:
     planned = study(tmp_path, machine, count=6)
-    trials = tmp_path / folder.TRIALS
+    trials = tmp_path / study_folder.TRIALS
     (trials / "P01_1_02.json").unlink()  # missing
     for path in [*trials.glob("P02_1_*"), *trials.glob("P02_2_*")]:  # stopped after practice
         path.unlink()
-    folder.write_participant(tmp_path, "P02", {"stopped": True, "reason": "felt unwell"})
+    study_folder.write_participant(tmp_path, "P02", {"stopped": True, "reason": "felt unwell"})
     first = json.loads((trials / "P03_1_01.json").read_text())
-    folder.write_trial(
+    study_folder.write_trial(
         tmp_path, "P03_1_01", {**first, "created": "2999-01-01", "limit_s": 20.0}
     )  # done twice
-    folder.write_trial(tmp_path, "P99_1_01", {**first, "participant": "P99"})  # unknown
+    study_folder.write_trial(tmp_path, "P99_1_01", {**first, "participant": "P99"})  # unknown
     swapped = "unguided" if first["condition"] == "guided" else "guided"
-    folder.write_trial(tmp_path, "P03_1_07", {**first, "number": 7, "condition": swapped})
+    study_folder.write_trial(tmp_path, "P03_1_07", {**first, "number": 7, "condition": swapped})
     (trials / "P04_1_01.json").write_text("{broken")
-    (tmp_path / folder.RECORDINGS / "P05_2_01.parquet").write_bytes(b"cut off")
+    (tmp_path / study_folder.RECORDINGS / "P05_2_01.parquet").write_bytes(b"cut off")
     aborted = json.loads((trials / "P05_1_01.json").read_text())
     (trials / "P05_1_01.json").write_text(
         json.dumps({**aborted, "outcome": "aborted", "reason": "hose burst"})
     )
-    (tmp_path / folder.QUESTIONNAIRES / "P04_2.json").unlink()
+    (tmp_path / study_folder.QUESTIONNAIRES / "P04_2.json").unlink()
     half = {"ratings": {"mental": 40}, "pairs": []}
-    folder.write_questionnaire(tmp_path, "P05", 1, half)
-    data = folder.read(tmp_path)
+    study_folder.write_questionnaire(tmp_path, "P05", 1, half)
+    data = study_folder.read_study(tmp_path)
     found = analysis.analyse(data, machine)
     text = said(found)
     for claim in (
@@ -164,39 +166,41 @@ def test_what_went_wrong_is_kept_and_said(machine: Machine, tmp_path: Path) -> N
     assert sum(not t.counts and bool(t.facts["period"]) for t in found.trials) == 4
     assert found.effects["time_s"].num_persons == 5 and found.effects["tlx_raw"].num_persons == 4
     assert math.isnan(found.means["time_s"]["guided"][1])
-    assert (tmp_path / folder.TRIALS / "P03_1_01_again2.json").exists()
-    page = report.write(tmp_path / "out", data, found).read_text()
+    assert (tmp_path / study_folder.TRIALS / "P03_1_01_again2.json").exists()
+    page = report.write_report(tmp_path / "out", data, found).read_text()
     assert "hose burst" in page and "felt unwell" in page
 
 
 def test_a_participant_is_forgotten_on_request(machine: Machine, tmp_path: Path) -> None:
     study(tmp_path, machine, count=4)
-    folder.write_participant(tmp_path, "P02", {"hand": "left"})
-    folder.note_report(tmp_path, tmp_path / "out")
+    study_folder.write_participant(tmp_path, "P02", {"hand": "left"})
+    study_folder.note_report(tmp_path, tmp_path / "out")
     (tmp_path / "out").mkdir()
-    gone, reports = folder.erase(tmp_path, "P02")
+    gone, reports = study_folder.erase(tmp_path, "P02")
     assert len(gone) == 8 + 8 + 2 + 1 and reports == [tmp_path / "out"]
     assert not list(tmp_path.rglob("P02*"))
-    found = analysis.analyse(folder.read(tmp_path), machine)
+    found = analysis.analyse(study_folder.read_study(tmp_path), machine)
     assert found.participants == ["P01", "P03", "P04"] and "P02: erased on request" in said(found)
     with pytest.raises(ConfigError, match="no such participant"):
-        folder.erase(tmp_path, "Jane")
+        study_folder.erase(tmp_path, "Jane")
 
 
 def test_an_outcome_that_the_recording_contradicts_is_said(
     machine: Machine, tmp_path: Path
 ) -> None:
     study(tmp_path, machine)
-    path = tmp_path / folder.TRIALS / "P01_1_01.json"
+    path = tmp_path / study_folder.TRIALS / "P01_1_01.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"outcome": "time limit"}))
     assert "written down as 'time limit', but the recording shows an insertion" in said(
-        analysis.analyse(folder.read(tmp_path), machine)
+        analysis.analyse(study_folder.read_study(tmp_path), machine)
     )
 
 
 def test_every_hole_and_start_stands_everywhere_equally_often(machine: Machine) -> None:
     what = made(machine, count=12)
-    planned = [trial for trial in design.trials(what, np.random.default_rng(1)) if trial.period]
+    planned = [
+        trial for trial in design.plan_trials(what, np.random.default_rng(1)) if trial.period
+    ]
     for attribute, names in (("hole", "ABC"), ("start", "123")):
         for name in names:
             places = [(t.period, t.number) for t in planned if getattr(t, attribute) == name]
@@ -214,12 +218,18 @@ def test_every_hole_and_start_stands_everywhere_equally_often(machine: Machine) 
 
 @pytest.mark.parametrize("size", [2, 3, 4, 5, 6, 7])
 def test_squares_are_latin(size: int) -> None:
-    for square in design.squares(size):
+    for square in design.make_latin_squares(size):
         for line in (*square, *square.T):
             assert sorted(line) == list(range(size))
     if size in (3, 5, 7):
         assert (
-            len(set(zip(*(square.ravel() for square in design.squares(size)), strict=True)))
+            len(
+                set(
+                    zip(
+                        *(square.ravel() for square in design.make_latin_squares(size)), strict=True
+                    )
+                )
+            )
             == size**2
         )
 
@@ -227,7 +237,10 @@ def test_squares_are_latin(size: int) -> None:
 def test_orders_are_drawn_in_pairs_and_differ_from_seed_to_seed(machine: Machine) -> None:
     what = made(machine, count=20)
     drawn = [
-        [c[0] == "guided" for c in design.sequences(what, np.random.default_rng(seed)).values()]
+        [
+            c[0] == "guided"
+            for c in design.draw_sequences(what, np.random.default_rng(seed)).values()
+        ]
         for seed in range(3)
     ]
     for firsts in drawn:

@@ -13,7 +13,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from deploy.study import measures, tlx
 from deploy.study.design import Hole, Success
-from deploy.study.smoothness import sparc
+from deploy.study.measures import compute_sparc
 
 RATE_HZ = 20.0
 SUCCESS = Success(depth_m=0.1, clearance_m=0.013)
@@ -45,20 +45,20 @@ def test_the_tool_is_where_the_projects_kinematics_has_it(machine: Machine) -> N
 
 def test_sparc_is_that_of_the_published_algorithm() -> None:
     t = np.arange(-1, 1, 0.01)
-    assert sparc(np.exp(-5 * t**2), 100.0) == pytest.approx(
+    assert compute_sparc(np.exp(-5 * t**2), 100.0) == pytest.approx(
         -1.41403, abs=1e-5
     )  # the example of the authors' own code
     two = np.exp(-40 * (t + 0.5) ** 2) + np.exp(-40 * (t - 0.5) ** 2)
-    assert sparc(two, 100.0) < -1.6
-    assert sparc(7 * two, 100.0) == pytest.approx(sparc(two, 100.0))
-    assert math.isnan(sparc(np.zeros(50), 20.0))
+    assert compute_sparc(two, 100.0) < -1.6
+    assert compute_sparc(7 * two, 100.0) == pytest.approx(compute_sparc(two, 100.0))
+    assert math.isnan(compute_sparc(np.zeros(50), 20.0))
 
 
 def test_a_straight_path_has_its_length_and_noise_hardly_adds_to_it() -> None:
     line = np.linspace([0.0, 0.0, 0.0], [3.0, 4.0, 0.0], 401)
-    assert measures.length(line, 0.05) == pytest.approx(5.0)
+    assert measures.measure_path_length(line, 0.05) == pytest.approx(5.0)
     noisy = line + 0.002 * np.random.default_rng(0).standard_normal(line.shape)
-    assert measures.length(noisy, 0.05) == pytest.approx(5.0, abs=0.01)
+    assert measures.measure_path_length(noisy, 0.05) == pytest.approx(5.0, abs=0.01)
     assert np.linalg.norm(np.diff(noisy, axis=0), axis=1).sum() > 5.2
 
 
@@ -67,8 +67,8 @@ def test_lever_movements_are_counted_with_a_margin_for_tremor() -> None:
     u[1:5, 0] = [0.3, 0.08, 0.12, 0.3]  # one movement: 0.08 is not yet let go
     u[6:8, 0] = [0.2, 0.2]
     u[9:, 1] = 0.5
-    assert measures.movements(u).tolist() == [[1, 0], [6, 0], [9, 1]]
-    assert not len(measures.movements(np.full((5, 2), 0.07)))
+    assert measures.detect_lever_movements(u).tolist() == [[1, 0], [6, 0], [9, 1]]
+    assert not len(measures.detect_lever_movements(np.full((5, 2), 0.07)))
 
 
 def test_a_trial_of_known_motion_gives_known_numbers(machine: Machine) -> None:
@@ -117,10 +117,14 @@ def test_lag_and_distance_from_the_advice() -> None:
     advice = np.zeros((200, 5))
     advice[:, 0] = np.sin(np.arange(200) * 0.1)
     late = np.roll(advice, 6, 0)
-    found = measures.tracking(late, advice, 0.05)
+    found = measures.measure_tracking(late, advice, 0.05)
     assert found["advice_lag_s"] == pytest.approx(0.3, abs=0.051)
-    assert measures.tracking(advice + 0.1, advice, 0.05)["advice_error"] == pytest.approx(0.1)
-    assert math.isnan(measures.tracking(advice, np.full_like(advice, np.nan), 0.05)["advice_error"])
+    assert measures.measure_tracking(advice + 0.1, advice, 0.05)["advice_error"] == pytest.approx(
+        0.1
+    )
+    assert math.isnan(
+        measures.measure_tracking(advice, np.full_like(advice, np.nan), 0.05)["advice_error"]
+    )
 
 
 ANSWERS = {
@@ -139,10 +143,12 @@ ANSWERS = {
 
 def test_tlx_raw_and_weighted_by_hand() -> None:
     assert len(tlx.PAIRS) == 15
-    assert tlx.raw(ANSWERS) == pytest.approx(45.0)
-    assert tlx.weighted(ANSWERS) == pytest.approx((5 * 70 + 4 * 20 + 3 * 40 + 2 * 30 + 1 * 60) / 15)
+    assert tlx.compute_raw_tlx(ANSWERS) == pytest.approx(45.0)
+    assert tlx.compute_weighted_tlx(ANSWERS) == pytest.approx(
+        (5 * 70 + 4 * 20 + 3 * 40 + 2 * 30 + 1 * 60) / 15
+    )
     assert tlx.check(ANSWERS) == []
-    shown = tlx.pairs(np.random.default_rng(0))
+    shown = tlx.list_pairs(np.random.default_rng(0))
     assert {frozenset(pair) for pair in shown} == {
         frozenset(pair) for pair in tlx.PAIRS
     } and shown != list(tlx.PAIRS)
@@ -150,9 +156,11 @@ def test_tlx_raw_and_weighted_by_hand() -> None:
 
 def test_a_half_filled_questionnaire_has_no_score_and_says_why() -> None:
     half = {"ratings": {**ANSWERS["ratings"], "effort": None}, "pairs": ANSWERS["pairs"][:9]}
-    assert math.isnan(tlx.raw(half)) and math.isnan(tlx.weighted(half))
-    assert tlx.ratings(half)["mental"] == 70
+    assert math.isnan(tlx.compute_raw_tlx(half)) and math.isnan(tlx.compute_weighted_tlx(half))
+    assert tlx.read_ratings(half)["mental"] == 70
     assert "effort not answered" in tlx.check(half)[0] and "9 of 15" in tlx.check(half)[1]
     assert "expected 0 to 100" in tlx.check({"ratings": {**ANSWERS["ratings"], "mental": 170}})[0]
     never = {"ratings": {**ANSWERS["ratings"], "frustration": None}, "pairs": ANSWERS["pairs"]}
-    assert tlx.weighted(never) == pytest.approx(tlx.weighted(ANSWERS))  # its weight is 0
+    assert tlx.compute_weighted_tlx(never) == pytest.approx(
+        tlx.compute_weighted_tlx(ANSWERS)
+    )  # its weight is 0

@@ -160,7 +160,10 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
 
 
 def test_a_study_needs_neither_torch_nor_simulator() -> None:
-    code = "import sys, deploy.modes.study, deploy.study.study; print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
+    code = (
+        "import sys, deploy.modes.study, deploy.study.study_steps;"
+        "print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
+    )
     assert (
         subprocess.run(
             [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT

@@ -22,10 +22,10 @@ from sitting import FACTS, Arm, conductor, in_trial, machine, plan, saved
 from brokk_rl import record
 from brokk_rl.errors import ConfigError
 from deploy.page.protocol import OperatorRequest
-from deploy.study import analysis, folder, tlx
+from deploy.study import analysis, study_folder, tlx
 from deploy.study.conductor import Conductor
-from deploy.study.sitting import alone
-from deploy.study.steps import next_step
+from deploy.study.sitting import reserve_study
+from deploy.study.steps import find_next_step
 from deploy.study.study_server import StudyFeed
 
 MACHINE = machine()
@@ -66,11 +66,11 @@ def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(
             assert lead.take({"do": "next"}) == ""
         else:
             answer(lead)
-    conditions = folder.read_plan(tmp_path)["participants"]["P01"]
+    conditions = study_folder.read_plan(tmp_path)["participants"]["P01"]
     assert seen == [
         (kind, period, conditions[period - 1]) for period in (1, 2) for kind in ("trial", "trial", "questionnaire")
     ]  # fmt: skip
-    found = analysis.analyse(folder.read(tmp_path), MACHINE)
+    found = analysis.analyse(study_folder.read_study(tmp_path), MACHINE)
     mine = [trial for trial in found.trials if trial.facts["participant"] == "P01"]
     assert len(mine) == 4 and all(trial.values["success"] == 1 for trial in mine)
     assert all(
@@ -94,7 +94,9 @@ def test_who_does_not_agree_takes_no_part(tmp_path: Path, arm: Arm) -> None:
     assert lead.take({"do": "begin"}) != ""
     lead.take({"do": "consent", "agreed": False})
     assert lead.view()["kind"] == "stopped" and not (tmp_path / "trials").exists()
-    assert "no consent" in "".join(remark.text for remark in folder.read(tmp_path).remarks)
+    assert "no consent" in "".join(
+        remark.text for remark in study_folder.read_study(tmp_path).remarks
+    )
 
 
 def test_a_trial_that_the_program_did_not_survive_is_kept_and_done_again(
@@ -116,10 +118,10 @@ def test_a_trial_that_the_program_did_not_survive_is_kept_and_done_again(
     assert lost["outcome"] == "aborted" and "interrupted" in lost["reason"]
     in_trial(again, again._stage)  # type: ignore[arg-type]
     again.take({"do": "next"})
-    data = folder.read(tmp_path)
+    data = study_folder.read_study(tmp_path)
     assert (
         data.trials["P01", 1, 2]["outcome"] == "inserted"
-        and next_step(data, "P01").kind == "questionnaire"
+        and find_next_step(data, "P01").kind == "questionnaire"
     )
     assert any("aborted (interrupted" in remark.text for remark in data.remarks)
 
@@ -147,7 +149,10 @@ def test_half_a_questionnaire_is_kept_said_and_gone_on_with(tmp_path: Path, arm:
         assert again.take({"do": "rate", "scale": "effort", **wrong}) == "malformed"
     again.take({"do": "to", "to": 21})
     assert again.take({"do": "finish"}) == "" and again.view()["kind"] == "trial"
-    said = [remark.text for remark in analysis.analyse(folder.read(tmp_path), MACHINE).remarks]
+    said = [
+        remark.text
+        for remark in analysis.analyse(study_folder.read_study(tmp_path), MACHINE).remarks
+    ]
     assert any(
         "physical, temporal, performance, effort, frustration not answered" in text for text in said
     )
@@ -164,7 +169,7 @@ def test_who_stops_in_a_trial_is_believed_and_may_come_back(tmp_path: Path, arm:
     assert read(tmp_path / "trials" / "P01_1_01.json")["outcome"] == "stopped"
     assert any(
         "stopped after 1 trials (felt unwell)" in remark.text
-        for remark in folder.read(tmp_path).remarks
+        for remark in study_folder.read_study(tmp_path).remarks
     )
     lead.take({"do": "go_on"})
     assert (lead.view()["kind"], lead.view()["number"]) == ("trial", 2)
@@ -271,7 +276,7 @@ def test_a_disk_that_takes_no_more_ends_the_trial_and_is_said(
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(folder, "write_json", full)
+        patch.setattr(study_folder, "write_json", full)
         arm.q = MACHINE.home
         arm.later(lead, 0.2)
         assert (
@@ -298,7 +303,7 @@ def test_nobody_is_led_who_is_not_in_the_plan(tmp_path: Path, arm: Arm) -> None:
     agreed(lead)
     (tmp_path / "captures" / "P01_1_01").mkdir(parents=True)
     (tmp_path / "captures" / "P01_1_01" / "capture.mcap").write_bytes(b"all that was on the bus")
-    folder.erase(tmp_path, "P01")
+    study_folder.erase(tmp_path, "P01")
     assert not list(tmp_path.rglob("P01*"))
     assert conductor(tmp_path, arm).view()["participants"][0]["state"] == "erased"
     assert np.all([FACTS["twin"], not FACTS["simulated"]])
@@ -321,9 +326,13 @@ def test_a_recording_that_an_interruption_left_unsaved_is_made_the_next_time(
 
 
 def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None:
-    with alone(tmp_path), pytest.raises(ConfigError, match="go on already"), alone(tmp_path):
+    with (
+        reserve_study(tmp_path),
+        pytest.raises(ConfigError, match="go on already"),
+        reserve_study(tmp_path),
+    ):
         pass
-    with alone(tmp_path):
+    with reserve_study(tmp_path):
         pass
 
 
@@ -385,7 +394,7 @@ def test_a_simulated_participant_at_the_twin_in_real_time_goes_on_after_everythi
         "mode=study", "study.do=report", "study.folder=study", "ground=none", "session.out=report"
     )
     assert reported.code == 0, reported.err
-    data = folder.read(tmp_path / "study")
+    data = study_folder.read_study(tmp_path / "study")
     trials = [trial for (who, _, _), trial in data.trials.items() if who == "P01"]
     assert (
         len(trials) == 4

@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from deploy.study import exact, sample_size
-from deploy.study.crossover import dz_interval, effect, hodges_lehmann
+from deploy.study import permutation_tests, sample_size
+from deploy.study.crossover_analysis import (
+    compute_dz_interval,
+    estimate_effect,
+    estimate_hodges_lehmann,
+)
 from deploy.study.practice import Practice, share_significant
 
 DARWIN = np.array([49, -67, 8, 16, 6, 23, 28, 41, 14, 29, 56, 24, 75, 60, -48], float)
@@ -27,7 +31,7 @@ PEOPLE = Practice(
 
 
 def test_the_paired_test_counts_what_fisher_counted() -> None:
-    assert exact.paired_p(DARWIN) == pytest.approx(1726 / 32768, abs=1e-12)
+    assert permutation_tests.compute_paired_p(DARWIN) == pytest.approx(1726 / 32768, abs=1e-12)
 
 
 def test_tests_agree_with_scipys_permutations() -> None:
@@ -47,9 +51,11 @@ def test_tests_agree_with_scipys_permutations() -> None:
         n_resamples=np.inf,
         vectorized=True,
     )
-    assert exact.paired_p(difference) == pytest.approx(paired.pvalue)
-    assert exact.sequence_p(difference, first) == pytest.approx(sequences.pvalue)
-    assert exact.wilcoxon_p(difference) == pytest.approx(
+    assert permutation_tests.compute_paired_p(difference) == pytest.approx(paired.pvalue)
+    assert permutation_tests.compute_sequence_p(difference, first) == pytest.approx(
+        sequences.pvalue
+    )
+    assert permutation_tests.compute_wilcoxon_p(difference) == pytest.approx(
         stats.wilcoxon(difference, method="exact").pvalue
     )
 
@@ -57,43 +63,47 @@ def test_tests_agree_with_scipys_permutations() -> None:
 def test_wilcoxon_with_ties_counts_midranks() -> None:
     # |d| = 1 1 2: ranks 1.5 1.5 3, sum of signed ranks 6 is the largest; 2 of 8 sign patterns are
     # as extreme
-    assert exact.wilcoxon_p(np.array([1.0, 1.0, 2.0, 0.0])) == 0.25
-    assert exact.wilcoxon_p(np.zeros(4)) == 1.0
+    assert permutation_tests.compute_wilcoxon_p(np.array([1.0, 1.0, 2.0, 0.0])) == 0.25
+    assert permutation_tests.compute_wilcoxon_p(np.zeros(4)) == 1.0
 
 
 def test_five_persons_cannot_reach_five_percent_and_six_can() -> None:
-    assert exact.smallest_paired_p(5) == 0.0625 == exact.paired_p(np.arange(1.0, 6.0))
-    assert exact.smallest_paired_p(6) == 0.03125
     assert (
-        exact.smallest_sequence_p(4, 8)
-        == pytest.approx(2 / 70)
-        == exact.sequence_p(np.arange(8.0), np.arange(8) < 4)
+        permutation_tests.get_smallest_paired_p(5)
+        == 0.0625
+        == permutation_tests.compute_paired_p(np.arange(1.0, 6.0))
     )
-    assert exact.smallest_sequence_p(4, 7) == pytest.approx(1 / 35)
-    assert sample_size.least(0.05) == (6, 7)
+    assert permutation_tests.get_smallest_paired_p(6) == 0.03125
+    assert (
+        permutation_tests.get_smallest_sequence_p(4, 8)
+        == pytest.approx(2 / 70)
+        == permutation_tests.compute_sequence_p(np.arange(8.0), np.arange(8) < 4)
+    )
+    assert permutation_tests.get_smallest_sequence_p(4, 7) == pytest.approx(1 / 35)
+    assert sample_size.find_smallest_sizes(0.05) == (6, 7)
 
 
 def test_many_studies_at_once_are_those_one_by_one() -> None:
     rows, first = np.random.default_rng(0).normal(size=(4, 8)), np.arange(8) % 2 == 0
-    assert exact.sequence_p(rows, first).tolist() == [
-        float(exact.sequence_p(row, first)) for row in rows
+    assert permutation_tests.compute_sequence_p(rows, first).tolist() == [
+        float(permutation_tests.compute_sequence_p(row, first)) for row in rows
     ]
     with pytest.raises(ValueError, match="both sequences"):
-        exact.sequence_p(rows, np.ones(8, bool))
+        permutation_tests.compute_sequence_p(rows, np.ones(8, bool))
 
 
 def test_more_ways_than_can_be_counted_are_drawn() -> None:
     difference = np.random.default_rng(1).normal(0.3, 1.0, 30)
-    assert exact.paired_p(difference) == pytest.approx(
+    assert permutation_tests.compute_paired_p(difference) == pytest.approx(
         stats.ttest_1samp(difference, 0.0).pvalue, abs=0.02
     )
 
 
 def test_holm_is_worked_by_hand() -> None:
     # sorted 0.005 0.01 0.03 0.04, times 4 3 2 1: 0.02 0.03 0.06 0.04, never falling: 0.06
-    assert exact.holm(np.array([0.01, 0.04, np.nan, 0.03, 0.005])).tolist() == pytest.approx(
-        [0.03, 0.06, math.nan, 0.06, 0.02], nan_ok=True
-    )
+    assert permutation_tests.adjust_by_holm(
+        np.array([0.01, 0.04, np.nan, 0.03, 0.005])
+    ).tolist() == pytest.approx([0.03, 0.06, math.nan, 0.06, 0.02], nan_ok=True)
 
 
 def test_hodges_lehmann_is_that_of_hollander_and_wolfe() -> None:
@@ -101,18 +111,18 @@ def test_hodges_lehmann_is_that_of_hollander_and_wolfe() -> None:
     # estimate 0.46, 96.1 % interval from 0.01 to 0.786; exact signed-rank p of 0.0391 (two-sided)
     x = np.array([1.83, 0.50, 1.62, 2.48, 1.68, 1.88, 1.55, 3.06, 1.30])
     y = np.array([0.878, 0.647, 0.598, 2.05, 1.06, 1.29, 1.06, 3.14, 1.29])
-    middle, interval = hodges_lehmann(x - y)
+    middle, interval = estimate_hodges_lehmann(x - y)
     assert middle == pytest.approx(0.46)
     assert interval == pytest.approx((0.01, 0.786))
-    assert exact.wilcoxon_p(x - y) == pytest.approx(0.0390625)
-    assert hodges_lehmann(np.arange(5.0))[1] is None
+    assert permutation_tests.compute_wilcoxon_p(x - y) == pytest.approx(0.0390625)
+    assert estimate_hodges_lehmann(np.arange(5.0))[1] is None
 
 
 def test_the_interval_of_dz_turns_back_into_t() -> None:
-    low, high = dz_interval(0.8, 4.0, 15)
+    low, high = compute_dz_interval(0.8, 4.0, 15)
     assert stats.nct.cdf(3.2, 15, 4 * low) == pytest.approx(0.975)
     assert stats.nct.cdf(3.2, 15, 4 * high) == pytest.approx(0.025)
-    low, high = dz_interval(
+    low, high = compute_dz_interval(
         -300.0, math.sqrt(2), 1
     )  # two persons who agree: almost anything is possible
     assert low < -600 and -40 < high < 0
@@ -125,7 +135,7 @@ def test_guidance_and_period_come_apart() -> None:
     own = np.array([-1.0, 0.0, 1.0, 2.0, 0.0, -2.0])
     guided = 50.0 - 5.0 - 8.0 * ~first + own
     unguided = 50.0 - 8.0 * first
-    found = effect(guided, unguided, first)
+    found = estimate_effect(guided, unguided, first)
     assert found.adjusted == pytest.approx(-5.0) and found.period == pytest.approx(-8.0)
     assert found.difference == pytest.approx(
         -5.0
@@ -144,9 +154,9 @@ def test_guidance_and_period_come_apart() -> None:
 
 
 def test_with_one_sequence_nothing_is_said_about_guidance_apart_from_order() -> None:
-    found = effect(np.arange(6.0), np.arange(6.0) ** 2, np.ones(6, bool))
+    found = estimate_effect(np.arange(6.0), np.arange(6.0) ** 2, np.ones(6, bool))
     assert found.p is None and found.adjusted is None and found.paired_p is not None
-    assert effect(np.full(3, np.nan), np.ones(3), np.ones(3, bool)).difference is None
+    assert estimate_effect(np.full(3, np.nan), np.ones(3), np.ones(3, bool)).difference is None
 
 
 def test_without_effect_a_counterbalanced_study_errs_as_often_as_it_says_and_one_of_fixed_order_nearly_always() -> (
@@ -164,4 +174,4 @@ def test_a_large_effect_is_found_by_sixteen() -> None:
     power = stats.nct.sf(
         stats.t.ppf(0.975, 14), 14, 3.2
     )  # of the t test with the period in the model
-    assert sample_size.size(16, 0.05).power[1] == pytest.approx(power, abs=0.04)
+    assert sample_size.evaluate_size(16, 0.05).power[1] == pytest.approx(power, abs=0.04)

@@ -16,7 +16,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
-from deploy.study.twins import BEFORE_S, desks
+from deploy.study.twins import BEFORE_S, make_desks
 from deploy.twin.faults import ActiveFaults
 
 MACHINE = option("machine", "brokk170")
@@ -29,7 +29,7 @@ DEAD_SAMPLES = 11
 
 def desk(tmp_path: Path, guided: bool = True) -> Any:
     session = Session(out=str(tmp_path), seed=0, device="cpu")
-    return desks(GROUND, MACHINE, session, [(7, START, RIM_M, guided)])[0]
+    return make_desks(GROUND, MACHINE, session, [(7, START, RIM_M, guided)])[0]
 
 
 def test_what_is_given_reaches_the_valves_as_the_bus_rounds_it(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from deploy.study.operators.traits import Range, Traits
 
 @spec
 class Hands:
-    """How a person moves levers; ranges differ from person to person.
+    """Motor properties of a person at the levers; ranges are drawn per person.
 
     Attributes:
         delay_s: Reaction delay, from what is seen to the hand.
@@ -52,7 +52,7 @@ class Hands:
             )
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> HandsModel:
-        """Returns the hands of the persons `(N,)`."""
+        """Return the hands of the persons `(N,)`."""
         return HandsModel(self, machine, persons, seed)
 
 
@@ -97,7 +97,7 @@ class HandsModel:
         return self._hand
 
     def step(self, wanted: np.ndarray) -> np.ndarray:
-        """Returns the mean command of the coming period, `(N, J)`, where deflections `(N, J)` are wanted from now on."""
+        """Return the mean command of the coming period, `(N, J)`, where deflections `(N, J)` are wanted from now on."""
         self._wanted = np.concatenate((self._wanted[:, 1:], wanted[:, None]), 1)
         last = self._wanted.shape[1] - 1
         whole = np.floor(self._delay + 5e-7)
@@ -117,7 +117,7 @@ class HandsModel:
         )
 
     def _holds(self, asked: np.ndarray) -> np.ndarray:
-        """Returns which levers are held, `(N, J)` bool: the exclusive or the others, the largest, those once taken for a while."""
+        """Return which levers are held, `(N, J)` bool: the exclusive or the others, the largest, those once taken for a while."""
         priority = np.abs(asked) + 1e-6 * np.abs(self._hand)
         alone = np.where(self._exclusive, priority, 0.0).max(1)
         among = np.where(self._exclusive, 0.0, priority).max(1)
@@ -133,7 +133,7 @@ class HandsModel:
     def _reach(
         self, hand: np.ndarray, target: np.ndarray, part: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns where the hand is after `part` of a period on its way to `target`, and what that adds to the period's mean."""
+        """Return where the hand is after `part` of a period on its way to `target`, and what that adds to the period's mean."""
         left = np.exp(-part / self._lag)
         return target + (hand - target) * left, target * part + (hand - target) * self._lag * (
             1.0 - left

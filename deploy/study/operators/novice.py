@@ -87,7 +87,7 @@ class NoviceModel:
         return self._hands.step(self._move * part[:, None])
 
     def _decide(self, idle: np.ndarray) -> None:
-        """Lets those who are idle, `(N,)` bool, choose a joint and how long to move it."""
+        """Let those who are idle, `(N,)` bool, choose a joint and how long to move it."""
         config, speed = self._config, self._machine.max_speed
         way, rows = self._sight.way, np.arange(len(idle))
         joint = (np.abs(way) / speed).argmax(1)
@@ -114,5 +114,5 @@ class NoviceModel:
         self._left_s = np.where(moves, time_s, self._left_s)
 
     def _rate(self, level: np.ndarray) -> np.ndarray:
-        """Returns the share of full speed at a deflection."""
+        """Return the share of full speed at a deflection."""
         return (level - self._config.band) / (1.0 - self._config.band)

@@ -1,4 +1,4 @@
-"""What an operator without advice goes by: where the tool is seen from the hole, and what each joint would have to do about it.
+"""The view of an operator without advice: tool error as seen from the hole, and the motion of each joint to do about it.
 
 The eye judges the way left with an error in proportion to it, a few times a second; the head knows
 how the arm moves. The tool is first brought above the hole, then, as far as it is aligned, lowered
@@ -18,14 +18,14 @@ from brokk_rl.spec import spec
 from deploy.study.operators.traits import Range, Traits
 
 DAMPING = 0.05
-"""Of the least squares, m at unit motion."""
+"""Damping of the least squares, m at unit motion."""
 ROUNDS = 4
 """Gauss-Newton steps from the arm as it is to the arm as it should be."""
 
 
 @spec
 class Sight:
-    """How an operator sees and where they aim.
+    """An operator's visual errors and aim.
 
     Attributes:
         looks_hz: Pictures a second.
@@ -52,7 +52,7 @@ class Sight:
     clear_m: float
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> SightModel:
-        """Returns the eyes of the persons `(N,)`."""
+        """Return the eyes of the persons `(N,)`."""
         return SightModel(self, machine, persons, seed)
 
 
@@ -75,11 +75,11 @@ class SightModel:
         self._period = max(1, round(1.0 / (sight.looks_hz * machine.period_s)))
         self._steps = 0
         self.way = np.zeros((len(persons), machine.num_joints))
-        """How far each joint seems to be from where it should be, `(N, J)`: exclusive joints alone,
+        """Return the apparent error of each joint, `(N, J)`: exclusive joints alone,
         or all others."""
 
     def look(self, view: OperatorView, q: np.ndarray) -> bool:
-        """Looks, where it is time to, at the arm at `q`, `(N, J)` (where it is, or will be); says whether `way` is new."""
+        """Look, where it is time to, at the arm at `q`, `(N, J)` (where it is, or will be); says whether `way` is new."""
         self._steps += 1
         if (self._steps - 1) % self._period:
             return False
@@ -103,7 +103,7 @@ class SightModel:
         return True
 
     def _solved(self, q: np.ndarray, goal_m: np.ndarray) -> np.ndarray:
-        """Returns joint positions that put the upright tool at `goal_m`, `(N, 3)`, within the limits, by the free joints."""
+        """Return joint positions that put the upright tool at `goal_m`, `(N, 3)`, within the limits, by the free joints."""
         machine, start = self._machine, q
         free = ~machine.is_exclusive
         for _ in range(ROUNDS):
@@ -122,7 +122,7 @@ class SightModel:
         return np.where(np.isfinite(q), q, start)
 
     def _position(self, joint: int, q: np.ndarray, rim_m: np.ndarray, tip_m: np.ndarray) -> None:
-        """Lets the exclusive joint move alone where the hole is out of reach of the others and the tool is clear of it."""
+        """Let the exclusive joint move alone where the hole is out of reach of the others and the tool is clear of it."""
         near, far = self._config.reach_m
         distance = self._reach(q, rim_m)
         nudged = q.copy()
@@ -142,7 +142,7 @@ class SightModel:
         self.way[moves, joint] = (target - q[:, joint])[moves]
 
     def _reach(self, q: np.ndarray, rim_m: np.ndarray) -> np.ndarray:
-        """Returns the distance of the hole from the first joint behind the exclusive ones, turned into the arm's plane, `(N,)`."""
+        """Return the distance of the hole from the first joint behind the exclusive ones, turned into the arm's plane, `(N,)`."""
         origin = compute_tool_kinematics(self._machine, q).joints_in_base_m[:, self._reach_joint]
         radius = np.hypot(origin[:, 0], origin[:, 1])
         return np.hypot(np.hypot(rim_m[:, 0], rim_m[:, 1]) - radius, rim_m[:, 2] - origin[:, 2])

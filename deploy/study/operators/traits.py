@@ -25,7 +25,7 @@ class Traits:
         self._persons, self._seed = np.asarray(persons, int), seed
 
     def draw(self, name: str, value: Range) -> np.ndarray:
-        """Returns the number `name` in each trial, `(N, 1)`."""
+        """Return the number `name` in each trial, `(N, 1)`."""
         low, high = value if isinstance(value, tuple) else (value, value)
         if high < low:
             raise ConfigError(f"operator: {name} is [{low}, {high}], expected the lower end first")

@@ -14,13 +14,13 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.study import design as designs
-from deploy.study import folder as folders
 from deploy.study import plan_page, report
+from deploy.study import study_folder as folders
 from deploy.study.analysis import analyse
 from deploy.study.design import Design
 from deploy.study.practice import Practice, share_significant
 from deploy.study.simulation import NOTICE, Nowhere, simulate
-from deploy.study.sitting import Sitting, alone
+from deploy.study.sitting import Sitting, reserve_study
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class Steps:
         guided: Operator,
         unguided: Operator,
     ) -> None:
-        """Does the step `do`; see `deploy.modes.study.Steps`."""
+        """Do the step `do`; see `deploy.modes.study.Steps`."""
         if self.do == "plan":
             self._plan(machine, session)
         elif self.do == "erase":
@@ -105,11 +105,14 @@ class Steps:
         folder.mkdir(parents=True, exist_ok=True)
         write_json(
             folder / folders.PLAN,
-            designs.as_json(self.design, machine, session.seed, plan) | {"simulated": is_simulated},
+            designs.format_plan(self.design, machine, session.seed, plan)
+            | {"simulated": is_simulated},
         )
         write_json(folder / "plan_errors.json", errors)
         notice = f"The trials of this study are done by {NOTICE}." if is_simulated else ""
-        page = plan_page.page(self.design, machine.name, session.seed, plan, errors, notice)
+        page = plan_page.build_plan_page(
+            self.design, machine.name, session.seed, plan, errors, notice
+        )
         page.write(folder / "plan.html")
         for entry in errors["studies"]:
             log.info(
@@ -123,16 +126,16 @@ class Steps:
         return plan
 
     def _report(self, machine: Machine, session: Session) -> None:
-        data = folders.read(self._home(session))
+        data = folders.read_study(self._home(session))
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {data.folder}")
         found = analyse(
             data, machine, lambda trials: track(trials, "measuring trials", transient=True)
         )
-        path = report.write(session.folder, data, found)
+        path = report.write_report(session.folder, data, found)
         folders.note_report(data.folder, session.folder)
         for remark in found.remarks:
             log.warning("%s: %s", remark.where, remark.text)
-        log.info("%s", report.verdict(found, data.is_simulated)[0])
+        log.info("%s", report.state_verdict(found, data.is_simulated)[0])
         log.info("report: %s", path)
 
     def _erase(self, session: Session) -> None:
@@ -141,7 +144,7 @@ class Steps:
                 "study.do=erase needs study.participant=<pseudonym> and study.folder=<folder>"
             )
         folders.read_plan(self._home(session))
-        with alone(self._home(session)):
+        with reserve_study(self._home(session)):
             gone, reports = folders.erase(self._home(session), self.participant)
         log.info("%s erased: %d files deleted", self.participant, len(gone))
         for place in reports:
@@ -155,13 +158,13 @@ class Steps:
 
 
 def plan_study(design: Design, machine: Machine, session: Session) -> list[designs.Trial]:
-    """Returns all trials of a new study."""
+    """Return all trials of a new study."""
     design.check_machine(machine)
-    return designs.trials(design, session.generator("study plan"))
+    return designs.plan_trials(design, session.generator("study plan"))
 
 
 def study_errors(design: Design, practice: Practice, num_studies: int, seed: int) -> dict[str, Any]:
-    """Returns how often studies like this one find what is not there and miss what is, beside those with a fixed order."""
+    """Return how often studies like this one find what is not there and miss what is, beside those with a fixed order."""
     num, trials = design.num_participants, len(design.holes)
     cases = [
         ("no effect, counterbalanced, period in the model", num, 0.0, False),

@@ -1,4 +1,4 @@
-"""What a study of two periods says about guidance: effect, interval, tests, and what practice did beside it.
+"""Analysis of a two-period crossover: effect of guidance, interval, tests, effect of practice.
 
 Each person has one figure in each period. `first - second` holds plus or minus the effect of
 guidance (by who was guided first) and the same effect of the period in both sequences, so that half
@@ -15,7 +15,7 @@ import numpy as np
 from scipy import optimize, stats
 
 from brokk_rl.intervals import CONFIDENCE
-from deploy.study import exact
+from deploy.study import permutation_tests
 
 Interval = tuple[float, float]
 ROUNDING = 1e-12
@@ -23,7 +23,7 @@ ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
-class Effect:
+class GuidanceEffect:
     """Guidance against no guidance in one measure; differences are guided minus unguided, `None` where too few persons have both.
 
     Attributes:
@@ -74,8 +74,10 @@ class Effect:
     carry_over_p: float | None = None
 
 
-def effect(guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray) -> Effect:
-    """Returns what one measure says.
+def estimate_effect(
+    guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray
+) -> GuidanceEffect:
+    """Return what one measure says.
 
     Args:
         guided: One figure a person, `(P,)`; NaN where there is none.
@@ -89,60 +91,60 @@ def effect(guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray) -
     if num:
         facts |= {"guided": float(guided.mean()), "unguided": float(unguided.mean())}
     if num >= 2:
-        facts |= _paired(guided - unguided)
+        facts |= _test_pairs(guided - unguided)
     if min(num_first, num - num_first) >= 2:
-        facts |= _adjusted(
+        facts |= _adjust_for_period(
             np.where(first, guided - unguided, unguided - guided), guided + unguided, first
         )
-    return Effect(num_persons=num, num_guided_first=num_first, **facts)
+    return GuidanceEffect(num_persons=num, num_guided_first=num_first, **facts)
 
 
-def _paired(difference: np.ndarray) -> dict:
+def _test_pairs(difference: np.ndarray) -> dict:
     num, mean, std = len(difference), float(difference.mean()), float(difference.std(ddof=1))
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, num - 1)) * std / math.sqrt(num)
     facts = {
         "difference": mean,
         "paired_ci95": (mean - half, mean + half),
-        "paired_p": float(exact.paired_p(difference)),
-        "wilcoxon_p": exact.wilcoxon_p(difference),
-        "hodges_lehmann": hodges_lehmann(difference)[0],
-        "hodges_lehmann_ci95": hodges_lehmann(difference)[1],
+        "paired_p": float(permutation_tests.compute_paired_p(difference)),
+        "wilcoxon_p": permutation_tests.compute_wilcoxon_p(difference),
+        "hodges_lehmann": estimate_hodges_lehmann(difference)[0],
+        "hodges_lehmann_ci95": estimate_hodges_lehmann(difference)[1],
     }
     if std > ROUNDING * float(np.abs(difference).max()):
         facts |= {
             "paired_dz": mean / std,
-            "paired_dz_ci95": dz_interval(mean / std, math.sqrt(num), num - 1),
+            "paired_dz_ci95": compute_dz_interval(mean / std, math.sqrt(num), num - 1),
         }
     return facts
 
 
-def _adjusted(period_difference: np.ndarray, total: np.ndarray, first: np.ndarray) -> dict:
+def _adjust_for_period(period_difference: np.ndarray, total: np.ndarray, first: np.ndarray) -> dict:
     before, after = period_difference[first].mean(), period_difference[~first].mean()
     guidance, period = float(before - after) / 2, -float(before + after) / 2
     shape, free = math.sqrt(1 / first.sum() + 1 / (~first).sum()), len(first) - 2
-    std = _within(period_difference, first)
+    std = _pool_variance(period_difference, first)
     error = std * shape / 2
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, free)) * error
     facts: dict = {
         "adjusted": guidance,
         "adjusted_ci95": (guidance - half, guidance + half),
-        "p": float(exact.sequence_p(period_difference, first)),
+        "p": float(permutation_tests.compute_sequence_p(period_difference, first)),
         "period": period,
     }
     if std > 0:
         facts |= {
             "dz": guidance / std,
-            "dz_ci95": dz_interval(guidance / std, 2 / shape, free),
+            "dz_ci95": compute_dz_interval(guidance / std, 2 / shape, free),
             "period_p": float(2 * stats.t.sf(abs(period / error), free)),
         }
-    if (spread := _within(total, first)) > 0:
+    if (spread := _pool_variance(total, first)) > 0:
         apart = float(total[first].mean() - total[~first].mean())
         facts["carry_over_p"] = float(2 * stats.t.sf(abs(apart) / (spread * shape), free))
     return facts
 
 
-def _within(values: np.ndarray, first: np.ndarray) -> float:
-    """Returns the standard deviation within sequences, 0 where it is rounding only."""
+def _pool_variance(values: np.ndarray, first: np.ndarray) -> float:
+    """Return the standard deviation within sequences, 0 where it is rounding only."""
     squares = sum(
         float(((part - part.mean()) ** 2).sum()) for part in (values[first], values[~first])
     )
@@ -150,8 +152,8 @@ def _within(values: np.ndarray, first: np.ndarray) -> float:
     return std if std > ROUNDING * float(np.abs(values).max()) else 0.0
 
 
-def dz_interval(dz: float, scale: float, free: int) -> Interval:
-    """Returns the 95 % interval of a standardised mean difference.
+def compute_dz_interval(dz: float, scale: float, free: int) -> Interval:
+    """Return the 95 % interval of a standardised mean difference.
 
     The noncentralities under which t is just as far out as it may be (Cumming and Finch, Educ.
     Psychol. Meas. 61 (2001) 532-574).
@@ -177,8 +179,8 @@ def dz_interval(dz: float, scale: float, free: int) -> Interval:
     return bound(0.5 + CONFIDENCE / 2), bound(0.5 - CONFIDENCE / 2)
 
 
-def hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | None]:
-    """Returns the median of the means of all pairs, and its exact 95 % interval, `None` where so few persons allow none.
+def estimate_hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | None]:
+    """Return the median of the means of all pairs, and its exact 95 % interval, `None` where so few persons allow none.
 
     Source: Hollander, Wolfe and Chicken, Nonparametric Statistical Methods, 2014, sections 3.2 and
     3.3.
@@ -186,7 +188,7 @@ def hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | None]:
     num = len(difference)
     rows, columns = np.triu_indices(num)
     means = np.sort((difference[rows] + difference[columns]) / 2)
-    ways = np.ones(1)  # in how many ways ranks 1 … n add up to each sum
+    ways = np.ones(1)  # in how many assignments ranks 1 … n add up to each sum
     for rank in range(1, num + 1):
         ways = np.concatenate((ways, np.zeros(rank))) + np.concatenate((np.zeros(rank), ways))
     below = np.cumsum(ways) / 2.0**num

@@ -16,7 +16,7 @@ from brokk_rl.intervals import compute_student_interval
 from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, remove_frame
 from deploy.study import tlx
 from deploy.study.analysis import Analysis, MeasuredTrial
-from deploy.study.crossover import Effect
+from deploy.study.crossover_analysis import GuidanceEffect
 from deploy.study.measures import MEASURES
 
 LOOK = {"guided": (BLUE, "-"), "unguided": (ORANGE, ":")}
@@ -24,18 +24,18 @@ COLUMNS = 3
 """Panels beside each other."""
 
 
-def paths(found: Analysis) -> Figure:
-    """Draws the tool's paths from above and from the side, a panel a hole; a star is where a trial begins, a sphere the hole."""
+def draw_paths(found: Analysis) -> Figure:
+    """Draw the tool's paths from above and from the side, a panel a hole; a star is where a trial begins, a sphere the hole."""
     drawn = [trial for trial in found.trials if trial.counts and len(trial.tip_in_base_m)]
-    holes = sorted({_hole(trial) for trial in drawn})
+    holes = sorted({_name_hole(trial) for trial in drawn})
     figure = Figure(figsize=(3.6 * max(1, len(holes)), 6.8), layout="constrained")
     for column, name in enumerate(holes):
-        here = [trial for trial in drawn if _hole(trial) == name]
+        here = [trial for trial in drawn if _name_hole(trial) == name]
         for row, (title, horizontal, vertical) in enumerate(
             (("from above", 0, 1), ("from the side", None, 2))
         ):
             axis = figure.add_subplot(2, len(holes), row * len(holes) + column + 1)
-            _paths(axis, here, horizontal, vertical)
+            _draw_condition_paths(axis, here, horizontal, vertical)
             axis.set_title(f"hole {name}, {title}", fontsize=9)
             axis.set_xlabel("distance from the slew axis, m" if horizontal is None else "x, m")
             if not column:
@@ -45,8 +45,8 @@ def paths(found: Analysis) -> Figure:
     return figure
 
 
-def radar(found: Analysis) -> Figure:
-    """Draws the mean of each NASA-TLX scale, with and without guidance, with Student's intervals."""
+def draw_radar(found: Analysis) -> Figure:
+    """Draw the mean of each NASA-TLX scale, with and without guidance, with Student's intervals."""
     figure = Figure(figsize=(6.2, 5.6), layout="constrained")
     axis = figure.add_subplot(projection="polar")
     angles = np.linspace(0, 2 * math.pi, len(tlx.SCALES), endpoint=False)
@@ -55,7 +55,7 @@ def radar(found: Analysis) -> Figure:
         means = np.array(
             [np.nanmean(value) if not np.isnan(value).all() else math.nan for value in values]
         )
-        halves = np.array([_half(value) for value in values])
+        halves = np.array([_compute_half_width(value) for value in values])
         colour, line = LOOK[condition]
         closed = np.append(angles, angles[0]) + shift
         axis.plot(
@@ -74,8 +74,8 @@ def radar(found: Analysis) -> Figure:
     return figure
 
 
-def pairs(found: Analysis, names: Sequence[str]) -> Figure:
-    """Draws one line a participant from unguided to guided, a panel a measure; means with intervals beside."""
+def draw_pairs(found: Analysis, names: Sequence[str]) -> Figure:
+    """Draw one line a participant from unguided to guided, a panel a measure; means with intervals beside."""
     rows = -(-len(names) // COLUMNS)
     figure = Figure(figsize=(3.6 * COLUMNS, 2.9 * rows + 0.5), layout="constrained")
     for number, name in enumerate(names):
@@ -93,7 +93,7 @@ def pairs(found: Analysis, names: Sequence[str]) -> Figure:
                 axis.errorbar(
                     [place],
                     [np.nanmean(value)],
-                    [[_half(value)], [_half(value)]],
+                    [[_compute_half_width(value)], [_compute_half_width(value)]],
                     fmt="s",
                     color="black",
                     markersize=5,
@@ -101,7 +101,7 @@ def pairs(found: Analysis, names: Sequence[str]) -> Figure:
                 )
         axis.set_xticks([0, 1], ["unguided", "guided"])
         axis.set_xlim(-0.35, 1.35)
-        title = title_of(name)
+        title = get_title(name)
         if (effect := found.effects.get(name)) and effect.p is not None:
             title += "\np < 0.001" if effect.p < 0.001 else f"\np = {effect.p:.3f}"
         axis.set_title(title, fontsize=9)
@@ -111,13 +111,13 @@ def pairs(found: Analysis, names: Sequence[str]) -> Figure:
     return figure
 
 
-def effects(found: Analysis, names: Sequence[str]) -> Figure:
-    """Draws the effect of guidance on each measure in standard deviations of a person's difference, with 95 % intervals."""
+def draw_effects(found: Analysis, names: Sequence[str]) -> Figure:
+    """Draw the effect of guidance on each measure in standard deviations of a person's difference, with 95 % intervals."""
     figure = Figure(figsize=(8.0, 0.36 * len(names) + 1.4), layout="constrained")
     axis = figure.add_subplot()
     axis.axvline(0.0, color=GREY, linewidth=1)
     for row, name in enumerate(names):
-        dz, interval = standardised(found.effects[name])
+        dz, interval = standardize_effect(found.effects[name])
         if dz is None or interval is None:
             axis.text(0.0, row, "  too few", va="center", fontsize=8, color=GREY)
             continue
@@ -125,15 +125,15 @@ def effects(found: Analysis, names: Sequence[str]) -> Figure:
         colour = GREY if not better else BLUE if dz * better > 0 else RED
         axis.plot(interval, [row, row], color=colour, linewidth=2)
         axis.plot([dz], [row], "o", color=colour)
-    axis.set_yticks(range(len(names)), [title_of(name) for name in names], fontsize=8)
+    axis.set_yticks(range(len(names)), [get_title(name) for name in names], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlabel("guided minus unguided, dz (blue: better with guidance, red: worse)")
     remove_frame(axis)
     return figure
 
 
-def title_of(name: str) -> str:
-    """Returns what a measure or scale is called."""
+def get_title(name: str) -> str:
+    """Return what a measure or scale is called."""
     if name.startswith("tlx_"):
         scale = name.removeprefix("tlx_")
         return f"TLX: {tlx.SCALES.get(scale, scale)}"
@@ -141,8 +141,8 @@ def title_of(name: str) -> str:
     return each.title + (f", {each.unit}" if each.unit else "")
 
 
-def standardised(effect: Effect) -> tuple[float | None, tuple[float, float] | None]:
-    """Returns dz and its interval with the period in the model, without where sequences do not allow it."""
+def standardize_effect(effect: GuidanceEffect) -> tuple[float | None, tuple[float, float] | None]:
+    """Return dz and its interval with the period in the model, without where sequences do not allow it."""
     return (
         (effect.dz, effect.dz_ci95)
         if effect.dz is not None
@@ -150,7 +150,7 @@ def standardised(effect: Effect) -> tuple[float | None, tuple[float, float] | No
     )
 
 
-def _paths(
+def _draw_condition_paths(
     axis: Axes, trials: Sequence[MeasuredTrial], horizontal: int | None, vertical: int
 ) -> None:
     labelled = set()
@@ -169,12 +169,12 @@ def _paths(
     remove_frame(axis)
 
 
-def _hole(trial: MeasuredTrial) -> str:
+def _name_hole(trial: MeasuredTrial) -> str:
     return str(trial.facts["hole"].get("name", "?"))
 
 
-def _half(values: np.ndarray) -> float:
-    """Returns half of Student's 95 % interval, 0 for a single value."""
+def _compute_half_width(values: np.ndarray) -> float:
+    """Return half of Student's 95 % interval, 0 for a single value."""
     known = values[~np.isnan(values)]
     interval = compute_student_interval(known.tolist())
     return (interval[1] - interval[0]) / 2 if interval else 0.0

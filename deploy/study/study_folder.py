@@ -35,7 +35,7 @@ TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS = (
 )
 CAPTURES = "captures"
 OUTCOMES = ("inserted", "time limit", "stopped", "aborted")
-"""How a trial can end: by the task, by time, by the participant, by the experimenter or a fault."""
+"""Endings of a trial: task, time, participant, experimenter, fault."""
 TRIAL_FIELDS = {
     "participant": str,
     "period": int,
@@ -44,7 +44,7 @@ TRIAL_FIELDS = {
     "hole": dict,
     "limit_s": (int, float),
 }
-"""What a trial must say."""
+"""Required fields of a trial."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ class Remark:
 
 @dataclass
 class StudyData:
-    """What a study's folder holds.
+    """Content of a study's folder.
 
     Attributes:
         folder: The folder.
@@ -85,13 +85,13 @@ class StudyData:
 
     @property
     def is_simulated(self) -> bool:
-        """Whether any of it comes from simulated operators."""
+        """True if any trial comes from a simulated operator."""
         entries = [*self.trials.values(), *self.spare, *self.questionnaires.values()]
         return any(entry.get("simulated") for entry in entries)
 
 
 def read_plan(folder: Path) -> dict[str, Any]:
-    """Returns the plan of a study.
+    """Return the plan of a study.
 
     Raises:
         ConfigError: there is none, or it cannot be read.
@@ -108,10 +108,10 @@ def read_plan(folder: Path) -> dict[str, Any]:
     return plan
 
 
-def read(folder: Path) -> StudyData:
-    """Reads a study with all that is wrong with it."""
+def read_study(folder: Path) -> StudyData:
+    """Read a study with all that is wrong with it."""
     data = StudyData(folder, read_plan(folder))
-    for name, entry in _entries(folder / PARTICIPANTS, data):
+    for name, entry in _iterate_entries(folder / PARTICIPANTS, data):
         data.participants[str(entry.get("participant", name))] = entry
     _read_trials(data)
     _read_questionnaires(data)
@@ -120,7 +120,7 @@ def read(folder: Path) -> StudyData:
 
 
 def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
-    """Writes what is known of a trial; one that is there already stays, and this becomes a second one beside it."""
+    """Write what is known of a trial; one that is there already stays, and this becomes a second one beside it."""
     path = folder / TRIALS / f"{name}.json"
     for again in range(2, 100):
         if not path.exists():
@@ -130,14 +130,14 @@ def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
 
 
 def rewrite(path: Path, changes: dict[str, Any]) -> None:
-    """Changes what is known of a trial, participant or questionnaire that is still going on."""
+    """Change what is known of a trial, participant or questionnaire that is still going on."""
     _write(path, _read(path) | changes)
 
 
 def write_questionnaire(
     folder: Path, participant: str, period: int, answers: dict[str, Any]
 ) -> Path:
-    """Writes a questionnaire; answers given again take the place of those before, which are kept within the file."""
+    """Write a questionnaire; answers given again take the place of those before, which are kept within the file."""
     path = folder / QUESTIONNAIRES / f"{participant}_{period}.json"
     entry: dict[str, Any] = {"schema": 1, "participant": participant, "period": period}
     entry |= {"created": datetime.now().astimezone().isoformat(), **answers}
@@ -147,7 +147,7 @@ def write_questionnaire(
 
 
 def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> Path:
-    """Writes what is known of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
+    """Write what is known of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
     return _write(
         folder / PARTICIPANTS / f"{participant}.json",
         {"schema": 1, "participant": participant, **facts},
@@ -155,7 +155,7 @@ def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> 
 
 
 def note_report(folder: Path, report: Path) -> None:
-    """Remembers where a report of this study was written."""
+    """Remember where a report of this study was written."""
     path = folder / REPORTS
     known = _read(path) if path.exists() else []
     if str(report.resolve()) not in known:
@@ -163,7 +163,7 @@ def note_report(folder: Path, report: Path) -> None:
 
 
 def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
-    """Deletes every file about a participant; the plan keeps an empty place that says so.
+    """Delete every file about a participant; the plan keeps an empty place that says so.
 
     Returns:
         What was deleted, and folders with reports that were made with the participant's data, to be
@@ -183,7 +183,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
             if (
                 path.stem == participant
                 or path.stem.startswith(f"{participant}_")
-                or _belongs(path, participant)
+                or _is_of_participant(path, participant)
             ):
                 try:
                     if path.is_dir():
@@ -205,8 +205,8 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     return gone, [report for report in reports if report.exists()]
 
 
-def _belongs(path: Path, participant: str) -> bool:
-    """Says whether a file with another name is about the participant."""
+def _is_of_participant(path: Path, participant: str) -> bool:
+    """Return whether a file with another name is about the participant."""
     if path.suffix != ".json":
         return False
     try:
@@ -218,7 +218,8 @@ def _belongs(path: Path, participant: str) -> bool:
 
 def _read_trials(data: StudyData) -> None:
     found = sorted(
-        _entries(data.folder / TRIALS, data), key=lambda item: str(item[1].get("created", ""))
+        _iterate_entries(data.folder / TRIALS, data),
+        key=lambda item: str(item[1].get("created", "")),
     )
     for name, trial in found:
         lacking = [
@@ -255,7 +256,7 @@ def _read_trials(data: StudyData) -> None:
 
 
 def _read_questionnaires(data: StudyData) -> None:
-    for name, entry in _entries(data.folder / QUESTIONNAIRES, data):
+    for name, entry in _iterate_entries(data.folder / QUESTIONNAIRES, data):
         who, period = str(entry.get("participant")), entry.get("period")
         if who not in data.plan["participants"] or period not in PERIODS:
             data.remarks.append(
@@ -316,7 +317,7 @@ def _note_missing(data: StudyData) -> None:
                 data.remarks.append(Remark(who, f"no questionnaire for period {period}"))
 
 
-def _entries(folder: Path, data: StudyData) -> Iterator[tuple[str, dict[str, Any]]]:
+def _iterate_entries(folder: Path, data: StudyData) -> Iterator[tuple[str, dict[str, Any]]]:
     for path in sorted(folder.glob("*.json")):
         try:
             entry = json.loads(path.read_text())
