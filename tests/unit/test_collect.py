@@ -74,7 +74,7 @@ def test_every_run_is_cut_into_files_that_know_each_other(
     first, second, *_ = files.values()
     assert second.metadata["created"] == record.add_seconds(first.metadata["created"], 12.0)
     assert (
-        first.metadata["source"] == "simulator: FirstOrderLag, excitation: sine"
+        first.metadata["source"] == "simulator: Lag, excitation: sine"
         and first.metadata["seed"] == "0"
     )
     assert json.loads(first.metadata["fingerprint"]) == machine.fingerprint()

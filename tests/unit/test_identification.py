@@ -95,7 +95,7 @@ class Fit:
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Spares drawing and writing pictures, which is most of the time of an identification of so little."""
-    monkeypatch.setattr(page, "write", lambda *arguments: None)
+    monkeypatch.setattr(page, "write_page", lambda *arguments: None)
 
 
 def identify(
