@@ -80,7 +80,8 @@ COMMANDS: dict[str, dict[str, str]] = {
     "diagnosis": {
         "exam": f"mode=exam exam.do=make session.seed=160 exam.salt={SALT}"
         " exam.mix.num_cases=12 exam.workers={share}",
-        "answers": "mode=exam exam.do=run exam.folder={part}/exam exam.workers={share}",
+        "answers": "mode=exam exam.do=run exam.folder={part}/exam exam.workers={share}"
+        " exam.candidate.limit_s=3600",  # a busy computer is no reason for a missing answer
     },
     # marks, oracle and calibration from the answers of `diagnosis`, and a small exam for baselines
     "exam_score": {
@@ -135,6 +136,9 @@ COMMANDS: dict[str, dict[str, str]] = {
 
 NEEDS = {"exam_score": "diagnosis"}
 """Parts that use what another one leaves: asked for alone, they bring it."""
+RECORDED = {"identification": ("recorded", "sine")}
+"""Commands whose recordings get names of runs without the time of day. Runs are distributed over
+sets by a hash of their names: the same recordings made a second later are fitted otherwise."""
 ALONE = ("guard_reactions",)
 """Parts that measure times: run last, with nothing beside them."""
 
@@ -180,7 +184,7 @@ ANSWERS: dict[str, tuple[str, ...]] = {
 
 LEFT_OUT = (
     "*/seconds", "*/seconds/*", "*/fit_seconds", "*/fold_seconds*", "*/ms/*",  # times
-    "*/progress.csv/rate/*", "*/cores", "*/load*", "*/listener",
+    "*/progress.csv/rate/*",
     "*/_target_",  # where a class stands, which is what a refactor changes
     "*/use",  # an override with the path of a file
 )  # fmt: skip
@@ -210,6 +214,8 @@ NOISE_MS = 25.0
 LONGEST = 64
 """Numbers of a list that are kept one by one; longer ones as hash, mean and quantiles."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 1.0)
+HASH_LENGTH = 40
+CREATED = "2026-01-01T00:00:00.000+00:00"
 TAIL = 3000
 """Characters kept of what a failed command said."""
 SHOWN = 12
@@ -235,9 +241,11 @@ def main() -> int:
     compare = commands.add_parser("compare", help="compare two records")
     compare.add_argument("before", type=Path)
     compare.add_argument("after", type=Path)
+    compare.add_argument("--parts", help="as above: a part without a record is different otherwise")
     given = parser.parse_args()
     if given.command == "compare":
-        return compare_records(given.before, given.after)
+        wanted = given.parts.split(",") if given.parts else list(COMMANDS)
+        return compare_records(wanted, given.before, given.after)
     parts = choose_parts(given.parts)
     if given.keep is not None:
         return record_parts(parts, given.folder, given.tree.resolve(), given.workers, given.keep)
@@ -300,6 +308,8 @@ def record_part(
             start = time.monotonic()
             run_command(fill_words(words, place, scratch, share), place / step, tree, place)
             check_tree(place / step, facts["commit"])
+            if step in RECORDED.get(name, ()):
+                rename_runs(place / step / "recordings")
             seconds[step] = round(time.monotonic() - start, 1)
         if name in EXTRAS:
             numbers = EXTRAS[name](place, tree)
@@ -379,7 +389,7 @@ def check_tree(out: Path, commit: str | None) -> None:
     """
     path = out / "session.json"
     found = json.loads(path.read_text()).get("commit") if path.is_file() else None
-    if commit and found and found != commit:
+    if commit and found and found[:HASH_LENGTH] != commit[:HASH_LENGTH]:  # without `-dirty`
         raise RuntimeError(f"the code that answered is of commit {found}, the tree's is {commit}")
 
 
@@ -388,8 +398,9 @@ def collect_facts(tree: Path) -> Json:
     git = ["git", "-C", str(tree), "describe", "--always", "--abbrev=40", "--dirty", "--exclude=*"]
     commit = subprocess.run(git, capture_output=True, text=True).stdout.strip() or None
     versions = {"python": platform.python_version()}
-    for name in PACKAGES:
-        versions[name] = metadata.version(name)
+    for package in metadata.distributions():
+        if package.name in PACKAGES:
+            versions[package.name] = package.version
     return {"commit": commit, "versions": versions, "machine": describe_machine()}
 
 
@@ -528,6 +539,24 @@ def read_recordings(paths: list[Path], place: Path) -> Json:
     return {"files": files, "columns": together}
 
 
+def rename_runs(folder: Path) -> None:
+    """Writes recordings again with the name of the file's run for a name, and a fixed time.
+
+    Raises:
+        RuntimeError: they do not say of which run they are, or when they were made.
+    """
+    from pyarrow import parquet
+
+    for path in sorted(folder.glob("*.parquet")):
+        table = parquet.ParquetFile(path).read()
+        fixed = {b"run": path.stem.rpartition("_")[0].encode(), b"created": CREATED.encode()}
+        said = {key: fixed.get(key.rpartition(b".")[2]) for key in table.schema.metadata}
+        if len([one for one in said.values() if one is not None]) != len(fixed):
+            raise RuntimeError(f"{path.name}: expected `run` and `created` among its metadata")
+        known = {key: said[key] or value for key, value in table.schema.metadata.items()}
+        parquet.write_table(table.replace_schema_metadata(known), path)
+
+
 def read_number(text: str) -> Json:
     """Returns a cell as a number where it is one."""
     try:
@@ -607,10 +636,10 @@ def dump(value: Json) -> str:
 # --- Comparing ---------------------------------------------------------------
 
 
-def compare_records(before: Path, after: Path) -> int:
+def compare_records(parts: list[str], before: Path, after: Path) -> int:
     """Prints a line a part, writes the verdict into `after`; returns 1 if any part is different."""
     verdicts: dict[str, Json] = {}
-    for name in COMMANDS:
+    for name in parts:
         first, second = (read_record(folder / f"{name}.json") for folder in (before, after))
         verdicts[name] = compare_part(name, first, second)
     for name, verdict in verdicts.items():
