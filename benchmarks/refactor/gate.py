@@ -28,6 +28,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import metadata
@@ -226,6 +227,7 @@ SHOWN = 12
 """Paths printed of a part that differs; the verdict's file has up to `WRITTEN`."""
 WRITTEN = 200
 VERDICT = "verdict.json"
+INSTALLED = "installed"
 PACKAGES = ("hydra-core", "torch", "numpy", "scipy", "rsl-rl-lib", "mujoco", "mujoco-warp",
             "warp-lang", "onnxruntime", "opencv-python-headless", "pyarrow")  # fmt: skip
 
@@ -281,6 +283,7 @@ def record_parts(parts: list[str], folder: Path, tree: Path, workers: int, scrat
     failed = []
     running: dict[str, Future[bool]] = {}
     scratch = scratch.resolve()
+    announce_extensions(tree, scratch / INSTALLED)
     share = max(1, workers // 2)
 
     def run(name: str) -> bool:
@@ -357,7 +360,11 @@ def run_command(words: list[str], out: Path, tree: Path, place: Path) -> None:
 def run_process(command: list[str], tree: Path, place: Path) -> None:
     """Runs a process in an empty folder, so that nothing is found or left in the tree."""
     done = subprocess.run(
-        command, cwd=place, env=build_environment(tree), capture_output=True, text=True
+        command,
+        cwd=place,
+        env=build_environment(tree, place.parent / INSTALLED),
+        capture_output=True,
+        text=True,
     )
     if done.returncode:
         said = (done.stdout + done.stderr)[-TAIL:].replace(str(place), "{part}")
@@ -365,7 +372,25 @@ def run_process(command: list[str], tree: Path, place: Path) -> None:
         raise RuntimeError(f"exit code {done.returncode} of {words}\n{said}")
 
 
-def build_environment(tree: Path) -> dict[str, str]:
+def announce_extensions(tree: Path, folder: Path) -> None:
+    """Writes into a folder what an installation of the tree would say of its entry points.
+
+    Options of extensions are found by entry points of what is installed, and that may be another
+    commit than the tree's; on the path before it, this takes the place of what it says.
+    """
+    project = tomllib.loads((tree / "pyproject.toml").read_text())["project"]
+    place = folder / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
+    shutil.rmtree(place, ignore_errors=True)
+    place.mkdir(parents=True)
+    head = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (place / "METADATA").write_text(head)
+    lines = []
+    for group, entries in project.get("entry-points", {}).items():
+        lines += [f"[{group}]", *(f"{name} = {target}" for name, target in entries.items())]
+    (place / "entry_points.txt").write_text("\n".join(lines) + "\n")
+
+
+def build_environment(tree: Path, installed: Path) -> dict[str, str]:
     """Returns the environment of a command: the tree's packages, no GPU, one thread.
 
     Results of torch's sums depend on the number of its threads, and OpenCV's stereo on its own;
@@ -380,7 +405,7 @@ def build_environment(tree: Path) -> dict[str, str]:
         **{f"{name}_NUM_THREADS": "1" for name in threads},
         "OPENCV_FOR_THREADS_NUM": "1",
         "PYTHONHASHSEED": "0",
-        "PYTHONPATH": str(tree),
+        "PYTHONPATH": f"{tree}{os.pathsep}{installed}",
         "PYTHONDONTWRITEBYTECODE": "1",  # the tree stays as it is
         "CUDA_VISIBLE_DEVICES": "",
         "MPLBACKEND": "Agg",
