@@ -42,7 +42,7 @@ class JointErrors:
     shapes: dict[str, list[Response]]
     fold: np.ndarray
 
-    def build_rays(self, names: frozenset[str]) -> list[Response]:
+    def rays(self, names: frozenset[str]) -> list[Response]:
         """Return the shapes of several effects, in the order of their names."""
         return [shape for name in sorted(names) for shape in self.shapes[name]]
 
@@ -58,7 +58,7 @@ class CaseEvidence:
     """
 
     base: Baseline
-    build_rays: dict[str, Sequence[ParameterRay]]
+    rays: dict[str, Sequence[ParameterRay]]
     errors: list[JointErrors]
 
 

@@ -106,7 +106,7 @@ def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(
 
 
 def test_what_is_left_is_judged_by_the_motion_that_is_left(machine: Machine) -> None:
-    # a dead band split_by_family all speeds: errors of 5 % of what is left are 2.5 % of what was simulated
+    # a dead band halves all speeds: errors of 5 % of what is left are 2.5 % of what was simulated
     # before
     random, noise = (
         np.random.default_rng(7),

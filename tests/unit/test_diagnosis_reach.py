@@ -185,5 +185,5 @@ def test_a_half_of_the_recordings_that_says_nothing_of_a_size_does_not_deny_it(
         kind.name: build_rays(kind) for kind in effect_library.load_effects(axis, ["saturation"])
     }
     found = refine.fit_set(residuals, [frozenset(ways)], ways, [{"saturation": np.array([1.0])}])
-    np.testing.assert_allclose(found.split_by_family[:, 0, 0], (1.0 - 0.7) / 0.25, atol=0.1)
+    np.testing.assert_allclose(found.halves[:, 0, 0], (1.0 - 0.7) / 0.25, atol=0.1)
     assert np.square(found.z).mean() < 0.2 * np.square(residuals.z).mean()
