@@ -156,7 +156,9 @@ def _rename_targets(cfg: DictConfig) -> DictConfig:
     """Return the configuration with current targets, as `resolved.yaml` of an older run needs it."""
     text = OmegaConf.to_yaml(cfg)
     current = registry.rename_targets(text)
-    return cfg if current == text else OmegaConf.create(current)
+    renamed = cfg if current == text else OmegaConf.create(current)
+    assert isinstance(renamed, DictConfig)
+    return renamed
 
 
 def _drop_consumed_groups(cfg: DictConfig) -> DictConfig:

@@ -37,7 +37,8 @@ HEADINGS = {
 SCALES = {"lateral_error_m": 1e3, "peak_force_n": 1e-3}
 SUCCESS = "episode/success_strict"
 REACHED = 0.95
-"""Success rate whose first crossing is reported and drawn, the goal of one insertion in 20 failing."""
+"""Success rate whose first crossing is reported and drawn, the goal of one insertion in 20
+failing."""
 LABEL_WIDTH = 42
 """Characters of a row label before it wraps."""
 MOST_COLUMNS = 4

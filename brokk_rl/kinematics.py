@@ -339,10 +339,10 @@ def _build_group_columns(
 ) -> tuple[np.ndarray, int]:
     """Return the coefficients of one group's points, and the number of points `P`.
 
-    The columns, `(F, 15 + 3 P)` (`(F, 3 + 3 P)` for the last group), are: the heading (3; meaningful
-    for the first group alone); for all but the last group the rows of the transposed rotation
-    behind it (9) and the shift (3); then `P` points: origin and origin + axis of each joint, for the
-    last group also tip and tip + tool axis.
+    The columns, `(F, 15 + 3 P)` (`(F, 3 + 3 P)` for the last group), are: the heading (3;
+    meaningful for the first group alone); for all but the last group the rows of the transposed
+    rotation behind it (9) and the shift (3); then `P` points: origin and origin + axis of each
+    joint, for the last group also tip and tip + tool axis.
     """
     hinges = [j for j in group if machine.joints[j].kind == "hinge"]
     axis = np.array(machine.bodies[hinges[0]].axis) if hinges else np.array([0.0, 0.0, 1.0])

@@ -47,13 +47,13 @@ SMALLEST_FLOW = 0.1
 MOVED = 0.004
 """Part of the travel that counts as motion. Chosen by hand: well above the noise of a position."""
 LONGEST_S = 2.0
-"""Time after the beginning of flow within which the joint must have moved. Chosen by hand: longer than
-any dead time that a policy could be trained for."""
+"""Time after the beginning of flow within which the joint must have moved. Chosen by hand: longer
+than any dead time that a policy could be trained for."""
 REST_S = 0.5
 """Time for which the joint must have been at rest before. Chosen by hand."""
 ONSET_S = 0.15
-"""Length of the line that is drawn back to the beginning of a motion. Chosen by hand: longer averages
-more noise, shorter bends less with the acceleration."""
+"""Length of the line that is drawn back to the beginning of a motion. Chosen by hand: longer
+averages more noise, shorter bends less with the acceleration."""
 SPEED_S = 0.2
 """Time over which a speed is measured. Chosen by hand: longer averages more noise."""
 

@@ -2,8 +2,8 @@
 
 A lever angle is the joint's command times the angle at full command. The machine (`machine.levers`)
 or a pattern here assigns each joint to an axis. A joint that is never moved together with others
-shares an axis and needs the button of that lever held. The displayed positions change no faster than
-a hand can, and an axis passes through neutral before the button changes.
+shares an axis and needs the button of that lever held. The displayed positions change no faster
+than a hand can, and an axis passes through neutral before the button changes.
 """
 
 from __future__ import annotations

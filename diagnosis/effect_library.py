@@ -74,12 +74,12 @@ class EffectType:
 
     @cached_property
     def fitted(self) -> tuple[str, ...]:
-        """Numbers that make the effect: those with a neutral value."""
+        """Number that make the effect: those with a neutral value."""
         return tuple(name for name, number in self.numbers.items() if number.none is not None)
 
     @cached_property
     def shaping(self) -> tuple[str, ...]:
-        """Numbers that only shape it, such as a time constant."""
+        """Number that only shape it, such as a time constant."""
         return tuple(
             n for n, number in self.numbers.items() if number.none is None and n != self.running
         )

@@ -29,7 +29,8 @@ FLAT, STEP, LINEAR, QUADRATIC = 0.2, 0.35, 0.65, 1.3
 """Bounds of the slope of log(error) over log(time), chosen by hand about 0 (offset), 0.5 (random
 walk), 1 (ramp) and 2 (acceleration); they name the growth in words and change no figure."""
 MIN_EXCESS_RATIO = 1.2
-"""Error over floor from which a growth is classified; chosen by hand: below it the excess is noise."""
+"""Error over floor from which a growth is classified; chosen by hand: below it the excess is
+noise."""
 
 
 @dataclass(frozen=True)

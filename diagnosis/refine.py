@@ -240,7 +240,7 @@ class _Fit:
         return self.residuals.whiten(self.residuals.compute_error(paths)).swapaxes(0, 1), paths
 
     def nearest(self, sizes: np.ndarray) -> np.ndarray:
-        """Returns, joint by joint, the best of several multiples of sizes `(R, J)`."""
+        """Return, joint by joint, the best of several multiples of sizes `(R, J)`."""
         trials = np.clip(np.stack([sizes * by for by in START_FACTORS]), *self.bounds)
         best = _compute_totals(self.simulated(trials)[0], trials, 1.0).argmin(0)
         return np.where(self.mask, np.take_along_axis(trials, best[None, None], 0)[0], 0.0)

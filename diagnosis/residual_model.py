@@ -191,7 +191,7 @@ class SimulatedMotion:
 
     @cached_property
     def share(self) -> np.ndarray:
-        """Speeds of all joints over their full speed, `(W, I, J)`."""
+        """Speed of all joints over their full speed, `(W, I, J)`."""
         machine = self.residuals.simulator.machine
         return self.residuals.increments / (
             machine.max_speed * machine.period_s * INCREMENT_SAMPLES
@@ -250,7 +250,7 @@ def apply_fitted_set(residuals: Residuals, fitted: FittedSet | None) -> Residual
 
 
 def _build_start_stop(m: SimulatedMotion) -> list[np.ndarray]:
-    """Starts and stops, just before and after."""
+    """Start and stops, just before and after."""
     turn, faster = (
         np.diff(m.own, axis=1, prepend=m.own[:, :1]),
         np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0,

@@ -1,8 +1,9 @@
 """Errors of a simulator on recordings, divided by the standard deviation that they have anyway.
 
-Errors are compared as increments over `SPAN` samples. Their covariance has three parts: the sensor's
-(each increment by itself), one at changes of speed, and a speed that wanders by a few percent over
-some seconds. Whitening divides by the root of that covariance, so that all increments count alike
+Errors are compared as increments over `SPAN` samples. Their covariance has three parts: the
+sensor's (each increment by itself), one at changes of speed, and a speed that wanders by a few
+percent over some seconds. Whitening divides by the root of that covariance, so that all increments
+count alike
 and independently: a wandering speed is then no evidence for another gain.
 Axes: `C` candidates, `W` windows, `I` increments in a window, `J` joints, `B` blocks of `S`
 increments in a row, `E` entries (increments of all windows, `W` times `I`).

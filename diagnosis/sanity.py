@@ -159,11 +159,11 @@ hand."""
 JUMP_PERIODS = 1.15
 """Period over the median that counts as a jump; the format of recordings refuses 1.2."""
 MAX_CLOCK_PPM = 2000.0
-"""Largest deviation of the clock's rate from the stated one, ppm; chosen by hand: loggers are off by
-10 to 4000."""
+"""Largest deviation of the clock's rate from the stated one, ppm; chosen by hand: loggers are off
+by 10 to 4000."""
 MIN_SATURATED_ROWS = 10
-"""Least number of consecutive samples at the extreme of a sensor, away from the stops, that count as
-saturation; chosen by hand: half a second at 20 Hz."""
+"""Least number of consecutive samples at the extreme of a sensor, away from the stops, that count
+as saturation; chosen by hand: half a second at 20 Hz."""
 MIN_COMMANDED_S = 10.0
 """Least time with a command, s; chosen by hand: two windows of 5 s."""
 

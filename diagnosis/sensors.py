@@ -1,7 +1,8 @@
 """Noise and quantisation of sensors, from the scatter of samples; free runs are too coarse.
 
 A few statistics describe each recording, by joint. An effect is put onto recordings of the
-reference at several sizes. The most likely size has the statistics that are nearest to those of the field.
+reference at several sizes. The most likely size has the statistics that are nearest to those of the
+field.
 Axes: `T` time, `J` joints, `P` parts of the reference, `F` statistics.
 """
 

@@ -2,8 +2,8 @@
 
 A run of the diagnosis stores its candidate sets, so another penalty is tried without simulation:
 hundreds of trials take minutes. Exams of several plants are used at once, so that the result is not
-specific to one machine. The remainder after a choice is that of the stored run; it hardly depends on
-penalties.
+specific to one machine. The remainder after a choice is that of the stored run; it hardly depends
+on penalties.
 """
 
 from __future__ import annotations

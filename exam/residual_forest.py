@@ -2,8 +2,8 @@
 
 The model of the reference: the travel of a joint in a quarter of a second, piecewise linear in its
 delayed commands (Hammerstein). Each probe is the residual of one effect. A feature is the slope of
-the residual on a probe in the field less that in the reference, over its standard deviation from one
-minute of the reference to the next. Needs scikit-learn.
+the residual on a probe in the field less that in the reference, over its standard deviation from
+one minute of the reference to the next. Needs scikit-learn.
 """
 
 from __future__ import annotations

@@ -215,7 +215,7 @@ def write_picture(path: Path, picture: np.ndarray) -> None:
 
 
 def is_whole(stem: Path) -> bool:
-    """Says whether a rendered frame has been written to its end."""
+    """Return whether a rendered frame has been written to its end."""
     return _build_path(stem, TRUTH).is_file()
 
 

@@ -11,7 +11,8 @@ import numpy as np
 from brokk_rl.contracts.vision import Ellipse, EllipseDetector, SizePrior
 from brokk_rl.signals import Frame
 
-# Chosen by hand on rendered scenes (benchmarks/perception/table.py), unless a comment says otherwise.
+# Chosen by hand on rendered scenes (benchmarks/perception/table.py), unless a comment says
+# otherwise.
 STEP = 8
 """Pixels of the picture to a cell of the grid on which regions are built."""
 OCTAVES = 5
@@ -132,9 +133,9 @@ def plan_search_levels(
     """Return the levels to search: each part of the block in the coarsest resolution that suits it.
 
     The major semi-axis of a circle is focal length times radius over depth, however it is tilted.
-    The search reaches beyond the mask by the size of a hole: a hole may be a gap of the mask, or lie
-    at its border where something hides half of it. Where depth is unknown beside the mask, the face
-    may go on a few times as far.
+    The search reaches beyond the mask by the size of a hole: a hole may be a gap of the mask, or
+    lie at its border where something hides half of it. Where depth is unknown beside the mask, the
+    face may go on a few times as far.
 
     Args:
         frame: Frame with depth and camera matrix.

@@ -20,8 +20,8 @@ BATCH_FACTOR, MIN_BATCH, MAX_BATCHES = 4, 256, 64
 up. Chosen by hand."""
 
 REACH_STEPS, REACH_MAX_STEP = 40, 0.1
-"""Damped Newton steps of the exclusive joints towards the working range, and their largest step (rad
-or m). Chosen by hand."""
+"""Damped Newton steps of the exclusive joints towards the working range, and their largest step
+(rad or m). Chosen by hand."""
 POSE_STEPS, POSE_STEP_S = 120, 0.2
 """Steps of the classical controller's approach, and the time of each, s. Chosen by hand: 24 s,
 longer than an episode of `borehole_insertion`."""

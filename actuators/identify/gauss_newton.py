@@ -294,8 +294,8 @@ def estimate_uncertainty(runs: CandidateRuns, x: np.ndarray, robust: float) -> P
 
     The errors of a model that is not quite right are no white noise: the spread of the runs' own
     gradients says how far a number would move with other runs (Liang and Zeger 1986). It is never
-    taken for less than white errors would give, and a parameter that the data do not determine keeps its range
-    as standard error.
+    taken for less than white errors would give, and a parameter that the data do not determine
+    keeps its range as standard error.
     """
     error, slopes = runs.jacobian(x, SECANT)
     squares = np.square(error, dtype=np.float64).sum(1)

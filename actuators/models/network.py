@@ -3,8 +3,8 @@
 The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest
 position and the 12 increments
 between them: the same information in another basis, so that the network sees speeds at full
-resolution instead of small differences of large numbers, and a relation learned in one place holds in
-another unless the data say otherwise.
+resolution instead of small differences of large numbers, and a relation learned in one place holds
+in another unless the data say otherwise.
 
 Axes: `J` joints, `B` batch, `H` history, `K` steps.
 """
@@ -103,8 +103,8 @@ class PoseLoad(nn.Module):
 class JointNetworks(nn.Module):
     """Per joint a perceptron with two hidden ReLU layers to the next increment (paper, III-A).
 
-    Where they are coupled, their outputs are multiplied by the output of `SharedFlow` for the commands
-    of all joints, and by that of `PoseLoad` for the positions of all.
+    Where they are coupled, their outputs are multiplied by the output of `SharedFlow` for the
+    commands of all joints, and by that of `PoseLoad` for the positions of all.
 
     The last layer is followed by a dead zone of half width `quiet`: an increment smaller than the
     noise of the measurement is none. A machine at rest therefore stays at rest, however long the

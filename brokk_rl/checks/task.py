@@ -152,10 +152,11 @@ def _check_optional(
     process: TaskProcess, groups: dict[str, torch.Tensor], machine: Machine
 ) -> None:
     """Check `ClassicalTask` and `DeployableTask` where the task offers them."""
+    num_actions = process.num_actions
     if supports_classical_control(process):
         action = process.classical_action(groups)
         require(
-            tuple(action.shape) == (NUM_ENVS, process.num_actions),
+            tuple(action.shape) == (NUM_ENVS, num_actions),
             f"classical_action: got shape {tuple(action.shape)}",
         )
     half = [name for name in ("describe", "deployable") if hasattr(process, name)]
@@ -164,7 +165,7 @@ def _check_optional(
         f"{half}: a task that can be deployed has both methods, describe and deployable",
     )
     if supports_deployment(process):
-        _check_deployment(process, groups["policy"], machine, process.num_actions)
+        _check_deployment(process, groups["policy"], machine, num_actions)
 
 
 def _check_deployment(

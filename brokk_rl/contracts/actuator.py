@@ -97,8 +97,8 @@ class Segment:
                 zero. `inward`: this joint is
             driven the other way until its program next passes zero.
         stop_margin: Distance from the stops, as a part of the joint's travel.
-        repeat_of: Name of an earlier segment of the same length, of which this one repeats the commands
-            that were really sent.
+        repeat_of: Name of an earlier segment of the same length, of which this one repeats the
+            commands that were really sent.
     """
 
     name: str

@@ -18,5 +18,5 @@ class Mode(Protocol):
     """What `brokk mode=…` runs."""
 
     def run(self) -> float | None:
-        """Does the work; returns the objective of a sweep, or `None`."""
+        """Do the work; returns the objective of a sweep, or `None`."""
         ...

@@ -1,7 +1,7 @@
 """Contract of a task, and of the policies that act in it.
 
-A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes of
-`N` environments at once. That contract is all that training and evaluation need. Two more are
+A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes
+of `N` environments at once. That contract is all that training and evaluation need. Two more are
 optional, and `supports_classical_control` and `supports_deployment` ask for them:
 
 * `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
@@ -106,8 +106,8 @@ class TaskProcess(Protocol):
     ) -> dict[str, torch.Tensor]:
         """Return the observation groups, each `(N, …)` float32; one of them is `policy`.
 
-        Called once a control step, after `step` and `reset`. The tensors are the task's own, and the
-        next call overwrites them.
+        Called once a control step, after `step` and `reset`. The tensors are the task's own, and
+        the next call overwrites them.
 
         Args:
             history: Positions as sensors measure them, and the commands in force.

@@ -39,7 +39,8 @@ class World(Protocol):
         """Advance one control period.
 
         Args:
-            increment: Motion of each joint that the drive makes unless something blocks it, `(N, J)`.
+            increment: Motion of each joint that the drive makes unless something blocks it, `(N,
+                J)`.
         """
         ...
 

@@ -97,7 +97,7 @@ class Benchmark:
     """Several processes that `torchrun` starts measure at the same time and train together."""
 
     def run(self) -> float:
-        """Measures; returns the training rate of the last row, that of all processes together."""
+        """Measure; returns the training rate of the last row, that of all processes together."""
         alone = _read_single_process(self.bench)
         device = self.session.torch_device()
         plant = ControlLoopConfig(

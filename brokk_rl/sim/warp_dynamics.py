@@ -1,3 +1,7 @@
+# Kernels are written in Warp's own subset of Python, whose types a type checker does not know.
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportReturnType=false
+# pyright: reportGeneralTypeIssues=false, reportAssignmentType=false
 """Forces on an arm before contacts, and its step in time after them: one Warp launch each.
 
 Before the contacts: the mass matrix M, the forces of the servos (`brokk_rl.sim.drive`) and the

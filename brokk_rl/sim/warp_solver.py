@@ -1,3 +1,7 @@
+# Kernels are written in Warp's own subset of Python, whose types a type checker does not know.
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportReturnType=false
+# pyright: reportGeneralTypeIssues=false, reportAssignmentType=false
 """Contact solver of the Warp worlds: a world's whole problem in one launch.
 
 MuJoCo finds the acceleration x that minimises a convex cost (MuJoCo documentation, Computation,
@@ -17,7 +21,6 @@ dozen kernels an iteration. Here a warp of 32 threads solves a world: each threa
 and all share the sums.
 """
 
-# pyright: reportInvalidTypeForm=false
 # (sizes of vectors and matrices are known only at run time, so that their types are values)
 
 import functools

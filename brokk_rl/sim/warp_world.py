@@ -1,3 +1,7 @@
+# Kernels are written in Warp's own subset of Python, whose types a type checker does not know.
+# pyright: reportInvalidTypeForm=false, reportIndexIssue=false, reportCallIssue=false
+# pyright: reportArgumentType=false, reportOperatorIssue=false, reportReturnType=false
+# pyright: reportGeneralTypeIssues=false, reportAssignmentType=false
 """Worlds stepped by `mujoco_warp`, from its own stages or from our kernels.
 
 `brokk_rl.sim.simulator.WarpSimulator` is the spec that builds them.

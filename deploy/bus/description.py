@@ -9,8 +9,8 @@ one whole byte and the attribute `E2EDataId`. Cycle times are the DBC's (`GenMsg
 is written down twice.
 
 `generate_c_header` writes a header for the gateway's firmware. cantools generates the C source that
-packs and unpacks (`cantools generate_c_source <dbc>`); the header adds the end-to-end protection and
-the times, so that gateway and PC go by one file.
+packs and unpacks (`cantools generate_c_source <dbc>`); the header adds the end-to-end protection
+and the times, so that gateway and PC go by one file.
 """
 
 from __future__ import annotations

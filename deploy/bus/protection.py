@@ -19,8 +19,8 @@ from enum import Enum
 POLYNOMIAL, START, FINAL = 0x1D, 0xFF, 0xFF
 """CRC-8 SAE J1850: polynomial, initial value, and the value that the result is XORed with."""
 MAX_STEP = 4
-"""Largest step of a counter. Up to three messages lost in a row are accepted; whether that takes too
-long is decided by age."""
+"""Largest step of a counter. Up to three messages lost in a row are accepted; whether that takes
+too long is decided by age."""
 IN_A_ROW = 2
 """Good messages that make a channel valid, and errors in a row that make it invalid."""
 SCORE = 5

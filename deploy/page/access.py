@@ -1,8 +1,8 @@
 """Access rules of the page's server: pure functions, no I/O.
 
-Any browser on a page of this server may watch. A request needs the token and, except for `stop`, the
-dead-man: `stop` only ends a motion, as the dead-man does. A page of another origin cannot connect
-(a stranger's site in the same browser), nor can a host name that is not this server's (DNS
+Any browser on a page of this server may watch. A request needs the token and, except for `stop`,
+the dead-man: `stop` only ends a motion, as the dead-man does. A page of another origin cannot
+connect (a stranger's site in the same browser), nor can a host name that is not this server's (DNS
 rebinding).
 """
 
@@ -16,8 +16,8 @@ from typing import Literal
 from deploy.page.protocol import REQUEST_KINDS, OperatorRequest, PageState
 
 RefusalReason = Literal["token", "malformed", "deadman", "target", "nowhere", "busy"]
-"""Why a request was refused: wrong token; no such request; the dead-man is not held; no such target;
-nothing is measured where the person points; the loop does not take it."""
+"""Why a request was refused: wrong token; no such request; the dead-man is not held; no such
+target; nothing is measured where the person points; the loop does not take it."""
 LOCAL = ("localhost", "127.0.0.1", "[::1]")
 ANY_ADDRESS = ("0.0.0.0", "::")
 POINT = re.compile(r"0?\.\d{1,6},0?\.\d{1,6}")

@@ -1,8 +1,8 @@
 """A feed without a machine: a simulated state and camera, to see, try and test the page at a desk.
 
 The state is made up from the clock alone: the exclusive joint moves with the button held, then the
-others; the operator's levers follow the advice a little late. It claims nothing about a machine or a
-policy.
+others; the operator's levers follow the advice a little late. It claims nothing about a machine or
+a policy.
 """
 
 from __future__ import annotations

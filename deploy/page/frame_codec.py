@@ -1,10 +1,11 @@
 """Encoding of a frame for the page: depth in whole millimetres, and colour as JPEG.
 
-Depth is coded by differences along each row, then zstd. Small differences are small numbers (zigzag),
-and low and high bytes stand apart: 206 KiB for 640 x 360 px, where plain differences take 262, 32-bit
-points and colours 3.2 MB, and Draco 702 KiB and a second. The page makes points of it on the graphics
-card. A message is the length of a JSON header, 4 bytes little-endian, the header, the depth, and the
-JPEG, which also is the camera's picture.
+Depth is coded by differences along each row, then zstd. Small differences are small numbers
+(zigzag),
+and low and high bytes stand apart: 206 KiB for 640 x 360 px, where plain differences take 262,
+32-bit points and colours 3.2 MB, and Draco 702 KiB and a second. The page makes points of it on the
+graphics card. A message is the length of a JSON header, 4 bytes little-endian, the header, the
+depth, and the JPEG, which also is the camera's picture.
 """
 
 from __future__ import annotations

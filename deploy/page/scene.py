@@ -27,7 +27,8 @@ rim; a larger ring holds more of the face, and more that does not belong to it."
 ROUNDS = 4
 """Times that the face is measured, each time around a better centre. Chosen by hand."""
 SLANT = 0.05
-"""Sine of the angle between face and line of sight below which the face is not measured. By hand."""
+"""Sine of the angle between face and line of sight below which the face is not measured. By
+hand."""
 LEAST_POINTS, LEAST_SIDES = 24, 3
 """Points of the face, and quarters around the click in which there must be some. Chosen by hand."""
 HAND_PX = 4.0
@@ -60,8 +61,8 @@ def describe_geometry(machine: Machine) -> dict[str, Any] | None:
 def plan_approach(tip_m: np.ndarray, center_m: np.ndarray, axis: np.ndarray) -> tuple[Vector, ...]:
     """Return the way of the tip to a point over the rim, then along the axis into the hole.
 
-    In the base frame. This is where the tool has to go, not the path that the policy will take: that
-    depends on the operator too.
+    In the base frame. This is where the tool has to go, not the path that the policy will take:
+    that depends on the operator too.
 
     Args:
         tip_m: Tip of the tool, `(3,)`.

@@ -1,8 +1,9 @@
 """The page's server: one process, one port; files, and three WebSockets.
 
-`/state` sends the newest `PageState` as JSON, `/frames` the newest frame, `/control` takes requests.
-A page answers every message when it has drawn it, and gets no more while a few are not drawn. A page
-that is slow, asleep or not reading gets fewer messages and always the newest, and costs neither
+`/state` sends the newest `PageState` as JSON, `/frames` the newest frame, `/control` takes
+requests. A page answers every message when it has drawn it, and gets no more while a few are not
+drawn. A page that is slow, asleep or not reading gets fewer messages and always the newest, and
+costs neither
 memory nor the loop anything. The files are read once at the start: nothing on the disk can be
 reached through the server.
 """

@@ -1,8 +1,9 @@
 """A policy bundle of a trainer: `policy.onnx`, `policy.json` (the contract) and `golden.json`.
 
-The network goes from the observation vector to the masked command; the golden answers are those that
-it gave where it was made. A bundle is refused when it was made for another machine, joint order,
-history or rate, when contract and network do not belong together, or when its answers differ here.
+The network goes from the observation vector to the masked command; the golden answers are those
+that it gave where it was made. A bundle is refused when it was made for another machine, joint
+order, history or rate, when contract and network do not belong together, or when its answers differ
+here.
 """
 
 from __future__ import annotations

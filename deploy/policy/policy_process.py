@@ -1,7 +1,7 @@
 """The policy process: in each control period from the state of the machine to an advice.
 
-It never touches the bus. Where commands are sent at all (`deploy=auto`) it also writes them into the
-request slot, which the guard reads; otherwise there is no such slot.
+It never touches the bus. Where commands are sent at all (`deploy=auto`) it also writes them into
+the request slot, which the guard reads; otherwise there is no such slot.
 """
 
 from __future__ import annotations

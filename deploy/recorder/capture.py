@@ -1,9 +1,9 @@
 """The log process: writes messages and decisions, and flushes them to the disk twice a second.
 
 MCAP holds every decoded message as a JSON topic of its name, `advice`, `guard`, `fault`, `bus`,
-`holes`, and pictures of the camera as topic `camera` (`foxglove.CompressedImage`). BLF holds the raw
-frames, for any tool that reads it. Times are monotonic ones plus one constant, so that a step of the
-wall clock shows nowhere.
+`holes`, and pictures of the camera as topic `camera` (`foxglove.CompressedImage`). BLF holds the
+raw frames, for any tool that reads it. Times are monotonic ones plus one constant, so that a step
+of the wall clock shows nowhere.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Converts a capture into recordings for identification and diagnosis.
 
 `mode=convert import=capture`, at the machine's control rate. Positions are interpolated linearly
-between messages. Commands are the valves' feedback, averaged over the period that begins at each row,
-as in the policy's history. A gap in either splits the log; pieces of one log share the metadata
-`run`.
+between messages. Commands are the valves' feedback, averaged over the period that begins at each
+row, as in the policy's history. A gap in either splits the log; pieces of one log share the
+metadata `run`.
 """
 
 from __future__ import annotations

@@ -17,8 +17,8 @@ from deploy.guidance import LeverPositions
 from deploy.runtime.shared_memory import Axes, Joints, Point
 
 ALIVE_S = 0.2
-"""Age of the newest state up to which the bus process counts as running: 20 of its cycles. Chosen by
-hand; longer hides a dead process, shorter takes a busy computer for one."""
+"""Age of the newest state up to which the bus process counts as running: 20 of its cycles. Chosen
+by hand; longer hides a dead process, shorter takes a busy computer for one."""
 
 
 class AdviceStatus(Enum):

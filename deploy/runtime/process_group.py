@@ -30,8 +30,8 @@ commander (40)."""
 OPTIONAL = {"page": "nothing is shown any more", "camera": "nothing new is seen any more"}
 """Processes without which the loop goes on, and the loss that the alarm names."""
 END_ORDER = {"policy": 0, "bus": 1, "log": 3}
-"""Order in which processes are asked to end; 2 for others. The bus ends after the policy, so that it
-can send zero, and the log last, when all has been written."""
+"""Order in which processes are asked to end; 2 for others. The bus ends after the policy, so that
+it can send zero, and the log last, when all has been written."""
 OTHERS_END = 2
 
 

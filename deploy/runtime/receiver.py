@@ -35,8 +35,8 @@ FROM_PC = 2
 STAMP_MODULUS_S = 65.536
 """Time after which the gateway's clock wraps in the example DBC: 16 bits of milliseconds."""
 FORGET_S = 60.0
-"""Time after which the best transit time is taken anew. Chosen by hand: clocks that differ by 100 ppm
-drift 6 ms in it, well below the limits on ages."""
+"""Time after which the best transit time is taken anew. Chosen by hand: clocks that differ by 100
+ppm drift 6 ms in it, well below the limits on ages."""
 
 
 @dataclass

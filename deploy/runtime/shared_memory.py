@@ -26,8 +26,8 @@ CHECKSUM_BYTES = 4
 ALIGNMENT_BYTES = 8
 """Records begin at multiples of it, so that numpy reads them in place."""
 READ_ATTEMPTS = 5
-"""A reader that is overtaken more often was as good as stopped. Chosen by hand: bus and policy write
-every 10 and 50 ms, and a read takes microseconds."""
+"""A reader that is overtaken more often was as good as stopped. Chosen by hand: bus and policy
+write every 10 and 50 ms, and a read takes microseconds."""
 LENGTH_BYTES = 4
 """Of the length in front of each entry of a pipe."""
 

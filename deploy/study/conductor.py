@@ -1,8 +1,8 @@
 """Leads a participant through a sitting: takes what is said on the page, watches the machine, writes everything down at once.
 
-What was done stands in the study's folder (`deploy.study.study_folder`) before the next thing begins, so
-that an interruption at any time costs at most the trial that was under way; that one is kept as
-aborted, and done again.
+What was done stands in the study's folder (`deploy.study.study_folder`) before the next thing
+begins, so that an interruption at any time costs at most the trial that was under way; that one is
+kept as aborted, and done again.
 """
 
 from __future__ import annotations

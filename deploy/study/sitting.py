@@ -23,8 +23,8 @@ from deploy.study.trial import Times
 from deploy.twin.bench import TwinBench
 
 LOCK, TARGET = ".sitting", "target.json"
-"""FileTarget in the study's folder that one program at a time holds; file in the run folder that says to
-the loop where the hole is."""
+"""FileTarget in the study's folder that one program at a time holds; file in the run folder that
+says to the loop where the hole is."""
 
 
 @spec

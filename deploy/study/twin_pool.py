@@ -42,7 +42,7 @@ class Crew:
             mine, theirs = socket.socketpair()
             child = ChildProcess(
                 f"twins {number + 1}",
-                "deploy.study.twin_pool:work",
+                "deploy.study.twin_pool:run_worker",
                 (theirs.fileno(), self._build, part),
                 [theirs.fileno()],
             )

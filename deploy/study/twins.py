@@ -94,7 +94,7 @@ class Twins:
             np.full(num, round(self.settle_s / machine.period_s)),
         )
         running = np.ones(num, bool)
-        with Crew("deploy.study.twins:desks", parts, rows, num) as crew:
+        with Crew("deploy.study.twins:make_desks", parts, rows, num) as crew:
             now, found = crew.ask("seen", running), dict[int, Recording]()
             for _ in track(range(steps), "simulated operators at the twin", transient=True):
                 q = np.stack([now[n][0] for n in range(num)])

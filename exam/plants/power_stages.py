@@ -1,7 +1,8 @@
 """Power stages of the plants, from valve opening to speed: three makes.
 
 `TwoChamberCylinders`: two chamber pressures a cylinder, orifices in and out, a partial compensator,
-compressible oil. `CompensatedValves`: flow follows the opening, the pump starves the heaviest joint,
+compressible oil. `CompensatedValves`: flow follows the opening, the pump starves the heaviest
+joint,
 one oil column a joint. `ThrottleValves`: open-centre valves; speed settles to a static balance of
 first order, and loads count most at small openings.
 

@@ -420,7 +420,9 @@ class ArcDetector:
             angles = np.arange(number) * (2 * np.pi / number)
             dense = self._gather(candidate, edges, angles)[0][0]
             claimed[dense[dense >= 0]] = True
-            found.append(FoundEllipse(row, fit.rms_px[k], fit.coverage[k], score[k]))
+            found.append(
+                FoundEllipse(row, float(fit.rms_px[k]), float(fit.coverage[k]), float(score[k]))
+            )
         return found
 
     def _gather(

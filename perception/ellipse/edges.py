@@ -41,7 +41,8 @@ class Edges:
         nearest: Number of the edge point nearest to each pixel, `(h, w)`, -1 for none.
         spans: Pieces of chains without a branch, `(S, 2)`: first point and one past the last.
         arcs: Convex arcs, spans too, `(A, 2)`.
-        run: Number of the piece from corner to corner around each point, `(E,)`, -1 for a short one.
+        run: Number of the piece from corner to corner around each point, `(E,)`, -1 for a short
+            one.
         run_length: Length of each such piece, px.
     """
 

@@ -13,7 +13,8 @@ from perception.ellipse import conic
 from perception.ellipse.edges import Edges
 
 NUM_SAMPLES = 96
-"""Places around an ellipse at which its support is searched; 1 px apart on a rim of 15 px radius."""
+"""Places around an ellipse at which its support is searched; 1 px apart on a rim of 15 px
+radius."""
 WINDOW = NUM_SAMPLES // 8
 """Neighbouring places over which noise is averaged: an eighth of a turn."""
 ANGLES = np.arange(NUM_SAMPLES) * (2 * np.pi / NUM_SAMPLES)

@@ -32,7 +32,8 @@ MOST = 30_000
 WIDE_PX = 1000
 """Width of a part of the picture from which a coarser resolution serves, px. Limits the time."""
 ROUNDS, SETTLED_PX = 3, 0.004
-"""Largest number of steps, and length of a last one, px: each is about a fifth of the one before."""
+"""Largest number of steps, and length of a last one, px: each is about a fifth of the one
+before."""
 TUKEY = 4.685
 MARGIN_PX, BORDER_PX, SATURATED = 6, 4, 248.0
 """Margin around occluders, where a matcher bleeds, px; margin within the border, where blur mixes

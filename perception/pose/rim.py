@@ -24,7 +24,8 @@ TRIPLES = 120
 """Circles through three edges that are tried: with a third of the edges on the rim, four of them
 are expected to lie on it."""
 NEAR_PX, INLIER_PX = 0.7, 1.0
-"""Largest distance of an edge from its circle: in the vote, and in the final fit. Chosen by hand."""
+"""Largest distance of an edge from its circle: in the vote, and in the final fit. Chosen by
+hand."""
 NARROW_PX = 2.0
 """Reach of the profiles across a known circle. Chosen by hand."""
 ALIKE_PX, ALIKE_M = 8.0, 0.006

@@ -1,8 +1,8 @@
 """The concrete block: a box with drilled holes, chipped rims and painted discs.
 
 The missing volume is a union of convex cavities: half-open cylinders for holes, balls for chips. So
-a ray through it is followed exactly: from its entry on, it goes to the end of each cavity that it is
-in, until no cavity takes it further.
+a ray through it is followed exactly: from its entry on, it goes to the end of each cavity that it
+is in, until no cavity takes it further.
 """
 
 from __future__ import annotations

@@ -77,7 +77,7 @@ class FrameRenderer:
         return dataset.is_whole(stem)
 
     def shoot(self, stem: Path, generator: np.random.Generator) -> None:
-        """Draws, renders and writes one frame; the same generator makes the same files.
+        """Draw, renders and writes one frame; the same generator makes the same files.
 
         Raises:
             StorageError: a file could not be written.

@@ -28,8 +28,8 @@ PREFIX = "brokk."
 THRESHOLD = 0.5
 """Probability from which a pixel belongs to a mask."""
 SMALLEST_PIECE = 0.2
-"""Least piece of a partly hidden block, as a part of the largest one, that the second run must show.
-Chosen by hand."""
+"""Least piece of a partly hidden block, as a part of the largest one, that the second run must
+show. Chosen by hand."""
 MAX_CLOSE_RUNS, STABLE = 2, 0.1
 """Largest number of runs on the block alone; change of its box, as a part of its size, below which
 no other one follows. Chosen by hand."""

@@ -116,7 +116,8 @@ def build_inference(network: UNet, device: torch.device) -> Callable[[np.ndarray
 
 def average_picture(values: torch.Tensor) -> torch.Tensor:
     """Return the mean of each picture, `(B, 1, 1, 1)`."""
-    # Rows first: ONNX Runtime adds all 184,320 numbers of a picture in sequence, with rounding errors.
+    # Rows first: ONNX Runtime adds all 184,320 numbers of a picture in sequence, with rounding
+    # errors.
     return values.mean(3, keepdim=True).mean((1, 2), keepdim=True)
 
 

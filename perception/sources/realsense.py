@@ -125,8 +125,8 @@ class RealSenseDevice:
 def invert_distortion(inverse: np.ndarray, matrix: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """Return OpenCV's coefficients `k1 k2 p1 p2 k3` of a lens given by the inverse ones, `(5,)`.
 
-    OpenCV's polynomial maps rays to pixels, RealSense's inverse one of the same form pixels to rays.
-    Fitted by least squares on a grid over the picture.
+    OpenCV's polynomial maps rays to pixels, RealSense's inverse one of the same form pixels to
+    rays. Fitted by least squares on a grid over the picture.
 
     Args:
         inverse: Coefficients of the inverse.

@@ -102,8 +102,8 @@ class SegmenterTraining:
         """Train; write network (safetensors, ONNX), curve and samples (PNG) into the session's folder.
 
         Returns:
-            The content of `training.json`: `conditions` (see `evaluation.compute_metrics`), `best_update`,
-                `parameters`, `parity`, …
+            The content of `training.json`: `conditions` (see `evaluation.compute_metrics`),
+                `best_update`, `parameters`, `parity`, …
 
         Raises:
             FrameError: frames or masks cannot be used.
