@@ -17,7 +17,7 @@ from brokk_rl.session import write_json
 from deploy.study import design, study_folder
 from deploy.study.conductor import Conductor, Words
 from deploy.study.trial import Times
-from deploy.study.twin_control import Sight
+from deploy.study.twin_control import MachineView
 
 TEXT = {"en": ("You may stop at any time.",), "de": ("Sie können jederzeit aufhören.",)}
 FACTS = {"simulated": False, "twin": True}
@@ -53,8 +53,8 @@ class Arm:
         self.prepared: list[Any] = []
         self.fails = ""
 
-    def sight(self) -> Sight:
-        return Sight(self.q, self.advised, self.recorded is not None)
+    def sight(self) -> MachineView:
+        return MachineView(self.q, self.advised, self.recorded is not None)
 
     def prepare(self, hole: design.Hole, start: np.ndarray) -> None:
         self.prepared.append(hole)

@@ -34,7 +34,7 @@ FILLED = "filled"
 
 
 @dataclass(frozen=True)
-class Sight:
+class MachineView:
     """Present state of the machine.
 
     Attributes:
@@ -51,7 +51,7 @@ class Sight:
 class Stage(Protocol):
     """Where trials take place."""
 
-    def sight(self) -> Sight:
+    def sight(self) -> MachineView:
         """Return what is known now."""
         ...
 
@@ -90,7 +90,7 @@ class LoopStage:
     ) -> None:
         self._memory, self._machine, self._target, self._port = memory, machine, target, port
 
-    def sight(self) -> Sight:
+    def sight(self) -> MachineView:
         """See `Stage`."""
         state, advice, controls = (
             self._memory.state.read(),
@@ -104,7 +104,7 @@ class LoopStage:
             advised = advice.reason
         recording = controls is not None and controls.recording
         q = np.array(state.q) if fresh and state is not None else None
-        return Sight(q, advised.value, recording)
+        return MachineView(q, advised.value, recording)
 
     def prepare(self, hole: Hole, start: np.ndarray) -> None:
         """See `Stage`."""

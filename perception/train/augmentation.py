@@ -298,7 +298,7 @@ class MotionBlur:
 
 
 @spec
-class SensorNoise:
+class PictureNoise:
     """Noise of the sensor: a constant part and one by the root of the light, with grain.
 
     Attributes:

@@ -110,7 +110,7 @@ def test_contrast_gamma_exposure_and_haze_follow_their_formulas() -> None:
 def test_noise_has_the_strength_it_is_given_whatever_its_grain() -> None:
     flat = torch.full((1, 3, 200, 200), 0.5)
     for grain_px in (0.0, 0.3, 1.0):
-        noise = augmentation.SensorNoise(
+        noise = augmentation.PictureNoise(
             probability=1.0, constant=(0.03, 0.03), photon=(0.0, 0.0), grain_px=(grain_px, grain_px)
         )
         assert float(noise.changed(flat, chance(0)).std()) == pytest.approx(0.03, rel=0.05)

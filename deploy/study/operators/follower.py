@@ -11,7 +11,7 @@ from deploy.study.operators.hands import Hands, HandsModel
 
 
 @spec
-class Follower:
+class AdviceFollower:
     """Simulated: follows the advice shown, late and imprecisely, a few levers at once; without advice does nothing.
 
     Attributes:
@@ -22,10 +22,10 @@ class Follower:
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
         """See `brokk_rl.contracts.operator.Operator`."""
-        return FollowerModel(self.hands.build(machine, persons, seed))
+        return AdviceFollowerModel(self.hands.build(machine, persons, seed))
 
 
-class FollowerModel:
+class AdviceFollowerModel:
     """Followers at work."""
 
     def __init__(self, hands: HandsModel) -> None:
