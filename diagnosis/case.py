@@ -29,7 +29,7 @@ PAUSE_S = 4.0 * 3600.0
 
 @dataclass(frozen=True)
 class GapCase:
-    """What a diagnosis is given.
+    """Recordings and machine of a diagnosis.
 
     Attributes:
         machine: The machine.

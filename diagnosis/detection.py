@@ -59,7 +59,7 @@ ProgressCallback = Callable[[str, float], None]
 
 @spec
 class Penalties:
-    """What an effect must earn, in units of log likelihood on recordings that it was not fitted to.
+    """Penalties of effects, nats of log likelihood on recordings outside the fit.
 
     Attributes:
         joint: For each joint that has it, unless one cause is behind it on all joints.
@@ -82,7 +82,7 @@ class Penalties:
 
 @dataclass
 class DetectionResult:
-    """What the search found.
+    """Result of the search.
 
     Attributes:
         evidence: The simulator against the field, with what was found by other means.

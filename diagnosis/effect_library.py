@@ -49,7 +49,7 @@ class EffectType:
 
     @property
     def numbers(self) -> dict[str, Any]:
-        """What is known about each of its numbers: `none`, `typical`, `bounds`, `unit`, `per_joint`."""
+        """Facts about each of its numbers: `none`, `typical`, `bounds`, `unit`, `per_joint`."""
         return self.target.numbers
 
     @property
@@ -69,7 +69,7 @@ class EffectType:
 
     @property
     def together(self) -> bool:
-        """Whether what it does to one joint depends on the others."""
+        """True if its effect on one joint depends on the others."""
         return self.target.side == "joints"
 
     @cached_property

@@ -195,7 +195,7 @@ class GapClosure:
 
     @cached_property
     def has_gap(self) -> bool:
-        """Whether there is a floor, and errors that exceed it."""
+        """True if there is a floor, and errors that exceed it."""
         return self.floor is not None and compute_rmse(self.before) >= MIN_GAP_RATIO * compute_rmse(
             self.floor
         )

@@ -42,7 +42,7 @@ DECIDED_BY = {
 
 @dataclass(frozen=True)
 class DiagnosisPipeline:
-    """What a diagnosis works with.
+    """A diagnosis: case, baseline, library, penalties.
 
     Attributes:
         case: The recordings.

@@ -183,7 +183,7 @@ class SimulatedMotion:
 
     @cached_property
     def slip(self) -> np.ndarray:
-        """What increments lose where motion comes a sample late."""
+        """Loss of increments where motion comes a sample late."""
         q, start = self.residuals.base[..., self.j], self.residuals.start[:, None, self.j]
         return to_increments(np.diff(q, axis=1, prepend=start)[..., None], np.zeros((len(q), 1)))[
             ..., 0
@@ -285,7 +285,7 @@ def _build_sensor_angle(m: SimulatedMotion) -> list[np.ndarray]:
 
 
 def _build_other_joints(m: SimulatedMotion) -> list[np.ndarray]:
-    """What the others do, and all together ask for."""
+    """Motion of the other joints, and the sum of all demands."""
     full, columns = np.abs(m.own).max() + 1e-12, []
     for k in range(m.share.shape[-1]):
         if k != m.j:

@@ -346,7 +346,7 @@ class Residuals:
 
     @cached_property
     def faults(self) -> np.ndarray:
-        """What small faults of the simulator itself change, over the noise, `(J, P, E)`, each by its prior standard deviation."""
+        """Whitened change by small faults of the simulator, `(J, P, E)`, at one prior sigma each."""
         found = [
             self.whiten((self.increments * GAIN_FAULT * side)[None])
             for side in (self.increments > 0, self.increments < 0)

@@ -40,7 +40,7 @@ settles what they leave open."""
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What growing along a ray does to one joint: `change` `(S, E)` at `sizes` `(S,)`."""
+    """Response of one joint along a ray: `change` `(S, E)` at `sizes` `(S,)`."""
 
     sizes: np.ndarray
     change: np.ndarray

@@ -53,7 +53,7 @@ PenaltyFunction = Callable[[int, Subset], float]
 
 @dataclass
 class SubsetScore:
-    """What a subset of effects earns on a joint.
+    """Log-likelihood gain of a subset of effects on a joint.
 
     Attributes:
         gain: Entry by entry, `(E,)`.
@@ -65,7 +65,7 @@ class SubsetScore:
 
     @property
     def total(self) -> float:
-        """What it earns in all, nats."""
+        """Total log-likelihood gain, nats."""
         return float(self.gain.sum())
 
 
@@ -282,7 +282,7 @@ def list_promising_subsets(
 
     def pays(subset: Subset) -> bool:
         own = subset - shared
-        return table.scores[subset].total > least * len(own) and _adds_each(
+        return table.scores[subset].total > least * len(own) and _has_each_gain(
             subset, own, table, share
         )
 
@@ -291,7 +291,7 @@ def list_promising_subsets(
     return [s for place, s in enumerate(paying) if place < MAX_PENALISED or len(s) == 1]
 
 
-def _adds_each(subset: Subset, own: Subset, table: SubsetTable, share: float) -> bool:
+def _has_each_gain(subset: Subset, own: Subset, table: SubsetTable, share: float) -> bool:
     """Return True where each of the effects `own` has a size worth naming and adds its share: else it mends the form of another."""
     total, sizes = table.scores[subset].total, table.scores[subset].sizes
     if any(np.abs(sizes[name]).max() < MIN_SIZE for name in own):
@@ -311,7 +311,7 @@ def _sum_best(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
 
 @dataclass
 class ReferenceScores:
-    """What sets of effects earn on reference recordings; an effect is simulated there when it is first asked for.
+    """Log-likelihood gains of sets of effects on reference recordings, simulated on first use.
 
     Attributes:
         parts: The simulator against parts of the reference that it was not fitted to.

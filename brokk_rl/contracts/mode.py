@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Mode(Protocol):
-    """What `brokk mode=…` runs."""
+    """One verb of the command, `brokk mode=…`."""
 
     def run(self) -> float | None:
         """Do the work; returns the objective of a sweep, or `None`."""

@@ -121,7 +121,7 @@ class GuardDecision:
 
     @property
     def sends(self) -> bool:
-        """Whether anything is sent at all."""
+        """True if anything is sent at all."""
         return self.state is not GuardState.SILENT
 
 

@@ -22,7 +22,7 @@ class PlausibilityFilter:
 
     @property
     def plausible(self) -> bool:
-        """Whether no joint has jumped too often in a row."""
+        """True if no joint has jumped too often in a row."""
         return max(self._jumps) < self._limits.num_jumps
 
     def accept(self, joint: int, now_s: float, position: float) -> bool:

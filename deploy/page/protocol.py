@@ -57,7 +57,7 @@ class SourceAge:
 
     @property
     def stale(self) -> bool:
-        """Whether it is too old to be relied on."""
+        """True if it is too old to be relied on."""
         return self.age_s is None or self.age_s > self.limit_s
 
 
@@ -157,7 +157,7 @@ class PageState:
 
     @property
     def deadman(self) -> bool:
-        """Whether the dead-man is known to be held now."""
+        """True if the dead-man is known to be held now."""
         state = self.state
         if state is None or not self.alive or state.estop:
             return False

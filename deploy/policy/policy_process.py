@@ -56,7 +56,7 @@ class PolicyHistory:
 
     @property
     def full(self) -> bool:
-        """Whether every sample was measured."""
+        """True if every sample was measured."""
         return self.filled >= len(self.q)
 
     def empty(self) -> None:

@@ -51,7 +51,7 @@ class RecordingControl:
 
     @property
     def recording(self) -> bool:
-        """Whether a log process is writing."""
+        """True while a log process is writing."""
         return self._child is not None and not self._asked_to_stop
 
     @property

@@ -132,7 +132,7 @@ class PolicyAdvice:
 
     @property
     def valid(self) -> bool:
-        """Whether there is an advice."""
+        """True if there is an advice."""
         return self.reason is AdviceStatus.VALID
 
 
@@ -186,7 +186,7 @@ class LoopSnapshot:
 
     @property
     def alive(self) -> bool:
-        """Whether the bus process is running."""
+        """True while the bus process is running."""
         return self.state is not None and self.t_s - self.state.t_s < ALIVE_S
 
     def to_plain(self) -> dict[str, Any]:

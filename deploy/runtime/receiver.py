@@ -179,12 +179,12 @@ class BusReceiver:
 
     @property
     def plausible(self) -> bool:
-        """Whether the sensors call all positions valid, and none has jumped."""
+        """True if the sensors call all positions valid, and none has jumped."""
         return bool(self.q_valid.all()) and self.plausibility.plausible
 
     @property
     def trusted(self) -> bool:
-        """Whether none of the needed channels has become invalid."""
+        """True if none of the needed channels has become invalid."""
         return all(self.channels[name].trust is not ChannelTrust.INVALID for name in self._needed)
 
     def _is_alone(self, now_s: float) -> bool:

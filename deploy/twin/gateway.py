@@ -124,7 +124,7 @@ class Gateway:
 
     @property
     def exclusive_selected(self) -> bool:
-        """Whether the exclusive joint is selected at the remote."""
+        """True if the exclusive joint is selected at the remote."""
         return self._button
 
     def _trusts(self, name: str) -> bool:

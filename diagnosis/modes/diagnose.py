@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 @spec
 class DiagnosisSubject:
-    """What is diagnosed.
+    """Recordings to diagnose.
 
     Attributes:
         case: Folder with `reference/` and `field/`; or `null`.
@@ -71,7 +71,7 @@ class Diagnose:
         actuator: The simulator that `diagnosis.field` is held against.
         thresholds: When a stretch of a recording is worth telling.
         excitation: Experiments that could follow, by name.
-        diagnosis: What is diagnosed.
+        diagnosis: Recordings to diagnose.
     """
 
     session: Session

@@ -420,9 +420,8 @@ class ArcDetector:
             angles = np.arange(number) * (2 * np.pi / number)
             dense = self._gather(candidate, edges, angles)[0][0]
             claimed[dense[dense >= 0]] = True
-            found.append(
-                FoundEllipse(row, float(fit.rms_px[k]), float(fit.coverage[k]), float(score[k]))
-            )
+            judged = (float(values[k]) for values in (fit.rms_px, fit.coverage, score))
+            found.append(FoundEllipse(row, *judged))
         return found
 
     def _gather(

@@ -132,7 +132,7 @@ class SurroundingsRanges:
 
 @spec
 class LightRanges:
-    """How it is lit and how the camera takes it.
+    """Light and camera of a scene.
 
     Attributes:
         sun: Strength of the sun or a lamp.

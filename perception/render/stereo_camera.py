@@ -75,7 +75,7 @@ class StereoRig:
 
 @dataclass(frozen=True)
 class CameraExposure:
-    """How one picture of a scene is taken.
+    """Settings of one picture of a scene.
 
     Attributes:
         gain: Signal for unit radiance; 1 saturates.

@@ -74,7 +74,7 @@ class Augmentation(Protocol):
 
     @property
     def probability(self) -> float:
-        """How often it does; 0 switches it off."""
+        """Share of pictures that it changes; 0 switches it off."""
         ...
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:

@@ -30,10 +30,31 @@ SOURCES = {
 
 @pytest.mark.parametrize(
     "rule",
-    [rules.floors, rules.doors, rules.prints, rules.vague_names, rules.docstrings, rules.units],
+    [
+        rules.floors,
+        rules.doors,
+        rules.prints,
+        rules.vague_names,
+        rules.docstrings,
+        rules.units,
+        rules.unique_classes,
+        rules.first_lines,
+        rules.circles,
+    ],
 )
 def test_the_sources_keep(rule: Callable[[Mapping[str, str]], list[str]]) -> None:
     assert rule(SOURCES) == []
+
+
+NOUNS = ("spec", "supports_classical_control", "supports_deployment")
+"""Functions that are no verbs: the decorator of specs, and two questions about a task."""
+QUANTITIES = "tasks.reward"
+"""Module of reward terms, which are named by their quantity: users type these names."""
+
+
+def test_functions_begin_with_a_verb() -> None:
+    found = rules.verb_names(SOURCES, NOUNS)
+    assert [line for line in found if not line.startswith(f"{QUANTITIES}:")] == []
 
 
 def test_no_module_is_long_without_a_reason() -> None:
@@ -64,6 +85,8 @@ def test_no_module_is_long_without_a_reason() -> None:
         (rules.docstrings, "brokk_rl.a", "x = 1"),
         (rules.units, "brokk_rl.a", "tilt_deg: float = 1.0"),
         (rules.units, "brokk_rl.a", "def f(n_envs): pass"),
+        (rules.verb_names, "brokk_rl.a", "def distance(a): pass"),
+        (rules.first_lines, "brokk_rl.a", '"""What it is."""'),
     ],
 )
 def test_a_planted_violation_is_found(
