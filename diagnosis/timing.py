@@ -70,7 +70,7 @@ class FrameDelays:
 
 @dataclass(frozen=True)
 class DelayErrorModel:
-    """How delays err where all frames arrive in time: a t distribution.
+    """Error of measured delays where all frames arrive in time: a t distribution.
 
     Attributes:
         scale: Their errors over the standard errors.
