@@ -156,7 +156,7 @@ class SubsetTable:
                 for name in self.shapes
                 if name not in one and len(one) < most
             }
-            best = sorted({*best, *level}, key=net, reverse=True)[:BEAM_WIDTH]
+            best = sorted({*best, *level}, key=lambda one: (-net(one), sorted(one)))[:BEAM_WIDTH]
             if net(best[0]) <= before:
                 return
 
