@@ -336,7 +336,11 @@ class Exam:
         )
 
     def _of_machine(self) -> list[str]:
-        return [name for name, trouble in self.exam.mix.troubles.items() if trouble.joints == "all"]
+        shared = []
+        for name, trouble in self.exam.mix.troubles.items():
+            if trouble.joints == "all":
+                shared.append(name)
+        return shared
 
     def _score(self) -> None:
         self._scored(self.exam.answers)
