@@ -104,7 +104,7 @@ def apply_changes(actuator: Actuator, by: dict[str, np.ndarray], machine: Machin
 def _linearise_parameters(
     parts: Sequence[Residuals], names: list[str], now: np.ndarray, size: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors over the noise of all parts, `(J, E)`, and what a finite difference of each number takes off, `(J, P, E)`."""
+    """Return whitened residuals of all parts, `(J, E)`, and their decrease by a finite difference of each number, `(J, P, E)`."""
     count = len(names)
     varied = np.repeat(now[None], count + 1, 0)  # (P + 1, P, J)
     for p in range(count):
@@ -212,9 +212,9 @@ def fit_baseline(
 ) -> Baseline:
     """Return a simulator fitted to the reference, and fits that leave a part of it out.
 
-    A fit that knows how to `refit` is fitted anew to each rest, all others once to two thirds: the
-    price of a fit that takes long. `refined` may change the simulator before what it gets wrong is
-    learned; see `already`.
+    A fit with `refit` is fitted again without each fold. Any other fit is slow, so it is fitted
+    once, without the last fold. `refined` may change the simulator before its discrepancy is
+    learned; see `add_reference_effects`.
 
     Raises:
         RecordingError: too little reference.
@@ -243,7 +243,7 @@ def fit_baseline(
 
 
 def learn_errors(base: Baseline, machine: Machine) -> Baseline:
-    """Return the same simulator, with what it gets wrong on the reference taken off, and the noise of what is left."""
+    """Return the same simulator with its discrepancy on the reference subtracted, and the noise of the remaining residuals."""
     biases, of_field = residual_model.learn_discrepancy(
         [one.residuals for one in base.left_out], base.field.residuals
     )
@@ -270,9 +270,8 @@ def accept_simulator(
 ) -> Baseline:
     """Return a configured simulator held against the field, and flexible models of the field that leave a part of it out.
 
-    There is no reference that would tell how a machine errs that lacks nothing: what `fit` does not
-    explain of recordings that it was not fitted to takes its place, as noise, price and floor.
-    Where it cannot be fitted the noise is that of the simulator.
+    There is no reference here. The residuals of `fit` on recordings left out of its fit replace it:
+    they give noise, penalty and floor. Where `fit` fails, the noise is that of the simulator.
     """
     machine = case.machine
     field = compare_simulator(actuator, _list_started(case.field), machine, seed)
@@ -482,7 +481,7 @@ def _expand_values(
 def _wrap_simulator(
     base: Baseline, effects: Sequence[tuple[EffectType, EffectValues]], machine: Machine
 ) -> Baseline:
-    """Return the simulator with effects around it, and the noise of what it errs by then."""
+    """Return the simulator with effects around it, and the noise of its residuals with them."""
 
     def around(one: SimulatorComparison) -> SimulatorComparison:
         simulator = one.residuals.simulator

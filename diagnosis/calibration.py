@@ -44,9 +44,8 @@ class ProbabilityModel:
             logarithm of the odds.
         right: Of the signs that an effect is rightly named.
         none: Of the signs that there is nothing to find, where nothing was found.
-        form: By stage: standard deviation of what real forms of an effect add to the error of its
-            size, over the size.
-        temperature: Of effects that were not named: a worth of so much less makes odds of 1 to e.
+        form: Relative model-form error of the size of an effect, 1 sigma, by stage.
+        temperature: Deficit of net gain, nats, that divides the odds of an effect that was not named by e.
     """
 
     outside: dict[str, float]
@@ -82,12 +81,12 @@ def compute_probability(weights: Mapping[str, float], signs: Mapping[str, float]
 
 
 def compute_log_odds(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
-    """Return the logarithm of the odds, within what answers can tell."""
+    """Return the logarithm of the odds, clipped to -6 to 6."""
     return float(np.clip(sum(weights[name] * value for name, value in signs.items()), -6.0, 6.0))
 
 
 def subtract_reference_clues(result: DetectionResult) -> np.ndarray:
-    """Return what clues earn on what is left, beyond what they may on the reference, `(clues, J)`."""
+    """Return the gain of clues on the remaining residuals beyond `REFERENCE_FACTOR` times that on the reference, `(clues, J)`."""
     return np.maximum(result.clue_gains - REFERENCE_FACTOR * result.reference_clue_gains, 0.0)
 
 
@@ -131,7 +130,7 @@ def collect_effect_signs(
 
     Args:
         margin: By how much more it is worth than nothing in its place, and than any other effect.
-        adds: Share of what all effects of its joints earn that is lost without it.
+        adds: Share of the gain of all effects of its joints that is lost without it.
         size: Its largest size, over the typical one.
         names: Effects that were named.
         outside: Logarithm of the odds that the cause lies outside.
@@ -150,7 +149,7 @@ def collect_none_signs(nearest: float, outside: float) -> dict[str, float]:
     """Return the signs that there is nothing to find.
 
     Args:
-        nearest: What the best effect is worth; it was not enough.
+        nearest: Net gain of the best effect, nats; it was not enough.
         outside: Logarithm of the odds that the cause lies outside.
     """
     return {

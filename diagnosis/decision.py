@@ -34,7 +34,7 @@ from diagnosis.search import (
 
 
 def record_weights(result: DetectionResult, penalties: Penalties) -> dict[str, Any]:
-    """Return what was weighed."""
+    """Return all subsets with gains and penalties as plain JSON data."""
     joints, common = (
         [],
         list_shared_effects(ways[0].kind for ways in result.rays.values() if ways),
@@ -158,7 +158,7 @@ MAX_SCATTER = 1.6
 
 @dataclass(frozen=True)
 class Substitution:
-    """An effect in the place of a chosen one, and what it earns of what that one earns."""
+    """An effect in the place of a chosen one, its gain, and that over the gain of the chosen one."""
 
     name: str
     earned: float
@@ -166,7 +166,7 @@ class Substitution:
 
 
 def rank_substitutions(result: DetectionResult, name: str) -> list[Substitution]:
-    """Return what each other effect would earn in the place of `name`, the best first."""
+    """Return the gain of each other effect in the place of `name`, the best first."""
     found, subsets, own = [], result.chosen.subsets, 0.0
     places = [j for j, subset in enumerate(subsets) if name in subset]
     without = {j: result.tables[j].score(subsets[j] - {name}).total for j in places}
@@ -204,7 +204,7 @@ def look_up_values(result: DetectionResult, name: str, other: str) -> dict[str, 
 
 
 def compute_own_gain(result: DetectionResult, name: str) -> float:
-    """Return what a chosen effect adds to the rest of the set, on all joints that have it."""
+    """Return the gain of a chosen effect over the rest of the set, on all joints that have it."""
     subsets = [
         (t, s) for t, s in zip(result.tables, result.chosen.subsets, strict=True) if name in s
     ]
@@ -220,7 +220,7 @@ def compute_margin(
     swaps: Sequence[Substitution],
     like: Sequence[str],
 ) -> float:
-    """Return by how much a chosen effect is worth more than nothing in its place, and than what is not like it."""
+    """Return the net gain of a chosen effect over the best alternative: no effect, or one that is not like it."""
     own, subsets = compute_own_gain(result, name), result.chosen.subsets
     saved = sum(
         result.price(j, s) - result.price(j, s - {name}) for j, s in enumerate(subsets) if name in s
@@ -278,7 +278,7 @@ def read_none_signs(
 def estimate_numbers(
     result: DetectionResult, kind: EffectType, machine: Machine, form: float
 ) -> dict[str, dict[str, Estimate]]:
-    """Return the numbers of a selected effect by joint; `form`: what its real forms add to the error, over its size."""
+    """Return the numbers of a selected effect by joint; `form`: relative model-form error of its size, 1 sigma."""
     fitted = result.fitted
     assert fitted is not None, "a selected effect has been simulated"
     found: dict[str, dict[str, Estimate]] = {}
@@ -361,10 +361,10 @@ def compute_effect_probabilities(
 def is_unknown(result: DetectionResult, penalties: Penalties, weights: ProbabilityModel) -> bool:
     """Return True where the answer is an unknown cause.
 
-    Beside detected effects that takes a probability above `MIN_UNKNOWN`, else above that of none.
-
-    What sensors, frames or tool points show for sure is there whatever moves a joint besides: that
-    is then a remainder.
+    Beside named effects, the probability of an unknown cause must exceed `MIN_UNKNOWN`. Without
+    any, it must exceed that of no effect.
+    Sensors, frames or tool points may show an effect for sure. Any further cause is then a
+    remainder.
     """
     named = compute_effect_probabilities(result, penalties, weights)
     if any(named[one.kind.name] >= MIN_CERTAIN for one in result.detected):
@@ -387,8 +387,7 @@ def drop_unlikely_effects(
 ) -> DetectionResult:
     """Return the findings without effects that are more probably not there, dropped one by one; the most probable one stays.
 
-    What is left is judged anew each time: an effect may have been named only for what it was worth
-    beside another.
+    The rest is judged again each time: an effect may gain only beside another.
     """
     kept = result
     while len(chances := compute_effect_probabilities(kept, penalties, weights)) > 1:
@@ -417,7 +416,7 @@ def drop_unlikely_effects(
 def describe_detected_effect(
     result: DetectionResult, found: DetectedEffect, weights: ProbabilityModel, machine: Machine
 ) -> Selected:
-    """Return what is said of an effect that sensors, frames or tool points show."""
+    """Return the answer about an effect that sensors, frames or tool points show."""
     near = sorted(found.rivals, key=lambda name: -found.rivals[name])
     like = tuple(
         name
@@ -486,7 +485,7 @@ def rank_hypotheses(
 def _score_alone(
     result: DetectionResult, penalties: Penalties, name: str
 ) -> tuple[float, list[int]]:
-    """Return what an effect by itself is worth, and the joints on which it is worth something."""
+    """Return the net gain of a single effect, and the joints on which it is positive."""
     only, worth, places = frozenset({name}), -penalties.name, []
     for j, table in enumerate(result.tables):
         if only in table.scores and table.scores[only].total > penalties.joint:

@@ -54,7 +54,7 @@ TIMING_REFERENCES = 2
 MAX_REFITS = 2
 """Times that effects are simulated around what was found, where adding up is far off."""
 ProgressCallback = Callable[[str, float], None]
-"""Is told what is being done and how much of the whole is done."""
+"""Receives the name of the step and the share of the whole that is done."""
 
 
 @spec
@@ -63,11 +63,11 @@ class Penalties:
 
     Attributes:
         joint: For each joint that has it, unless one cause is behind it on all joints.
-        reference: Times what it earns on reference recordings.
+        reference: Factor on its gain on reference recordings.
         name: For the effect as such.
         partial: For each joint that lacks an effect with one cause for all joints.
-        share: Of what its joint's set earns: an effect that adds less only mends the form of
-            another.
+        share: Least part of the gain of its joint's set: an effect that adds less only corrects the
+            form of another.
         tool: Error of measured tool points over that of the reference from which something unknown
             is there.
     """
@@ -85,20 +85,20 @@ class DetectionResult:
     """Result of the search.
 
     Attributes:
-        evidence: The simulator against the field, with what was found by other means.
-        tables: Of each joint.
-        rays: Of each effect.
-        price: What a subset of effects costs on a joint.
+        residuals: Residuals of the simulator on the field, adjusted for the detected effects.
+        tables: Scores of the subsets of each joint.
+        rays: Rays of each effect.
+        price: Penalty of a subset of effects on a joint.
         chosen: The set.
-        repair: Its simulation; `None` for the empty set.
+        fitted: The set fitted by simulation; `None` for the empty set.
         detected: Effects that sensors, frames and tool points show.
-        clue_gains: What each of `remainder.CLUES` earns on what is left, `(clues, J)`.
-        left_null: The same on reference recordings, the most of any part, at the length of the
-            field, `(clues, J)`.
-        scatter: Mean square of what is left over that of the reference, by joint, `(J,)`.
-        strays: How far free runs with the set stray over those on the reference, each over what its
-            noise lets expect, `(J,)`.
-        tool_left: Error of measured tool points that is left over that of the reference.
+        clue_gains: Gain of each of `residual_model.CLUES` on the remaining residuals, `(clues, J)`.
+        reference_clue_gains: The same on reference recordings, the largest of any part, at the
+            length of the field, `(clues, J)`.
+        scatter: Mean square of the remaining residuals over that of the reference, `(J,)`.
+        strays: Free-run error with the set over that on the reference, each over its expectation
+            under the noise, `(J,)`.
+        tool_left: Remaining error of measured tool points over that of the reference.
     """
 
     residuals: Residuals
@@ -128,8 +128,8 @@ class EffectSearch:
         case: The recordings.
         base: The simulator.
         kinds: The library.
-        prices: What effects must earn.
-        tell: Is told what is being done.
+        penalties: Penalties of effects.
+        tell: Receives the name and the progress of each step.
     """
 
     case: GapCase
@@ -139,7 +139,7 @@ class EffectSearch:
     tell: ProgressCallback
 
     def run(self) -> DetectionResult:
-        """Return what is found."""
+        """Return the chosen set, its fit and the remaining residuals."""
         penalties, left_out = self.penalties, [one.residuals for one in self.base.left_out]
         self.tell("sensors", 0.32)
         on_sensors = sensors.find_sensor_effects(
@@ -230,7 +230,7 @@ class EffectSearch:
     def _simulated(
         self, residuals: Residuals, tracked: bool
     ) -> tuple[dict[str, list[ParameterRay]], list[dict[str, list[Response]]]]:
-        """Return the rays of each effect that free runs can show, and what it does to each joint."""
+        """Return the rays of each effect that free runs can show, and its responses on each joint."""
         grown: dict[str, list[ParameterRay]] = {}
         shapes: list[dict[str, list[Response]]] = [{} for _ in range(residuals.increments.shape[2])]
         for number, kind in enumerate(self.kinds):
@@ -305,7 +305,7 @@ class EffectSearch:
         scatter: np.ndarray,
         z: np.ndarray | None,
     ) -> list[SubsetTable]:
-        """Return what sets earn on each joint."""
+        """Return the scores of subsets on each joint."""
         tables, flat = (
             [],
             {name: self.penalties.joint * (name not in self.shared) for name in grown},
@@ -384,7 +384,7 @@ class EffectSearch:
         return np.mean(np.minimum(z**2, MAX_SQUARE), 1) / usual
 
     def _left(self, beside: Residuals) -> tuple[np.ndarray, np.ndarray]:
-        """Return what clues earn on what is left and, at most, on reference recordings, both `(clues, J)`."""
+        """Return the gain of clues on the remaining residuals, and the largest on reference recordings, both `(clues, J)`."""
         left_out = [one.residuals for one in self.base.left_out]
         earned, on_nulls = (
             residual_model.score_clues(beside, beside.z),

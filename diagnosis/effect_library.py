@@ -152,7 +152,7 @@ def list_shared_effects(kinds: Iterable[EffectType]) -> frozenset[str]:
 
 
 def _check_simulable(kind: EffectType, machine: Machine) -> None:
-    """Raise a `ConfigError` when the effect needs what is not known of the machine."""
+    """Raise a `ConfigError` when the effect needs unknown properties of the machine."""
     device = torch.device("cpu")
     rest = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32).expand(
         1, machine.num_history, -1
@@ -187,10 +187,10 @@ class DetectedEffect:
         kind: The effect.
         joints: Which joints have it, `(J,)` bool.
         parameters: By name and joint, or `machine`.
-        net_gain: What it earns in log likelihood less its price.
-        gain: What it earns.
-        closed: Share of what the statistic shows that the effect explains.
-        rivals: What other effects would earn in its place, by name.
+        net_gain: Log-likelihood gain less its penalty, nats.
+        gain: Log-likelihood gain, nats.
+        closed: Share of the statistic that the effect explains.
+        rivals: Gain of other effects in its place, by name, nats.
     """
 
     kind: EffectType

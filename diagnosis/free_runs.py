@@ -23,7 +23,7 @@ from brokk_rl.record import Recording
 
 @dataclass(frozen=True)
 class WindowedRuns:
-    """Free runs, each begun at what was measured.
+    """Free runs, each begun at a measured position.
 
     Attributes:
         recordings: Where the windows come from.

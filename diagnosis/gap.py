@@ -102,7 +102,7 @@ def estimate_closed(
 def compute_shapley(
     names: Sequence[str], closed_by: Callable[[frozenset[str]], Any]
 ) -> dict[str, Any]:
-    """Return what each effect closes, a number or an array of them: the mean over all orders of adding them."""
+    """Return the Shapley value of each effect, a number or an array: its mean contribution over all orders of adding."""
     count, found = len(names), dict.fromkeys(names, 0.0)
     value = {
         frozenset(s): closed_by(frozenset(s))
@@ -225,7 +225,7 @@ class GapClosure:
         )
 
     def by_effect(self, result: DetectionResult, names: Sequence[str]) -> dict[str, Estimate]:
-        """Return what each chosen effect closes, its Shapley value; without a floor of the whole error."""
+        """Return the share that each chosen effect closes, its Shapley value; without a floor, that of the whole error."""
         values = compute_shapley(names, lambda some: self.shares(self._with(result, some)))
         return {name: summarise_draws(value) for name, value in values.items()}
 

@@ -72,8 +72,8 @@ def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
 
     Sizes are then far beyond the typical ones, and an effect hides others or gains far less than
     `promised`.
-    What acts on the command hides what else does: nothing shows within a dead band. A speed that is
-    far off hides nothing.
+    An effect on the command hides all others: nothing shows within a dead band. A large error of
+    speed hides nothing.
     """
     far = [
         ray
@@ -91,7 +91,7 @@ def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
 def simulate_beside(
     residuals: Residuals, grown: Mapping[str, Sequence[ParameterRay]], fitted: FittedSet
 ) -> WideResponses:
-    """Return what effects do in the company of a set."""
+    """Return the responses to effects beside a fitted set."""
     joints = residuals.increments.shape[2]
     shapes: Shapes = [{} for _ in range(joints)]
     left = residuals.whiten(
@@ -123,7 +123,7 @@ def simulate_beside(
 def _simulate_response(
     residuals: Residuals, ray: ParameterRay, ways: Sequence[ParameterRay], fitted: FittedSet
 ) -> np.ndarray:
-    """Return what a ray changes at each of its sizes, in the company of the set, over the noise, `(J, C, E)`."""
+    """Return the whitened response at each size of a ray, beside the fitted set, `(J, C, E)`."""
     has = any(one.kind.name == ray.kind.name for one in fitted.rays)
     company = [*fitted.rays, *([] if has else ways)]
     place = next(
@@ -187,7 +187,7 @@ def combine_best(
 ) -> FittedSet | None:
     """Return the repair that takes for each joint the best of those `tried`, none where errors of free runs only grow by it.
 
-    `price` is what a set costs on a joint. `None` where no joint is left.
+    `price` is the penalty of a set on a joint. `None` where no joint is left.
     """
     measured = residuals.simulator.cut.measured
     squares = [
@@ -243,7 +243,7 @@ def _compute_losses(
 def _rank_additions(
     tables: Sequence[SubsetTable], chosen: EffectSet, ways: Mapping[str, Sequence[ParameterRay]]
 ) -> list[str]:
-    """Return effects that some joint with a set lacks: those on the command, which hide behind each other, then what adds most."""
+    """Return effects that some joint with a set lacks: first those on the command, which hide each other, then by gain."""
     found: dict[str, float] = {}
     for table, subset in zip(tables, chosen.subsets, strict=True):
         own = table.score(subset).total

@@ -48,8 +48,8 @@ class DiagnosisPipeline:
         case: The recordings.
         base: The simulator.
         kinds: The library.
-        prices: What effects must earn.
-        certainty: How sure what is said is.
+        penalties: Penalties of effects.
+        calibration: Calibration of the probabilities.
         thresholds: When a stretch of a recording is worth telling.
         excitations: Experiments that could follow, by name.
         generator: Draws bootstraps, permutations and excitations.
@@ -65,7 +65,7 @@ class DiagnosisPipeline:
     generator: np.random.Generator
 
     def run(self, tell: ProgressCallback) -> Outcome:
-        """Return the outcome; `tell` is told what is being done and how much of the whole is done."""
+        """Return the outcome; `tell` receives the name and the progress of each step."""
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
         search = detection.EffectSearch(self.case, self.base, self.kinds, self.penalties, tell)
@@ -155,7 +155,7 @@ class DiagnosisPipeline:
         return sorted(found, key=lambda one: -one.probability)
 
     def _remainder(self, result: DetectionResult, reach: GapClosure) -> dict[str, Any] | None:
-        """Return what is left beside the effects that were named and has no name; `None` where that is nothing."""
+        """Return the unexplained remainder beside the named effects; `None` without one."""
         predictable = decision.find_unexplained_joints(result)
         names = self.case.machine.joint_names
         beyond = reach.beyond()
@@ -176,7 +176,7 @@ class DiagnosisPipeline:
         return {"unseen": evaluate_unseen(result, self.case.unseen, self.case.machine)}
 
     def _next(self, result: DetectionResult, selected: Sequence[Selected]) -> NextExperiment | None:
-        """Return the experiment that would separate what is left open: classes, and rivals that earn nearly as much."""
+        """Return the experiment that would separate equivalent effects, and rivals with nearly the same gain."""
         kinds, rivals = {kind.name: kind for kind in self.kinds}, []
         undecided = next((one for one in selected if one.same_as), None)
         for one in selected:

@@ -57,7 +57,7 @@ class FittedSet:
         halves: Fitted to the entries outside of each half, `(2, R, J)`.
         after: Positions of free runs with the sizes that were not fitted to their window, `(W, K,
             J)`.
-        own: The same with the sizes that were fitted to their half: what `after` is foretold by.
+        own: The same with the sizes fitted to their own half: the prediction of `after`.
         z: Errors of `after` over the noise, `(J, E)`.
         deviation: Standard errors of the sizes, `(R, J)`.
     """
@@ -229,7 +229,7 @@ class _Fit:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Smallest and largest sizes, `(R, 1)`: beyond what was simulated before, within the bounds of the numbers."""
+        """Smallest and largest sizes, `(R, 1)`: beyond the simulated sizes, within the bounds of the numbers."""
         low, high = (np.array([ray.sizes[end] for ray in self.rays])[:, None] for end in (0, -1))
         by = np.array([1.0 if ray.is_tied else MAX_EXTRAPOLATION for ray in self.rays])[:, None]
         return np.where(low < 0, by * low, low), by * high
@@ -292,7 +292,7 @@ class _Fit:
         used: np.ndarray,
         damping: np.ndarray,
     ) -> np.ndarray:
-        """Return how far sizes should change, `(F, R, J)`; `off`: how far they are from what they are a priori."""
+        """Return the step of the sizes, `(F, R, J)`; `off`: their difference from the prior mean."""
         step = np.zeros_like(off)
         for f, j in np.ndindex(damping.shape):
             rows = self.mask[:, j]
@@ -344,8 +344,8 @@ def _estimate_deviations(
 ) -> np.ndarray:
     """Return standard errors of the sizes, `(R, J)`.
 
-    The larger of what the likelihood says and the spread between blocks, and what small faults of
-    the simulator would make of them: a constant fault shows in no spread.
+    The variance is the larger of that by the likelihood and that between blocks. Small faults of
+    the simulator add to it: a constant fault shows in no spread between blocks.
     """
     found = np.zeros(mask.shape)
     for j in np.flatnonzero(mask.any(0)):
@@ -381,11 +381,11 @@ def prune_set(
     """Return the set without effects of no size worth naming, and without joints where it does not pay when it is simulated.
 
     Args:
-        evidence: Errors of the simulator.
+        residuals: Residuals of the simulator.
         chosen: The set.
-        repaired: Its simulation, on halves of the recordings that sizes were not fitted to.
-        price: What a subset costs on a joint.
-        scatter: Mean square error over what the noise says, `(J,)`.
+        fitted: The set fitted by simulation, its residuals cross-validated between halves.
+        price: Penalty of a subset on a joint.
+        scatter: Mean square of the whitened residuals, `(J,)`.
         shared: Effects with one cause for all joints: they stay on all of them.
     """
     found = []

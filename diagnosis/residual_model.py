@@ -46,7 +46,7 @@ WARM_S = 900.0
 
 
 def build_features(residuals: Residuals, j: int) -> np.ndarray:
-    """Return what an error of joint `j` could depend on, in the simulator's own motion, `(W, I, F)`."""
+    """Return features of the simulator's own motion that may predict an error of joint `j`, `(W, I, F)`."""
     way, machine = residuals.increments, residuals.simulator.machine
     full = machine.max_speed * machine.period_s * INCREMENT_SAMPLES
     own, speed = way[..., j], way / full
@@ -137,9 +137,9 @@ def learn_discrepancy(
 
 
 def estimate_fault_scales(parts: Sequence[Residuals]) -> np.ndarray:
-    """Return how far the simulator's own numbers are off on parts of the reference, over what is usual, `(P,)`, 1 at least.
+    """Return the errors of the simulator's own numbers on the reference over the usual ones, `(P,)`, 1 at least.
 
-    All joints and parts together, less what chance alone does to an estimate.
+    Root mean square over all joints and parts, less the variance of the estimates.
     """
     squares, chance = [], []
     for part in parts:
@@ -219,7 +219,7 @@ class SimulatedMotion:
         return np.abs(self.share).sum(-1)
 
     def faded(self, column: np.ndarray, kept: float) -> np.ndarray:
-        """Return the mean of what came before in the recording, the longer ago the less; windows follow one another."""
+        """Return the exponentially weighted mean of the earlier samples of a recording, across its windows."""
         runs, found = self.residuals.simulator.cut.run, np.empty_like(column)
         for run in np.unique(runs):
             mine = runs == run
@@ -346,7 +346,7 @@ FORMS = (STARTS, CURVE)
 
 
 def score_clues(residuals: Residuals, z: np.ndarray) -> np.ndarray:
-    """Return what each clue earns on errors over the noise `z` `(J, E)`, `(clues, J)`."""
+    """Return the log-likelihood gain of each clue on whitened residuals `z` `(J, E)`, `(clues, J)`."""
     found, order = (
         np.zeros((len(CLUES), len(z))),
         [*FORMS, *(name for name in CLUES if name not in FORMS)],
@@ -369,8 +369,8 @@ def scale_reference_gains(
     """Return the most that clues earn on reference recordings at the length of the field, `(clues, J)`; 0 without any.
 
     Args:
-        earned: What they earn in the field.
-        nulls: The same on each part of the reference.
+        earned: Their gain in the field.
+        left_out: The same on each part of the reference.
         entries: Length of the field over that of each part.
     """
     return np.max(
@@ -379,11 +379,13 @@ def scale_reference_gains(
 
 
 def measure_straying(residuals: Residuals, error: np.ndarray) -> np.ndarray:
-    """Return how far free runs stray over what the noise lets expect, `(J,)`: mean squares of windows, cut at `FAR`.
+    """Return the mean square of free-run errors over its expectation under the noise, `(J,)`.
+
+    The ratio of each window is cut at `MAX_STRAY`.
 
     Args:
-        evidence: The simulator against recordings.
-        error: Increments that it misses, `(W, I, J)`.
+        residuals: Residuals of the simulator on recordings.
+        error: Measured less simulated increments, `(W, I, J)`.
     """
     assert residuals.noise is not None, "noise is known by now"
     expected = np.stack(
@@ -403,7 +405,7 @@ def measure_straying(residuals: Residuals, error: np.ndarray) -> np.ndarray:
 
 
 def _score_ridge(x: np.ndarray, z: np.ndarray) -> tuple[float, np.ndarray]:
-    """Return by how much features `(E, F)` make errors `(E,)` more likely, by Laplace's approximation, and what they leave."""
+    """Return the log evidence of features `(E, F)` for residuals `(E,)` by Laplace's approximation, and the new residuals."""
     best, least = 0.0, z
     for pull in CLUE_RIDGES:
         beta = fit_ridge(x, z, pull)

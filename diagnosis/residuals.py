@@ -60,8 +60,8 @@ class ErrorCovariance:
         change: The same over the change of speed between neighbouring increments.
         wander: Relative standard deviation of the speed.
         memory: Increments over which a wandering speed forgets.
-        reading: Standard deviation of each position as it is read, rad or m: what one increment
-            gains the next one loses.
+        reading: Standard deviation of each position as it is read, rad or m; it enters two
+            increments in a row with opposite signs.
     """
 
     sensor: float
@@ -204,16 +204,16 @@ class Residuals:
     """A simulator held against recordings.
 
     Attributes:
-        candidates: Its free runs.
+        simulator: The simulator, which makes the free runs.
         noise: Of each joint; `None` while it is still to be found.
-        claims: Whether each window says something about each joint, `(W, J)`.
-        mean: What effects of chance change on average, which are known already, `(W, K, J)`.
+        valid_mask: Whether each window counts for each joint, `(W, J)`.
+        mean: Mean response of known stochastic effects, `(W, K, J)`.
         bias: Increments that the simulator misses already on the reference, `(W, I, J)`; see
-            `discrepancy`.
-        widths: How large faults of the simulator's own numbers are, over the usual, `(P,)`; see
-            `discrepancy`.
-        late: What each change of a command does when it comes a standard deviation late, `(W, C, I,
-            J)`, where that is by chance.
+            `residual_model`.
+        widths: Size of faults of the simulator's own numbers over the usual, `(P,)`; see
+            `residual_model`.
+        late: Response to each change of a command that is one standard deviation late, `(W, C, I,
+            J)`, where delays are random.
         runs: Its free runs without any effect, `(W, K, J)`, where they are known already.
     """
 
@@ -368,7 +368,7 @@ class Residuals:
         return np.concatenate([lines, self.whiten(MEAN_FORM_ERROR * known[None])], 1)
 
     def response(self, ray: ParameterRay) -> np.ndarray:
-        """Return what an effect on all joints changes at each size of the ray, over the noise, `(J, C, E)`."""
+        """Return the whitened response to an effect on all joints at each size of the ray, `(J, C, E)`."""
         joints = self.increments.shape[2]
         sizes = ray.sizes[ray.sizes != 0.0]
         paths = self.simulator.simulate(

@@ -72,9 +72,9 @@ def fit_sizes(
 
     Args:
         z: Errors over the noise, `(E,)`.
-        shapes: What effects change.
-        start: Sizes from which the search begins; `None`: what each would be alone.
-        faults: What small faults of the simulator change, in standard deviations of theirs, `(P,
+        shapes: Responses to the effects.
+        start: Sizes from which the search begins; `None`: the best size of each effect alone.
+        faults: Responses to small faults of the simulator, each of one standard deviation, `(P,
             E)`.
         used: Weight of each entry, `(E,)`; `None`: all count.
 
@@ -166,7 +166,7 @@ class JointResiduals:
 
     Attributes:
         z: Errors over the noise, `(E,)`.
-        faults: What the simulator's own numbers change, `(P, E)`.
+        faults: Responses to the simulator's own numbers, `(P, E)`.
         loss: Loss of each entry.
         price: Of the faults: how unlikely their sizes are, and of having fitted them.
     """
@@ -218,7 +218,7 @@ def _compute_penalty(
 def cross_validate_change(
     z: np.ndarray, shapes: Sequence[Response], fold: np.ndarray
 ) -> np.ndarray:
-    """Return what shapes change, `(E,)`, on each half `fold` with sizes fitted to the other."""
+    """Return the sum of responses, `(E,)`, on each half `fold` with sizes fitted to the other."""
     change = np.zeros(len(z))
     for half in (0, 1):
         other = fold == half
@@ -304,9 +304,9 @@ def fit_joint_faults(
     """Return the errors of each joint with small faults of the simulator, in units of `scatter` times the noise.
 
     Args:
-        evidence: Errors over the noise.
-        scatter: Mean square error over what the noise says, `(J,)`.
-        z: Errors to explain in place of those of the evidence, `(J, E)`.
+        residuals: Residuals of the simulator.
+        scatter: Mean square of the whitened residuals, `(J,)`.
+        z: Whitened residuals to explain in place of those of `residuals`, `(J, E)`.
     """
     by = np.ones(len(residuals.z)) if scatter is None else 1.0 / np.sqrt(scatter)
     z = residuals.z if z is None else z

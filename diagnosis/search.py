@@ -48,7 +48,7 @@ there already."""
 
 Subset = frozenset[str]
 PenaltyFunction = Callable[[int, Subset], float]
-"""What a subset costs on a joint, by its number."""
+"""Penalty of a subset on a joint, by its number, nats."""
 
 
 @dataclass
@@ -71,13 +71,13 @@ class SubsetScore:
 
 @dataclass
 class SubsetTable:
-    """Subsets of effects that were tried on one joint, and what they earn.
+    """Subsets of effects that were tried on one joint, and their log-likelihood gains.
 
     Attributes:
         joint: The joint's errors over the noise.
         shapes: By effect: one shape a ray; effects that do nothing to the joint are absent.
         block: Part of the recordings, the same for neighbours, of each entry.
-        scores: What subsets earn, as far as they were tried.
+        scores: Gains of the subsets that were tried.
         single: Best sizes of shapes by themselves, by their identity.
     """
 
@@ -88,7 +88,7 @@ class SubsetTable:
     single: dict[int, float] = field(default_factory=dict)
 
     def score(self, subset: Subset) -> SubsetScore:
-        """Return what a subset earns."""
+        """Return the log-likelihood gain of a subset."""
         if subset not in self.scores:
             names = sorted(subset)
             shapes = [shape for name in names for shape in self.shapes[name]]
@@ -105,9 +105,9 @@ class SubsetTable:
     def _starts(self, names: Sequence[str]) -> list[np.ndarray]:
         """Return sizes at which a fit of several effects may begin: all somewhat smaller than alone, and the best smaller set.
 
-        What begins at a threshold does nothing below it, and a fit that begins there stays there.
-        So a set also begins where the best set with one effect less ended, with the other at what
-        explains best what that one leaves.
+        An effect with a threshold does nothing below it, and a fit that begins there stays there.
+        So a fit also begins at the best set with one effect less. The further effect then begins at
+        the size that explains most of the remaining residuals.
         """
         every = [shape for name in names for shape in self.shapes[name]]
         starts = [
@@ -156,7 +156,7 @@ class SubsetTable:
                 for name in self.shapes
                 if name not in one and len(one) < most
             }
-            best = sorted({*best, *level}, key=net, reverse=True)[:BEAM_WIDTH]
+            best = sorted({*best, *level}, key=lambda one: (-net(one), sorted(one)))[:BEAM_WIDTH]
             if net(best[0]) <= before:
                 return
 
@@ -167,7 +167,7 @@ class EffectSet:
 
     Attributes:
         subsets: Effects of each joint.
-        net_gain: What they earn in all, less their prices.
+        net_gain: Their gain in all, less their penalties.
     """
 
     subsets: tuple[Subset, ...]
@@ -188,17 +188,17 @@ def choose_set(
     partial: float = 0.0,
     least: float = 0.0,
 ) -> EffectSet:
-    """Return the set that is worth most, or one of fewer effects that is not surely worth less.
+    """Return the set with the largest net gain, or a simpler one whose net gain is not surely smaller.
 
     Args:
-        tables: What was tried on each joint.
-        price: What a subset costs on a joint.
-        name_price: What each effect costs once, however many joints have it.
-        share: Part of what a joint's subset earns that each of its effects must add.
-        shared: Effects with one cause for all joints; they cost once, as `name_price`.
-        partial: What such an effect costs for each joint that could show it and does not.
-        least: No effect that is not shared costs less on a joint; what earns less is not priced at
-            all.
+        tables: Scores of the subsets of each joint.
+        price: Penalty of a subset on a joint.
+        name_price: Penalty of each effect as such, however many joints have it.
+        share: Least part of the gain of a joint's subset that each of its effects must add.
+        shared: Effects with one cause for all joints; they have the penalty `name_price` only.
+        partial: Penalty of such an effect for each joint that could show it and does not.
+        least: Least penalty on a joint of an effect that is not shared; subsets with a smaller gain
+            are not tried on the reference.
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
@@ -251,7 +251,7 @@ def _find_simpler_set(
     partial: float,
     share: float,
 ) -> EffectSet | None:
-    """Return a set with fewer names whose loss is within what chance does between blocks, or a small part of the whole."""
+    """Return a set with fewer names whose loss is within the scatter between blocks, or a small part of the whole."""
     for name in sorted(best.names):
         other = _find_best_set(
             [{s: value for s, value in w.items() if name not in s} for w in worth],
@@ -318,8 +318,8 @@ class ReferenceScores:
         num_entries: Entries of the field, `E`.
         rays: Ways in which each effect grows, at small sizes.
         grown: The same as they are simulated in the field.
-        plain: Errors of each joint in the field.
-        shapes: What each effect does to each joint in the field.
+        joints: Residuals of each joint in the field.
+        shapes: Responses of each joint to each effect in the field.
         shared: Effects with one cause for all joints.
         tables: Of each part and joint.
         known: Effects that were simulated on the reference.
@@ -336,7 +336,7 @@ class ReferenceScores:
     known: set[str] = field(default_factory=set)
 
     def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[SubsetScore, float]]:
-        """Return what the subset earns on joint `j` in each part of the reference, and the length of the field over the part's."""
+        """Return the gain of the subset on joint `j` in each part of the reference, and the length of the field over the part's."""
         if not self.tables:
             self.tables = [
                 [SubsetTable(joint, {}, part.block) for joint in fit_joint_faults(part)]
@@ -365,7 +365,7 @@ class ReferenceScores:
         return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0
 
     def repeated(self, j: int, subset: frozenset[str]) -> float:
-        """Return what the subset earns in the field at the sizes that it has on the reference already; 0 where it has none."""
+        """Return the gain of the subset in the field at its sizes on the reference; 0 where it has none there."""
         parts = [scored for scored, _ in self._scored(j, subset)]
         if not parts or sum(scored.total for scored in parts) < ALREADY_THERE:
             return 0.0

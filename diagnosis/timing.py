@@ -50,7 +50,7 @@ MIN_SCATTER_RATIO = 1.1
 
 @dataclass(frozen=True)
 class FrameDelays:
-    """Hidden delays of frames that could be measured, less what is late always.
+    """Hidden delays of frames that could be measured, less their mean.
 
     Attributes:
         value: In periods, `(D,)`.
@@ -90,7 +90,7 @@ class DelayErrorModel:
         )
 
     def log(self, off: np.ndarray, error: np.ndarray) -> np.ndarray:
-        """Return the logarithm of the density of what delays with these standard errors are off by."""
+        """Return the log density of errors `off` of delays with these standard errors."""
         width = np.hypot(self.scale * error, TIMING_ERROR)
         return stats.t.logpdf(off / width, self.freedom) - np.log(width)
 
@@ -104,7 +104,7 @@ class DelayErrorModel:
 
 @dataclass(frozen=True)
 class CommandChanges:
-    """The changes of commands in some windows, and what it would do if they came one period later."""
+    """The changes of commands in some windows, and the responses to one period of delay."""
 
     residuals: Residuals
 
@@ -137,7 +137,7 @@ class CommandChanges:
 
     @cached_property
     def _told(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Per window: what each frame that changes a command does to errors over the noise when it comes a period late, `(J I, D)`.
+        """Per window: whitened response to one period of delay of each frame that changes a command, `(J I, D)`.
 
         With the number of the joint that tells most of each, `(D,)`.
         """
@@ -187,8 +187,8 @@ class CommandChanges:
     def delays(self, error: np.ndarray, without: int | None = None) -> FrameDelays:
         """Return the delays that explain errors `(W, I, J)` (measured less simulated increments) best.
 
-        What a joint alone is late by on average is none of them; `without`: a joint whose errors do
-        not count.
+        The mean delay of a single joint is subtracted first; `without`: a joint whose errors do not
+        count.
         """
         z = np.stack(
             [(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)], 1
@@ -215,7 +215,7 @@ class CommandChanges:
         )
 
     def spread(self, error: np.ndarray) -> np.ndarray:
-        """Return what each change does when it comes late by the standard deviation of the delays seen, `(W, C, I, J)`."""
+        """Return the response to each change at a delay of one standard deviation of those seen, `(W, C, I, J)`."""
         seen = self.delays(error)
         by = np.sqrt(max(0.0, float(np.mean(np.square(seen.value) - np.square(seen.error)))))
         return by * self.responses.swapaxes(0, 1)
@@ -233,11 +233,11 @@ def detect_timing_effect(
 
     Args:
         changes: Of the commands in the field.
-        error: Measured less simulated increments after what else was found, `(W, I, J)`.
-        nulls: The simulator against parts of the reference that it was not fitted to.
+        error: Measured less simulated increments with the other effects, `(W, I, J)`.
+        left_out: The simulator against parts of the reference that it was not fitted to.
         kinds: The library.
-        price: Beside what is earned on the reference.
-        name_price: For the effect as such.
+        price: Penalty beside that from the gain on the reference, nats.
+        name_price: Penalty of the effect as such, nats.
     """
     kinds = [kind for kind in kinds if kind.target.stochastic and kind.target.side == "command"]
     others = [CommandChanges(one) for one in left_out]
@@ -305,14 +305,14 @@ def detect_timing_effect(
 def add_mean_delay(
     residuals: Residuals, found: DetectedEffect, steady: Sequence[tuple[EffectType, EffectValues]]
 ) -> Residuals:
-    """Return the evidence with what the found effect changes on average, and the mean delay that joints share beyond it.
+    """Return the residuals with the mean response of the found effect, and the mean delay that joints share beyond it.
 
-    How delays scatter does not tell their mean: frames that may not overtake each other wait twice
-    as long as others that scatter alike. Frames are late for all joints alike, so that what one
-    joint alone is late by is left for an effect of its own.
+    The scatter of delays does not give their mean. Frames that may not overtake each other wait
+    twice as long as others with the same scatter. A late frame delays all joints alike, so the
+    delay of a single joint is left to another effect.
 
     Args:
-        evidence: The simulator against the field.
+        residuals: The simulator against the field.
         found: The effect.
         steady: Other effects that are there.
     """

@@ -41,8 +41,8 @@ class DiagnosisSubject:
         unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
             fitted: how far the effects carry.
         effects: Names of the effects to choose among; `null`: all that are registered.
-        prices: What an effect must earn.
-        certainty: How sure what is said is.
+        prices: Penalties of effects.
+        certainty: Calibration of the probabilities.
     """
 
     case: str | None
@@ -61,13 +61,13 @@ class DiagnosisSubject:
 
 @spec
 class Diagnose:
-    """Hold a simulator against recordings and says what it lacks.
+    """Compare a simulator with recordings and name the effects that it lacks.
 
     Attributes:
         session: Folder, seed, device.
         machine: The machine that was recorded.
-        fit: How the simulator is made from `reference/`; without one, the flexible model that tells
-            what could be explained at all.
+        fit: Fit of the simulator to `reference/`; without a reference, the flexible model that gives
+            the floor.
         actuator: The simulator that `diagnosis.field` is held against.
         thresholds: When a stretch of a recording is worth telling.
         excitation: Experiments that could follow, by name.
