@@ -398,7 +398,8 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
     assert stop["y"] >= 0 and stop["y"] + stop["height"] <= size[1]
     cut = page.evaluate(
         """() => [...document.querySelectorAll("button, #advice, #boreholes")].filter(node =>
-        node.scrollHeight > node.clientHeight + 1 || node.scrollWidth > node.clientWidth + 1).map(node => node.id + node.textContent)"""
+        node.scrollHeight > node.clientHeight + 1 || node.scrollWidth > node.clientWidth + 1)
+        .map(node => node.id + node.textContent)"""
     )
     assert cut == []
     # the buttons lie above the rest of an upright screen, which scrolls under them
