@@ -302,7 +302,10 @@ class _StateChecks:
             f"move one joint after the other, both ways, a second or more each: {', '.join(names)}"
         )
         found = self._watch_joints()
-        missing = [name for name in names if name not in found]
+        missing = []
+        for name in names:
+            if name not in found:
+                missing.append(name)
         turned = [name for name, response in found.items() if not response.agrees]
         dead_s = [response.dead_time_s for response in found.values()]
         faults = []

@@ -115,9 +115,9 @@ def read_truth(stem: Path) -> SceneTruth:
     path = _build_path(stem, TRUTH)
     try:
         told = json.loads(path.read_text())
-        circles = {
-            name: tuple(TrueCircle(**entry) for entry in told[name]) for name in ("holes", "decoys")
-        }
+        circles = {}
+        for name in ("holes", "decoys"):
+            circles[name] = tuple(TrueCircle(**entry) for entry in told[name])
         return SceneTruth(
             told["scene"], told["conditions"], circles["holes"], circles["decoys"], told["block"]
         )

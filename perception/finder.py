@@ -226,9 +226,9 @@ class StagedFinder:
             return one[0].score >= STRONG_SCORE * best, one[1].radius_m
 
         for ellipse, pose in sorted(found, key=rank, reverse=True):
-            distances_m = [
-                float(np.linalg.norm(pose.center_m - other.center_m)) for _, other in kept
-            ]
+            distances_m = []
+            for _, other in kept:
+                distances_m.append(float(np.linalg.norm(pose.center_m - other.center_m)))
             nearest_m = min(distances_m, default=np.inf)
             if nearest_m < limit_m:
                 reason = "distance to a larger rim, m"

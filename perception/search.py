@@ -197,7 +197,10 @@ def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[
     x, y, wide, high = cv2.boundingRect(mask.view(np.uint8))
     region = np.zeros([-(-size // STEP) for size in mask.shape], np.uint8)
     region[y // STEP : (y + high - 1) // STEP + 1, x // STEP : (x + wide - 1) // STEP + 1] = 1
-    priors = [level.prior for level in whole if level.prior]
+    priors = []
+    for level in whole:
+        if level.prior:
+            priors.append(level.prior)
     prior = None
     if priors:
         prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors))

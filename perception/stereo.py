@@ -101,10 +101,9 @@ class Stereo:
         )  # fmt: skip
         # The matcher leaves out a border as wide as the largest disparity: pad the pictures, and
         # discard the matches of the padding.
-        wide = [
-            cv2.copyMakeBorder(picture, 0, 0, count, 0, cv2.BORDER_REPLICATE)
-            for picture in (left, right)
-        ]
+        wide = []
+        for picture in (left, right):
+            wide.append(cv2.copyMakeBorder(picture, 0, 0, count, 0, cv2.BORDER_REPLICATE))
         found = matcher.compute(*wide)[:, count:].astype(np.float32) / 16.0
         columns = np.arange(left.shape[1], dtype=np.float32)
         return np.where((found > 0) & (columns[None] - found >= 0), found, np.nan).astype(

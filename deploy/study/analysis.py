@@ -125,9 +125,10 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
             found.effects[name] = estimate_effect(
                 by_condition["guided"], by_condition["unguided"], found.guided_first
             )
-    secondary = [
-        each.name for each in MEASURES if each.name in found.effects and each.name != found.primary
-    ]
+    secondary = []
+    for each in MEASURES:
+        if each.name in found.effects and each.name != found.primary:
+            secondary.append(each.name)
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
         p = [get_deciding_p(found.effects[name]) for name in family]
         found.holm |= dict(

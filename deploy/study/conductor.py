@@ -275,11 +275,10 @@ class Conductor:
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
-        known = {
-            key: value
-            for key, value in self._data.participants.get(self._who, {}).items()
-            if key != "participant"
-        }
+        known = {}
+        for key, value in self._data.participants.get(self._who, {}).items():
+            if key != "participant":
+                known[key] = value
         folders.write_participant(
             self._folder, self._who, known | facts | {"simulated": self._facts["simulated"]}
         )

@@ -88,9 +88,10 @@ class Form:
 
     def _missing(self) -> list[int]:
         """Return the screens that have no answer."""
-        scales = [
-            index for index, scale in enumerate(tlx.SCALES) if self._ratings.get(scale) is None
-        ]
+        scales = []
+        for index, scale in enumerate(tlx.SCALES):
+            if self._ratings.get(scale) is None:
+                scales.append(index)
         return scales + [
             NUM_RATINGS + i
             for i, pair in enumerate(self._shown)
@@ -98,11 +99,10 @@ class Form:
         ]
 
     def _write(self) -> None:
-        answers = [
-            {"pair": pair, "chosen": self._chosen[frozenset(pair)]}
-            for pair in self._shown
-            if frozenset(pair) in self._chosen
-        ]
+        answers = []
+        for pair in self._shown:
+            if frozenset(pair) in self._chosen:
+                answers.append({"pair": pair, "chosen": self._chosen[frozenset(pair)]})
         folders.rewrite(
             self._path, {"ratings": self._ratings, "pairs": answers, "finished": self.finished}
         )

@@ -194,9 +194,10 @@ class _Taking:
     def _presses(self, study: dict[str, Any]) -> list[dict[str, Any]]:
         kind, phase = study["kind"], study.get("phase")
         if kind == "choose":
-            waiting = [
-                one["name"] for one in study["participants"] if one["state"] in ("new", "begun")
-            ]
+            waiting = []
+            for one in study["participants"]:
+                if one["state"] in ("new", "begun"):
+                    waiting.append(one["name"])
             if waiting and self._left > 0:
                 return [{"do": "choose", "who": waiting[0]}]
             self._end()
@@ -224,10 +225,9 @@ class _Taking:
         made = answer_questionnaire(float(np.mean(self._took_s or [0.0])) / 100.0, 0.0, generator)
         chosen = {frozenset(answer["pair"]): answer["chosen"] for answer in made["pairs"]}
         self._took_s.clear()
-        found = [
-            {"do": "rate", "scale": scale, "value": value}
-            for scale, value in made["ratings"].items()
-        ]
+        found = []
+        for scale, value in made["ratings"].items():
+            found.append({"do": "rate", "scale": scale, "value": value})
         found += [
             {"do": "pair", "pair": i, "chosen": chosen[frozenset(pair)]}
             for i, pair in enumerate(study["pairs"])

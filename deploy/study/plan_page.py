@@ -150,7 +150,10 @@ def _add_error_rates(found: Report, errors: dict[str, Any]) -> None:
 
 def _add_schedule(found: Report, planned: list[Trial]) -> None:
     for participant in dict.fromkeys(trial.participant for trial in planned):
-        mine = [trial for trial in planned if trial.participant == participant]
+        mine = []
+        for trial in planned:
+            if trial.participant == participant:
+                mine.append(trial)
         found.add_heading(participant, 3)
         columns = [
             "",

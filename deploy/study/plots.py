@@ -26,7 +26,10 @@ COLUMNS = 3
 
 def draw_paths(found: Analysis) -> Figure:
     """Draw the tool's paths from above and from the side, a panel a hole; a star is where a trial begins, a sphere the hole."""
-    drawn = [trial for trial in found.trials if trial.counts and len(trial.tip_in_base_m)]
+    drawn = []
+    for trial in found.trials:
+        if trial.counts and len(trial.tip_in_base_m):
+            drawn.append(trial)
     holes = sorted({_name_hole(trial) for trial in drawn})
     figure = Figure(figsize=(3.6 * max(1, len(holes)), 6.8), layout="constrained")
     for column, name in enumerate(holes):

@@ -115,7 +115,10 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
             f"With {num} participants no test here can reach p = {found.alpha:g}: the smallest possible is {least:.3g}.",
             "bad",
         )
-    counted = [trial for trial in found.trials if trial.counts]
+    counted = []
+    for trial in found.trials:
+        if trial.counts:
+            counted.append(trial)
     page.add_facts(
         {
             "participants": f"{num}, {num_first} of them guided first",
@@ -237,7 +240,10 @@ def _build_paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cel
 
 
 def _format_mean(found: Analysis, name: str) -> str:
-    values = [value for value in found.means[name]["guided"] if not math.isnan(value)]
+    values = []
+    for value in found.means[name]["guided"]:
+        if not math.isnan(value):
+            values.append(value)
     return _format_number(sum(values) / len(values) if values else None)
 
 
@@ -268,32 +274,34 @@ def _format_interval(value: tuple[float, float] | None) -> str:
 def _format_trials(found: Analysis) -> str:
     keys = ("participant", "period", "condition", "number", "outcome", "simulated", "operator")
     head = [*keys, "hole", "start", "counts", *(each.name for each in MEASURES)]
-    rows = [
-        [
-            *(trial.facts.get(key, "") for key in keys),
-            (trial.facts.get("hole") or {}).get("name", ""),
-            trial.facts.get("start", ""),
-            trial.counts,
-            *(_blank(trial.values[each.name]) for each in MEASURES),
-        ]
-        for trial in found.trials
-    ]
+    rows = []
+    for trial in found.trials:
+        rows.append(
+            [
+                *(trial.facts.get(key, "") for key in keys),
+                (trial.facts.get("hole") or {}).get("name", ""),
+                trial.facts.get("start", ""),
+                trial.counts,
+                *(_blank(trial.values[each.name]) for each in MEASURES),
+            ]
+        )
     return _format_csv(head, rows)
 
 
 def _format_means(found: Analysis, is_simulated: bool) -> str:
     columns = found.means | {f"tlx_{name}": values for name, values in found.loads.items()}
-    rows = [
-        [
-            name,
-            is_simulated,
-            condition,
-            "first" if (condition == "guided") == bool(first) else "second",
-            *(_blank(values[condition][i]) for values in columns.values()),
-        ]
-        for i, (name, first) in enumerate(zip(found.participants, found.guided_first, strict=True))
-        for condition in ("guided", "unguided")
-    ]
+    rows = []
+    for i, (name, first) in enumerate(zip(found.participants, found.guided_first, strict=True)):
+        for condition in ("guided", "unguided"):
+            rows.append(
+                [
+                    name,
+                    is_simulated,
+                    condition,
+                    "first" if (condition == "guided") == bool(first) else "second",
+                    *(_blank(values[condition][i]) for values in columns.values()),
+                ]
+            )
     return _format_csv(["participant", "simulated", "condition", "period", *columns], rows)
 
 
@@ -313,7 +321,10 @@ def _format_effects(found: Analysis, is_simulated: bool) -> str:
 
 def _flatten(values: Iterable) -> list:
     """Return numbers and the ends of intervals in one row; '' for what there is none of."""
-    row = [part for value in values for part in (value if isinstance(value, tuple) else (value,))]
+    row = []
+    for value in values:
+        for part in value if isinstance(value, tuple) else (value,):
+            row.append(part)
     return ["" if part is None else part for part in row]
 
 

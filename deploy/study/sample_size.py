@@ -50,17 +50,18 @@ def evaluate_size(num: int, alpha: float) -> SampleSize:
     ways = permutation_tests.count_sequences(num_first, num)
     studies = min(STUDIES, MOST_COUNTED // ways) if ways <= permutation_tests.MOST_WAYS else STUDIES
     chance = np.random.default_rng(num).standard_normal((studies, num))
-    power = [
-        float(
-            (
-                permutation_tests.compute_sequence_p(chance + np.where(first, dz, -dz), first)
-                <= alpha
-            ).mean()
+    power = []
+    for dz in EFFECTS_DZ:
+        power.append(
+            float(
+                (
+                    permutation_tests.compute_sequence_p(chance + np.where(first, dz, -dz), first)
+                    <= alpha
+                ).mean()
+            )
+            if smallest <= alpha
+            else 0.0
         )
-        if smallest <= alpha
-        else 0.0
-        for dz in EFFECTS_DZ
-    ]
     return SampleSize(num, permutation_tests.get_smallest_paired_p(num), smallest, tuple(power))
 
 

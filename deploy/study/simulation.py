@@ -114,16 +114,14 @@ def answer_questionnaire(
 ) -> dict[str, Any]:
     """Return a questionnaire as made up from how long and busy the trials were; it has the form of answers, no more."""
     middle = 25.0 + 60.0 * load + habit
-    ratings = {
-        scale: int(
+    ratings = {}
+    for scale in tlx.SCALES:
+        ratings[scale] = int(
             np.clip(tlx.STEP * round((middle + generator.normal(0.0, 8.0)) / tlx.STEP), 0, 100)
         )
-        for scale in tlx.SCALES
-    }
-    chosen = [
-        {"pair": list(pair), "chosen": pair[int(generator.integers(2))]}
-        for pair in tlx.list_pairs(generator)
-    ]
+    chosen = []
+    for pair in tlx.list_pairs(generator):
+        chosen.append({"pair": list(pair), "chosen": pair[int(generator.integers(2))]})
     return {"ratings": ratings, "pairs": chosen, "note": NOTICE}
 
 

@@ -86,7 +86,10 @@ class Sitting:
         """
         data = folders.read_study(folder)
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {folder}")
-        there = [who for who in data.plan["participants"] if who not in data.plan.get("erased", {})]
+        there = []
+        for who in data.plan["participants"]:
+            if who not in data.plan.get("erased", {}):
+                there.append(who)
         if participant is not None and participant not in there:
             raise ConfigError(
                 f"study.participant={participant}: nobody of the plan; {list_choices(participant, there)}"

@@ -46,11 +46,10 @@ def find_next_step(data: StudyData, who: str) -> Step:
     if not (known.get("consent") or {}).get("agreed"):
         return Step("consent")
     for period in (0, *PERIODS):
-        planned = [
-            Trial(**trial)
-            for trial in data.plan["trials"]
-            if trial["participant"] == who and trial["period"] == period
-        ]
+        planned = []
+        for trial in data.plan["trials"]:
+            if trial["participant"] == who and trial["period"] == period:
+                planned.append(Trial(**trial))
         lacking = [trial for trial in planned if (who, period, trial.number) not in data.trials]
         if lacking and not (period == 0 and is_practised(data, who)):
             return Step(
@@ -70,11 +69,10 @@ def find_next_step(data: StudyData, who: str) -> Step:
 
 def is_practised(data: StudyData, who: str) -> bool:
     """Return whether practice is over before all of it was done: by success, by time, or because the experimenter said so."""
-    done = [
-        trial
-        for (name, period, _), trial in sorted(data.trials.items())
-        if name == who and not period
-    ]
+    done = []
+    for (name, period, _), trial in sorted(data.trials.items()):
+        if name == who and not period:
+            done.append(trial)
     row = [trial.get("outcome") == "inserted" for trial in done[-ENOUGH:]]
     minutes = sum(float(trial.get("seconds", 0.0)) for trial in done) / 60.0
     ended = bool(data.participants.get(who, {}).get("practice_ended"))

@@ -199,9 +199,9 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
         datetime.now().astimezone().isoformat(timespec="seconds")
     )
     _write(folder / PLAN, plan)
-    reports = [
-        Path(name) for name in (_read(folder / REPORTS) if (folder / REPORTS).exists() else [])
-    ]
+    reports = []
+    for name in _read(folder / REPORTS) if (folder / REPORTS).exists() else []:
+        reports.append(Path(name))
     return gone, [report for report in reports if report.exists()]
 
 

@@ -269,11 +269,10 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
 def _describe_target(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
     """Return the recording with the hole, and without advice that was not shown."""
     guided = trial["condition"] == "guided"
-    extra = {
-        name: values
-        for name, values in found.extra.items()
-        if guided or not name.startswith("advice_")
-    }
+    extra = {}
+    for name, values in found.extra.items():
+        if guided or not name.startswith("advice_"):
+            extra[name] = values
     at = zip("xyz", trial["hole"]["center_in_base_m"], strict=True)
     extra |= {f"target_{axis}_m": np.full(len(found.t_s), value, np.float32) for axis, value in at}
     return replace(found, extra=extra)

@@ -77,18 +77,21 @@ class Twins:
     ) -> list[Recording]:
         """See `brokk_rl.contracts.operator.TrialGround`."""
         num, nothing = len(trials.q), np.full(machine.num_joints, np.nan)
-        places = [
-            (
-                session.stream(f"twin {n}"),
-                trials.q[n],
-                trials.rim_in_base_m[n],
-                bool(trials.guided[n]),
+        places = []
+        for n in range(num):
+            places.append(
+                (
+                    session.stream(f"twin {n}"),
+                    trials.q[n],
+                    trials.rim_in_base_m[n],
+                    bool(trials.guided[n]),
+                )
             )
-            for n in range(num)
-        ]
         processes = min(self.num_processes or count_cores(), num)
         rows = [np.arange(first, num, processes) for first in range(processes)]
-        parts = [(self, machine, session, [places[n] for n in mine]) for mine in rows]
+        parts = []
+        for mine in rows:
+            parts.append((self, machine, session, [places[n] for n in mine]))
         steps, left = (
             round(trials.limit_s / machine.period_s),
             np.full(num, round(self.settle_s / machine.period_s)),
@@ -120,10 +123,11 @@ def make_desks(
 ) -> list[_Desk]:
     """Return a desk for each of `places`: seed, start, rim, and whether advice is shown there."""
     bundle, description = PolicyBundle(ground.policy, machine), BusDescription(ground.dbc, machine)
-    made = [
-        _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided)
-        for seed, q, rim, guided in places
-    ]
+    made = []
+    for seed, q, rim, guided in places:
+        made.append(
+            _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided)
+        )
     for desk in made:
         desk.wait(BEFORE_S)
     return made

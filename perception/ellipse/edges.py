@@ -137,11 +137,10 @@ def detect_edges(
     if roi is not None:
         canny = cv2.bitwise_and(canny, canny, mask=roi.view(np.uint8))
     canny[[0, -1]] = canny[:, [0, -1]] = 0
-    contours = [
-        c
-        for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-        if len(c) >= least
-    ]
+    contours = []
+    for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
+        if len(c) >= least:
+            contours.append(c)
     if not contours:
         return _make_empty_edges(gray.shape)
     pixels, spans = _chain_pixels(contours, gray.shape, least)
@@ -174,10 +173,9 @@ def _split_chains(
     if not len(spans):
         return NO_SPANS, NO_SPANS
     fine = np.round(edges.points * 16).astype(np.int32)
-    polygons = [
-        cv2.approxPolyDP(fine[start:stop, None], tolerance_px * 16, False)[:, 0]
-        for start, stop in spans.tolist()
-    ]
+    polygons = []
+    for start, stop in spans.tolist():
+        polygons.append(cv2.approxPolyDP(fine[start:stop, None], tolerance_px * 16, False)[:, 0])
     owner = np.repeat(np.arange(len(spans)), [len(polygon) for polygon in polygons])
     corners = np.concatenate(polygons)
     steps = np.diff(corners / 16.0, axis=0)

@@ -225,7 +225,10 @@ class Perceive:
 
     def _show(self, entries: list[FrameEntry]) -> None:
         """Print a table of counts, refusals, the target and the durations."""
-        used = [entry.found for entry in entries if entry.found]
+        used = []
+        for entry in entries:
+            if entry.found:
+                used.append(entry.found)
         table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
         table.add_row("frames", f"{len(used)} used, {len(entries) - len(used)} refused")
         if self.perceive.until == "ellipses":

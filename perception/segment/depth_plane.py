@@ -272,11 +272,10 @@ class PlaneSegmenter:
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=4)
-        large = [
-            label
-            for label in range(1, count)
-            if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size
-        ]
+        large = []
+        for label in range(1, count):
+            if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size:
+                large.append(label)
         nearer = (known & (excess > self._tolerance)).astype(np.uint8)
         nearer = np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
         pieces = [_fill_holes((labels == label).astype(np.uint8), nearer) for label in large]

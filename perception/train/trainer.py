@@ -214,7 +214,10 @@ class _Training:
     def _remember(self, part: float) -> None:
         """Move the mean network by a part of the way to the one under training."""
         now = self._network.state_dict()
-        moving = [name for name, value in now.items() if value.is_floating_point()]
+        moving = []
+        for name, value in now.items():
+            if value.is_floating_point():
+                moving.append(name)
         # all at once: a graphics card takes longer to be told of each of a hundred small tensors
         # than to move them
         torch._foreach_lerp_(
@@ -294,7 +297,10 @@ class _Training:
 
     def _identity(self) -> dict[str, str]:
         """Return fingerprints of settings and data, which must be the same to resume."""
-        same = {name: value for name, value in vars(self._settings).items() if name not in FREE}
+        same = {}
+        for name, value in vars(self._settings).items():
+            if name not in FREE:
+                same[name] = value
         data = hashlib.sha256()
         for views in (self._train, self._unseen):
             data.update(views.layers[:: max(1, len(views) // 50)].numpy().tobytes())
@@ -327,9 +333,10 @@ class _Training:
                 f"{path}: corrupt ({error}); delete it to begin the training again"
             ) from error
         if state["stamp"] != self._stamp:
-            differing = [
-                name for name, value in self._stamp.items() if state["stamp"].get(name) != value
-            ]
+            differing = []
+            for name, value in self._stamp.items():
+                if state["stamp"].get(name) != value:
+                    differing.append(name)
             raise CheckpointError(
                 f"{path}: an interrupted training that cannot go on: its {' and '.join(differing)} differ. Train with what it "
                 "began with, or choose another folder (session.out=…)."
