@@ -8,7 +8,7 @@ NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is 
   `axis_in_base`, `radius_m`, `depth_m`, `hidden`: the part of the rim that cannot be seen,
   `in_view`), `decoys` (likewise), `block` (`center_m`, `rotation`, `half_m`). Axes point out of the
   hole; coordinates without a frame in their name are the left camera's.
-* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (what is seen through the rim of a
+* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (all that is seen through the rim of a
   hole), `ARM`.
 """
 

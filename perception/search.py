@@ -73,10 +73,8 @@ class SearchLevel:
         if self.sizes_px is None:
             return True
         reach = AROUND * one.a
-        rows, columns = (
-            slice(max(0, int((at - reach) / STEP)), int((at + reach) / STEP) + 1)
-            for at in (one.y, one.x)
-        )
+        rows = slice(max(0, int((one.y - reach) / STEP)), int((one.y + reach) / STEP) + 1)
+        columns = slice(max(0, int((one.x - reach) / STEP)), int((one.x + reach) / STEP) + 1)
         near = self.sizes_px[rows, columns]
         near = near[np.isfinite(near)]
         return not near.size or near.min() / (1.0 + self.slack) <= one.a <= near.max() * (
@@ -87,10 +85,8 @@ class SearchLevel:
         """Return the ellipses of the region, whatever their size at their place."""
         x, y, wide, high = cv2.boundingRect(self.region)
         left, top = x * STEP, y * STEP
-        height, width = (
-            min(size * STEP, whole - start) // self.shrink
-            for size, whole, start in ((high, len(gray), top), (wide, len(gray[0]), left))
-        )
+        height = min(high * STEP, len(gray) - top) // self.shrink
+        width = min(wide * STEP, len(gray[0]) - left) // self.shrink
         if min(height, width) < 1:
             return []
         part = gray[top : top + height * self.shrink, left : left + width * self.shrink]
@@ -246,5 +242,6 @@ def _dilate(small: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _enlarge(one: Ellipse, factor: int, left: int, top: int) -> Ellipse:
-    x, y = ((place + 0.5) * factor - 0.5 + start for place, start in ((one.x, left), (one.y, top)))
+    x = (one.x + 0.5) * factor - 0.5 + left
+    y = (one.y + 0.5) * factor - 0.5 + top
     return replace(one, x=x, y=y, a=one.a * factor, b=one.b * factor, rms_px=one.rms_px * factor)

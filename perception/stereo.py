@@ -78,9 +78,8 @@ class Stereo:
             focal_px: Focal length.
             baseline_m: Distance between the cameras.
         """
-        one, other = (
-            np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)) for picture in (left, right)
-        )
+        one = np.asarray(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY))
+        other = np.asarray(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
         found = self._matched(one, other, focal_px * baseline_m / self.nearest_m)
         if self.refinements:
             found = self._refined(one, other, found)
@@ -112,10 +111,8 @@ class Stereo:
 
     def _refined(self, left: np.ndarray, right: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Return disparities refined by registration of windows, free in brightness and contrast."""
-        one, other = (
-            cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX)
-            for picture in (left, right)
-        )
+        one = cv2.GaussianBlur(left.astype(np.float32), (0, 0), _SMOOTH_PX)
+        other = cv2.GaussianBlur(right.astype(np.float32), (0, 0), _SMOOTH_PX)
         slope = cv2.Sobel(other, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
         x, y = np.meshgrid(*[np.arange(size, dtype=np.float32) for size in left.shape[::-1]])
         known = np.isfinite(start).astype(np.float32)
@@ -128,9 +125,8 @@ class Stereo:
         mine = mean(one)
         mine_spread = mean(one * one) - mine * mine
         for _ in range(self.refinements):
-            seen, rise = (
-                cv2.remap(picture, x - found, y, cv2.INTER_CUBIC) for picture in (other, slope)
-            )
+            seen = cv2.remap(other, x - found, y, cv2.INTER_CUBIC)
+            rise = cv2.remap(slope, x - found, y, cv2.INTER_CUBIC)
             theirs, mean_rise = mean(seen), mean(rise)
             spread = mean(seen * seen) - theirs * theirs
             gain = np.sqrt(np.clip(spread / np.maximum(mine_spread, 1e-3), 0.25, 4.0))

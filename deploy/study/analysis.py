@@ -1,4 +1,4 @@
-"""From a study's folder to what it says: every trial measured, means of each person and condition, effects, and what to beware of.
+"""From a study's folder to its results: every trial measured, means of each person and condition, effects, and warnings.
 
 Axes: `P` participants in the order of the plan.
 """
@@ -33,7 +33,7 @@ class MeasuredTrial:
     """A trial with its numbers.
 
     Attributes:
-        facts: What stands in its file.
+        facts: Contents of its file.
         values: By measure, NaN where the recording does not tell.
         tip_in_base_m: Path of the tool until the trial ended, `(T, 3)`; empty where there is no
             recording.
@@ -61,7 +61,7 @@ class Analysis:
             scales.
         primary: Name of the measure that decides.
         alpha: Level.
-        remarks: What a reader must know.
+        remarks: Warnings to the reader.
     """
 
     participants: list[str]
@@ -77,10 +77,10 @@ class Analysis:
 
 
 def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] = iter) -> Analysis:
-    """Return what the study says.
+    """Return the results of the study.
 
     Args:
-        data: What is there.
+        data: Contents of the study's folder.
         machine: The machine of the plan.
         progress: Wraps the list of trials while their recordings are read.
     """
@@ -97,9 +97,11 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
         alpha=design["alpha"],
         remarks=list(data.remarks),
     )
-    everything = [(trial, bool(trial["period"])) for trial in data.trials.values()] + [
-        (trial, False) for trial in data.spare
-    ]
+    everything = []
+    for trial in data.trials.values():
+        everything.append((trial, bool(trial["period"])))
+    for trial in data.spare:
+        everything.append((trial, False))
     if at_twin := sum(bool(trial.get("twin")) for trial, counts in everything if counts):
         found.remarks.append(
             Remark(
@@ -111,10 +113,10 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
         found.trials.append(
             _measure_trial(data.folder, trial, counts, machine, success, found.remarks)
         )
-    found.means = {
-        each.name: {which: _average_participants(found, each.name, which) for which in CONDITIONS}
-        for each in MEASURES
-    }
+    for each in MEASURES:
+        found.means[each.name] = {}
+        for which in CONDITIONS:
+            found.means[each.name][which] = _average_participants(found, each.name, which)
     _note_few(found)
     _add_loads(found, data)
     for name, by_condition in (
@@ -208,9 +210,11 @@ def _average_participants(found: Analysis, measure_name: str, condition: str) ->
     """Return each participant's mean over the trials that tell, `(P,)`."""
     means = np.full(len(found.participants), np.nan)
     for index, name in enumerate(found.participants):
-        values = np.array(
-            [t.values[measure_name] for t in found.trials if _is_of(t, name, condition)]
-        )
+        told = []
+        for trial in found.trials:
+            if _is_of(trial, name, condition):
+                told.append(trial.values[measure_name])
+        values = np.array(told)
         values = values[~np.isnan(values)]
         means[index] = values.mean() if len(values) else math.nan
     return means
@@ -235,10 +239,10 @@ def _note_few(found: Analysis) -> None:
 
 def _add_loads(found: Analysis, data: StudyData) -> None:
     keys = (*tlx.SCALES, "raw", "weighted")
-    found.loads = {
-        key: {which: np.full(len(found.participants), np.nan) for which in CONDITIONS}
-        for key in keys
-    }
+    for key in keys:
+        found.loads[key] = {}
+        for which in CONDITIONS:
+            found.loads[key][which] = np.full(len(found.participants), np.nan)
     for (name, period), answers in data.questionnaires.items():
         if name not in found.participants:
             continue
@@ -249,7 +253,5 @@ def _add_loads(found: Analysis, data: StudyData) -> None:
         }
         for key, value in values.items():
             found.loads[key][condition][found.participants.index(name)] = value
-        found.remarks += [
-            Remark(f"{name} period {period}", f"questionnaire: {text}")
-            for text in tlx.check(answers)
-        ]
+        for text in tlx.check(answers):
+            found.remarks.append(Remark(f"{name} period {period}", f"questionnaire: {text}"))

@@ -1,4 +1,4 @@
-"""Who does what when: sequences drawn by lot, holes and starts in Latin squares, practice before.
+"""Plan of the trials: sequences drawn by lot, holes and starts in Latin squares, practice before.
 
 A participant does a few trials in each of two periods, one with guidance and one without. Which
 comes first is drawn, in pairs of participants, so that at no time one sequence is two ahead. Within
@@ -148,10 +148,8 @@ def draw_sequences(design: Design, generator: np.random.Generator) -> dict[str, 
     for _ in range(math.ceil(design.num_participants / 2)):
         guided_first = bool(generator.integers(2)) or design.order == "fixed"
         second_first = guided_first if design.order == "fixed" else not guided_first
-        drawn += [
-            CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0])
-            for first in (guided_first, second_first)
-        ]
+        for first in (guided_first, second_first):
+            drawn.append(CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0]))
     return dict(zip(make_pseudonyms(design.num_participants), drawn, strict=False))
 
 
@@ -214,14 +212,15 @@ def format_plan(
     for trial in planned:
         if trial.period:
             conditions[trial.participant][trial.period] = trial.condition
+    ordered = {}
+    for name, found in conditions.items():
+        ordered[name] = [found[period] for period in PERIODS]
     return {
         "schema": 1,
         "machine": machine.name,
         "fingerprint": machine.fingerprint(),
         "seed": seed,
         "design": asdict(design),
-        "participants": {
-            name: [found[period] for period in PERIODS] for name, found in conditions.items()
-        },
+        "participants": ordered,
         "trials": [asdict(trial) for trial in planned],
     }

@@ -1,6 +1,6 @@
 """A simulated participant at the twin, in real time: a browser's connections, a remote on the bus, a person's hands between them.
 
-The participant sees what the page is sent and nothing else, presses what a person would press, and
+The participant sees only the messages to the page, presses the buttons of a person, and
 moves the remote's levers as the simulated operators of `conf/operator` do. Everything that comes of
 it is marked as simulated.
 """
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 STARTING_S = 60.0
 """Longest wait for the page, s."""
 AGAIN_S = 2.0
-"""Time after which what was pressed without effect is pressed again."""
+"""Time after which a button that had no effect is pressed again."""
 
 
 @spec
@@ -120,10 +120,13 @@ class _Taking:
         self._person, self._bench, self._machine = person, bench, machine
         levers = bench.guidance.levers or machine.levers
         self._shown_map, self._own = LeverMap(levers, machine), LeverMap(machine.levers, machine)
-        self._shown_full = [
-            max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0)
-            for axis in AXES
-        ]
+        self._shown_full = []
+        for axis in AXES:
+            angles_rad = []
+            for one in levers:
+                if (one.side, one.axis) == axis:
+                    angles_rad.append(one.max_angle_rad)
+            self._shown_full.append(max(angles_rad, default=1.0))
         self._shown: dict[str, Any] = {}
         self._study: dict[str, Any] = {}
         self._model: OperatorModel | None = None
@@ -165,14 +168,14 @@ class _Taking:
         return host, token
 
     async def _look(self, state: ClientConnection) -> None:
-        """See what the page is sent, and says that it is drawn."""
+        """Read the messages to the page, and report them as drawn."""
         async for text in state:
             said, now_ms = json.loads(text), 1000 * time.monotonic()
             self._shown = said["shown"]
             await state.send(json.dumps([said["number"], now_ms, now_ms, now_ms]))
 
     async def _press(self, study: ClientConnection) -> None:
-        """Press what a person would press next."""
+        """Press the next button, as a person would."""
         pressed, pressed_s = list[Any](), 0.0
         async for text in study:
             said = json.loads(text)
@@ -228,10 +231,8 @@ class _Taking:
         found = []
         for scale, value in made["ratings"].items():
             found.append({"do": "rate", "scale": scale, "value": value})
-        found += [
-            {"do": "pair", "pair": i, "chosen": chosen[frozenset(pair)]}
-            for i, pair in enumerate(study["pairs"])
-        ]
+        for number, pair in enumerate(study["pairs"]):
+            found.append({"do": "pair", "pair": number, "chosen": chosen[frozenset(pair)]})
         return [*found, {"do": "to", "to": study["last"]}, {"do": "finish"}]
 
     @property
@@ -260,7 +261,7 @@ class _Taking:
                 bus.send(remote.build_frame())
 
     def _given(self) -> np.ndarray:
-        """Return what the hands give in the coming period, `(J,)`; nothing but in a trial."""
+        """Return the hands' command of the coming period, `(J,)`; zero outside a trial."""
         shown, study, num = self._shown, self._study, self._machine.num_joints
         if study.get("phase") != "running" or shown.get("q") is None or not shown.get("targets"):
             self._model = None

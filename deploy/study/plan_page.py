@@ -1,4 +1,4 @@
-"""The plan as a page to print: what the numbers can show, the rules, everybody's order of trials with room for notes."""
+"""The plan as a page to print: the power of the design, the rules, everybody's order of trials with room for notes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def build_plan_page(
     """Return the page.
 
     Args:
-        design: What was planned with.
+        design: The design of the plan.
         machine: Name of the machine.
         seed: Seed of the draw.
         planned: All trials.

@@ -1,4 +1,4 @@
-"""The pictures of a study: the paper's two (tool paths, radar), and what those cannot show (each person, intervals).
+"""The pictures of a study: the paper's two (tool paths, radar), each person, and intervals.
 
 Guided is always blue and solid, unguided orange and dotted.
 """
@@ -136,7 +136,7 @@ def draw_effects(found: Analysis, names: Sequence[str]) -> Figure:
 
 
 def get_title(name: str) -> str:
-    """Return what a measure or scale is called."""
+    """Return the title of a measure or scale."""
     if name.startswith("tlx_"):
         scale = name.removeprefix("tlx_")
         return f"TLX: {tlx.SCALES.get(scale, scale)}"

@@ -74,7 +74,7 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
 
 
 def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
-    """Return what the primary measure says, in words, and whether that is good, bad or no news."""
+    """Return the result of the primary measure in words, and whether it is good, bad or no news."""
     effect, title = found.effects[found.primary], plots.get_title(found.primary)
     better = next(each.better for each in MEASURES if each.name == found.primary)
     if effect.adjusted is None or effect.p is None or effect.adjusted_ci95 is None:
@@ -311,16 +311,15 @@ def _format_effects(found: Analysis, is_simulated: bool) -> str:
         head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
     rows = []
     for name, effect in found.effects.items():
-        values = [
-            (None, None) if value is None and key.endswith("_ci95") else value
-            for key, value in asdict(effect).items()
-        ]
+        values = []
+        for field, value in asdict(effect).items():
+            values.append((None, None) if value is None and field.endswith("_ci95") else value)
         rows.append([name, is_simulated, *_flatten(values), _blank(found.holm.get(name, math.nan))])
     return _format_csv(["measure", "simulated", *head, "p_holm"], rows)
 
 
 def _flatten(values: Iterable) -> list:
-    """Return numbers and the ends of intervals in one row; '' for what there is none of."""
+    """Return numbers and the ends of intervals in one row; '' for missing ones."""
     row = []
     for value in values:
         for part in value if isinstance(value, tuple) else (value,):

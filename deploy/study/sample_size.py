@@ -69,10 +69,10 @@ def find_sufficient_size(
     alpha: float, power: float = 0.8, effect: int = 1, most: int = 40
 ) -> int | None:
     """Return the smallest even number of participants that reaches `power`, or `None`."""
-    return next(
-        (num for num in range(6, most + 1, 2) if evaluate_size(num, alpha).power[effect] >= power),
-        None,
-    )
+    for num in range(6, most + 1, 2):
+        if evaluate_size(num, alpha).power[effect] >= power:
+            return num
+    return None
 
 
 def find_smallest_sizes(alpha: float) -> tuple[int, int]:

@@ -53,7 +53,7 @@ def simulate(
 
     Args:
         folder: The study's folder, with its plan.
-        design: What was planned with.
+        design: The design of the plan.
         planned: Its trials; practice is left out, since these operators do not learn.
         machine: The machine.
         session: Gives the seed.
@@ -147,14 +147,11 @@ class Divided:
         seed: int,
     ) -> None:
         self._shape = (len(persons), machine.num_joints)
-        self._parts: list[tuple[np.ndarray, OperatorModel]] = [
-            (rows, operator.build(machine, persons[rows], seed))
-            for rows, operator in (
-                (np.flatnonzero(is_guided), guided),
-                (np.flatnonzero(~is_guided), unguided),
-            )
-            if len(rows)
-        ]
+        self._parts: list[tuple[np.ndarray, OperatorModel]] = []
+        for chosen, operator in ((is_guided, guided), (~is_guided, unguided)):
+            rows = np.flatnonzero(chosen)
+            if len(rows):
+                self._parts.append((rows, operator.build(machine, persons[rows], seed)))
 
     def step(self, view: OperatorView) -> np.ndarray:
         """See `brokk_rl.contracts.operator.OperatorModel`."""

@@ -55,7 +55,7 @@ class Sitting:
         bench: The twin, and a simulated participant, in place of machine and person; `null` on a
             machine.
         page: The operator's page.
-        consent: What is agreed to.
+        consent: Text of the consent.
         times: How a trial begins and ends.
     """
 

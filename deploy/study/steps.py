@@ -1,4 +1,4 @@
-"""Where a participant's sitting stands, read from the study's folder alone: what comes next after any interruption stands there.
+"""The state of a participant's sitting, read from the study's folder alone: the next step after any interruption stands there.
 
 Consent, practice, the trials of the first period, its questionnaire, the trials of the second, its
 questionnaire.
@@ -39,7 +39,7 @@ class Step:
 
 
 def find_next_step(data: StudyData, who: str) -> Step:
-    """Return what a participant, known to the plan, has to do next."""
+    """Return the next step of a participant who is known to the plan."""
     known = data.participants.get(who, {})
     if known.get("stopped"):
         return Step("stopped")

@@ -1,14 +1,14 @@
 """A study on disk: plan, trials, questionnaires, who stopped; and everything of it that is not as it should be, in words.
 
-    plan.json                          what was planned
+    plan.json                          the plan
     trials/<P>_<period>_<nn>.json      one trial: who, when, where, how it ended, and the name of
     its recording recordings/<P>_<period>_<nn>.parquet
-    captures/<P>_<period>_<nn>/        what the loop recorded, whole: messages and frames of the bus
+    captures/<P>_<period>_<nn>/        the loop's whole recording: messages and frames of the bus
     questionnaires/<P>_<period>.json   NASA-TLX after a period
-    participants/<P>.json              what is known of a participant: whether they stopped, and why
+    participants/<P>.json              a participant's record: whether they stopped, and why
     reports.json                       where reports were written, for who wants to be forgotten
 
-Nothing that is there is passed over in silence: what cannot be used, is there twice or is missing
+Nothing that is there is passed over in silence: a file that cannot be used, stands twice or is missing
 becomes a remark.
 """
 
@@ -53,7 +53,7 @@ class Remark:
 
     Attributes:
         where: Participant or file.
-        text: What is the matter, and what was done about it.
+        text: The problem, and how it was handled.
     """
 
     where: str
@@ -69,10 +69,10 @@ class StudyData:
         plan: `plan.json`.
         trials: Trials that count, by participant, period and number.
         questionnaires: By participant and period.
-        participants: What is known of participants, by pseudonym.
+        participants: Records of participants, by pseudonym.
         spare: Trials that are kept but do not count: doubled ones, those of the unknown, those
             whose condition was not the planned one.
-        remarks: What is not as it should be.
+        remarks: Deviations from the plan and from the expected files.
     """
 
     folder: Path
@@ -120,7 +120,7 @@ def read_study(folder: Path) -> StudyData:
 
 
 def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
-    """Write what is known of a trial; one that is there already stays, and this becomes a second one beside it."""
+    """Write the record of a trial; one that is there already stays, and this becomes a second one beside it."""
     path = folder / TRIALS / f"{name}.json"
     for again in range(2, 100):
         if not path.exists():
@@ -130,7 +130,7 @@ def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
 
 
 def rewrite(path: Path, changes: dict[str, Any]) -> None:
-    """Change what is known of a trial, participant or questionnaire that is still going on."""
+    """Change the record of a trial, participant or questionnaire that is still going on."""
     _write(path, _read(path) | changes)
 
 
@@ -147,7 +147,7 @@ def write_questionnaire(
 
 
 def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> Path:
-    """Write what is known of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
+    """Write the record of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
     return _write(
         folder / PARTICIPANTS / f"{participant}.json",
         {"schema": 1, "participant": participant, **facts},
@@ -166,7 +166,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     """Delete every file about a participant; the plan keeps an empty place that says so.
 
     Returns:
-        What was deleted, and folders with reports that were made with the participant's data, to be
+        Deleted paths, and folders with reports that were made with the participant's data, to be
         deleted and made again.
 
     Raises:
@@ -222,9 +222,10 @@ def _read_trials(data: StudyData) -> None:
         key=lambda item: str(item[1].get("created", "")),
     )
     for name, trial in found:
-        lacking = [
-            key for key, kind in TRIAL_FIELDS.items() if not isinstance(trial.get(key), kind)
-        ]
+        lacking = []
+        for key, kind in TRIAL_FIELDS.items():
+            if not isinstance(trial.get(key), kind):
+                lacking.append(key)
         if lacking:
             data.remarks.append(
                 Remark(name, f"the trial lacks {', '.join(lacking)}; it does not count")

@@ -53,13 +53,13 @@ class Attempt:
     Args:
         folder: The study's.
         design: The plan's design, as plain data.
-        trial: What is planned.
+        trial: The planned trial.
         hole: Its hole, as plain data.
         start: Joint positions to begin from, `(J,)`.
         machine: The machine.
         stage: Where it takes place.
         times: Countdown and the like.
-        facts: What the trial says of itself besides.
+        facts: Further fields of the trial.
         clock: Monotonic time, s.
     """
 
@@ -179,7 +179,7 @@ class Attempt:
             self._enter("over")
 
     def view(self) -> dict[str, Any]:
-        """Return what pages show of it, as plain data."""
+        """Return the trial as plain data for the pages."""
         now_s, sight = self._clock(), self._stage.sight()
         away = None if sight.q is None else sight.q - self._start
         joints = [] if away is None else [
@@ -202,7 +202,7 @@ class Attempt:
         self._worker.shutdown(wait=True)
 
     def leave(self) -> None:
-        """End it now; what is not on the disk yet is made of the capture the next time."""
+        """End it now; the recording, if missing, is made of the capture the next time."""
         self.abort("the program ended")
         self._worker.shutdown(wait=False, cancel_futures=True)
 
@@ -244,7 +244,7 @@ class Attempt:
 
 
 def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
-    """Make a recording of what was captured of the trial in the file `path`; what cannot be used is said in that file.
+    """Write the captured trial as a recording to the file `path`; faults are reported in that file.
 
     A trial that began has a `window_s`, so that this can be done again where it was interrupted:
     the clock is that of the capture.

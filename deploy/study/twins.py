@@ -3,7 +3,7 @@
 Each trial has a twin (`deploy.twin`: plant, gateway, its messages), a remote, and of the loop the
 receiver and the adviser with
 policy and lever display. Frames go through the bus description both ways: coded, counted, checked.
-What is not there: a bus with latencies, processes and their scheduling, guard and page. A simulated
+Not simulated are a bus with latencies, processes and their scheduling, guard and page. A simulated
 person sees an advice in the control period in which it is made, a real one some tens of
 milliseconds later.
 Axes: `N` trials, `J` joints.
@@ -53,7 +53,7 @@ class Twins:
     Attributes:
         plant: The machine beside its block.
         dbc: Description of the bus.
-        limits: Of what the loop believes.
+        limits: Plausibility limits of the loop.
         guidance: How advice is shown.
         policy: Policy bundle that advises.
         settle_s: Time for which a recording goes on after the insertion.
@@ -239,7 +239,7 @@ class _Desk:
         self._rows.clear()
 
     def period(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Let a control period go by in which the levers stand as `given`, `(J,)`, wants them; returns what is `seen` then."""
+        """Step one control period with the levers at `given`, `(J,)`; return `seen` at its end."""
         receiver, before = self._receiver, (self._receiver.flow_sum, self._receiver.flow_number)
         q = receiver.q.copy() if receiver.frames else self.seen()[0]
         force = getattr(self._link, "extra", dict)().get("force_n", np.zeros(1))
@@ -269,7 +269,7 @@ class _Desk:
         self._air.frames.clear()
 
     def _advise(self) -> None:
-        """Publish what is known, as the bus process does, and lets the policy speak."""
+        """Publish the state as the bus process does, and let the policy propose a command."""
         now_s = self._now_s
         state = self._receiver.build_state(now_s, bus_up=True, decision=self._silent, missed=0)
         self._shared.state.write(state)
@@ -286,14 +286,14 @@ class _Desk:
     def recording(self) -> Recording:
         """Return the trial at the control rate, commands as the valves got them."""
         machine = self._machine
-        q, u, advice = (
-            np.stack([row[i] for row in self._rows]).astype(np.float32) for i in range(3)
-        )
+        columns = []
+        for column in range(3):
+            stacked = np.stack([row[column] for row in self._rows])
+            columns.append(stacked.astype(np.float32))
+        q, u, advice = columns
         extra = {"force_n": np.array([row[3] for row in self._rows], np.float32)}
-        extra |= {
-            f"target_{axis}_m": np.full(len(q), self._rim_m[i], np.float32)
-            for i, axis in enumerate("xyz")
-        }
+        for index, axis in enumerate("xyz"):
+            extra[f"target_{axis}_m"] = np.full(len(q), self._rim_m[index], np.float32)
         if self._guided:
             extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
         return Recording(

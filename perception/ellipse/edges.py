@@ -121,7 +121,8 @@ def detect_edges(
         near_px: Largest distance at which `Edges.nearest` names an edge point.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
-    gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
+    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
     magnitude = cv2.magnitude(gx, gy)
     some = np.s_[::2, ::2] if magnitude.size < MANY else np.s_[::4, ::4]
     looked = magnitude[some].ravel() if roi is None else magnitude[some][roi[some]]
@@ -278,7 +279,8 @@ def _refine_points(
     x, y = pixels[:, 0], pixels[:, 1]
     here = np.maximum(magnitude[y, x], 1e-6)
     direction = np.column_stack([gx[y, x], gy[y, x]]) / here[:, None]
-    before, after = (_interpolate(magnitude, pixels + side * direction) for side in (-1.0, 1.0))
+    before = _interpolate(magnitude, pixels - direction)
+    after = _interpolate(magnitude, pixels + direction)
     bend = before - 2 * here + after
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.where(bend < 0, 0.5 * (before - after) / bend, 0.0)
@@ -305,10 +307,8 @@ def _map_nearest_edges(pixels: np.ndarray, shape: tuple, near_px: int) -> np.nda
 def _interpolate(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the picture at `(E, 2)` points away from its border, bilinear."""
     height, width = picture.shape
-    x0, y0 = (
-        np.floor(points[:, k]).astype(np.intp).clip(0, size - 2)
-        for k, size in ((0, width), (1, height))
-    )
+    x0 = np.floor(points[:, 0]).astype(np.intp).clip(0, width - 2)
+    y0 = np.floor(points[:, 1]).astype(np.intp).clip(0, height - 2)
     fx, fy = points[:, 0] - x0, points[:, 1] - y0
     flat, here = picture.ravel(), y0 * width + x0
     top = flat.take(here) * (1 - fx) + flat.take(here + 1) * fx
@@ -408,7 +408,8 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     polarity = np.sign((edges.directions[middle] * towards).sum(1))
     depth, width = np.linalg.norm(towards, axis=1), np.linalg.norm(chord, axis=1)
     bend = 8 * depth / np.maximum(width**2 + 4 * depth**2, 1e-9)
-    head, tail = (_compute_tangents(edges, place, polarity) for place in (first, last))
+    head = _compute_tangents(edges, first, polarity)
+    tail = _compute_tangents(edges, last, polarity)
     head, tail = np.where(turned[:, None], tail, head), np.where(turned[:, None], head, tail)
     usable = np.flatnonzero((depth > STRAIGHT_PX) & (width > 2))
     result = np.full(len(arcs), -1)

@@ -320,10 +320,9 @@ def _find_occluding_edges(
     near &= np.abs(conic.sum_products(edges.directions[number], normal)) > CHORD_COSINE
     deep = -conic.measure_sampson_distance(ellipses, edges.points[number])[0]
     near &= deep > CHORD_PX  # nearer it may be the ellipse's own edge
-    middle, ends = (
-        (off * near)[:, part].sum(1) / np.maximum(near[:, part].sum(1), 1)
-        for part in (np.s_[2:-2], np.array([0, 1, -2, -1]))
-    )
+    inner, outer = np.s_[2:-2], np.array([0, 1, -2, -1])
+    middle = (off * near)[:, inner].sum(1) / np.maximum(near[:, inner].sum(1), 1)
+    ends = (off * near)[:, outer].sum(1) / np.maximum(near[:, outer].sum(1), 1)
     near &= edges.strength[number] < usual[:, None] / ALIKE
     return (
         (near.mean(1) >= CHORD_PART)

@@ -212,10 +212,8 @@ def align_plane(
         departs = values - cv2.boxFilter(values * weight, -1, window) / counted
         return departs.reshape(-1, 2)[at].T.astype(float)
 
-    left, right = (
-        cv2.merge([picture, cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
-        for picture in (both.left, both.right)
-    )
+    left = cv2.merge([both.left, cv2.Sobel(both.left, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
+    right = cv2.merge([both.right, cv2.Sobel(both.right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
     mine, instrument = departing(left[::stride])
     row = np.repeat(lines.astype(np.float32)[:, None], width, 1)
     line, column = np.divmod(at, width)
@@ -224,10 +222,8 @@ def align_plane(
     m, seen = face.m, mine
     for _ in range(ROUNDS):
         seen, rise = departing(both.seen(u, v, row, m, right))
-        push, heavy = (
-            np.vstack([ray * (-both.pull_px / both.shrink * slope), -mine])
-            for slope in (rise, instrument)
-        )
+        push = np.vstack([ray * (-both.pull_px / both.shrink * rise), -mine])
+        heavy = np.vstack([ray * (-both.pull_px / both.shrink * instrument), -mine])
         gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
         off = seen - gain * mine
         scale = 1.4826 * compute_upper_median(np.abs(off)) + 1e-6

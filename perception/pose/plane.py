@@ -150,7 +150,11 @@ def collect_support(
     v, u = top + step * line, left + step * place
     cell = number_cells(v // cell_px * (width // cell_px + 1) + u // cell_px)
     outwards = np.argsort(radii)
-    u, v, radii, inverse, cell = (some[outwards] for some in (u, v, radii, inverse, cell))
+    u = u[outwards]
+    v = v[outwards]
+    radii = radii[outwards]
+    inverse = inverse[outwards]
+    cell = cell[outwards]
     rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
     return FaceSupport(rays, inverse, radii, cell, known)
 

@@ -195,9 +195,8 @@ def _find_profile_edges(
     part = gray[max(top, 0) : int(y.max()) + 4, max(left, 0) : int(x.max()) + 4]
     if min(part.shape) < 4:
         return None
-    map_x, map_y = (
-        (some - max(corner, 0)).astype(np.float32) for some, corner in ((x, left), (y, top))
-    )
+    map_x = (x - max(left, 0)).astype(np.float32)
+    map_y = (y - max(top, 0)).astype(np.float32)
     profile = cv2.remap(
         part, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     ).astype(np.float32)
@@ -214,7 +213,9 @@ def _find_profile_edges(
     rows = np.arange(number)[:, None]
     good = strength[rows, chosen] > FAINT * usual
     at = chosen + 1
-    before, here, after = (slope[rows, at + shift] for shift in (-1, 0, 1))
+    before = slope[rows, at - 1]
+    here = slope[rows, at]
+    after = slope[rows, at + 1]
     bend = before - 2 * here + after
     shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0).clip(
         -0.5, 0.5
@@ -250,7 +251,8 @@ def _vote_for_circle(
     ]
     if not len(circles):
         return None
-    dx, dy = (edges[None, ..., k] - circles[:, k, None, None] for k in (0, 1))
+    dx = edges[None, ..., 0] - circles[:, 0, None, None]
+    dy = edges[None, ..., 1] - circles[:, 1, None, None]
     off = np.abs(np.sqrt(dx * dx + dy * dy) - circles[:, 2, None, None])
     # `fmin` leaves out the NaN of profiles with fewer edges.
     near = np.fmin.reduce(off, 2, initial=np.inf) / pixel_m

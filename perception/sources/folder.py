@@ -191,9 +191,8 @@ class FolderSource:
         self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
     ) -> np.ndarray:
         """Return the stored depth of a frame, else that of its two pictures."""
-        stored, millimetres = (
-            stem.with_name(stem.name + ending) for ending in (dataset.DEPTH, dataset.DEPTH_MM)
-        )
+        stored = stem.with_name(stem.name + dataset.DEPTH)
+        millimetres = stem.with_name(stem.name + dataset.DEPTH_MM)
         least = self._settings.least_known
         if stored.exists() or millimetres.exists():
             where = stored if stored.exists() else millimetres

@@ -344,7 +344,8 @@ class _Training:
         self._network.load_state_dict(state["network"])
         self._mean = state["mean"]
         self._optimizer.load_state_dict(state["optimizer"])
-        self._update, self._best, self._curve, self._seconds = (
-            state[key] for key in ("update", "best", "curve", "seconds")
-        )
+        self._update = state["update"]
+        self._best = state["best"]
+        self._curve = state["curve"]
+        self._seconds = state["seconds"]
         self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}

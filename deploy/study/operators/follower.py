@@ -1,4 +1,4 @@
-"""An operator who does what is advised, as well as hands can."""
+"""An operator who follows the advice, as well as hands can."""
 
 from __future__ import annotations
 
