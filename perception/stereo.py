@@ -78,11 +78,13 @@ class Stereo:
             focal_px: Focal length.
             baseline_m: Distance between the cameras.
         """
+        # Matching is done on grey values; colour adds time and little information.
         one = np.asarray(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY))
         other = np.asarray(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
         found = self._matched(one, other, focal_px * baseline_m / self.nearest_m)
         if self.refinements:
             found = self._refined(one, other, found)
+        # No disparity is infinitely far; the limits below remove it.
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = focal_px * baseline_m / found
         return np.where(
@@ -91,6 +93,7 @@ class Stereo:
 
     def _matched(self, left: np.ndarray, right: np.ndarray, largest_px: float) -> np.ndarray:
         """Return disparities, NaN where there is none."""
+        # The matcher wants a multiple of 16, and no more than the picture is wide.
         count = min(-(-int(np.ceil(largest_px)) // 16), max(1, (left.shape[1] - 1) // 16)) * 16
         step = self.smoothness * self.window_px**2
         matcher = cv2.StereoSGBM.create(

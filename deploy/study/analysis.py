@@ -102,12 +102,14 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
         everything.append((trial, bool(trial["period"])))
     for trial in data.spare:
         everything.append((trial, False))
+    # Said in the results: a twin is no machine.
     if at_twin := sum(bool(trial.get("twin")) for trial, counts in everything if counts):
         found.remarks.append(
             Remark(
                 "study", f"{at_twin} trials that count were done at a simulated machine, the twin"
             )
         )
+    # The criterion of the plan, not of today's configuration.
     success = Success(**design["success"])
     for trial, counts in progress(everything):
         found.trials.append(
@@ -131,6 +133,7 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
     for each in MEASURES:
         if each.name in found.effects and each.name != found.primary:
             secondary.append(each.name)
+    # Holm within each family: the scales are no more tests of the recordings.
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
         p = [get_deciding_p(found.effects[name]) for name in family]
         found.holm |= dict(
@@ -162,6 +165,7 @@ def _measure_trial(
     empty = MeasuredTrial(
         trial, dict.fromkeys((each.name for each in MEASURES), math.nan), np.zeros((0, 3)), counts
     )
+    # Without a recording the outcome is still evidence.
     where = trial.get("hole")
     if not trial.get("recording") or not isinstance(where, dict):
         why = f" ({trial['recording_problem']})" if trial.get("recording_problem") else ""
@@ -181,6 +185,7 @@ def _measure_trial(
         return _keep_outcome(empty)
     values = measure(recording, machine, hole, success, float(trial["limit_s"]))
     said = trial.get("outcome")
+    # The recording is the measurement; the note of the outcome may be wrong.
     if said in ("inserted", "time limit") and (said == "inserted") != bool(values["success"]):
         seen = "an insertion" if values["success"] else "none"
         remarks.append(
@@ -189,6 +194,7 @@ def _measure_trial(
                 f"written down as '{said}', but the recording shows {seen}; the recording counts",
             )
         )
+    # Only the path up to the end: afterwards the arm is moved away.
     num = int(np.searchsorted(recording.t_s - recording.t_s[0], values["time_s"], side="right"))
     return MeasuredTrial(
         trial, values, compute_tool_kinematics(machine, recording.q[:num]).tip_in_base_m, counts
@@ -215,6 +221,7 @@ def _average_participants(found: Analysis, measure_name: str, condition: str) ->
             if _is_of(trial, name, condition):
                 told.append(trial.values[measure_name])
         values = np.array(told)
+        # A trial that does not tell is left out of the mean.
         values = values[~np.isnan(values)]
         means[index] = values.mean() if len(values) else math.nan
     return means
@@ -246,6 +253,7 @@ def _add_loads(found: Analysis, data: StudyData) -> None:
     for (name, period), answers in data.questionnaires.items():
         if name not in found.participants:
             continue
+        # The condition of the period follows from the plan.
         condition = data.plan["participants"][name][PERIODS.index(period)]
         values = tlx.read_ratings(answers) | {
             "raw": tlx.compute_raw_tlx(answers),

@@ -46,6 +46,7 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
             "simulated": data.is_simulated,
             "participants": found.participants,
         }
+        # JSON has no NaN, so missing figures are null.
         write_json(
             folder / "report.json",
             _convert_plain(
@@ -60,6 +61,7 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
         }
         for name, figure in drawn.items():
             if data.is_simulated:
+                # Every picture says so by itself: pictures leave the report.
                 figure.suptitle(
                     "SIMULATED OPERATORS", fontsize=9, color="#b3261e", x=0.02, ha="left"
                 )
@@ -76,8 +78,10 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
 def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
     """Return the result of the primary measure in words, and whether it is good, bad or no news."""
     effect, title = found.effects[found.primary], plots.get_title(found.primary)
+    # Measures differ in which direction is better.
     better = next(each.better for each in MEASURES if each.name == found.primary)
     if effect.adjusted is None or effect.p is None or effect.adjusted_ci95 is None:
+        # Four persons are the least for a test over sequences.
         why = (
             "all had the same order, so guidance and order cannot be told apart"
             if effect.num_persons >= 4
@@ -91,6 +95,7 @@ def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str
             f"No effect of guidance is shown on the primary measure. {size}; {effect.num_persons} participants.",
             "warn",
         )
+    # The sign says whether the change is for the better.
     helps = effect.adjusted * better > 0
     who = "In this simulation guidance" if is_simulated else "Guidance"
     return (
@@ -106,6 +111,7 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
     if data.is_simulated:
         page.add_text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
     num, num_first = len(found.participants), int(found.guided_first.sum())
+    # Both tests bound the attainable p: with few people no result can be significant.
     least = max(
         get_smallest_paired_p(num),
         get_smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0,
@@ -180,6 +186,7 @@ def _build_table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list
     columns = ["measure", "guided", "unguided", "difference", "dz", "p", "p, Holm"]
     rows: list[list[str | Cell]] = []
     for name in names:
+        # The primary measure decides alone and is not corrected.
         e, is_primary = found.effects[name], name == found.primary
         note = f"{e.num_persons} people" + ", the primary measure" * is_primary
         means = [
@@ -244,6 +251,7 @@ def _format_mean(found: Analysis, name: str) -> str:
     for value in found.means[name]["guided"]:
         if not math.isnan(value):
             values.append(value)
+    # Participants without a value are left out, not counted as 0.
     return _format_number(sum(values) / len(values) if values else None)
 
 
@@ -307,6 +315,7 @@ def _format_means(found: Analysis, is_simulated: bool) -> str:
 
 def _format_effects(found: Analysis, is_simulated: bool) -> str:
     head: list[str] = []
+    # Intervals take two columns.
     for key in asdict(GuidanceEffect(num_persons=0, num_guided_first=0)):
         head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
     rows = []

@@ -48,7 +48,9 @@ def evaluate_size(num: int, alpha: float) -> SampleSize:
     first = np.arange(num) < num_first
     smallest = permutation_tests.get_smallest_sequence_p(num_first, num)
     ways = permutation_tests.count_sequences(num_first, num)
+    # Fewer studies where a test counts many ways, so that the time stays bounded.
     studies = min(STUDIES, MOST_COUNTED // ways) if ways <= permutation_tests.MOST_WAYS else STUDIES
+    # Seeded by the size: the table is the same each time.
     chance = np.random.default_rng(num).standard_normal((studies, num))
     power = []
     for dz in EFFECTS_DZ:
@@ -69,6 +71,7 @@ def find_sufficient_size(
     alpha: float, power: float = 0.8, effect: int = 1, most: int = 40
 ) -> int | None:
     """Return the smallest even number of participants that reaches `power`, or `None`."""
+    # Even numbers: both sequences then have as many people.
     for num in range(6, most + 1, 2):
         if evaluate_size(num, alpha).power[effect] >= power:
             return num

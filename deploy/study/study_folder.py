@@ -86,6 +86,7 @@ class StudyData:
     @property
     def is_simulated(self) -> bool:
         """True if any trial comes from a simulated operator."""
+        # One simulated entry marks the whole study: nobody must take it for evidence.
         entries = [*self.trials.values(), *self.spare, *self.questionnaires.values()]
         return any(entry.get("simulated") for entry in entries)
 
@@ -110,6 +111,7 @@ def read_plan(folder: Path) -> dict[str, Any]:
 
 def read_study(folder: Path) -> StudyData:
     """Read a study with all that is wrong with it."""
+    # Problems are collected, not raised: a study in the field cannot be repeated.
     data = StudyData(folder, read_plan(folder))
     for name, entry in _iterate_entries(folder / PARTICIPANTS, data):
         data.participants[str(entry.get("participant", name))] = entry
@@ -122,6 +124,7 @@ def read_study(folder: Path) -> StudyData:
 def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
     """Write the record of a trial; one that is there already stays, and this becomes a second one beside it."""
     path = folder / TRIALS / f"{name}.json"
+    # A hundred repetitions of one trial are an error elsewhere.
     for again in range(2, 100):
         if not path.exists():
             break
@@ -142,6 +145,7 @@ def write_questionnaire(
     entry: dict[str, Any] = {"schema": 1, "participant": participant, "period": period}
     entry |= {"created": datetime.now().astimezone().isoformat(), **answers}
     if path.exists():
+        # The earlier answers stay inside, since nothing that a participant said is thrown away.
         entry["before"] = _read(path)
     return _write(path, entry)
 
@@ -158,6 +162,7 @@ def note_report(folder: Path, report: Path) -> None:
     """Remember where a report of this study was written."""
     path = folder / REPORTS
     known = _read(path) if path.exists() else []
+    # Absolute paths: reports may be written anywhere.
     if str(report.resolve()) not in known:
         _write(path, [*known, str(report.resolve())])
 
@@ -180,6 +185,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     gone = []
     for part in (TRIALS, RECORDINGS, CAPTURES, QUESTIONNAIRES, PARTICIPANTS):
         for path in sorted((folder / part).glob("*")):
+            # Also files that were renamed by hand: their content tells whose they are.
             if (
                 path.stem == participant
                 or path.stem.startswith(f"{participant}_")
@@ -195,6 +201,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
                         f"cannot delete {path}: {error.strerror}; {len(gone)} files are gone, run it again"
                     ) from error
                 gone.append(path)
+    # The plan keeps the place, so that the sequences of the others still make sense.
     plan.setdefault("erased", {})[participant] = (
         datetime.now().astimezone().isoformat(timespec="seconds")
     )
@@ -217,6 +224,7 @@ def _is_of_participant(path: Path, participant: str) -> bool:
 
 
 def _read_trials(data: StudyData) -> None:
+    # In the order of their making, so that the first of two counts.
     found = sorted(
         _iterate_entries(data.folder / TRIALS, data),
         key=lambda item: str(item[1].get("created", "")),
@@ -232,6 +240,7 @@ def _read_trials(data: StudyData) -> None:
             )
             data.spare.append(trial)
             continue
+        # Checks from the gravest to the mildest: one problem is reported for a trial.
         who, period, condition = trial["participant"], trial["period"], trial["condition"]
         key = (who, period, trial["number"])
         if who not in data.plan["participants"]:
@@ -285,6 +294,7 @@ def _read_questionnaires(data: StudyData) -> None:
 
 
 def _note_missing(data: StudyData) -> None:
+    # Practice has period 0 and need not be complete.
     planned: dict[str, set[tuple[int, int]]] = {}
     for trial in data.plan["trials"]:
         if trial["period"]:
@@ -343,6 +353,7 @@ def _write(path: Path, value: Any) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, value)
     except OSError as error:
+        # `write_json` writes beside and renames, so that no half file is left.
         raise StorageError(
             f"cannot write {path}: {error.strerror or error}; nothing was left behind"
         ) from error

@@ -30,6 +30,7 @@ PAIRS = tuple(combinations(SCALES, 2))
 
 def list_pairs(generator: np.random.Generator) -> list[tuple[str, str]]:
     """Return the 15 pairs in random order, each in random order, as they are to be shown."""
+    # Pairs in random order, and each pair in random order, against habits of the finger.
     shuffled = [PAIRS[index] for index in generator.permutation(len(PAIRS))]
     return [pair if generator.integers(2) else pair[::-1] for pair in shuffled]
 
@@ -58,6 +59,7 @@ def read_ratings(answers: Mapping) -> dict[str, float]:
     """Return the rating of each scale, NaN where there is none that makes sense."""
     given = answers.get("ratings") or {}
     values = {scale: given.get(scale) for scale in SCALES}
+    # NaN and not 0: a missing rating is no light workload.
     ratings = dict.fromkeys(SCALES, math.nan)
     for scale, value in values.items():
         if isinstance(value, (int, float)) and 0 <= value <= 100:

@@ -81,13 +81,18 @@ class Twins:
         for n in range(num):
             places.append(
                 (
+                    # A stream for each trial: results do not depend on how trials are spread over
+                    # processes.
                     session.stream(f"twin {n}"),
                     trials.q[n],
                     trials.rim_in_base_m[n],
                     bool(trials.guided[n]),
                 )
             )
+        # Never more processes than twins.
         processes = min(self.num_processes or count_cores(), num)
+        # Dealt out in turn: long and short trials mix, so that processes end at about the same
+        # time.
         rows = [np.arange(first, num, processes) for first in range(processes)]
         parts = []
         for mine in rows:
@@ -96,16 +101,20 @@ class Twins:
             round(trials.limit_s / machine.period_s),
             np.full(num, round(self.settle_s / machine.period_s)),
         )
+        # Trials end at different times; those that ended take no more steps.
         running = np.ones(num, bool)
         with Crew("deploy.study.twins:make_desks", parts, rows, num) as crew:
             now, found = crew.ask("seen", running), dict[int, Recording]()
             for _ in track(range(steps), "simulated operators at the twin", transient=True):
+                # Operators are models over all trials at once, so their inputs are stacked.
                 q = np.stack([now[n][0] for n in range(num)])
                 advice = np.stack([now[n][1] if trials.guided[n] else nothing for n in range(num)])
                 given = operators.step(
                     OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice)
                 )
                 now |= crew.ask("period", running, given)
+                # The recording goes on for a while after the insertion, as that of a real trial
+                # does.
                 left -= _detect_insertion(machine, q, trials) & running
                 found |= crew.ask("end", running & (left <= 0))
                 running &= left > 0
@@ -135,6 +144,7 @@ def make_desks(
 
 def _detect_insertion(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
     away = compute_tool_kinematics(machine, q).tip_in_base_m - trials.rim_in_base_m
+    # The clearance tells a chisel inside the hole from one beside it at the same depth.
     return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (
         away[:, 2] <= -trials.depth_m
     )
@@ -192,6 +202,7 @@ class _Desk:
         self._seed, self._guided = session.seed, guided
         self._machine, self._rim_m, self._now_s = machine, rim_m, BEGIN_S
         start, hole = tuple(q.tolist()), tuple(rim_m.tolist())
+        # A plant that cannot be placed has no such fields; `link=site` has.
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
         self._link, self._air = placed.build(machine, 1, session), _Air()
         twin = Twin(
@@ -209,13 +220,16 @@ class _Desk:
             RadioRemote(description),
             BusReceiver(description, machine, ground.limits),
         )
+        # The operator holds the dead-man throughout: the twin is driven by hand.
         self._remote.deadman = True
         target = np.zeros((), TARGET)
         target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
         self._shared = _Shared(_Newest(), _Newest(), _Newest(target), None, _NoLog())
+        # Nothing is ever commanded in a study: the guard stays silent.
         self._silent = GuardDecision(
             GuardState.SILENT, (0.0,) * machine.num_joints, GuardTrip.NONE, GuardTrip.NONE
         )
+        # 1e9 s: the borehole never grows old, as the study says where it is.
         counsel = PolicyProcessConfig(
             machine, ground.policy, ground.guidance, ground.limits.joints_s, 1e9, None
         )
@@ -236,11 +250,13 @@ class _Desk:
         """Let time go by before the trial, levers in neutral."""
         for _ in range(round(seconds / self._machine.period_s)):
             self.period(np.zeros(self._machine.num_joints))
+        # Time before the trial is no part of its recording.
         self._rows.clear()
 
     def period(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Step one control period with the levers at `given`, `(J,)`; return `seen` at its end."""
         receiver, before = self._receiver, (self._receiver.flow_sum, self._receiver.flow_number)
+        # Before the first message the position is that of the plant.
         q = receiver.q.copy() if receiver.frames else self.seen()[0]
         force = getattr(self._link, "extra", dict)().get("force_n", np.zeros(1))
         angles_rad, self._remote.button_right = self._own.levers(given)
@@ -251,6 +267,7 @@ class _Desk:
             advice = np.array(advised.u)
         for _ in range(round(self._machine.period_s / CYCLE_S)):
             self._cycle()
+        # The mean flow of the period, as the recorder computes it from the counters.
         u = (receiver.flow_sum - before[0]) / max(1, receiver.flow_number - before[1])
         self._rows.append((q, u, advice, float(force[0])))
         self._advise()
@@ -258,6 +275,7 @@ class _Desk:
 
     def _cycle(self) -> None:
         self._now_s += CYCLE_S
+        # The remote sends more slowly than the gateway.
         if self._cycles % round(self._remote.period_s / CYCLE_S) == 0:
             frame = self._remote.build_frame()
             self._twin.hear(frame, self._now_s)
@@ -280,6 +298,7 @@ class _Desk:
     def end(self) -> Recording:
         """Return the recording, and lets go of the twin: its memory is wanted for nothing any more."""
         found = self.recording()
+        # Hundreds of twins would fill the memory until the last trial ends.
         del self._twin, self._link
         return found
 
@@ -298,6 +317,7 @@ class _Desk:
             extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
         return Recording(
             machine=machine.name,
+            # Flow may exceed full by rounding.
             joints=machine.joint_names,
             units=tuple(joint.unit for joint in machine.joints),
             rate_hz=1.0 / machine.period_s,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from brokk_rl.contracts.operator import OperatorModel, OperatorView
@@ -19,6 +21,9 @@ class AdviceFollower:
     """
 
     hands: Hands
+
+    # Recordings and reports of earlier versions hold this name.
+    label: ClassVar[str] = "follower"
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
         """See `brokk_rl.contracts.operator.Operator`."""
