@@ -356,11 +356,11 @@ class EffectSearch:
             if not drops or paying == subsets or not any(paying):
                 break
             best = refine.drop_effects(residuals, wide.rays, best, paying)
-        worth = 0.0
+        gains = []
         for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
             if subset:
-                worth += table.score(subset).total - price(j, subset)
-        net_gain = worth - self.penalties.name * len(frozenset().union(*subsets))
+                gains.append(table.score(subset).total - price(j, subset))
+        net_gain = sum(gains) - self.penalties.name * len(frozenset().union(*subsets))
         after = CandidateEffects(residuals, wide.rays, effects.shapes)
         return SearchState(after, wide, tables, EffectSet(subsets, net_gain), best)
 
