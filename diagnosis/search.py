@@ -157,7 +157,7 @@ class SubsetTable:
         for _ in range(2, most + 1):
             before = net(best[0])
             level = self._extend([one for one in best if len(one) < most])
-            best = sorted({*best, *level}, key=net, reverse=True)[:BEAM_WIDTH]
+            best = sorted({*best, *level}, key=lambda one: (-net(one), sorted(one)))[:BEAM_WIDTH]
             if net(best[0]) <= before:
                 return
 

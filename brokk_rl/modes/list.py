@@ -26,7 +26,7 @@ class ListOptions:
     list: ListSelection
 
     def run(self) -> None:
-        """Print the list; lines are cut at the width of the terminal.
+        """Print the list; a line of an option is never cut.
 
         Raises:
             ConfigError: There is no such group.
@@ -48,4 +48,5 @@ class ListOptions:
                 own = option.package == registry.CORE
                 origin = "" if own else f" [dim]({escape(option.package)})[/dim]"
                 line = f"  {option.name:<{width}}  {escape(option.summary())}{origin}"
-                console.print(line, no_wrap=True, overflow="ellipsis")
+                # a text that is cut loses its end without a trace: the terminal may wrap it instead
+                console.print(line, soft_wrap=True)

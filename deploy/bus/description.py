@@ -18,8 +18,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
-from pathlib import Path
 
 import cantools
 from cantools.database import Database
@@ -27,6 +25,7 @@ from cantools.database.can import Message
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.registry import resolve_package_path
 from deploy.bus.protection import FINAL, MAX_STEP, START, TABLE, MessageFault, compute_crc8
 
 COUNTER, CRC = "Counter", "Crc"
@@ -167,19 +166,6 @@ class BusDescription:
         decoded = self._messages[layout.name].decode(data, decode_choices=False)
         assert isinstance(decoded, dict)
         return {name: float(value) for name, value in decoded.items()}  # type: ignore[arg-type]
-
-
-def resolve_package_path(name: str) -> Path:
-    """Return the path of a file: a path, or `package:path` within an installed package."""
-    package, colon, inside = name.partition(":")
-    if not colon or Path(name).exists():
-        return Path(name)
-    try:
-        return Path(str(resources.files(package))) / inside
-    except (ModuleNotFoundError, ValueError, TypeError) as error:
-        raise ConfigError(
-            f"{name}: there is no package '{package}' ({error}); give a path, or package:path"
-        ) from error
 
 
 def _load_database(name: str) -> Database:

@@ -25,7 +25,8 @@ from mcap.writer import CompressionType, Writer
 
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
-from deploy.bus.description import BusDescription, MessageLayout, resolve_package_path
+from brokk_rl.registry import resolve_package_path
+from deploy.bus.description import BusDescription, MessageLayout
 from deploy.bus.protection import MessageFault
 from deploy.picture import encode_jpeg
 from deploy.runtime.bus_process import FRAME, FRAMES

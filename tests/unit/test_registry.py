@@ -58,6 +58,28 @@ def test_an_override_is_described_by_the_first_sentence_of_its_comment(tmp_path:
     assert option(tmp_path, "ablation", text).summary() == "What happens without a mask."
 
 
+LONGEST_SUMMARY = 58
+"""Characters: 80 columns less the longest name (18), its margins (2 + 2)."""
+
+
+def test_texts_of_the_list_are_short_and_distinct() -> None:
+    first: dict[tuple[str, str], str] = {}
+    wrong = []
+    for option in registry.list_options():
+        name, text = f"{option.group}={option.name}", option.summary()
+        if not 0 < len(text) <= LONGEST_SUMMARY or "…" in text:
+            wrong.append(f"{name}: {len(text)} characters")
+        if (other := first.setdefault((option.group, text.lower()), name)) != name:
+            wrong.append(f"{name}: same text as {other}")
+    assert wrong == []
+
+
+def test_the_list_cuts_no_text(brokk: Callable[..., Any]) -> None:
+    lines = brokk("mode=list").out.splitlines()
+    for option in registry.list_options():
+        assert any(option.name in line and option.summary() in line for line in lines)
+
+
 def test_a_spec_that_cannot_be_found_does_not_break_the_list(tmp_path: Path) -> None:
     assert (
         option(tmp_path, "task", "# A comment.\n_target_: nowhere.at.All\n").summary()
@@ -136,9 +158,9 @@ def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
         "CUDA graphs",
         "Warp",
         "kernel cache",
-        "check_rendering",
-        "check_disk",
+        "rendering",
+        "disk",
         "import names",
-        "check_extensions",
+        "extensions",
     ):
         assert topic in done.out
