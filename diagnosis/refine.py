@@ -18,7 +18,7 @@ from diagnosis.search import MIN_SIZE, EffectSet, PenaltyFunction, Subset
 
 # Chosen by hand; not searched.
 MAX_FIT_STEPS = 6
-"""Steps of a fit at most."""
+"""Steps of a fit at most. It was 4 before; no comparison is recorded."""
 
 REFIT_STEPS = 2
 """The same for the residuals without some effects, which needs no exact sizes."""
