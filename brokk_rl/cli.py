@@ -296,6 +296,10 @@ def _explain_bad_node(error: InstantiationException) -> str:
         known = list(getattr(get_class(called[1]), "__dataclass_fields__", ()))
         name = called[1].rpartition(".")[2]
         if unknown := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
+            place = re.search(r"full_key: (\S+)", str(error))
+            key = f"{place[1]}.{unknown[1]}" if place else unknown[1]
+            if renamed := registry.find_renamed_field(key):
+                return f"{name} has no field '{unknown[1]}': '{renamed[0]}' is now '{renamed[1]}'"
             return f"{name} has no field '{unknown[1]}'; {list_choices(unknown[1], known)}{_locate_node(error)}"
         if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", str(cause)):
             return f"{name} lacks {lacking[1]}{_locate_node(error)}"
@@ -330,6 +334,8 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
         return text
     where, key = found[1], found[2].split("@")[0]
     source = f"{where} changes" if where and where != "config" else "you gave"
+    if renamed := registry.find_renamed_field(key):
+        return f"{source} '{key}', but '{renamed[0]}' is now '{renamed[1]}'"
     # The mode itself may not compose; the message is then shorter.
     with contextlib.suppress(Exception):
         cfg = _compose_mode()

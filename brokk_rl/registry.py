@@ -105,6 +105,26 @@ def load_renamed_targets() -> dict[str, str]:
     return json.loads((Path(__file__).parent / "renamed_targets.json").read_text())
 
 
+@lru_cache
+def load_renamed_fields() -> dict[str, str]:
+    """Return the current name of each field and group of fields that an earlier version had."""
+    return json.loads((Path(__file__).parent / "renamed_fields.json").read_text())
+
+
+def find_renamed_field(key: str) -> tuple[str, str] | None:
+    """Return the earlier and the current name of the longest renamed part at the head of `key`.
+
+    `None` where no part of `key` was renamed.
+    """
+    renamed = load_renamed_fields()
+    parts = key.split(".")
+    for count in range(len(parts), 0, -1):
+        head = ".".join(parts[:count])
+        if head in renamed:
+            return head, renamed[head]
+    return None
+
+
 def rename_targets(text: str) -> str:
     """Return YAML text with current targets, so that files of earlier versions still load."""
     renamed = load_renamed_targets()

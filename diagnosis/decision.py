@@ -18,19 +18,12 @@ from brokk_rl.machine import Machine
 from diagnosis import calibration
 from diagnosis.answer import Estimate, Ranked, Selected
 from diagnosis.calibration import ProbabilityModel
-from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.detection import DetectionResult, Penalties, choose_by_penalties
 from diagnosis.effect_library import DetectedEffect, EffectType, list_shared_effects
 from diagnosis.refine import drop_effects
 from diagnosis.residuals import Residuals
 from diagnosis.responses import fit_faults
-from diagnosis.search import (
-    EffectSet,
-    Subset,
-    SubsetScore,
-    SubsetTable,
-    choose_set,
-    list_promising_subsets,
-)
+from diagnosis.search import EffectSet, Subset, SubsetScore, SubsetTable, list_promising_subsets
 
 
 def record_weights(result: DetectionResult, penalties: Penalties) -> dict[str, Any]:
@@ -127,8 +120,7 @@ def choose_again(
     tables: Sequence[SubsetTable], price: Any, penalties: Penalties, kinds: Sequence[EffectType]
 ) -> EffectSet:
     """Return the set with the largest net gain at these penalties."""
-    shared, own = list_shared_effects(kinds), penalties
-    return choose_set(tables, price, own.name, own.share, shared, own.partial, own.joint)
+    return choose_by_penalties(tables, price, penalties, list_shared_effects(kinds))
 
 
 SAME_SHARE = 0.9

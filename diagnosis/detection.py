@@ -45,14 +45,15 @@ from diagnosis.search import (
 
 log = logging.getLogger(__name__)
 
+# Chosen by hand; not searched.
 SCATTER_LIMIT = 1.3
-"""Mean square error over that of the reference from which what effects earn is taken down."""
+"""Mean square of whitened residuals over that of the reference from which gains are scaled down."""
 MAX_SQUARE = 25.0
-"""Squares of errors over the noise count no more than this in what scatters."""
+"""Largest square of a whitened residual in the scatter: 5 standard deviations."""
 TIMING_REFERENCES = 2
-"""Parts of the reference that tell how delays scatter."""
+"""Parts of the reference that show the error of delays; a run takes time for each."""
 MAX_REFITS = 2
-"""Times that effects are simulated around what was found, where adding up is far off."""
+"""Rounds in which all effects are simulated beside a fitted set."""
 ProgressCallback = Callable[[str, float], None]
 """Receives the name of the step and the share of the whole that is done."""
 
@@ -120,6 +121,40 @@ class DetectionResult:
         return {*self.chosen.names, *(one.kind.name for one in self.detected)}
 
 
+@dataclass(frozen=True)
+class CandidateEffects:
+    """Effects to choose among.
+
+    Attributes:
+        residuals: Residuals of the simulator on the field.
+        rays: Rays of each effect.
+        shapes: Responses of each joint to each effect, one a ray.
+    """
+
+    residuals: Residuals
+    rays: dict[str, list[ParameterRay]]
+    shapes: list[dict[str, list[Response]]]
+
+
+@dataclass(frozen=True)
+class SearchState:
+    """State of the search after a set was chosen.
+
+    Attributes:
+        effects: The effects to choose among.
+        wide: Responses beside a fitted set; `None` while responses add up.
+        tables: Scores of the subsets of each joint.
+        chosen: The set.
+        fitted: The set fitted by simulation; `None` for the empty set.
+    """
+
+    effects: CandidateEffects
+    wide: nonadditive_refit.WideResponses | None
+    tables: list[SubsetTable]
+    chosen: EffectSet
+    fitted: FittedSet | None
+
+
 @dataclass
 class EffectSearch:
     """The search for effects.
@@ -140,7 +175,7 @@ class EffectSearch:
 
     def run(self) -> DetectionResult:
         """Return the chosen set, its fit and the remaining residuals."""
-        penalties, left_out = self.penalties, [one.residuals for one in self.base.left_out]
+        penalties = self.penalties
         self.tell("sensors", 0.32)
         on_sensors = sensors.find_sensor_effects(
             self.case, self.kinds, penalties.joint, penalties.name
@@ -151,75 +186,30 @@ class EffectSearch:
         residuals = _adjust_residuals(
             self.base.field.residuals, self.case, [*on_sensors, *on_tool.found]
         )
-        grown, shapes = self._simulated(
-            residuals, geometry.is_tracked(self.case.field, self.case.machine)
-        )
-        small = {name: choose_rays(ways[0].kind, REFERENCE_GRID) for name, ways in grown.items()}
-        known = ReferenceScores(
-            left_out,
-            self.base.field.residuals.z.shape[1],
-            small,
-            grown,
-            fit_joint_faults(residuals),
-            shapes,
-            self.shared,
-        )
-
-        def price(j: int, subset: frozenset[str]) -> float:
-            known_there = max(
-                penalties.reference * known.earned(j, subset), known.repeated(j, subset)
-            )
-            return penalties.joint * len(subset - self.shared) + known_there
-
-        scatter = np.ones(self.case.machine.num_joints)
-        tables, chosen, fitted = self._round(residuals, grown, shapes, price, scatter)
-        wide = None
-        if fitted and nonadditive_refit.is_needed(residuals, fitted, _sum_scores(tables, chosen)):
-            wide, tables, chosen, fitted = self._around(residuals, grown, chosen, fitted, price)
-            grown = wide.rays
+        effects = self._simulate_effects(residuals)
+        price = self._build_price(effects)
+        search = self._choose(effects, price, np.ones(self.case.machine.num_joints))
+        if search.fitted and nonadditive_refit.is_needed(
+            residuals, search.fitted, _sum_scores(search.tables, search.chosen)
+        ):
+            search = self._refit_beside(search, search.fitted, price)
         self.tell("frames", 0.8)
-        after = fitted.after if fitted else residuals.base
-        changes, error = timing.CommandChanges(residuals), residuals.compute_error(after)
-        late = timing.detect_timing_effect(
-            changes,
-            error,
-            left_out[:TIMING_REFERENCES],
-            self.kinds,
-            penalties.joint,
-            penalties.name,
-        )
-        if late:  # from here on errors scatter after each change of a command
-            chancy = replace(residuals, late=changes.spread(error))
-            shapes = [
-                {
-                    name: [replace(s, change=chancy.rewhiten(residuals, s.change, j)) for s in own]
-                    for name, own in mine.items()
-                }
-                for j, mine in enumerate(shapes)
-            ]
-            residuals = chancy
-        scatter = np.maximum(1.0, self._scatter(residuals.whiten(error[None])[:, 0]))
+        error = residuals.compute_error(search.fitted.after if search.fitted else residuals.base)
+        late, search = self._detect_late_frames(search, error)
+        z = search.effects.residuals.whiten(error[None])[:, 0]
+        # A penalty is in nats of the noise model: where residuals scatter more, gains count less.
+        scatter = np.maximum(1.0, self._scatter(z))
         for _ in range(2 if late else int(scatter.max() > SCATTER_LIMIT)):
-            if (
-                late
-            ):  # what delays change depends on when commands act, and so on what else delays them
-                residuals = timing.add_mean_delay(
-                    residuals, late, fitted.effects() if fitted else []
-                )
-                wide = (
-                    nonadditive_refit.simulate_beside(residuals, grown, fitted)
-                    if wide and fitted
-                    else None
-                )
-            z, grown, shapes = wide or (None, grown, shapes)
-            tables, chosen, fitted = self._round(residuals, grown, shapes, price, scatter, z)
+            # The mean delay depends on the other effects, and these on it: hence two rounds.
+            search = _add_mean_delay(search, late) if late else search
+            search = self._choose(search.effects, price, scatter, search.wide)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
-        beside = residual_model.apply_fitted_set(residuals, fitted)
+        beside = residual_model.apply_fitted_set(search.effects.residuals, search.fitted)
         left, reference_clue_gains = self._left(beside)
         return DetectionResult(
-            residuals, tables, grown, price, chosen, fitted, others, left, reference_clue_gains,
-            self._scatter(beside.z), self._strays(beside), on_tool.left,
+            search.effects.residuals, search.tables, search.effects.rays, price, search.chosen, search.fitted,
+            others, left, reference_clue_gains, self._scatter(beside.z), self._strays(beside), on_tool.left,
         )  # fmt: skip
 
     @property
@@ -227,219 +217,282 @@ class EffectSearch:
         """Effects with one cause for all joints."""
         return effect_library.list_shared_effects(self.kinds)
 
-    def _simulated(
-        self, residuals: Residuals, tracked: bool
-    ) -> tuple[dict[str, list[ParameterRay]], list[dict[str, list[Response]]]]:
-        """Return the rays of each effect that free runs can show, and its responses on each joint."""
-        grown: dict[str, list[ParameterRay]] = {}
+    @property
+    def _left_out(self) -> list[Residuals]:
+        """Residuals on each part of the reference, left out of the fit."""
+        return [one.residuals for one in self.base.left_out]
+
+    def _build_price(self, effects: CandidateEffects) -> PenaltyFunction:
+        """Return the penalty of a subset on a joint, with its gain on the reference."""
+        penalties, shared = self.penalties, self.shared
+        known = ReferenceScores(
+            self._left_out,
+            self.base.field.residuals.z.shape[1],
+            {
+                name: choose_rays(ways[0].kind, REFERENCE_GRID)
+                for name, ways in effects.rays.items()
+            },
+            effects.rays,
+            fit_joint_faults(effects.residuals),
+            effects.shapes,
+            shared,
+        )
+
+        def price(j: int, subset: frozenset[str]) -> float:
+            known_there = max(
+                penalties.reference * known.earned(j, subset), known.repeated(j, subset)
+            )
+            return penalties.joint * len(subset - shared) + known_there
+
+        return price
+
+    def _simulate_effects(self, residuals: Residuals) -> CandidateEffects:
+        """Return the effects that free runs can show, with their responses on each joint."""
+        tracked = geometry.is_tracked(self.case.field, self.case.machine)
+        rays: dict[str, list[ParameterRay]] = {}
         shapes: list[dict[str, list[Response]]] = [{} for _ in range(residuals.increments.shape[2])]
         for number, kind in enumerate(self.kinds):
+            # `geometry` finds encoder errors from tool points, and `sensors` noise and steps: no
+            # simulation is needed.
             measured = kind.target.side == "measurement" and (tracked or not kind.target.smooth)
             if kind.target.stochastic or kind.target.side == "kinematics" or measured:
                 continue
             self.tell(f"simulating {kind.name}", 0.35 + 0.2 * number / len(self.kinds))
-            grown[kind.name] = add_responses(shapes, kind.name, choose_rays(kind), residuals)
-        return grown, shapes
+            rays[kind.name] = add_responses(shapes, kind.name, choose_rays(kind), residuals)
+        return CandidateEffects(residuals, rays, shapes)
 
-    def _round(
+    def _choose(
         self,
-        residuals: Residuals,
-        grown: Mapping[str, list[ParameterRay]],
-        shapes: Sequence[Mapping[str, list[Response]]],
+        effects: CandidateEffects,
         price: PenaltyFunction,
         scatter: np.ndarray,
-        z: np.ndarray | None = None,
-    ) -> tuple[list[SubsetTable], EffectSet, FittedSet | None]:
-        """Search sets where errors scatter more than the noise says: they are worth less by as much; `z`: errors to explain."""
-        tables = self._tables(residuals, grown, shapes, scatter, z)
+        wide: nonadditive_refit.WideResponses | None = None,
+    ) -> SearchState:
+        """Choose a set, fit it by simulation, and prune it.
+
+        Args:
+            effects: The effects to choose among.
+            price: Penalty of a subset on a joint.
+            scatter: Mean square of the whitened residuals over that of the reference, `(J,)`.
+            wide: Responses beside a fitted set, which replace those of `effects`.
+        """
+        residuals, z = effects.residuals, wide.z if wide else None
+        if wide:
+            effects = CandidateEffects(residuals, wide.rays, wide.shapes)
+        tables = self._score_subsets(effects, scatter, z)
         self.tell("the same on the reference", 0.7)
-        penalties = self.penalties
-        chosen = choose_set(
-            tables,
-            price,
-            penalties.name,
-            penalties.share,
-            self.shared,
-            penalties.partial,
-            penalties.joint,
-        )
+        chosen = choose_by_penalties(tables, price, self.penalties, self.shared)
+        tied = effects
+        # Joints first size a shared effect separately; it is bound where responses still add up.
         if z is None and (common := chosen.names & self.shared):
-            grown, shapes = bind_shared_sizes(common, tables, grown, shapes)
-            tables = self._tables(residuals, grown, shapes, scatter, z)
-            chosen = choose_set(
-                tables,
-                price,
-                penalties.name,
-                penalties.share,
-                self.shared,
-                penalties.partial,
-                penalties.joint,
+            tied = CandidateEffects(
+                residuals, *bind_shared_sizes(common, tables, effects.rays, effects.shapes)
             )
-        fitted = self._repaired(residuals, grown, tables, chosen)
-        if (
-            fitted
-            and (kept := refine.prune_set(residuals, chosen, fitted, price, scatter, self.shared))
-            != chosen.subsets
-        ):
-            chosen = EffectSet(kept, chosen.net_gain)
-            fitted = self._repaired(residuals, grown, tables, chosen)
-        return tables, chosen, fitted
+            tables = self._score_subsets(tied, scatter, z)
+            chosen = choose_by_penalties(tables, price, self.penalties, self.shared)
+        fitted = _fit_chosen_set(tied, tables, chosen)
+        if fitted:
+            # Adding up responses is an approximation: the simulated set decides.
+            kept = refine.prune_set(residuals, chosen, fitted, price, scatter, self.shared)
+            if kept != chosen.subsets:
+                chosen = EffectSet(kept, chosen.net_gain)
+                fitted = _fit_chosen_set(tied, tables, chosen)
+        return SearchState(effects, wide, tables, chosen, fitted)
 
-    def _repaired(
-        self,
-        residuals: Residuals,
-        grown: Mapping[str, list[ParameterRay]],
-        tables: Sequence[SubsetTable],
-        chosen: EffectSet,
-    ) -> FittedSet | None:
-        start = [
-            table.score(subset).sizes for table, subset in zip(tables, chosen.subsets, strict=True)
-        ]
-        return fit_set(residuals, chosen.subsets, grown, start) if chosen.names else None
-
-    def _tables(
-        self,
-        residuals: Residuals,
-        grown: Mapping[str, list[ParameterRay]],
-        shapes: Sequence[Mapping[str, list[Response]]],
-        scatter: np.ndarray,
-        z: np.ndarray | None,
+    def _score_subsets(
+        self, effects: CandidateEffects, scatter: np.ndarray, z: np.ndarray | None
     ) -> list[SubsetTable]:
-        """Return the scores of subsets on each joint."""
-        tables, flat = (
-            [],
-            {name: self.penalties.joint * (name not in self.shared) for name in grown},
-        )
-        for j, (mine, joint) in enumerate(
-            zip(shapes, fit_joint_faults(residuals, scatter, z), strict=True)
-        ):
+        """Return the scores of subsets on each joint; `z`: whitened residuals to explain."""
+        residuals, shapes = effects.residuals, effects.shapes
+        flat = {name: self.penalties.joint * (name not in self.shared) for name in effects.rays}
+        tables = []
+        joints = fit_joint_faults(residuals, scatter, z)
+        for j, (mine, joint) in enumerate(zip(shapes, joints, strict=True)):
             self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
-            by = 1.0 / np.sqrt(scatter[j])
-            scaled = {
-                name: [Response(shape.sizes, shape.change * by) for shape in own]
-                for name, own in mine.items()
-            }
+            scaled = _scale_responses(mine, 1.0 / np.sqrt(scatter[j]))
             tables.append(SubsetTable(joint, scaled, residuals.block))
             tables[-1].explore(flat, 3 if z is None else MAX_EFFECTS)
         return tables
 
-    def _around(
-        self,
-        residuals: Residuals,
-        grown: Mapping[str, list[ParameterRay]],
-        chosen: EffectSet,
-        fitted: FittedSet,
-        price: PenaltyFunction,
-    ) -> tuple[nonadditive_refit.WideResponses, list[SubsetTable], EffectSet, FittedSet | None]:
-        """Continue from a set whose effects do not add up: simulates all others in its company, fits sizes together."""
+    def _refit_beside(
+        self, search: SearchState, fitted: FittedSet, price: PenaltyFunction
+    ) -> SearchState:
+        """Continue from a set whose responses do not add up: simulate all effects beside it, fit sizes together."""
+        effects, residuals = search.effects, search.effects.residuals
         tried, scatter = [fitted], np.ones(self.case.machine.num_joints)
-        wide = nonadditive_refit.simulate_beside(residuals, grown, fitted)
+        wide = nonadditive_refit.simulate_beside(residuals, effects.rays, fitted)
         for turn in range(MAX_REFITS):
             self.tell("simulating around what was found", 0.72 + 0.04 * turn)
-            before = chosen
-            tables, chosen, now = self._round(
-                residuals, wide.rays, wide.shapes, price, scatter, wide.z
-            )
-            tried += [now] if now else []
-            more = now and nonadditive_refit.add_effect(
-                residuals, wide.rays, tables, chosen, now, self.penalties.joint
-            )
-            tried += [more] if more else []
-            if now is None or (more is None and chosen.subsets == before.subsets):
+            before, search = search, self._choose(effects, price, scatter, wide)
+            now = search.fitted
+            if now is None:
                 break
-            wide = nonadditive_refit.simulate_beside(residuals, grown, more or now)
+            more = nonadditive_refit.add_effect(
+                residuals, wide.rays, search.tables, search.chosen, now, self.penalties.joint
+            )
+            tried += [now, more] if more else [now]
+            if more is None and search.chosen.subsets == before.chosen.subsets:
+                break
+            wide = nonadditive_refit.simulate_beside(residuals, effects.rays, more or now)
+        # The responses before keep their place: a later round without a fitted set needs them.
+        after = CandidateEffects(residuals, wide.rays, effects.shapes)
         best = nonadditive_refit.combine_best(residuals, wide.rays, tried, price)
         if best is None:
-            return wide, tables, EffectSet((frozenset(),) * len(tables), 0.0), None
+            empty = EffectSet((frozenset(),) * len(search.tables), 0.0)
+            return SearchState(after, wide, search.tables, empty, None)
+        return self._drop_unneeded(effects, best, price)
+
+    def _drop_unneeded(
+        self, effects: CandidateEffects, best: FittedSet, price: PenaltyFunction
+    ) -> SearchState:
+        """Return the set `best` without effects that add less than they cost beside the others."""
+        residuals, scatter = effects.residuals, np.ones(self.case.machine.num_joints)
         for drops in (True, False):
-            wide, subsets = (
-                nonadditive_refit.simulate_beside(residuals, grown, best),
-                refine.list_subsets(best),
-            )
-            tables = self._tables(residuals, wide.rays, wide.shapes, scatter, wide.z)
+            wide = nonadditive_refit.simulate_beside(residuals, effects.rays, best)
+            subsets = refine.list_subsets(best)
+            beside = CandidateEffects(residuals, wide.rays, wide.shapes)
+            tables = self._score_subsets(beside, scatter, wide.z)
             paying = nonadditive_refit.drop_unneeded(tables, subsets, price, self.penalties.name)
             if not drops or paying == subsets or not any(paying):
                 break
             best = refine.drop_effects(residuals, wide.rays, best, paying)
-        worth = sum(
-            table.score(s).total - price(j, s)
-            for j, (table, s) in enumerate(zip(tables, subsets, strict=True))
-            if s
+        gains = []
+        for j, (table, subset) in enumerate(zip(tables, subsets, strict=True)):
+            if subset:
+                gains.append(table.score(subset).total - price(j, subset))
+        net_gain = sum(gains) - self.penalties.name * len(frozenset().union(*subsets))
+        after = CandidateEffects(residuals, wide.rays, effects.shapes)
+        return SearchState(after, wide, tables, EffectSet(subsets, net_gain), best)
+
+    def _detect_late_frames(
+        self, search: SearchState, error: np.ndarray
+    ) -> tuple[DetectedEffect | None, SearchState]:
+        """Return the effect on the arrival of commands, if any, and the search with its noise.
+
+        Args:
+            search: The search so far.
+            error: Measured less simulated increments with the chosen set, `(W, I, J)`.
+        """
+        changes = timing.CommandChanges(search.effects.residuals)
+        late = timing.detect_timing_effect(
+            changes,
+            error,
+            self._left_out[:TIMING_REFERENCES],
+            self.kinds,
+            self.penalties.joint,
+            self.penalties.name,
         )
-        return (
-            wide,
-            tables,
-            EffectSet(subsets, worth - self.penalties.name * len(frozenset().union(*subsets))),
-            best,
-        )
+        if late is None:
+            return None, search
+        # From here on residuals scatter after each change of a command.
+        noisy = replace(search.effects.residuals, late=changes.spread(error))
+        return late, replace(search, effects=_rewhiten_effects(search.effects, noisy))
 
     def _scatter(self, z: np.ndarray) -> np.ndarray:
-        """Return the mean square of errors over the noise `(J, E)` over that of the reference, outliers cut, `(J,)`."""
-        left_out = [one.residuals.z for one in self.base.left_out]
-        usual = (
-            np.mean(np.minimum(np.concatenate(left_out, 1) ** 2, MAX_SQUARE), 1)
-            if left_out
-            else np.ones(len(z))
-        )
+        """Return the mean square of whitened residuals `(J, E)` over that of the reference, outliers cut, `(J,)`."""
+        usual = np.ones(len(z))
+        if left_out := self._left_out:
+            known = np.concatenate([one.z for one in left_out], 1)
+            usual = np.mean(np.minimum(known**2, MAX_SQUARE), 1)
         return np.mean(np.minimum(z**2, MAX_SQUARE), 1) / usual
 
     def _left(self, beside: Residuals) -> tuple[np.ndarray, np.ndarray]:
         """Return the gain of clues on the remaining residuals, and the largest on reference recordings, both `(clues, J)`."""
-        left_out = [one.residuals for one in self.base.left_out]
-        earned, on_nulls = (
-            residual_model.score_clues(beside, beside.z),
-            [residual_model.score_clues(one, one.z) for one in left_out],
-        )
-        return earned, residual_model.scale_reference_gains(
-            earned, on_nulls, [beside.z.shape[1] / one.z.shape[1] for one in left_out]
-        )
+        earned = residual_model.score_clues(beside, beside.z)
+        left_out = self._left_out
+        known = [residual_model.score_clues(one, one.z) for one in left_out]
+        # Gains grow with the number of entries.
+        lengths = [beside.z.shape[1] / one.z.shape[1] for one in left_out]
+        return earned, residual_model.scale_reference_gains(earned, known, lengths)
 
     def _strays(self, beside: Residuals) -> np.ndarray:
         own = residual_model.measure_straying(beside, beside.error)
-        left_out = [
-            residual_model.measure_straying(one.residuals, one.residuals.error)
-            for one in self.base.left_out
-        ]
-        return (
-            np.sqrt(own / np.maximum(np.mean(left_out, 0), 1e-9)) if left_out else np.ones_like(own)
-        )
+        known = [residual_model.measure_straying(one, one.error) for one in self._left_out]
+        return np.sqrt(own / np.maximum(np.mean(known, 0), 1e-9)) if known else np.ones_like(own)
+
+
+def choose_by_penalties(
+    tables: Sequence[SubsetTable],
+    price: PenaltyFunction,
+    penalties: Penalties,
+    shared: frozenset[str],
+) -> EffectSet:
+    """Return the set that `choose_set` selects at these penalties."""
+    return choose_set(
+        tables,
+        price,
+        name_price=penalties.name,
+        share=penalties.share,
+        shared=shared,
+        partial=penalties.partial,
+        least=penalties.joint,
+    )
+
+
+def _fit_chosen_set(
+    effects: CandidateEffects, tables: Sequence[SubsetTable], chosen: EffectSet
+) -> FittedSet | None:
+    if not chosen.names:
+        return None
+    scored = zip(tables, chosen.subsets, strict=True)
+    start = [table.score(subset).sizes for table, subset in scored]
+    return fit_set(effects.residuals, chosen.subsets, effects.rays, start)
+
+
+def _add_mean_delay(search: SearchState, late: DetectedEffect) -> SearchState:
+    """Return the search with the mean response of late frames in its residuals."""
+    fitted, effects = search.fitted, search.effects
+    steady = fitted.effects() if fitted else []
+    residuals = timing.add_mean_delay(effects.residuals, late, steady)
+    wide = None
+    if search.wide and fitted:
+        wide = nonadditive_refit.simulate_beside(residuals, effects.rays, fitted)
+    return replace(search, effects=replace(effects, residuals=residuals), wide=wide)
+
+
+def _scale_responses(
+    responses: Mapping[str, list[Response]], by: float
+) -> dict[str, list[Response]]:
+    scaled = {}
+    for name, own in responses.items():
+        scaled[name] = [Response(one.sizes, one.change * by) for one in own]
+    return scaled
+
+
+def _rewhiten_effects(effects: CandidateEffects, noisy: Residuals) -> CandidateEffects:
+    """Return the effects with residuals `noisy`, responses whitened by their noise."""
+    shapes: list[dict[str, list[Response]]] = []
+    for j, mine in enumerate(effects.shapes):
+        shapes.append({})
+        for name, own in mine.items():
+            changes = [noisy.rewhiten(effects.residuals, one.change, j) for one in own]
+            pairs = zip(own, changes, strict=True)
+            shapes[j][name] = [replace(one, change=change) for one, change in pairs]
+    return CandidateEffects(noisy, effects.rays, shapes)
 
 
 def _sum_scores(tables: Sequence[SubsetTable], chosen: EffectSet) -> float:
-    return sum(
-        table.score(subset).total for table, subset in zip(tables, chosen.subsets, strict=True)
-    )
+    scored = zip(tables, chosen.subsets, strict=True)
+    return sum(table.score(subset).total for table, subset in scored)
 
 
 def _adjust_residuals(
     residuals: Residuals, case: GapCase, found: Sequence[DetectedEffect]
 ) -> Residuals:
-    """Return the evidence where encoders err as was found, and where sensors that scatter more say less."""
-    steady = [
-        (one.kind, one.values())
-        for one in found
-        if one.kind.target.side == "measurement" and _is_steady(one.kind)
-    ]
-    residuals = replace(
-        residuals,
-        simulator=replace(residuals.simulator, fixed=[*residuals.simulator.fixed, *steady]),
-    )
-    rough = [
-        one.joints
-        for one in found
-        if one.kind.target.side == "measurement" and not _is_steady(one.kind)
-    ]
+    """Return the residuals with encoder errors in the simulator, and with the added noise of sensors."""
+    of_sensors = [one for one in found if one.kind.target.side == "measurement"]
+    steady = [(one.kind, one.values()) for one in of_sensors if _is_steady(one.kind)]
+    simulator = residuals.simulator
+    simulator = replace(simulator, fixed=[*simulator.fixed, *steady])
+    residuals = replace(residuals, simulator=simulator)
+    rough = [one.joints for one in of_sensors if not _is_steady(one.kind)]
     if not rough:
         return residuals
     assert residuals.noise is not None, "noise is known by now"
-    reading = sensors.measure_excess_scatter(case.field, case.reference, case.machine) * np.any(
-        rough, 0
-    )
-    noise = [
-        replace(one, reading=float(more))
-        for one, more in zip(residuals.noise, reading, strict=True)
-    ]
-    return replace(residuals, noise=noise)
+    excess = sensors.measure_excess_scatter(case.field, case.reference, case.machine)
+    reading = (excess * np.any(rough, 0)).tolist()
+    pairs = zip(residuals.noise, reading, strict=True)
+    return replace(residuals, noise=[replace(one, reading=more) for one, more in pairs])
 
 
 def _is_steady(kind: EffectType) -> bool:

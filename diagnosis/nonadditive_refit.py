@@ -35,6 +35,7 @@ from diagnosis.residuals import (
 from diagnosis.responses import MIN_RESPONSE, Response
 from diagnosis.search import EffectSet, PenaltyFunction, SubsetTable
 
+# Chosen by hand; not searched.
 WIDE_GRID = tuple(sorted({*SIZE_GRID, 4.0, 5.5, 7.5, 10.0, 14.0}))
 """Sizes, over the typical one, at which effects are simulated; numbers keep their bounds."""
 
@@ -75,17 +76,14 @@ def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
     An effect on the command hides all others: nothing shows within a dead band. A large error of
     speed hides nothing.
     """
-    far = [
-        ray
-        for ray, sizes in zip(fitted.rays, fitted.sizes, strict=True)
-        if np.abs(sizes).max() > LARGE_SIZE
-    ]
-    hides = any(ray.kind.target.side == "command" for ray in far)
-    return hides or (
-        bool(far)
-        and float(compute_loss(residuals.z) - compute_loss(fitted.z))
-        < MIN_ADDITIVE_SHARE * promised
-    )
+    far: list[ParameterRay] = []
+    for ray, sizes in zip(fitted.rays, fitted.sizes, strict=True):
+        if np.abs(sizes).max() > LARGE_SIZE:
+            far.append(ray)
+    if any(ray.kind.target.side == "command" for ray in far):
+        return True
+    gain = float(compute_loss(residuals.z) - compute_loss(fitted.z))
+    return bool(far) and gain < MIN_ADDITIVE_SHARE * promised
 
 
 def simulate_beside(
@@ -94,25 +92,20 @@ def simulate_beside(
     """Return the responses to effects beside a fitted set."""
     joints = residuals.increments.shape[2]
     shapes: Shapes = [{} for _ in range(joints)]
-    left = residuals.whiten(
-        residuals.compute_error(
-            simulate_sizes(residuals.simulator, fitted.rays, fitted.sizes[None])
-        )
-    )[:, 0]
+    paths = simulate_sizes(residuals.simulator, fitted.rays, fitted.sizes[None])
+    left = residuals.whiten(residuals.compute_error(paths))[:, 0]
     wide: dict[str, list[ParameterRay]] = {}
     mine = {(ray.kind.name, ray.name): place for place, ray in enumerate(fitted.rays)}
     for name, ways in grown.items():
-        grid = sorted(
-            {*WIDE_GRID, *ways[0].sizes[ways[0].sizes > 0.0].tolist()}
-        )  # as close as they were before
+        # As close as before: an effect that rings is out of step on a coarser grid.
+        grid = sorted({*WIDE_GRID, *ways[0].sizes[ways[0].sizes > 0.0].tolist()})
         wide[name] = [replace(ray, shape=ways[0].shape) for ray in build_rays(ways[0].kind, grid)]
         responses = [_simulate_response(residuals, ray, wide[name], fitted) for ray in wide[name]]
         for j in range(joints):
             if max(np.abs(response[j]).max() for response in responses) >= MIN_RESPONSE:
-                shapes[j][name] = [
-                    Response(ray.sizes, response[j])
-                    for ray, response in zip(wide[name], responses, strict=True)
-                ]
+                pairs = zip(wide[name], responses, strict=True)
+                shapes[j][name] = [Response(ray.sizes, response[j]) for ray, response in pairs]
+        # Effects of the set are to be chosen again, so their own responses are added back.
         for ray, response in zip(wide[name], responses, strict=True):
             place = mine.get((name, ray.name))
             for j in range(joints) if place is not None else ():
@@ -126,11 +119,7 @@ def _simulate_response(
     """Return the whitened response at each size of a ray, beside the fitted set, `(J, C, E)`."""
     has = any(one.kind.name == ray.kind.name for one in fitted.rays)
     company = [*fitted.rays, *([] if has else ways)]
-    place = next(
-        k
-        for k, one in enumerate(company)
-        if one.kind.name == ray.kind.name and one.name == ray.name
-    )
+    place = [(one.kind.name, one.name) for one in company].index((ray.kind.name, ray.name))
     sizes = np.zeros((len(ray.sizes), len(company), fitted.sizes.shape[1]))
     sizes[:, : len(fitted.rays)] = fitted.sizes
     sizes[:, place] = ray.sizes[:, None]
@@ -156,27 +145,30 @@ def add_effect(
     least = _compute_losses(part, fitted.rays, fitted.sizes)
     found, most = None, 0.0
     for name in _rank_additions(tables, chosen, ways):
-        subsets = [
-            s | {name} if s and name in t.shapes else s
-            for t, s in zip(tables, chosen.subsets, strict=True)
-        ]
-        rays_ = [ray for one in sorted(frozenset().union(*subsets)) for ray in ways[one]]
+        # A joint without any effect has no set to which the effect could belong.
+        pairs = zip(tables, chosen.subsets, strict=True)
+        new = np.array([bool(s) and name in t.shapes and name not in s for t, s in pairs])
+        subsets = _add_name(chosen.subsets, new, name)
+        rays_: list[ParameterRay] = []
+        for one in sorted(frozenset().union(*subsets)):
+            rays_ += ways[one]
         mask = np.array([[ray.kind.name in subset for subset in subsets] for ray in rays_])
-        sizes = search_sizes(
-            part, rays_, mask, look_up_sizes(rays_, fitted), np.random.default_rng(0)
-        )
+        known = look_up_sizes(rays_, fitted)
+        # The same draws for each effect, so that chance does not decide between them.
+        sizes = search_sizes(part, rays_, mask, known, np.random.default_rng(0))
         gain = least - _compute_losses(part, rays_, sizes)
-        new = np.array(
-            [name in s and name not in old for s, old in zip(subsets, chosen.subsets, strict=True)]
-        )
         pays = new & (gain > price)
         if (worth := float((gain - price)[pays].sum())) > most:
-            kept = [
-                s if p else old for s, p, old in zip(subsets, pays, chosen.subsets, strict=True)
-            ]
-            start = np.where(pays, sizes, look_up_sizes(rays_, fitted))
-            found, most = (kept, rays_, start), worth
+            kept = _add_name(chosen.subsets, pays, name)
+            found, most = (kept, rays_, np.where(pays, sizes, known)), worth
     return refit_from(residuals, ways, *found) if found else None
+
+
+def _add_name(
+    subsets: Sequence[frozenset[str]], joints: np.ndarray, name: str
+) -> list[frozenset[str]]:
+    """Return the subsets, with `name` on the `joints` `(J,)` bool."""
+    return [s | {name} if has else s for s, has in zip(subsets, joints, strict=True)]
 
 
 def combine_best(
@@ -190,21 +182,20 @@ def combine_best(
     `price` is the penalty of a set on a joint. `None` where no joint is left.
     """
     measured = residuals.simulator.cut.measured
-    squares = [
-        np.square(paths - measured).mean((0, 1))
-        for paths in (residuals.base, *(one.after for one in tried))
-    ]
-    subsets, rays_ = (
-        [],
-        list({(ray.kind.name, ray.name): ray for one in tried for ray in one.rays}.values()),
-    )
+    squares = [np.square(residuals.base - measured).mean((0, 1))]
+    by_name: dict[tuple[str, str], ParameterRay] = {}
+    for one in tried:
+        squares.append(np.square(one.after - measured).mean((0, 1)))
+        for ray in one.rays:
+            by_name[ray.kind.name, ray.name] = ray
+    subsets, rays_ = [], list(by_name.values())
     start = np.zeros((len(rays_), residuals.increments.shape[2]))
     for j in range(residuals.increments.shape[2]):
         own = [list_subsets(one)[j] for one in tried]
-        cost = [
-            float(compute_loss(one.z[j])) + (price(j, s) if s else 0.0)
-            for one, s in zip(tried, own, strict=True)
-        ]
+        cost = []
+        for one, subset in zip(tried, own, strict=True):
+            cost.append(float(compute_loss(one.z[j])) + (price(j, subset) if subset else 0.0))
+        # Increments may fit better while errors of whole free runs grow.
         closing = [k for k in np.argsort(cost) if squares[k + 1][j] < squares[0][j]]
         subsets.append(own[closing[0]] if closing else frozenset())
         if closing:
@@ -249,6 +240,8 @@ def _rank_additions(
         own = table.score(subset).total
         for name in table.shapes.keys() - subset if subset else ():
             found[name] = found.get(name, 0.0) + max(0.0, table.score(subset | {name}).total - own)
-    return sorted(
-        found, key=lambda name: (ways[name][0].kind.target.side != "command", -found[name])
-    )[:MAX_ADDITIONS]
+
+    def rank(name: str) -> tuple[bool, float]:
+        return ways[name][0].kind.target.side != "command", -found[name]
+
+    return sorted(found, key=rank)[:MAX_ADDITIONS]

@@ -29,6 +29,8 @@ MIN_SPEED = 0.1
 """Least speed of a start, of full speed; chosen by hand: slower ones amplify the noise of time."""
 MIN_EVENTS = 8
 """Least number of starts or stops; chosen by hand."""
+MIN_STOP_SAMPLES = 5
+"""Least number of samples after a stop; chosen by hand."""
 MAD = 1.4826
 """Median absolute deviation to standard deviation of a normal distribution."""
 
@@ -40,27 +42,32 @@ def measure_onsets(
 
     Each with its standard error; joints with fewer than `FEWEST` starts or stops are left out.
     """
-    acting = [shift_by_dead_time(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
-    label = [
-        label_regimes(u, r.q, machine, r.rate_hz)
-        for u, r in zip(acting, runs.recordings, strict=True)
-    ]
+    _, label = _label_recordings(runs, machine, dead_time_s)
     found = {}
     for j, name in enumerate(machine.joint_names):
         late_s = np.array(list(_measure_lateness(runs, runs.cut(label)[..., j], j, machine)))
         if len(late_s) >= MIN_EVENTS:
+            # The median: a few starts fail for other reasons, such as a joint at its end stop.
             off = MAD * np.abs(late_s - np.median(late_s))
-            found["delay_jitter", name] = (
-                float(np.median(off)),
-                float(off.std() / np.sqrt(len(off))),
-            )
+            error = float(off.std() / np.sqrt(len(off)))
+            found["delay_jitter", name] = (float(np.median(off)), error)
         shaken = np.array(list(_measure_ringing(runs, [part[:, j] for part in label], j)))
         if len(shaken) >= MIN_EVENTS:
-            found["compliance", name] = (
-                float(np.median(shaken)),
-                float(MAD * shaken.std() / np.sqrt(len(shaken))),
-            )
+            error = float(MAD * shaken.std() / np.sqrt(len(shaken)))
+            found["compliance", name] = (float(np.median(shaken)), error)
     return found
+
+
+def _label_recordings(
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Return the commands when they act, and the regime of each sample, by recording."""
+    acting, label = [], []
+    for one in runs.recordings:
+        u = shift_by_dead_time(one.u, dead_time_s, 1.0 / one.rate_hz)
+        acting.append(u)
+        label.append(label_regimes(u, one.q, machine, one.rate_hz))
+    return acting, label
 
 
 def _measure_lateness(
@@ -72,16 +79,16 @@ def _measure_lateness(
     error, path = runs.error[..., joint], runs.simulated[..., joint]
     for window, begin in zip(*np.nonzero(is_start[:, 1:] & ~is_start[:, :-1]), strict=True):
         end = begin + ahead
+        # A start that is cut short never reaches its speed.
         if end >= error.shape[1] or not is_start[window, begin + 1 : end].all():
             continue
-        speed = (path[window, end] - path[window, end - ahead // 3]) / (
-            ahead // 3 * machine.period_s
-        )
-        late_s = (
-            (error[window, end] - error[window, begin]) / speed
-            if abs(speed) > MIN_SPEED * machine.max_speed[joint]
-            else np.nan
-        )
+        # By the last third of the start the simulated speed is nearly steady.
+        third = ahead // 3
+        moved = path[window, end] - path[window, end - third]
+        speed = moved / (third * machine.period_s)
+        if not abs(speed) > MIN_SPEED * machine.max_speed[joint]:
+            continue
+        late_s = (error[window, end] - error[window, begin]) / speed
         if np.isfinite(late_s):
             yield float(late_s)
 
@@ -92,8 +99,10 @@ def _measure_ringing(runs: WindowedRuns, label: list[np.ndarray], joint: int) ->
         is_stop = regime == REGIMES.index("stop")
         edges = np.flatnonzero(np.diff(is_stop.astype(np.int8)))
         for begin, end in zip(edges[::2], edges[1::2], strict=False) if not is_stop[0] else []:
+            # The braking itself is no ringing: only the second half of the time counts.
             after = recording.q[begin + 1 + (end - begin) // 2 : end + 1, joint].astype(float)
-            if len(after) >= 5:
+            # A line through fewer samples leaves nothing to scatter.
+            if len(after) >= MIN_STOP_SAMPLES:
                 line = np.polyfit(np.arange(len(after)), after, 1)
                 yield float(np.std(after - np.polyval(line, np.arange(len(after)))))
 
@@ -140,6 +149,7 @@ class Probe:
 
 
 PERCENT, MILLI = 1e2, 1e3
+"""Factors of the sentences: shares to per cent, m, rad and s to thousandths."""
 TEXTS = {
     "dead_time": (
         "moves {:.0f} ms later than simulated",
@@ -209,12 +219,8 @@ def probe_residuals(
         machine: Gives joints and masses.
         dead_time_s: Time from command to motion of each joint, `(J,)`.
     """
-    mine, other = (
-        _fit_coefficients(side, machine, dead_time_s) | measure_onsets(side, machine, dead_time_s)
-        if side
-        else {}
-        for side in (runs, reference)
-    )
+    mine = _measure_probes(runs, machine, dead_time_s)
+    other = _measure_probes(reference, machine, dead_time_s) if reference else {}
     found = []
     for (effect, joint), (value, error) in mine.items():
         base, base_error = other.get((effect, joint), (0.0, 0.0))
@@ -226,6 +232,15 @@ def probe_residuals(
         z = (value - base) / max(float(np.hypot(error, base_error)), np.finfo(float).tiny)
         found.append(Probe(effect, joint, value, base, z, text))
     return sorted(found, key=lambda probe: -abs(probe.z))
+
+
+def _measure_probes(
+    runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
+) -> dict[tuple[str, str], tuple[float, float]]:
+    """Return all figures with their standard errors, by effect and joint."""
+    return _fit_coefficients(runs, machine, dead_time_s) | measure_onsets(
+        runs, machine, dead_time_s
+    )
 
 
 def _describe_coefficient(effect: str, value: float, unit: str) -> str:
@@ -246,17 +261,14 @@ def _fit_coefficients(
     found = {}
     for j, name in enumerate(machine.joint_names):
         given = np.isfinite(lacks[..., j]) & np.isfinite(acceleration[..., j])
+        # Every simulator errs a little in gain and timing, which would pass for other effects.
         always = np.stack([acceleration[..., j][given], speed[..., j][given]], 1)
         for effect, values in clues.of(j, speed[..., j]):
             column = np.nan_to_num(values[given])
-            rows = (
-                always
-                if effect in ("dead_time", "flow_gain")
-                else np.concatenate([always, column[:, None]], 1)
-            )
             if (np.abs(column) > 0).sum() < MIN_SAMPLES:
                 continue
             place = {"dead_time": 0, "flow_gain": 1}.get(effect, 2)
+            rows = always if place < 2 else np.concatenate([always, column[:, None]], 1)
             found[effect, name] = _estimate_coefficient(
                 rows, lacks[..., j][given], block[given], place
             )
@@ -267,22 +279,16 @@ class _ProbeColumns:
     """Regressors of the excess speed, one an effect, `(W, K)` for each joint."""
 
     def __init__(self, runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray) -> None:
-        acting = [shift_by_dead_time(r.u, dead_time_s, 1.0 / r.rate_hz) for r in runs.recordings]
-        self._u = runs.cut(acting)
-        self._regime = runs.cut(
-            [
-                label_regimes(u, r.q, machine, r.rate_hz)
-                for u, r in zip(acting, runs.recordings, strict=True)
-            ]
-        )
+        acting, label = _label_recordings(runs, machine, dead_time_s)
+        self._u, self._regime = runs.cut(acting), runs.cut(label)
         self._load = None
         if machine.has_bodies:
-            gravity = Gravity(machine, torch.device("cpu"))
-            loads = [
-                gravity.load(torch.as_tensor(r.q, dtype=torch.float32)).numpy()
-                for r in runs.recordings
-            ]
-            self._load = runs.cut([load / np.maximum(np.abs(load).max(0), 1.0) for load in loads])
+            gravity, loads = Gravity(machine, torch.device("cpu")), []
+            for one in runs.recordings:
+                load = gravity.load(torch.as_tensor(one.q, dtype=torch.float32)).numpy()
+                # Over the largest of the recording; the floor of 1 is for joints without any load.
+                loads.append(load / np.maximum(np.abs(load).max(0), 1.0))
+            self._load = runs.cut(loads)
         late_s = runs.elapsed_s - runs.elapsed_s.mean()
         self._late = (late_s / max(float(np.ptp(late_s)), 1e-9))[:, None]
 
@@ -327,6 +333,7 @@ def _estimate_coefficient(
     crosses = np.stack([rows[block == b].T @ target[block == b] for b in names])
 
     def solved(gram: np.ndarray, cross: np.ndarray) -> float:
+        # Keeps the matrix regular where a column is a multiple of another.
         ridge = 1e-9 * np.trace(gram) / len(gram) + 1e-15
         return float(np.linalg.solve(gram + ridge * np.eye(len(gram)), cross)[place])
 
@@ -334,7 +341,7 @@ def _estimate_coefficient(
     count = len(names)
     if count < 2:
         return value, float("inf")
-    left = np.array(
-        [solved(grams.sum(0) - g, crosses.sum(0) - c) for g, c in zip(grams, crosses, strict=True)]
-    )
+    # Samples of a block depend on each other, so blocks are left out as a whole.
+    pairs = zip(grams.sum(0) - grams, crosses.sum(0) - crosses, strict=True)
+    left = np.array([solved(gram, cross) for gram, cross in pairs])
     return value, float(np.sqrt((count - 1) / count * ((left - left.mean()) ** 2).sum()))

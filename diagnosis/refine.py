@@ -16,11 +16,12 @@ from diagnosis.residuals import ParameterRay, Residuals, compute_loss, weigh_res
 from diagnosis.responses import SIZE_PRIOR, fit_joint_faults
 from diagnosis.search import MIN_SIZE, EffectSet, PenaltyFunction, Subset
 
+# Chosen by hand; not searched.
 MAX_FIT_STEPS = 6
-"""Steps of a fit at most."""
+"""Steps of a fit at most. It was 4 before; no comparison is recorded."""
 
 REFIT_STEPS = 2
-"""The same where it is only to be told what is left without some effects."""
+"""The same for the residuals without some effects, which needs no exact sizes."""
 
 SIZE_STEP = 0.05
 """Finite difference, of the typical size."""
@@ -88,14 +89,11 @@ class FittedSet:
 
     def size(self, name: str, joint: int) -> float:
         """Return the largest size of an effect on a joint, along any of its rays."""
-        return max(
-            (
-                abs(float(row[joint]))
-                for ray, row in zip(self.rays, self.sizes, strict=True)
-                if ray.kind.name == name
-            ),
-            default=0.0,
-        )
+        found = []
+        for ray, row in zip(self.rays, self.sizes, strict=True):
+            if ray.kind.name == name:
+                found.append(abs(float(row[joint])))
+        return max(found, default=0.0)
 
 
 def simulate_sizes(
@@ -136,22 +134,20 @@ def fit_set(
         steps: Steps of each fit at most.
     """
     found, mask, sizes = _lay_out(subsets, rays, start)
-    every, halves = (
-        np.ones((1, len(residuals.fold))),
-        np.stack([residuals.fold != 0, residuals.fold != 1]).astype(float),
-    )
+    every = np.ones((1, len(residuals.fold)))
+    halves = np.stack([residuals.fold != 0, residuals.fold != 1]).astype(float)
     fit = _Fit(residuals, found, mask)
     whole = fit.descended(fit.nearest(sizes)[None], every, steps)
+    # Fits to a half begin and are centred at the whole: a half may say nothing about a size.
     apart = fit.descended(np.repeat(whole, 2, 0), halves, max(1, steps // 2), whole)
     z, slopes, _ = _linearise(residuals, found, whole)
     z_apart, paths = fit.simulated(apart)
     half = residuals.fold.reshape(len(residuals.increments), -1)[:, 0]
     first = (half == 0)[:, None, None]
+    # The simulator leaves the mean response of stochastic effects out.
     mean = 0.0 if residuals.mean is None else residuals.mean
-    after, own = (
-        np.where(first, paths[0], paths[1]) + mean,
-        np.where(first, paths[1], paths[0]) + mean,
-    )
+    after = np.where(first, paths[0], paths[1]) + mean
+    own = np.where(first, paths[1], paths[0]) + mean
     held = np.where(residuals.fold == 0, z_apart[0], z_apart[1])
     return FittedSet(
         found,
@@ -184,20 +180,15 @@ def _lay_out(
     start: Sequence[Mapping[str, np.ndarray]],
 ) -> tuple[list[ParameterRay], np.ndarray, np.ndarray]:
     """Return the rays of a set, which joints have them `(R, J)`, and sizes to begin at `(R, J)`."""
-    chosen = [
-        (ray, place)
-        for name in sorted(frozenset().union(*subsets))
-        for place, ray in enumerate(rays[name])
-    ]
-    mask = np.array([[ray.kind.name in subset for subset in subsets] for ray, _ in chosen])
-    sizes = [
-        [
-            start[j][ray.kind.name][place] if ray.kind.name in subset else 0.0
-            for j, subset in enumerate(subsets)
-        ]
-        for ray, place in chosen
-    ]
-    return [ray for ray, _ in chosen], mask, np.array(sizes)
+    chosen: list[ParameterRay] = []
+    mask, sizes = [], []
+    for name in sorted(frozenset().union(*subsets)):
+        for place, ray in enumerate(rays[name]):
+            chosen.append(ray)
+            has = [ray.kind.name in subset for subset in subsets]
+            mask.append(has)
+            sizes.append([start[j][name][place] if one else 0.0 for j, one in enumerate(has)])
+    return chosen, np.array(mask), np.array(sizes)
 
 
 def search_sizes(
@@ -230,7 +221,8 @@ class _Fit:
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Smallest and largest sizes, `(R, 1)`: beyond the simulated sizes, within the bounds of the numbers."""
-        low, high = (np.array([ray.sizes[end] for ray in self.rays])[:, None] for end in (0, -1))
+        low = np.array([ray.sizes[0] for ray in self.rays])[:, None]
+        high = np.array([ray.sizes[-1] for ray in self.rays])[:, None]
         by = np.array([1.0 if ray.is_tied else MAX_EXTRAPOLATION for ray in self.rays])[:, None]
         return np.where(low < 0, by * low, low), by * high
 
@@ -253,30 +245,23 @@ class _Fit:
         for _ in range(steps):
             z, slopes, _ = _linearise(self.residuals, self.rays, now)
             least = _compute_totals(z, now - about, weights)
-            trials = np.stack(
-                [
-                    now + self._step(z, slopes, now - about, used, by * damping)
-                    for by in DAMPING_FACTORS
-                ]
-            )
-            trials = np.clip(trials, *self.bounds) * self.mask
-            tried = self.simulated(trials.reshape(-1, *now.shape[1:]))[0].reshape(
-                len(DAMPING_FACTORS), *z.shape
-            )
+            # All dampings are simulated at once: a step costs one call of the simulator.
+            steps_by_damping = []
+            for by in DAMPING_FACTORS:
+                steps_by_damping.append(self._step(z, slopes, now - about, used, by * damping))
+            trials = np.clip(now + np.stack(steps_by_damping), *self.bounds) * self.mask
+            tried = self.simulated(trials.reshape(-1, *now.shape[1:]))[0]
+            tried = tried.reshape(len(DAMPING_FACTORS), *z.shape)
+            pairs = zip(tried, trials, strict=True)
             totals = np.stack(
-                [
-                    _compute_totals(one, sizes - about, weights)
-                    for one, sizes in zip(tried, trials, strict=True)
-                ]
+                [_compute_totals(one, sizes - about, weights) for one, sizes in pairs]
             )  # (D, F, J)
             best = totals.argmin(0)
             gained = least - totals.min(0)
             better = gained > 0.0
-            damping = np.clip(
-                damping
-                * np.where(better, np.array(DAMPING_FACTORS)[best], DAMPING_FACTORS[-1] ** 2),
-                *DAMPING_BOUNDS,
-            )
+            # Where no damping helps, the linearisation fails beyond a much smaller step.
+            factor = np.where(better, np.array(DAMPING_FACTORS)[best], DAMPING_FACTORS[-1] ** 2)
+            damping = np.clip(damping * factor, *DAMPING_BOUNDS)
             now = np.where(
                 better[:, None], np.take_along_axis(trials, best[None, :, None], 0)[0], now
             )
@@ -317,15 +302,10 @@ def _linearise(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return errors `(F, J, E)`, their slopes over the sizes `(F, J, R, E)`, and free runs `(F, W, K, J)` at sizes `(F, R, J)`."""
     fits, count, joints = sizes.shape
-    sign = np.array(
-        [
-            [
-                1.0 if (row + SIZE_STEP <= ray.sizes[-1] * 2).all() else -1.0
-                for row, ray in zip(one, rays, strict=True)
-            ]
-            for one in sizes
-        ]
-    )
+    # Large sizes step backward, away from their bounds.
+    last = np.array([ray.sizes[-1] for ray in rays])
+    fits_in = (sizes + SIZE_STEP <= last[:, None] * 2).all(2)
+    sign = np.where(fits_in, 1.0, -1.0)
     varied = np.repeat(sizes[:, None], count + 1, 1)
     for r in range(count):
         varied[:, r + 1, r] += SIZE_STEP * sign[:, r, None]
@@ -352,12 +332,10 @@ def _estimate_deviations(
         rows = mask[:, j]
         weighted = slopes[j][rows] * weigh_residuals(z[j])
         inverse = np.linalg.inv(weighted @ slopes[j][rows].T + np.eye(rows.sum()) / SIZE_PRIOR**2)
-        scores = np.stack(
-            [
-                (weighted * z[j])[:, residuals.block == one].sum(1)
-                for one in np.unique(residuals.block)
-            ]
-        )
+        # The sandwich estimator over blocks holds where entries of a block depend on each other.
+        score = weighted * z[j]
+        blocks = np.unique(residuals.block)
+        scores = np.stack([score[:, residuals.block == one].sum(1) for one in blocks])
         factor = len(scores) / max(1, len(scores) - 1)
         spread = inverse @ (factor * scores.T @ scores) @ inverse
         of_faults = np.square(inverse @ weighted @ residuals.faults[j].T).sum(1)
@@ -397,13 +375,11 @@ def prune_set(
     for j, (subset, (before, after)) in enumerate(zip(chosen.subsets, joints, strict=True)):
         earned = float(before.loss.sum() - after.loss.sum()) + before.price - after.price
         pays = earned > price(j, subset)
-        found.append(
-            frozenset(
-                name
-                for name in subset
-                if name in shared or (pays and fitted.size(name, j) >= MIN_SIZE)
-            )
-        )
+        kept = []
+        for name in subset:
+            if name in shared or (pays and fitted.size(name, j) >= MIN_SIZE):
+                kept.append(name)
+        found.append(frozenset(kept))
     return tuple(found)
 
 
@@ -419,10 +395,11 @@ def drop_effects(
 
 def list_subsets(fitted: FittedSet) -> tuple[frozenset[str], ...]:
     """Return the effects of each joint."""
-    return tuple(
-        frozenset(ray.kind.name for ray, has in zip(fitted.rays, mask, strict=True) if has)
-        for mask in fitted.mask.T
-    )
+    found = []
+    for mask in fitted.mask.T:
+        pairs = zip(fitted.rays, mask, strict=True)
+        found.append(frozenset(ray.kind.name for ray, has in pairs if has))
+    return tuple(found)
 
 
 def refit_from(
@@ -434,10 +411,12 @@ def refit_from(
 ) -> FittedSet:
     """Return the repair with `subsets` whose fit begins at `sizes` `(R, J)` of `rays_`."""
     place = {(ray.kind.name, ray.name): k for k, ray in enumerate(rays_)}
-    start = [
-        {n: np.array([sizes[place[n, ray.name], j] for ray in ways[n]]) for n in s}
-        for j, s in enumerate(subsets)
-    ]
+    start: list[dict[str, np.ndarray]] = []
+    for j, subset in enumerate(subsets):
+        start.append({})
+        for name in subset:
+            rows = [place[name, ray.name] for ray in ways[name]]
+            start[j][name] = sizes[rows, j]
     return fit_set(residuals, subsets, ways, start)
 
 
@@ -448,11 +427,11 @@ def drop_windows(residuals: Residuals, each: int) -> Residuals:
     cut = replace(
         simulator.cut, **{name: getattr(simulator.cut, name)[rows] for name in ("u", "q", "run")}
     )
-    some = {
-        name: value[rows]
-        for name in ("valid_mask", "mean", "bias", "late")
-        if (value := getattr(residuals, name, None)) is not None
-    }
+    some = {}
+    for name in ("valid_mask", "mean", "bias", "late"):
+        value = getattr(residuals, name, None)
+        if value is not None:
+            some[name] = value[rows]
     return replace(
         residuals,
         simulator=replace(simulator, cut=cut, running_s=simulator.running_s[rows]),
@@ -463,6 +442,5 @@ def drop_windows(residuals: Residuals, each: int) -> Residuals:
 def look_up_sizes(rays_: Sequence[ParameterRay], fitted: FittedSet) -> np.ndarray:
     """Return the sizes that are known already, 0 where none is, `(R, J)`."""
     sizes = {(ray.kind.name, ray.name): fitted.sizes[k] for k, ray in enumerate(fitted.rays)}
-    return np.stack(
-        [sizes.get((ray.kind.name, ray.name), np.zeros(fitted.sizes.shape[1])) for ray in rays_]
-    )
+    none = np.zeros(fitted.sizes.shape[1])
+    return np.stack([sizes.get((ray.kind.name, ray.name), none) for ray in rays_])

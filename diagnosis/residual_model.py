@@ -27,6 +27,7 @@ from diagnosis.residuals import (
 )
 from diagnosis.responses import fit_sizes
 
+# Chosen by hand; not searched.
 DISCREPANCY_RIDGES = (10.0, 100.0, 1000.0)
 """Pulls towards no discrepancy, in features of unit size over the noise; that which predicts best
 is used."""
@@ -98,10 +99,8 @@ def learn_discrepancy(
             noise.
         field: The simulator against the field.
     """
-    found, of_field = (
-        [np.zeros_like(part.increments) for part in parts],
-        np.zeros_like(field.increments),
-    )
+    found = [np.zeros_like(part.increments) for part in parts]
+    of_field = np.zeros_like(field.increments)
     if len(parts) < 2:
         return found, of_field
     for j in range(of_field.shape[2]):
@@ -110,19 +109,17 @@ def learn_discrepancy(
         size = np.sqrt(np.mean(np.square(np.concatenate(white)), 0))
         by = np.where(size > 1e-9, 1.0 / np.maximum(size, 1e-9), 0.0)
         x, z = [one * by for one in white], [part.z[j] for part in parts]
-        others = [[k for k in range(len(parts)) if k != out] for out in range(len(parts))]
+        # Without any discrepancy the loss is that of the residuals: a ridge must predict better.
         best, lowest = None, sum(float(compute_loss(one)) for one in z)
         for pull in DISCREPANCY_RIDGES:
-            betas = [
-                fit_ridge(
-                    np.concatenate([x[k] for k in rest]), np.concatenate([z[k] for k in rest]), pull
-                )
-                for rest in others
-            ]
-            total = sum(
-                float(compute_loss(one - columns @ beta))
-                for one, columns, beta in zip(z, x, betas, strict=True)
-            )
+            betas, losses = [], []
+            for out in range(len(parts)):
+                rest = [k for k in range(len(parts)) if k != out]
+                known_x = np.concatenate([x[k] for k in rest])
+                known_z = np.concatenate([z[k] for k in rest])
+                betas.append(fit_ridge(known_x, known_z, pull))
+                losses.append(float(compute_loss(z[out] - x[out] @ betas[out])))
+            total = sum(losses)
             if total < lowest:
                 best, lowest = (pull, betas), total
         if best is None:
@@ -146,11 +143,9 @@ def estimate_fault_scales(parts: Sequence[Residuals]) -> np.ndarray:
         for z, faults in zip(part.z, part.faults, strict=True):
             lines = MAX_FAULT_SCALE * faults
             found = fit_sizes(z, [], faults=lines)
-            slack = np.diag(
-                np.linalg.inv(
-                    (lines * weigh_residuals(z - found @ lines)) @ lines.T + np.eye(len(lines))
-                )
-            )
+            weighted = lines * weigh_residuals(z - found @ lines)
+            slack = np.diag(np.linalg.inv(weighted @ lines.T + np.eye(len(lines))))
+            # A variance near that of the prior: the recordings tell nothing about the fault.
             squares.append(np.where(slack < MAX_VARIANCE_SHARE, np.square(found), np.nan))
             chance.append(np.where(slack < MAX_VARIANCE_SHARE, slack, np.nan))
     told = np.isfinite(squares)
@@ -158,6 +153,7 @@ def estimate_fault_scales(parts: Sequence[Residuals]) -> np.ndarray:
     return np.clip(MAX_FAULT_SCALE * np.sqrt(np.maximum(excess, 0.0)), 1.0, MAX_FAULT_SCALE)
 
 
+# Chosen by hand. CLUE_RIDGES grew from 3 values to 7; no comparison is recorded.
 CLUE_RIDGES = (3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3000.0)
 """Pulls towards nothing, in features of unit size over the noise; that which makes the errors most
 likely is used."""
@@ -251,37 +247,39 @@ def apply_fitted_set(residuals: Residuals, fitted: FittedSet | None) -> Residual
 
 def _build_start_stop(m: SimulatedMotion) -> list[np.ndarray]:
     """Start and stops, just before and after."""
-    turn, faster = (
-        np.diff(m.own, axis=1, prepend=m.own[:, :1]),
-        np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0,
-    )
-    return [
-        _shift_later(turn * when * side, by)
-        for by in (-1, 0, 1, 2, 3)
-        for when in (faster, ~faster)
-        for side in m.sides
-    ]
+    turn = np.diff(m.own, axis=1, prepend=m.own[:, :1])
+    faster = np.diff(np.abs(m.own), axis=1, prepend=np.abs(m.own[:, :1])) > 0
+    columns = []
+    # A valve may answer a start later than a stop, and one side later than the other.
+    for by in (-1, 0, 1, 2, 3):
+        for when in (faster, ~faster):
+            columns += [_shift_later(turn * when * side, by) for side in m.sides]
+    return columns
 
 
 def _build_speed_curve(m: SimulatedMotion) -> list[np.ndarray]:
-    return [
-        m.own * hat * side
-        for hat in _build_hats(np.abs(m.share[..., m.j]), 1.0, 8)
-        for side in m.sides
-    ]
+    return _split_by_side(m, _build_hats(np.abs(m.share[..., m.j]), 1.0, 8))
 
 
 def _build_position(m: SimulatedMotion) -> list[np.ndarray]:
-    return [m.own * hat * side for hat in _build_hats(m.place.mean(0), 1.0, 10) for side in m.sides]
+    return _split_by_side(m, _build_hats(m.place.mean(0), 1.0, 10))
+
+
+def _split_by_side(m: SimulatedMotion, hats: Sequence[np.ndarray]) -> list[np.ndarray]:
+    columns = []
+    for hat in hats:
+        columns += [m.own * hat * side for side in m.sides]
+    return columns
 
 
 def _build_sensor_angle(m: SimulatedMotion) -> list[np.ndarray]:
     """An encoder whose error depends on where it stands."""
-    return [
-        np.diff(wave(2 * np.pi * turns * m.place), axis=0)[0]
-        for turns in (0.5, 1, 1.5, 2, 3, 4)
-        for wave in (np.sin, np.cos)
-    ]
+    columns = []
+    for turns in (0.5, 1, 1.5, 2, 3, 4):
+        columns += [
+            np.diff(wave(2 * np.pi * turns * m.place), axis=0)[0] for wave in (np.sin, np.cos)
+        ]
+    return columns
 
 
 def _build_other_joints(m: SimulatedMotion) -> list[np.ndarray]:
@@ -296,11 +294,9 @@ def _build_other_joints(m: SimulatedMotion) -> list[np.ndarray]:
                 full * other,
                 full * np.maximum(other, 0.0),
             ]
-    return (
-        columns
-        + [m.own * hat for hat in _build_hats(m.work, 2.0, 5)]
-        + [m.own * np.maximum(m.work - at, 0.0) for at in (0.5, 1.0)]
-    )
+    # A pump at its limit slows all joints from a demand on, so the sum has hinges of its own.
+    columns += [m.own * hat for hat in _build_hats(m.work, 2.0, 5)]
+    return columns + [m.own * np.maximum(m.work - at, 0.0) for at in (0.5, 1.0)]
 
 
 def _build_running_time(m: SimulatedMotion) -> list[np.ndarray]:
@@ -317,14 +313,11 @@ def _build_past_work(m: SimulatedMotion) -> list[np.ndarray]:
     went = np.sign(m.own) * (np.abs(m.share[..., m.j]) > 0.03)
     for past_s in PAST_S:
         kept = np.exp(-INCREMENT_SAMPLES * machine.period_s / past_s)
-        tired, own, way = (
-            m.faded(one, kept) for one in (np.minimum(m.work, 1.0), np.abs(m.share[..., m.j]), went)
-        )
-        columns += [
-            m.own * (tired - tired.mean()),
-            m.own * (own - own.mean()),
-            np.abs(m.own) * way,
-        ]  # the mean is another gain
+        tired = m.faded(np.minimum(m.work, 1.0), kept)
+        own = m.faded(np.abs(m.share[..., m.j]), kept)
+        # The mean would be another gain.
+        columns += [m.own * (tired - tired.mean()), m.own * (own - own.mean())]
+        columns.append(np.abs(m.own) * m.faded(went, kept))
     return columns
 
 
@@ -347,10 +340,8 @@ FORMS = (STARTS, CURVE)
 
 def score_clues(residuals: Residuals, z: np.ndarray) -> np.ndarray:
     """Return the log-likelihood gain of each clue on whitened residuals `z` `(J, E)`, `(clues, J)`."""
-    found, order = (
-        np.zeros((len(CLUES), len(z))),
-        [*FORMS, *(name for name in CLUES if name not in FORMS)],
-    )
+    found = np.zeros((len(CLUES), len(z)))
+    order = [*FORMS, *(name for name in CLUES if name not in FORMS)]
     for j, errors in enumerate(z):
         motion = SimulatedMotion(residuals, j)
         for name in order:
@@ -373,9 +364,8 @@ def scale_reference_gains(
         left_out: The same on each part of the reference.
         entries: Length of the field over that of each part.
     """
-    return np.max(
-        [np.zeros_like(earned), *(one * by for one, by in zip(left_out, entries, strict=True))], 0
-    )
+    scaled = [one * by for one, by in zip(left_out, entries, strict=True)]
+    return np.max([np.zeros_like(earned), *scaled], 0)
 
 
 def measure_straying(residuals: Residuals, error: np.ndarray) -> np.ndarray:
@@ -388,19 +378,15 @@ def measure_straying(residuals: Residuals, error: np.ndarray) -> np.ndarray:
         error: Measured less simulated increments, `(W, I, J)`.
     """
     assert residuals.noise is not None, "noise is known by now"
-    expected = np.stack(
-        [
-            noise.strayed(residuals.increments[..., j]).mean(1)
-            for j, noise in enumerate(residuals.noise)
-        ],
-        -1,
-    )
+    by_joint = []
+    for j, noise in enumerate(residuals.noise):
+        by_joint.append(noise.strayed(residuals.increments[..., j]).mean(1))
+    expected = np.stack(by_joint, -1)
     if residuals.late is not None:
         expected = expected + np.square(np.cumsum(residuals.late, 2)).sum(1).mean(1)
-    over = (
-        np.minimum(np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18), MAX_STRAY)
-        * residuals.valid_mask
-    )
+    ratio = np.square(np.cumsum(error, 1)).mean(1) / np.maximum(expected, 1e-18)
+    # A few windows that fail for another reason must not decide the mean.
+    over = np.minimum(ratio, MAX_STRAY) * residuals.valid_mask
     return over.sum(0) / np.maximum(residuals.valid_mask.sum(0), 1)
 
 

@@ -43,18 +43,19 @@ def compare_policies(evaluations: Mapping[str, Mapping[str, Any]]) -> dict[str, 
     """
     rows = {plant: evaluations[plant]["policies"] for plant in PLANTS}
     policies = list(rows["machine"])
-    success = {
-        policy: {plant: _compute_rate(rows[plant][policy]) for plant in PLANTS}
-        for policy in policies
-    }
+    success: dict[str, dict[str, SuccessRate]] = {}
+    times: dict[str, dict[str, Any]] = {}
+    for policy in policies:
+        success[policy], times[policy] = {}, {}
+        for plant in PLANTS:
+            row = rows[plant][policy]
+            success[policy][plant] = _compute_rate(row)
+            times[policy][plant] = row["time_to_insert_s"]["median"]
     return {
         "schema": 1,
         "episodes": evaluations["machine"]["episodes"],
         "success": success,
-        "time_to_insert_s": {
-            policy: {plant: rows[plant][policy]["time_to_insert_s"]["median"] for plant in PLANTS}
-            for policy in policies
-        },
+        "time_to_insert_s": times,
         "fall": subtract_rates(success[BEFORE]["simulator"], success[BEFORE]["machine"]),
         "return": subtract_rates(success[AFTER]["machine"], success[BEFORE]["machine"]),
         "left": subtract_rates(success[BEFORE]["simulator"], success[AFTER]["machine"]),
@@ -96,10 +97,9 @@ def measure_rank_agreement(
         mean over policies of the worst pair (mean maximum rank violation; Li et al. 2024, SIMPLER),
         0 at best; `error`: mean absolute difference of success.
     """
-    simulated, real = (
-        np.array([success[policy][place]["mean"] for policy in success])
-        for place in (plant, "machine")
-    )
+    simulated = np.array([rates[plant]["mean"] for rates in success.values()])
+    real = np.array([rates["machine"]["mean"] for rates in success.values()])
+    # Tau divides by the number of pairs that differ: it has no value where all are equal.
     known = np.ptp(simulated) > 0 and np.ptp(real) > 0
     tau: Any = stats.kendalltau(simulated, real) if known else None
     return {
@@ -123,6 +123,7 @@ def write_headline(found: Mapping[str, Any]) -> tuple[str, Tone]:
     success = found["success"]
     before, after = success[BEFORE], success[AFTER]
     fall, back, left = found["fall"], found["return"], found["left"]
+    # An interval that holds 0 shows no loss: the headline must not promise a recovery.
     if fall["ci95"][0] <= 0.0:
         return (
             f"Nothing to regain: the policy succeeds in {format_rate(before['simulator'])} in the simulator and in "
@@ -187,29 +188,29 @@ def write_report(found: Mapping[str, Any], folder: Path) -> None:
         ],
         "Percentage points and per cent",
     )
-    page.add_heading("Does the simulator know which policy is better?")
-    page.add_table(
-        ["", "Kendall's tau", "cost of wrong orders", "mean error of success"],
-        [
-            [
-                PLANT_NAMES[plant],
-                None if one["kendall"] is None else f"{one['kendall']:.2f}",
-                f"{one['rank_violation']:.3f}",
-                f"{one['error']:.3f}",
-            ]
-            for plant, one in found["agreement"].items()
-        ],
-        f"Over {len(found['success'])} policies: {', '.join(_name_policy(policy) for policy in found['success'])}",
-    )
+    _add_agreement_table(page, found)
     if "retraining" in found:
         page.add_heading("How it was made")
-        page.add_facts(
-            {
-                **{PLANT_NAMES[name]: text for name, text in found["plants"].items()},
-                **found["retraining"],
-            }
-        )
+        plants = {PLANT_NAMES[name]: text for name, text in found["plants"].items()}
+        page.add_facts(plants | found["retraining"])
     page.write(folder / REPORT_FILE)
+
+
+def _add_agreement_table(page: Report, found: Mapping[str, Any]) -> None:
+    """Add the agreement of each simulator with the machine about the order of policies."""
+    page.add_heading("Does the simulator know which policy is better?")
+    rows = []
+    for plant, one in found["agreement"].items():
+        tau = None if one["kendall"] is None else f"{one['kendall']:.2f}"
+        rows.append(
+            [PLANT_NAMES[plant], tau, f"{one['rank_violation']:.3f}", f"{one['error']:.3f}"]
+        )
+    names = ", ".join(map(_name_policy, found["success"]))
+    page.add_table(
+        ["", "Kendall's tau", "cost of wrong orders", "mean error of success"],
+        rows,
+        f"Over {len(found['success'])} policies: {names}",
+    )
 
 
 def add_success_table(page: Report, found: Mapping[str, Any]) -> None:
@@ -218,15 +219,13 @@ def add_success_table(page: Report, found: Mapping[str, Any]) -> None:
     rows = []
     for policy, shares in found["success"].items():
         times = found["time_to_insert_s"][policy]
-        cells = [
-            Cell(
-                f"{100 * shares[plant]['mean']:.1f}",
-                _note_interval(shares[plant], times[plant]),
-                best=shares is best and plant == "machine",
-            )
-            for plant in PLANTS
-        ]
-        rows.append([_name_policy(policy), *cells])
+        row: list[Any] = [_name_policy(policy)]
+        for plant in PLANTS:
+            text = f"{100 * shares[plant]['mean']:.1f}"
+            # Only the machine decides which policy is the best.
+            is_best = shares is best and plant == "machine"
+            row.append(Cell(text, _note_interval(shares[plant], times[plant]), best=is_best))
+        rows.append(row)
     page.add_table(
         ["", *(PLANT_NAMES[plant] for plant in PLANTS)],
         rows,
@@ -245,9 +244,8 @@ def draw_success(found: Mapping[str, Any]) -> Figure:
         mean = np.array([share["mean"] for share in shares])
         low, high = np.array([share["ci95"] for share in shares]).T
         place = np.arange(len(PLANTS)) + (number - (len(policies) - 1) / 2) * width
-        error = 100 * np.maximum(
-            0.0, [mean - low, high - mean]
-        )  # rounding must not make it negative
+        # Rounding must not make it negative.
+        error = 100 * np.maximum(0.0, [mean - low, high - mean])
         axis.bar(
             place,
             100 * mean,

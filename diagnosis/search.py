@@ -28,23 +28,24 @@ from diagnosis.responses import (
     sum_responses,
 )
 
+# Chosen by hand; not searched.
 MAX_EFFECTS = 4
-"""Effects in a set."""
+"""Largest number of effects in a set; time grows with the subsets of `MAX_NAMES`."""
+SHARED_START = 0.7
+"""First guess of the size of an effect beside others, over its size alone."""
 BEAM_WIDTH = 5
-"""Subsets of each size that a joint goes on from."""
+"""Subsets that a joint keeps for the next number of effects."""
 MAX_NAMES = 12
-"""Names among which whole sets are chosen."""
+"""Number of names among which whole sets are chosen; they make 793 sets of up to 4."""
 MIN_SIZE = 0.15
-"""Smallest size, over the typical one, that is worth naming: what is smaller any simulator gets
-wrong."""
+"""Smallest size, over the typical one, that is named: simulators err by as much."""
 SIMPLER_MARGIN = 1.0
-"""Standard errors by which a set must earn more than a simpler one."""
+"""Standard errors by which the gain of a set must exceed that of a simpler one: the one-standard-error
+rule. It was 2.0 before; no comparison is recorded."""
 MAX_PENALISED = 14
-"""Subsets of each joint that are tried on the reference too."""
-
+"""Subsets of each joint that are simulated on the reference too."""
 ALREADY_THERE = 3.0
-"""Log of a Bayes factor, all parts of the reference together, from which an effect is taken to be
-there already."""
+"""Log Bayes factor, all parts of the reference together, from which an effect is there already."""
 
 Subset = frozenset[str]
 PenaltyFunction = Callable[[int, Subset], float]
@@ -91,7 +92,7 @@ class SubsetTable:
         """Return the log-likelihood gain of a subset."""
         if subset not in self.scores:
             names = sorted(subset)
-            shapes = [shape for name in names for shape in self.shapes[name]]
+            shapes = self._list_responses(names)
             if not shapes:
                 return SubsetScore(np.zeros(len(self.joint.z)), {})
             found = [score_responses(self.joint, shapes, start) for start in self._starts(names)]
@@ -109,27 +110,33 @@ class SubsetTable:
         So a fit also begins at the best set with one effect less. The further effect then begins at
         the size that explains most of the remaining residuals.
         """
-        every = [shape for name in names for shape in self.shapes[name]]
-        starts = [
-            np.array([self.alone(shape) for shape in every]) * (1.0 if len(every) == 1 else 0.7)
-        ]
+        every = self._list_responses(names)
+        # Effects share the residuals, so each is smaller beside the others.
+        factor = 1.0 if len(every) == 1 else SHARED_START
+        starts = [np.array([self.alone(shape) for shape in every]) * factor]
+        if len(names) == 1:
+            return starts
+        # Pairs need their single effects; of larger subsets those suffice that were tried.
         tried = self.score if len(names) == 2 else self.scores.get
-        smaller = [
-            (one, new)
-            for new in names
-            if len(names) > 1 and (one := tried(frozenset(names) - {new}))
-        ]
-        if smaller:
-            best, new = max(smaller, key=lambda pair: pair[0].total)
-            known = [shape for name in sorted(best.sizes) for shape in self.shapes[name]]
-            left = self.joint.z - sum_responses(
-                known, np.concatenate([best.sizes[name] for name in sorted(best.sizes)])
-            )
+        best, new = None, ""
+        for name in names:
+            one = tried(frozenset(names) - {name})
+            if one and (best is None or one.total > best.total):
+                best, new = one, name
+        if best:
+            kept = sorted(best.sizes)
+            sizes = np.concatenate([best.sizes[name] for name in kept])
+            left = self.joint.z - sum_responses(self._list_responses(kept), sizes)
             added = [fit_single_size(left, shape) for shape in self.shapes[new]]
-            starts.append(
-                np.concatenate([added if name == new else best.sizes[name] for name in names])
-            )
+            parts = best.sizes | {new: np.array(added)}
+            starts.append(np.concatenate([parts[name] for name in names]))
         return starts
+
+    def _list_responses(self, names: Sequence[str]) -> list[Response]:
+        found: list[Response] = []
+        for name in names:
+            found += self.shapes[name]
+        return found
 
     def alone(self, shape: Response) -> float:
         """Return the size of a shape that explains the joint's errors best by itself."""
@@ -150,15 +157,19 @@ class SubsetTable:
             return  # a joint without a gap
         for _ in range(2, most + 1):
             before = net(best[0])
-            level = {
-                one | {name}
-                for one in best
-                for name in self.shapes
-                if name not in one and len(one) < most
-            }
+            level = self._extend([one for one in best if len(one) < most])
             best = sorted({*best, *level}, key=lambda one: (-net(one), sorted(one)))[:BEAM_WIDTH]
             if net(best[0]) <= before:
                 return
+
+    def _extend(self, subsets: Sequence[Subset]) -> set[Subset]:
+        """Return all subsets with one effect more."""
+        larger = set()
+        for subset in subsets:
+            for name in self.shapes:
+                if name not in subset:
+                    larger.add(subset | {name})
+        return larger
 
 
 @dataclass(frozen=True)
@@ -202,41 +213,57 @@ def choose_set(
     """
     worth: list[dict[Subset, float]] = []
     for j, table in enumerate(tables):
-        priced = {
-            subset: table.scores[subset].total - price(j, subset)
-            for subset in list_promising_subsets(table, least, share, shared)
-        }
-        worth.append(
-            {subset: value for subset, value in priced.items() if value > 0 or subset <= shared}
-        )
+        worth.append({})
+        for subset in list_promising_subsets(table, least, share, shared):
+            value = table.scores[subset].total - price(j, subset)
+            # A shared effect may lose on one joint and gain in all.
+            if value > 0 or subset <= shared:
+                worth[j][subset] = value
     felt = [shared & table.shapes.keys() for table in tables]
-    best = _find_best_set(worth, felt, name_price, partial)
-    while simpler := _find_simpler_set(best, worth, tables, felt, name_price, partial, share):
+    terms = _SetPenalties(felt, name_price, partial, share)
+    best = _find_best_set(worth, terms)
+    while simpler := _find_simpler_set(best, worth, tables, terms):
         best = simpler
     return best
 
 
-def _find_best_set(
-    worth: Sequence[Mapping[Subset, float]],
-    felt: Sequence[Subset],
-    name_price: float,
-    partial: float,
-) -> EffectSet:
-    """Return the set of at most `MOST` names that is worth most; each joint takes the best subset of them."""
-    names = sorted(
-        {name for by_subset in worth for subset in by_subset for name in subset},
-        key=lambda n: -_sum_best(worth, n),
-    )[:MAX_NAMES]
+@dataclass(frozen=True)
+class _SetPenalties:
+    """Penalties of whole sets; see `choose_set`.
+
+    Attributes:
+        felt: Shared effects that each joint could show.
+        name: Penalty of each effect as such, nats.
+        partial: Penalty of a shared effect for each joint that lacks it, nats.
+        share: Least part of the gain that each effect must add.
+    """
+
+    felt: Sequence[Subset]
+    name: float
+    partial: float
+    share: float
+
+
+def _find_best_set(worth: Sequence[Mapping[Subset, float]], terms: _SetPenalties) -> EffectSet:
+    """Return the set of at most `MAX_EFFECTS` with the largest net gain; each joint takes its best subset."""
+    known: set[str] = set()
+    for by_subset in worth:
+        for subset in by_subset:
+            for name in subset:
+                known.add(name)
+    names = sorted(known, key=lambda name: -_sum_best(worth, name))[:MAX_NAMES]
     best = EffectSet((frozenset(),) * len(worth), 0.0)
     for size in range(1, MAX_EFFECTS + 1):
         for chosen in combinations(names, size):
             among = frozenset(chosen)
-            total, subsets = -name_price * size, []
-            for w, every in zip(worth, felt, strict=True):
-                net = {s: w[s] - partial * len(among & every - s) for s in w if s <= among}
-                net[frozenset()] = -partial * len(among & every)
+            total, subsets = -terms.name * size, []
+            for w, every in zip(worth, terms.felt, strict=True):
+                lacking = among & every
+                net = {s: w[s] - terms.partial * len(lacking - s) for s in w if s <= among}
+                net[frozenset()] = -terms.partial * len(lacking)
                 subsets.append(max(net, key=net.__getitem__))
                 total += net[subsets[-1]]
+            # A set with a name that no joint takes is a smaller set, which is tried by itself.
             if total > best.net_gain and frozenset().union(*subsets) == among:
                 best = EffectSet(tuple(subsets), total)
     return best
@@ -246,19 +273,12 @@ def _find_simpler_set(
     best: EffectSet,
     worth: Sequence[Mapping[Subset, float]],
     tables: Sequence[SubsetTable],
-    felt: Sequence[Subset],
-    name_price: float,
-    partial: float,
-    share: float,
+    terms: _SetPenalties,
 ) -> EffectSet | None:
     """Return a set with fewer names whose loss is within the scatter between blocks, or a small part of the whole."""
     for name in sorted(best.names):
-        other = _find_best_set(
-            [{s: value for s, value in w.items() if name not in s} for w in worth],
-            felt,
-            name_price,
-            partial,
-        )
+        rest = [{s: w[s] for s in w if name not in s} for w in worth]
+        other = _find_best_set(rest, terms)
         if len(other.names) >= len(best.names) or not other.names:
             continue
         lost, whole, blocks = 0.0, 0.0, np.zeros(int(tables[0].block.max()) + 1)
@@ -267,7 +287,9 @@ def _find_simpler_set(
                 difference = table.score(mine).gain - table.score(others).gain
                 lost, whole = lost + difference.sum(), whole + table.score(mine).total
                 blocks += np.bincount(table.block, difference, len(blocks))
-        if lost < max(SIMPLER_MARGIN * blocks.std() * np.sqrt(len(blocks)), share * whole):
+        # Entries of a block depend on each other, so the standard error is taken over blocks.
+        error = blocks.std() * np.sqrt(len(blocks))
+        if lost < max(SIMPLER_MARGIN * error, terms.share * whole):
             return other
     return None
 
@@ -296,17 +318,18 @@ def _has_each_gain(subset: Subset, own: Subset, table: SubsetTable, share: float
     total, sizes = table.scores[subset].total, table.scores[subset].sizes
     if any(np.abs(sizes[name]).max() < MIN_SIZE for name in own):
         return False
-    return len(subset) == 1 or all(
-        total - table.score(subset - {name}).total >= share * total for name in own
-    )
+    if len(subset) == 1:
+        return True
+    return all(total - table.score(subset - {name}).total >= share * total for name in own)
 
 
 def _sum_best(worth: Sequence[Mapping[Subset, float]], name: str) -> float:
     """Return the most that a subset with `name` is worth, summed over joints."""
-    return sum(
-        max([value for subset, value in by_subset.items() if name in subset], default=0.0)
-        for by_subset in worth
-    )
+    best = []
+    for by_subset in worth:
+        values = [value for subset, value in by_subset.items() if name in subset]
+        best.append(max(values, default=0.0))
+    return sum(best)
 
 
 @dataclass
@@ -338,20 +361,20 @@ class ReferenceScores:
     def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[SubsetScore, float]]:
         """Return the gain of the subset on joint `j` in each part of the reference, and the length of the field over the part's."""
         if not self.tables:
-            self.tables = [
-                [SubsetTable(joint, {}, part.block) for joint in fit_joint_faults(part)]
-                for part in self.parts
-            ]
+            for part in self.parts:
+                joints = fit_joint_faults(part)
+                self.tables.append([SubsetTable(joint, {}, part.block) for joint in joints])
         for name in subset - self.known:
-            ways = [
-                replace(ray, shape=self.grown[name][0].shape) for ray in self.rays[name]
-            ]  # shaped as they are in the field
+            # The field chose the values of numbers that only shape the effect.
+            shape = self.grown[name][0].shape
+            ways = [replace(ray, shape=shape) for ray in self.rays[name]]
             for tables, part in zip(self.tables, self.parts, strict=True):
                 add_responses([table.shapes for table in tables], name, ways, part)
             self.known.add(name)
         found = []
-        for mine in (tables[j] for tables in self.tables):
-            usable = frozenset(name for name in subset if name in mine.shapes)
+        for tables in self.tables:
+            mine = tables[j]
+            usable = frozenset(subset & mine.shapes.keys())
             found.append((mine.score(usable), self.num_entries / len(mine.joint.z)))
         return found
 
@@ -378,8 +401,8 @@ class ReferenceScores:
 
 
 SHARED_PLAY = 0.3
-"""Sizes may differ by so much of what they have in common: an effect's form is not quite the same
-on all joints."""
+"""Relative difference of a joint's size from the shared one: forms differ between joints. Chosen by
+hand; not searched."""
 
 Rays = Mapping[str, Sequence[ParameterRay]]
 Shapes = Sequence[Mapping[str, Sequence[Response]]]
@@ -389,17 +412,17 @@ def bind_shared_sizes(
     names: Subset, tables: Sequence[SubsetTable], grown: Rays, shapes: Shapes
 ) -> tuple[dict[str, list[ParameterRay]], list[dict[str, list[Response]]]]:
     """Return rays and shapes with those of the effects `names` bounded to about the size that the joints agree on."""
-    rays, narrow = (
-        {name: list(ways) for name, ways in grown.items()},
-        [{n: list(s) for n, s in mine.items()} for mine in shapes],
-    )
+    rays = {name: list(ways) for name, ways in grown.items()}
+    narrow: list[dict[str, list[Response]]] = []
+    for mine in shapes:
+        narrow.append({name: list(own) for name, own in mine.items()})
     for name in names:
         scored = [table.score(frozenset({name})) for table in tables if name in table.shapes]
         for place, ray in enumerate(rays[name]):
             size = np.array([one.sizes[name][place] for one in scored])
-            told = np.array([max(one.total, 0.0) for one in scored]) / np.maximum(
-                np.square(size), 1e-6
-            )
+            # Gain over squared size is the information that a joint has about the size.
+            gain = np.array([max(one.total, 0.0) for one in scored])
+            told = gain / np.maximum(np.square(size), 1e-6)
             common = find_weighted_median(size, told)
             if common == 0.0:
                 continue
@@ -408,9 +431,8 @@ def bind_shared_sizes(
             for mine in narrow:
                 if name in mine:
                     shape = mine[name][place]
-                    mine[name][place] = Response(
-                        ends, np.stack([shape.at(float(size))[0] for size in ends])
-                    )
+                    changes = [shape.at(float(size))[0] for size in ends]
+                    mine[name][place] = Response(ends, np.stack(changes))
     return rays, narrow
 
 

@@ -28,7 +28,7 @@ from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points
 from diagnosis.probes import SPAN_S, Probe, probe_residuals
 from diagnosis.sanity import RecordingRemark, examine_recordings
-from diagnosis.where import GapLocation, locate_gap
+from diagnosis.where import GapLocation, JointError, locate_gap
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,9 @@ MIN_EXPLAINED, MIN_EXCESS_RATIO = 0.05, 1.5
 kinematics count as wrong; chosen by hand: the noise of tool points differs between poses."""
 MAX_TARGET_DISTANCE_M = 0.5
 """Largest distance of the touched hole from the tip, m; chosen by hand."""
+MIN_NOISE_PART, MIN_GAP_PART = 0.1, 0.01
+"""Part of a joint's excess, and of the gap, from which its sensor noise is told. Chosen by hand; not
+searched."""
 TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
 
 
@@ -160,29 +163,25 @@ def attribute_to_stages(
     """Return the contribution of each stage about which the recordings tell something."""
     whole_m = _compute_tip_excess(known.budget) if known.budget else None
     found = _split_joint_gap(known, runs, reference, machine, whole_m)
-    found += list(
-        filter(
-            None,
-            (
-                _assess_kinematics(known),
-                assess_perception(runs.recordings, machine),
-                _assess_contact(runs),
-            ),
-        )
+    others = (
+        _assess_kinematics(known),
+        assess_perception(runs.recordings, machine),
+        _assess_contact(runs),
     )
-    return found
+    return [*found, *filter(None, others)]
 
 
 def select_stage(findings: Sequence[StageFinding], has_gap: bool) -> Stage | None:
     """Return the stage with the largest contribution at the tool; `None` without a gap."""
-    those = [
-        f
-        for f in findings
-        if f.stage in ("timing", "actuation", "sensing", "kinematics", "perception")
-    ]
-    those = [f for f in those if has_gap or f.stage in ("kinematics", "perception")]
-    weighed = [(f.rms_m if f.rms_m is not None else f.part or 0.0, f.stage) for f in those]
-    weighed = [pair for pair in weighed if pair[0] > 0.0]
+    # Tool points and touches show errors of their own where the joints have no gap.
+    usable = ["kinematics", "perception"]
+    if has_gap:
+        usable += ["timing", "actuation", "sensing"]
+    weighed = []
+    for one in findings:
+        weight = one.rms_m if one.rms_m is not None else one.part or 0.0
+        if one.stage in usable and weight > 0.0:
+            weighed.append((weight, one.stage))
     return max(weighed)[1] if weighed else None  # type: ignore[return-value]
 
 
@@ -199,51 +198,69 @@ def _split_joint_gap(
     machine: Machine,
     whole_m: float | None,
 ) -> list[StageFinding]:
-    noise, floor = (
-        estimate_sensor_noise(runs.recordings),
-        estimate_sensor_noise(reference.recordings) if reference else None,
+    timing, late = _assess_timing(known, runs, machine)
+    sensing, noisy = _assess_sensing(known, runs, reference, machine)
+    timing = min(timing, 1.0)
+    sensing = min(sensing, 1.0 - timing)
+    rows = (
+        (
+            "timing",
+            timing,
+            "; ".join(late)
+            or "no joint moves earlier or later than simulated, beyond what the reference shows",
+        ),
+        ("sensing", sensing, "; ".join(noisy) or "no sensor is noisier than on the reference"),
+        ("actuation", 1.0 - timing - sensing, "what is left of the joints' gap"),
     )
-    parts, texts = {"timing": 0.0, "sensing": 0.0}, {"timing": [], "sensing": []}
-    late = {
-        probe.joint: probe
-        for probe in known.probes
-        if probe.effect == "dead_time" and probe.is_clear
-    }
+    found = []
+    for stage, part, text in rows:
+        rms_m = None if whole_m is None else whole_m * float(np.sqrt(part))
+        found.append(StageFinding(stage, part, rms_m, text))
+    return found
+
+
+def _assess_timing(
+    known: StageEvidence, runs: WindowedRuns, machine: Machine
+) -> tuple[float, list[str]]:
+    """Return the part of timing in the joints' gap, and a sentence for each late joint."""
+    part, texts = 0.0, []
+    clear = [probe for probe in known.probes if probe.effect == "dead_time" and probe.is_clear]
+    late = {probe.joint: probe for probe in clear}
     span = max(1, round(SPAN_S / machine.period_s))
     speed = (runs.simulated[:, span:] - runs.simulated[:, :-span]) / SPAN_S
     for j, (name, joint) in enumerate(known.location.joints.items()):
-        excess = max(joint.rmse**2 - joint.floor**2, 1e-18)
         if name in late:
             probe = late[name]
+            # A delay displaces by speed times time.
             moved = float(np.mean(speed[..., j] ** 2)) * (probe.value - probe.reference) ** 2
-            parts["timing"] += joint.gap * min(1.0, moved / excess)
-            texts["timing"].append(probe.text)
-        # the start of a window is measured as well, so noise counts twice
-        more = 2.0 * max(noise[j] ** 2 - (floor[j] ** 2 if floor is not None else 0.0), 0.0)
-        if more > 0.1 * excess and joint.gap > 0.01:
-            parts["sensing"] += joint.gap * min(1.0, more / excess)
+            part += joint.gap * min(1.0, moved / _compute_joint_excess(joint))
+            texts.append(probe.text)
+    return part, texts
+
+
+def _assess_sensing(
+    known: StageEvidence, runs: WindowedRuns, reference: WindowedRuns | None, machine: Machine
+) -> tuple[float, list[str]]:
+    """Return the part of sensor noise in the joints' gap, and a sentence for each noisy joint."""
+    part, texts = 0.0, []
+    noise = estimate_sensor_noise(runs.recordings)
+    floor = estimate_sensor_noise(reference.recordings) if reference else np.zeros_like(noise)
+    for j, (name, joint) in enumerate(known.location.joints.items()):
+        excess = _compute_joint_excess(joint)
+        # The start of a window is measured as well, so noise counts twice.
+        more = 2.0 * max(noise[j] ** 2 - floor[j] ** 2, 0.0)
+        if more > MIN_NOISE_PART * excess and joint.gap > MIN_GAP_PART:
+            part += joint.gap * min(1.0, more / excess)
             unit = machine.joints[j].unit
-            before = 0.0 if floor is None else 1e3 * floor[j]
-            texts["sensing"].append(
-                f"{name} has {1e3 * noise[j]:.2f} m{unit} of noise, {before:.2f} on the reference"
+            texts.append(
+                f"{name} has {1e3 * noise[j]:.2f} m{unit} of noise, {1e3 * floor[j]:.2f} on the reference"
             )
-    timing, sensing = (
-        min(parts["timing"], 1.0),
-        min(parts["sensing"], 1.0 - min(parts["timing"], 1.0)),
-    )
-    rows = {"timing": timing, "sensing": sensing, "actuation": 1.0 - timing - sensing}
-    sayings = {
-        "timing": "; ".join(texts["timing"])
-        or "no joint moves earlier or later than simulated, beyond what the reference shows",
-        "sensing": "; ".join(texts["sensing"]) or "no sensor is noisier than on the reference",
-        "actuation": "what is left of the joints' gap",
-    }
-    return [
-        StageFinding(
-            stage, part, None if whole_m is None else whole_m * float(np.sqrt(part)), sayings[stage]
-        )
-        for stage, part in rows.items()
-    ]
+    return part, texts
+
+
+def _compute_joint_excess(joint: JointError) -> float:
+    """Return the mean squared error beyond the floor, never 0."""
+    return max(joint.rmse**2 - joint.floor**2, 1e-18)
 
 
 def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
@@ -252,10 +269,9 @@ def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
     The median makes edges of motions, which are few, count little. White noise of 1 has third
     differences of sqrt(20).
     """
-    third = np.concatenate(
-        [np.diff(recording.q.astype(float), 3, axis=0) for recording in recordings]
-    )
-    return np.median(np.abs(third), 0) / 0.6745 / np.sqrt(20.0)
+    third = [np.diff(recording.q.astype(float), 3, axis=0) for recording in recordings]
+    # 0.6745: median absolute value of a standard normal. 20 = 1 + 9 + 9 + 1, the squared weights.
+    return np.median(np.abs(np.concatenate(third)), 0) / 0.6745 / np.sqrt(20.0)
 
 
 def _assess_kinematics(known: StageEvidence) -> StageFinding | None:
@@ -284,18 +300,17 @@ def assess_perception(recordings: Sequence[Recording], machine: Machine) -> Stag
         return None
     off = []
     for recording in recordings:
-        if not all(column in recording.extra for column in (*TARGET_COLUMNS, "force_n")):
+        extra = recording.extra
+        if not {*TARGET_COLUMNS, "force_n"} <= extra.keys():
             continue
-        target = np.stack([recording.extra[column] for column in TARGET_COLUMNS], 1).astype(float)
-        if all(column in recording.extra for column in TOOL_COLUMNS):
-            tip = np.stack([recording.extra[column] for column in TOOL_COLUMNS], 1).astype(float)
+        target = np.stack([extra[column] for column in TARGET_COLUMNS], 1).astype(float)
+        if {*TOOL_COLUMNS} <= extra.keys():
+            tip = np.stack([extra[column] for column in TOOL_COLUMNS], 1).astype(float)
         else:
-            tip = (
-                Kinematics(machine)
-                .pose(torch.as_tensor(recording.q, dtype=torch.float32))
-                .tip_in_base_m.numpy()
-            )
-        touches = recording.extra["force_n"] > CONTACT_N
+            q = torch.as_tensor(recording.q, dtype=torch.float32)
+            tip = Kinematics(machine).pose(q).tip_in_base_m.numpy()
+        # Only the first sample of a touch: afterwards the tool may slide.
+        touches = extra["force_n"] > CONTACT_N
         first = touches & ~np.append(False, touches[:-1])
         distance = np.linalg.norm(tip - target, axis=1)[first]
         off += distance[distance < MAX_TARGET_DISTANCE_M].tolist()
@@ -344,12 +359,11 @@ class Survey:
 
     def where(self) -> Where:
         """Return the field `where` of `diagnosis.json`; shares are those of the gap."""
-        joints = {
-            name: JointGap(j.rmse, j.floor, j.gap) for name, j in self.location.joints.items()
-        }
-        regimes = [
-            RegimeGap(p.joint, p.category, p.gap) for p in self.location.largest() if p.gap > 0.0
-        ]
+        joints = {}
+        for name, joint in self.location.joints.items():
+            joints[name] = JointGap(joint.rmse, joint.floor, joint.gap)
+        parts = [part for part in self.location.largest() if part.gap > 0.0]
+        regimes = [RegimeGap(part.joint, part.category, part.gap) for part in parts]
         stage = select_stage(self.stages, self.location.has_gap)
         return Where(
             joints,
@@ -395,28 +409,33 @@ def examine_gap(
     """
     location = locate_gap(before, floor, machine, dead_time_s, generator, whole)
     clues = probe_residuals(before, floor, machine, dead_time_s)
-    shapes = [
-        compare_tool_points(runs.recordings, machine) if runs else None for runs in (before, floor)
-    ]
-    accounts = [
-        measure_tip_error(runs, machine) if runs and machine.has_bodies else None
-        for runs in (before, after, floor)
-    ]
-    budget = TipErrorBudget(accounts[0], accounts[1], accounts[2], {}) if accounts[0] else None
-    rows = attribute_to_stages(
-        StageEvidence(location, clues, budget, shapes[0], shapes[1]), before, floor, machine
-    )
+    field_geometry = compare_tool_points(before.recordings, machine)
+    reference_geometry = compare_tool_points(floor.recordings, machine) if floor else None
+    budget = _measure_budget(before, after, floor, machine) if machine.has_bodies else None
+    evidence = StageEvidence(location, clues, budget, field_geometry, reference_geometry)
+    rows = attribute_to_stages(evidence, before, floor, machine)
     if budget:
-        of_geometry = {
-            row.stage: row.rms_m for row in rows if row.part is None and row.rms_m is not None
-        }
-        budget = TipErrorBudget(budget.before, budget.after, budget.floor, of_geometry)
+        # A row without a part of the joints' gap is an error of its own, at the tool.
+        for row in rows:
+            if row.part is None and row.rms_m is not None:
+                budget.stages_m[row.stage] = row.rms_m
     return Survey(
         examine_recordings(before.recordings, machine, thresholds),
         location,
         clues,
         rows,
         budget,
-        shapes[0],
+        field_geometry,
         machine,
+    )
+
+
+def _measure_budget(
+    before: WindowedRuns, after: WindowedRuns | None, floor: WindowedRuns | None, machine: Machine
+) -> TipErrorBudget:
+    return TipErrorBudget(
+        measure_tip_error(before, machine),
+        measure_tip_error(after, machine) if after else None,
+        measure_tip_error(floor, machine) if floor else None,
+        {},
     )

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from scipy import stats
@@ -22,6 +23,7 @@ from diagnosis.residuals import Residuals, to_increments
 from diagnosis.responses import fit_sizes
 from diagnosis.search import find_weighted_median
 
+# Chosen by hand; not searched.
 MIN_COMMAND_CHANGE = 0.06
 """Smaller changes of a command tell nothing about when it arrived."""
 DELAY_PRIOR = 1.5
@@ -44,8 +46,11 @@ MAX_EXTRA_MEAN = 2.0
 is an effect of its own."""
 SCALES, FREEDOMS = np.linspace(0.7, 1.5, 9), (3.0, 5.0, 7.0, 10.0)
 """Among which the distribution of the errors of delays is found."""
+REFERENCE_PENALTY = 1.5
+"""Penalty of the gain on the reference, over that gain."""
 MIN_SCATTER_RATIO = 1.1
-"""Scatter of the delays, over that of reference recordings, below which nothing is looked for."""
+"""Scatter of the delays, over that of reference recordings, below which nothing is looked for.
+It was 1.2 before; no comparison is recorded."""
 
 
 @dataclass(frozen=True)
@@ -83,11 +88,11 @@ class DelayErrorModel:
     @classmethod
     def of(cls, known: Sequence[FrameDelays]) -> DelayErrorModel:
         """Return the most likely one for the delays of recordings in which no frame is late."""
-        tried = [cls(scale, freedom) for scale in SCALES for freedom in FREEDOMS]
-        return max(
-            tried,
-            key=lambda one: sum(float(one.log(seen.value, seen.error).sum()) for seen in known),
-        )
+
+        def total(one: DelayErrorModel) -> float:
+            return sum(float(one.log(seen.value, seen.error).sum()) for seen in known)
+
+        return max((cls(*pair) for pair in product(SCALES, FREEDOMS)), key=total)
 
     def log(self, off: np.ndarray, error: np.ndarray) -> np.ndarray:
         """Return the log density of errors `off` of delays with these standard errors."""
@@ -123,10 +128,10 @@ class CommandChanges:
         count, windows = int(rank.max(initial=0)), len(cut.u)
         if not count:
             return np.zeros((0, *self.residuals.increments.shape))
-        late = [
-            np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:]) for number in range(1, count + 1)
-        ]
-        u = np.concatenate([np.repeat(cut.u[None, :, :1], count, 0), np.stack(late)], 2)
+        # One simulation shifts the n-th change of all joints; each joint is read for its own.
+        number = np.arange(1, count + 1)[:, None, None, None]
+        late = np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:])
+        u = np.concatenate([np.repeat(cut.u[None, :, :1], count, 0), late], 2)
         rows = np.tile(np.arange(windows), count)
         many = replace(cut, u=u.reshape(-1, *u.shape[2:]), q=cut.q[rows], run=cut.run[rows])
         simulator = replace(
@@ -190,9 +195,8 @@ class CommandChanges:
         The mean delay of a single joint is subtracted first; `without`: a joint whose errors do not
         count.
         """
-        z = np.stack(
-            [(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)], 1
-        )  # (W, J, I)
+        whitened = [(w @ error[..., j, None])[..., 0] for j, w in enumerate(self._whiteners)]
+        z = np.stack(whitened, 1)  # (W, J, I)
         always = np.stack([x.sum(1).reshape(z.shape[1:]) for x, _ in self._told])
         share = (always * z).sum((0, 2)) / (np.square(always).sum((0, 2)) + DELAY_PRIOR**-2)
         z = z - share[:, None] * always
@@ -203,16 +207,11 @@ class CommandChanges:
             value.append((matrix @ row.ravel())[sure])
             deviation.append(errors[sure])
             joint.append(most[sure])
-        value, deviation, joint = (
-            np.concatenate(value),
-            np.concatenate(deviation),
-            np.concatenate(joint),
-        )
-        return FrameDelays(
-            value - np.average(value, weights=deviation**-2) if len(value) else value,
-            deviation,
-            joint,
-        )
+        value, deviation = np.concatenate(value), np.concatenate(deviation)
+        # A common delay is a dead time, which the simulator or another effect has.
+        if len(value):
+            value = value - np.average(value, weights=deviation**-2)
+        return FrameDelays(value, deviation, np.concatenate(joint))
 
     def spread(self, error: np.ndarray) -> np.ndarray:
         """Return the response to each change at a delay of one standard deviation of those seen, `(W, C, I, J)`."""
@@ -258,26 +257,24 @@ def detect_timing_effect(
         drawn = [_subsample_delays(one) for one in _draw_delays(changes, kind)]
         gains[kind.name] = np.array([usual.gain(seen, one) for one in drawn])
         best = drawn[int(np.argmax(gains[kind.name]))]
-        by_joint = {
-            int(j): usual.gain(seen.of(j), best)
-            for j in np.unique(seen.joint)
-            if len(seen.of(j).value) >= MIN_DELAYS
-        }
-        rest = (
-            changes.delays(error, max(by_joint, key=by_joint.__getitem__))
-            if len(by_joint) > 1
-            else seen
-        )
+        by_joint: dict[int, float] = {}
+        for j in np.unique(seen.joint):
+            if len(seen.of(j).value) >= MIN_DELAYS:
+                by_joint[int(j)] = usual.gain(seen.of(j), best)
+        rest = seen
+        if len(by_joint) > 1:
+            rest = changes.delays(error, max(by_joint, key=by_joint.__getitem__))
         if min(by_joint.values(), default=0.0) < -price or usual.gain(rest, best) < price:
             gains[kind.name] = gains[kind.name] * 0.0  # frames are late for all joints or for none
-        share = [len(seen.value) / max(1, len(one.value)) for one in known]
-        earned[kind.name] = max(
-            0.0, *(usual.gain(one, best) * part for one, part in zip(known, share, strict=True))
-        )
-    worth = {
-        name: float(gain.max()) - price - 1.5 * earned[name] - name_price
-        for name, gain in gains.items()
-    }
+        # Gains grow with the number of delays.
+        known_gains = []
+        for one in known:
+            share = len(seen.value) / max(1, len(one.value))
+            known_gains.append(usual.gain(one, best) * share)
+        earned[kind.name] = max(0.0, *known_gains)
+    worth = {}
+    for name, gain in gains.items():
+        worth[name] = float(gain.max()) - price - REFERENCE_PENALTY * earned[name] - name_price
     best = max(kinds, key=lambda kind: worth[kind.name])
     if worth[best.name] <= 0:
         return None
@@ -285,9 +282,8 @@ def detect_timing_effect(
     machine = changes.residuals.simulator.machine
     parameters = {}
     for name in best.fitted:
-        mean, low, high = (
-            float(v) for v in best.clipped(name, best.numbers[name].none + best.size(name) * ends)
-        )
+        values = best.numbers[name].none + best.size(name) * ends
+        mean, low, high = (float(value) for value in best.clipped(name, values))
         parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
     rest = {name: float(gain.max()) for name, gain in gains.items() if name != best.name}
     every = np.ones(machine.num_joints, dtype=bool)
@@ -359,10 +355,9 @@ def _draw_delays(changes: CommandChanges, kind: EffectType) -> list[np.ndarray]:
     paths = residuals.simulator.simulate([(kind, values)], len(sizes))
     moved = to_increments(paths, residuals.start) - residuals.increments
     found = [changes.delays(one).value for one in moved]
-    return [
-        np.concatenate(found[start : start + DRAWS_PER_WINDOW])
-        for start in range(0, len(found), DRAWS_PER_WINDOW)
-    ]
+    # Draws of one size lie in a row.
+    starts = range(0, len(found), DRAWS_PER_WINDOW)
+    return [np.concatenate(found[start : start + DRAWS_PER_WINDOW]) for start in starts]
 
 
 def _compute_scatter(values: np.ndarray) -> float:

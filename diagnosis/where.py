@@ -92,10 +92,10 @@ def sum_by_condition(
     runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[str, GroupSums]:
     """Return the sums by regime, direction, load (where masses are known) and frequency."""
-    every = group_samples(list(runs.recordings), machine, dead_time_s)
-    return {dimension.name: _sum_by_origin(runs, dimension, machine) for dimension in every} | {
-        "frequency": _sum_by_band(runs, machine)
-    }
+    found = {}
+    for dimension in group_samples(list(runs.recordings), machine, dead_time_s):
+        found[dimension.name] = _sum_by_origin(runs, dimension, machine)
+    return found | {"frequency": _sum_by_band(runs, machine)}
 
 
 def sum_by_time(runs: WindowedRuns, machine: Machine) -> dict[str, GroupSums]:
@@ -125,16 +125,16 @@ def _measure_increments(runs: WindowedRuns, machine: Machine) -> np.ndarray:
 
 
 def _sum_by_origin(runs: WindowedRuns, dimension: SampleGrouping, machine: Machine) -> GroupSums:
-    label, error, added = (
-        runs.cut(dimension.label),
-        np.nan_to_num(runs.error),
-        _measure_increments(runs, machine),
-    )
-    names = dimension.categories
+    label, names = runs.cut(dimension.label), dimension.categories
+    error, added = np.nan_to_num(runs.error), _measure_increments(runs, machine)
     square = (trace_to_origin(runs.error, label, len(names)) * error).sum(2)
     belongs = np.stack([label == c for c in range(len(names))])
-    sums = (square, (added * belongs).sum(2), belongs.sum(2).astype(float))
-    return GroupSums(names, *(np.moveaxis(values, 0, 2) for values in sums))
+    return GroupSums(
+        names,
+        np.moveaxis(square, 0, 2),
+        np.moveaxis((added * belongs).sum(2), 0, 2),
+        np.moveaxis(belongs.sum(2).astype(float), 0, 2),
+    )
 
 
 def _sum_by_band(runs: WindowedRuns, machine: Machine) -> GroupSums:
@@ -143,10 +143,10 @@ def _sum_by_band(runs: WindowedRuns, machine: Machine) -> GroupSums:
     power = np.abs(np.fft.rfft(error, axis=1)) ** 2 / error.shape[1]
     hertz = np.fft.rfftfreq(error.shape[1], machine.period_s)
     power[:, (hertz > 0) & (hertz < 0.5 / machine.period_s - 1e-9)] *= 2.0  # the mirrored half
-    edges = (0.0, *BANDS_HZ, np.inf)
-    square = np.stack(
-        [power[:, (hertz >= low) & (hertz < high)].sum(1) for low, high in pairwise(edges)], 2
-    )
+    bands = []
+    for low, high in pairwise((0.0, *BANDS_HZ, np.inf)):
+        bands.append(power[:, (hertz >= low) & (hertz < high)].sum(1))
+    square = np.stack(bands, 2)
     names = (
         f"below {BANDS_HZ[0]:g} Hz",
         *(f"{a:g} to {b:g} Hz" for a, b in pairwise(BANDS_HZ)),
@@ -157,6 +157,7 @@ def _sum_by_band(runs: WindowedRuns, machine: Machine) -> GroupSums:
 
 
 TINY = np.finfo(float).tiny
+"""Smallest divisor: a sum of squares may be 0."""
 
 
 @dataclass(frozen=True)
@@ -185,10 +186,10 @@ class GapPart:
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain JSON data."""
-        return {
-            name: round(value, 6) if isinstance(value, float) else value
-            for name, value in self.__dict__.items()
-        }
+        found = {}
+        for name, value in self.__dict__.items():
+            found[name] = round(value, 6) if isinstance(value, float) else value
+        return found
 
 
 @dataclass(frozen=True)
@@ -295,6 +296,7 @@ class _GapTest:
         generator: np.random.Generator,
     ) -> None:
         self._machine, self._generator = machine, generator
+        # Metres and radians do not add up, so mixed joints count by their travel.
         alike = len({joint.unit for joint in machine.joints}) == 1
         self._weight = (
             np.ones(machine.num_joints) if alike else (machine.upper - machine.lower) ** -2.0
@@ -318,12 +320,12 @@ class _GapTest:
         gap = excess / max(excess.sum(), TINY)
         p = self._p(self._mine, self._floor)[:, 0]
         sure = adjust_p_values(p) <= FALSE_DISCOVERY_RATE
-        return {
-            name: JointError(
+        found = {}
+        for j, name in enumerate(self._machine.joint_names):
+            found[name] = JointError(
                 rmse[j], floor[j], float(error[j]), float(gap[j]), _drop_nan(p[j]), bool(sure[j])
             )
-            for j, name in enumerate(self._machine.joint_names)
-        }
+        return found
 
     def parts(
         self, sums: GroupSums, floor: GroupSums | None, joints: dict[str, JointError]
@@ -337,6 +339,7 @@ class _GapTest:
                 seen > 0, floor.square.sum(0) / np.maximum(seen, 1.0) * count, expected
             )
         chance = self._chance(sums, floor) * count
+        # A joint keeps parts that add up to 1 even where nothing exceeds the floor for sure.
         rows = zip(square - expected - chance, square - expected, square, strict=True)
         excess = np.stack([_take_first_positive(*row) for row in rows])
         within = excess / np.maximum(excess.sum(1, keepdims=True), TINY)
@@ -346,19 +349,12 @@ class _GapTest:
         time = count / np.maximum(self._mine.count.sum(0), 1.0)
         p = self._p(sums, floor)
         sure = adjust_p_values(p) <= FALSE_DISCOVERY_RATE
-        return [
-            GapPart(
-                name,
-                category,
-                float(time[j, c]),
-                float(error[j, c]),
-                float(gap[j, c]),
-                _drop_nan(p[j, c]),
-                bool(sure[j, c]),
-            )
-            for j, name in enumerate(self._machine.joint_names)
-            for c, category in enumerate(sums.categories)
-        ]
+        found = []
+        for j, name in enumerate(self._machine.joint_names):
+            for c, category in enumerate(sums.categories):
+                shares = (float(time[j, c]), float(error[j, c]), float(gap[j, c]))
+                found.append(GapPart(name, category, *shares, _drop_nan(p[j, c]), bool(sure[j, c])))
+        return found
 
     def _floor_mean(self) -> np.ndarray:
         return _average_square(self._floor) if self._floor else np.zeros(self._machine.num_joints)
@@ -369,12 +365,12 @@ class _GapTest:
         if floor is None or self._blocks is None:
             return np.zeros(shape)
         square = np.zeros(shape)
+        # Field and reference are independent, so their variances add up.
         for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference)):
-            totals = (
-                sum_by_block(values.reshape(len(block), -1), block)
-                for values in (sums.square, sums.count)
+            error = estimate_standard_error(
+                _sum_blocks(sums.square, block), _sum_blocks(sums.count, block)
             )
-            square += np.nan_to_num(estimate_standard_error(*totals).reshape(shape)) ** 2
+            square += np.nan_to_num(error.reshape(shape)) ** 2
         return np.sqrt(square)
 
     def _p(self, mine: GroupSums, floor: GroupSums | None) -> np.ndarray:
@@ -382,22 +378,22 @@ class _GapTest:
         shape = mine.square.shape[1:]
         if floor is None or self._blocks is None:
             return np.full(shape, np.nan)
-        field, reference = (
-            (
-                sum_by_block(sums.tested.reshape(len(block), -1), block),
-                sum_by_block(sums.count.reshape(len(block), -1), block),
-            )
-            for sums, block in ((mine, self._blocks.field), (floor, self._blocks.reference))
-        )
+        own, other = self._blocks.field, self._blocks.reference
+        field = (_sum_blocks(mine.tested, own), _sum_blocks(mine.count, own))
+        reference = (_sum_blocks(floor.tested, other), _sum_blocks(floor.count, other))
         return compute_excess_p(field, reference, self._generator).reshape(shape)
+
+
+def _sum_blocks(values: np.ndarray, block: np.ndarray) -> np.ndarray:
+    return sum_by_block(values.reshape(len(block), -1), block)
 
 
 def _take_first_positive(*choices: np.ndarray) -> np.ndarray:
     """Return the positive part of the first choice that has any."""
-    return next(
-        (np.maximum(choice, 0.0) for choice in choices if (choice > 0).any()),
-        np.zeros_like(choices[-1]),
-    )
+    for choice in choices:
+        if (choice > 0).any():
+            return np.maximum(choice, 0.0)
+    return np.zeros_like(choices[-1])
 
 
 def _average_square(sums: GroupSums) -> np.ndarray:

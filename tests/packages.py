@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
+import sys
 from pathlib import Path
 
+import pytest
 
-def install_package(folder: Path, name: str, files: dict[str, str]) -> None:
-    """Put a package with an entry point where a wheel would put it."""
+
+def install_package(
+    folder: Path, name: str, files: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Put a package with an entry point where a wheel would put it, on the import path.
+
+    Modules of another test's package of the same name are forgotten first.
+    """
+    for module in [one for one in sys.modules if one.split(".")[0] == name]:
+        del sys.modules[module]
     for path, text in {"__init__.py": "", "conf/__init__.py": "", **files}.items():
         (folder / name / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / name / path).write_text(text)
@@ -14,3 +25,5 @@ def install_package(folder: Path, name: str, files: dict[str, str]) -> None:
     about.mkdir()
     (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(f"[brokk_rl.conf]\n{name} = {name}.conf\n")
+    monkeypatch.syspath_prepend(str(folder))
+    importlib.invalidate_caches()

@@ -8,7 +8,6 @@ the task can be deployed, `policy.onnx` (from the observation vector to the mask
 from __future__ import annotations
 
 import json
-from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,6 +26,7 @@ from brokk_rl.contracts.task import (
 )
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.registry import resolve_package_path
 from brokk_rl.rl.runner import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import write_json
@@ -198,17 +198,10 @@ def locate_bundle(folder: str) -> Path:
     Raises:
         CheckpointError: There is no such package.
     """
-    package, colon, inside = folder.partition(":")
-    if not colon or Path(folder).exists():
-        return Path(folder)
     try:
-        return Path(str(resources.files(package))) / inside
-    except (ModuleNotFoundError, ValueError, TypeError) as error:
-        raise CheckpointError(
-            f"policy.folder={folder}: there is no package '{package}' ({error}); give a run "
-            "folder, "
-            "or package:path"
-        ) from error
+        return resolve_package_path(folder)
+    except ConfigError as error:
+        raise CheckpointError(f"policy.folder={error}") from error
 
 
 def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:

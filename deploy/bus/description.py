@@ -18,8 +18,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
-from pathlib import Path
 
 import cantools
 from cantools.database import Database
@@ -27,6 +25,7 @@ from cantools.database.can import Message
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.registry import resolve_package_path
 from deploy.bus.protection import FINAL, MAX_STEP, START, TABLE, MessageFault, compute_crc8
 
 COUNTER, CRC = "Counter", "Crc"
@@ -86,16 +85,17 @@ class BusDescription:
     def __init__(self, name: str, machine: Machine) -> None:
         self.name = name
         self._database = _load_database(name)
-        self._messages: dict[str, Message] = {
-            message.name: message for message in self._database.messages
-        }
-        self.layouts = {
-            message.name: _build_layout(message, name) for message in self._database.messages
-        }
-        self.by_id = {layout.frame_id: layout for layout in self.layouts.values()}
+        self._messages: dict[str, Message] = {}
+        self.layouts: dict[str, MessageLayout] = {}
+        self.by_id: dict[int, MessageLayout] = {}
         self._home: dict[str, str] = {}
         for message in self._database.messages:
-            self._home |= {signal.name: message.name for signal in message.signals}
+            layout = _build_layout(message, name)
+            self._messages[message.name] = message
+            self.layouts[message.name] = layout
+            self.by_id[layout.frame_id] = layout
+            for signal in message.signals:
+                self._home[signal.name] = message.name
         required = []
         for kind in ("Command", "Position", "Valid", "Flow"):
             required += [f"{kind}_{joint}" for joint in machine.joint_names]
@@ -131,11 +131,11 @@ class BusDescription:
 
     def signals(self, message: str) -> list[str]:
         """Return the names of the signals of `message`, without counter and CRC."""
-        return [
-            signal.name
-            for signal in self._messages[message].signals
-            if signal.name not in (COUNTER, CRC)
-        ]
+        names = []
+        for signal in self._messages[message].signals:
+            if signal.name not in (COUNTER, CRC):
+                names.append(signal.name)
+        return names
 
     def unit(self, message: str, signal: str) -> str:
         """Return the unit of a signal, '' for none."""
@@ -167,19 +167,6 @@ class BusDescription:
         decoded = self._messages[layout.name].decode(data, decode_choices=False)
         assert isinstance(decoded, dict)
         return {name: float(value) for name, value in decoded.items()}  # type: ignore[arg-type]
-
-
-def resolve_package_path(name: str) -> Path:
-    """Return the path of a file: a path, or `package:path` within an installed package."""
-    package, colon, inside = name.partition(":")
-    if not colon or Path(name).exists():
-        return Path(name)
-    try:
-        return Path(str(resources.files(package))) / inside
-    except (ModuleNotFoundError, ValueError, TypeError) as error:
-        raise ConfigError(
-            f"{name}: there is no package '{package}' ({error}); give a path, or package:path"
-        ) from error
 
 
 def _load_database(name: str) -> Database:

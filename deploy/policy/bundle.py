@@ -18,7 +18,7 @@ import onnxruntime
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder, TargetScaling
-from deploy.bus.description import resolve_package_path
+from brokk_rl.registry import resolve_package_path
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
 SCHEMA = 1
@@ -42,7 +42,7 @@ class PolicyBundle:
         contract: Contents of `policy.json`.
 
     Raises:
-        CheckpointError: see the module; the message says what differs.
+        CheckpointError: see the module; the message names the difference.
     """
 
     def __init__(self, folder: str, machine: Machine) -> None:

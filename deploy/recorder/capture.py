@@ -25,7 +25,8 @@ from mcap.writer import CompressionType, Writer
 
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
-from deploy.bus.description import BusDescription, MessageLayout, resolve_package_path
+from brokk_rl.registry import resolve_package_path
+from deploy.bus.description import BusDescription, MessageLayout
 from deploy.bus.protection import MessageFault
 from deploy.picture import encode_jpeg
 from deploy.runtime.bus_process import FRAME, FRAMES
@@ -242,9 +243,8 @@ class CaptureWriter:
         title = topic
         if topic == PICTURES:
             title = "foxglove.CompressedImage"
-            properties |= {"timestamp": TIME, "data": BINARY} | {
-                key: {"type": "string"} for key in ("frame_id", "format")
-            }
+            text = {"type": "string"}
+            properties |= {"timestamp": TIME, "data": BINARY, "frame_id": text, "format": text}
         schema = {"title": title, "type": "object", "properties": properties}
         return self._mcap.register_schema(title, "jsonschema", json.dumps(schema).encode())
 

@@ -5,10 +5,6 @@ compares where the camera sees the board with where it should. Its covariance ho
 error of the corners and the uncertainty of the arm, so that a poor arm does not distort the optics.
 Weights are Student's t (Lange, Little and Taylor, 1989): wrong detections lose their weight and are
 left out in the end. One factor on the arm's uncertainty is estimated by the median of all views.
-
-Seven closed forms of our own, five of them from random groups of poses, served no better than
-OpenCV's two. Over 50 draws each of six settings (6 to 60 poses, up to 30 % wrong detections) both
-gave the same success rate (298 of 300) and the same error (largest difference 7e-5 mm).
 """
 
 from __future__ import annotations

@@ -44,8 +44,11 @@ TRIM_SIGMAS = 2.5 * 1.4826
 """Pixels farther off than 2.5 robust standard deviations are trimmed (1.4826 x the median)."""
 PIXELS_PER_SAMPLE = 10.0
 """Neighbours share a matcher's window: some ten pixels are as good as one; chosen by hand."""
-GIVEN_FOCAL_PX = 1000.0
-"""Focal length that turns a click's error into metres where a point has no frame; by hand."""
+ASSUMED_FOCAL_PX = 1000.0
+"""Focal length that turns a click's error into metres where no frame tells the camera's own.
+
+Chosen by hand; not searched. A ZED 2i at 1080p has 1056 px (`rig=zed_2i_1080p`).
+"""
 
 
 @dataclass(frozen=True)
@@ -185,7 +188,7 @@ def _refine_pose(
 
 @dataclass(frozen=True)
 class TouchedPoint:
-    """A point as the file gives it; what is not given is `None`.
+    """A point as the file gives it; a missing value is `None`.
 
     Attributes:
         name: For messages.
@@ -212,7 +215,7 @@ class TouchCalibration:
         source: The frames that were clicked in; not opened where the file gives camera coordinates.
         points: YAML file; see `EXAMPLE`.
         tip_std_m: Standard deviation of the tip in each direction, from joints and geometry.
-        click_px: Standard deviation of a click.
+        click_px: Standard deviation of a click, also where the file gives camera coordinates.
         noise_per_m: Standard deviation of inverse depth, 1/m; a plane through the window averages
             it.
         window_px: Depth is read from a plane through a window that reaches this far from the click.
@@ -246,7 +249,7 @@ class TouchCalibration:
 
         Raises:
             ConfigError: the file of points cannot be read.
-            FrameError: the points do not determine the camera; says what is missing.
+            FrameError: the points do not determine the camera; the message names the lack.
         """
         names, points, refused = self._collect_pairs(machine)
         fit = fit_camera_to_points(points, self.tip_std_m) if names else None
@@ -284,10 +287,14 @@ class TouchCalibration:
         """Return names and coordinates of the points that can be used, and those that cannot."""
         touches = read_touched_points(Path(self.points), machine.num_joints)
         frames = self._read_frames({one.frame for one in touches if one.frame is not None})
+        # all points are of one camera, so any frame tells its focal length
+        focal_px = ASSUMED_FOCAL_PX
+        for frame in frames.values():
+            focal_px = float(frame.camera_matrix[0, 0])
         names, seen, touched, covs, refused = [], [], [], [], []
         for one in touches:
             try:
-                point, cov = self._locate(one, frames)
+                point, cov = self._locate(one, frames, focal_px)
             except FrameError as error:
                 refused.append(PoseResidual(one.name, None, None, str(error)))
                 continue
@@ -315,12 +322,20 @@ class TouchCalibration:
                 if Path(frame.name).name in wanted:
                     found[Path(frame.name).name] = frame
 
-    def _locate(self, one: TouchedPoint, frames: dict[str, Frame]) -> tuple[np.ndarray, np.ndarray]:
-        """Return a point in camera coordinates, and its covariance."""
+    def _locate(
+        self, one: TouchedPoint, frames: dict[str, Frame], focal_px: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return a point in camera coordinates, and its covariance.
+
+        Args:
+            one: The point.
+            frames: Frames that were clicked in, by stem.
+            focal_px: Focal length for points that are given in camera coordinates.
+        """
         if one.camera_m is not None:
             z = float(one.camera_m[2])
             ray = one.camera_m / np.linalg.norm(one.camera_m)
-            along_m, across_m = self.noise_per_m * z**2, self.click_px * z / GIVEN_FOCAL_PX
+            along_m, across_m = self.noise_per_m * z**2, self.click_px * z / focal_px
             return one.camera_m, _build_point_cov(ray, along_m, across_m)
         frame = frames.get(str(one.frame))
         if frame is None or one.pixel is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import re
 import shlex
@@ -27,9 +26,7 @@ TRAINING = next(line for line in PAGE.splitlines() if line.startswith("brokk mod
 def package(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
     """The package `mine`, installed."""
     folder = tmp_path_factory.mktemp("site")
-    install_package(folder, "mine", FILES)
-    monkeypatch.syspath_prepend(str(folder))
-    importlib.invalidate_caches()
+    install_package(folder, "mine", FILES, monkeypatch)
     extensions.register_options([])
 
 

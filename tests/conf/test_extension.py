@@ -93,8 +93,7 @@ def mine(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPat
         "conf/perception/dowser.yaml": "_target_: mine.parts.Dowser\n",
         "conf/mode/show.yaml": MODE,
     }
-    install_package(folder, "mine", options)
-    monkeypatch.syspath_prepend(str(folder))
+    install_package(folder, "mine", options, monkeypatch)
     return folder
 
 
@@ -120,11 +119,10 @@ def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_
 
 
 def test_an_option_that_two_packages_offer_is_an_error_that_names_both(
-    mine: Path, brokk: Callable[..., Any]
+    mine: Path, brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    install_package(
-        mine, "yours", {"conf/actuator/sticky.yaml": "_target_: mine.parts.Sticky\nshare: 0.5\n"}
-    )
+    sticky = "_target_: mine.parts.Sticky\nshare: 0.5\n"
+    install_package(mine, "yours", {"conf/actuator/sticky.yaml": sticky}, monkeypatch)
     done = brokk("mode=list")
     assert done.code == 2
     for part in ("actuator=sticky", "mine.conf", "yours.conf"):

@@ -34,6 +34,23 @@ COMPARE = ("mode=compare", "compare.runs=nowhere")
         (("mode=compare",), ("compare.runs=<value>",)),
         (("-m", "mode=lst,list"), ("there is no mode=lst",)),
         (("-m", "mode=compare", "compare.runs=a,b"), ("compare.runs", "'a'")),
+        (
+            ("mode=perceive", "perception.filter.forget_s=3"),
+            ("'perception.filter.forget_s' is now 'tracker.forget_s'",),
+        ),
+        (
+            ("mode=perceive", "+perception.filter.forget_s=3"),
+            ("no field 'filter'", "'perception.filter' is now 'tracker'"),
+        ),
+        (("mode=perceive", "perception.filter.gate=3"), ("'perception.filter' is now 'tracker'",)),
+        (
+            ("mode=perceive", "perception/filter=fusion"),
+            ("'perception/filter' is now 'perception/tracker@tracker'",),
+        ),
+        (
+            ("mode=deploy", "camera=pictures", "deploy.camera.forget_s=3"),
+            ("'deploy.camera.forget_s' is now 'deploy.camera.tracker.forget_s'",),
+        ),
         (("mode=null",), ("must be a string",)),
         (("--config-dir", "nowhere", "mode=list"), ("nowhere",)),
     ],

@@ -68,8 +68,8 @@ OPTION = "_target_: spots.finder.DarkestSpot\nradius_m: 0.05   # m\nstd_m: 0.05 
 def finder_spec(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The spec of a finder in an installed package `spots`."""
     folder = tmp_path_factory.mktemp("site")
-    install_package(folder, "spots", {"finder.py": FINDER, "conf/perception/darkest.yaml": OPTION})
-    monkeypatch.syspath_prepend(str(folder))
+    files = {"finder.py": FINDER, "conf/perception/darkest.yaml": OPTION}
+    install_package(folder, "spots", files, monkeypatch)
     return importlib.import_module("spots.finder").DarkestSpot(radius_m=0.05, std_m=0.05)
 
 

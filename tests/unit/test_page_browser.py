@@ -382,3 +382,34 @@ def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
     assert wish.kind == "point" and [
         float(part) for part in wish.value.split(",")
     ] == pytest.approx([0.25, 0.6], abs=0.01)
+
+
+@pytest.mark.parametrize("size", [(1280, 800), (1920, 1080), (800, 1280), (390, 844)], ids=str)
+@pytest.mark.parametrize("language", ["en", "de"])
+def test_nothing_overlaps_and_stop_stays_in_sight(
+    feed: Scripted, port: int, opened: Callable[..., Any], size: tuple[int, int], language: str
+) -> None:
+    feed.now = replace(SHOWN, streams=(*SHOWN.streams, SourceAge("camera", 0.0, 1e6)))
+    page = opened(port, query=f"?lang={language}")
+    page.set_viewport_size({"width": size[0], "height": size[1]})
+    until(page, "!document.getElementById('camera').hidden")
+    stop = page.locator("#stop").bounding_box()
+    assert stop["x"] >= 0 and stop["x"] + stop["width"] <= size[0]
+    assert stop["y"] >= 0 and stop["y"] + stop["height"] <= size[1]
+    cut = page.evaluate(
+        """() => [...document.querySelectorAll("button, #advice, #boreholes")].filter(node =>
+        node.scrollHeight > node.clientHeight + 1 || node.scrollWidth > node.clientWidth + 1)
+        .map(node => node.id + node.textContent)"""
+    )
+    assert cut == []
+    # the buttons lie above the rest of an upright screen, which scrolls under them
+    boxes = [page.locator(name).bounding_box() for name in ("#view", "aside", "#levers")]
+    for number, one in enumerate(boxes):
+        for other in boxes[number + 1 :]:
+            apart = (
+                one["x"] + one["width"] <= other["x"] + 1,
+                other["x"] + other["width"] <= one["x"] + 1,
+                one["y"] + one["height"] <= other["y"] + 1,
+                other["y"] + other["height"] <= one["y"] + 1,
+            )
+            assert any(apart)

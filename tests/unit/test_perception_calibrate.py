@@ -422,6 +422,45 @@ def test_the_command_takes_touched_points(
     assert done.code == 2 and "q has 2 numbers, expected 5" in done.err
 
 
+def test_a_given_point_is_as_exact_as_a_click_of_the_camera_that_is_known(
+    machine: Machine, tmp_path: Path
+) -> None:
+    # beside the axis a point is known by its click alone: 2 px at 2 m are 2 * 2 / 400 m
+    matrix = np.array([[400.0, 0.0, 160.0], [0.0, 400.0, 120.0], [0.0, 0.0, 1.0]])
+    dataset.write_camera(tmp_path, matrix, None, None)
+    depth = np.full((240, 320), 2.0, np.float32)
+    dataset.write_frame(tmp_path / "00", np.zeros((240, 320, 3), np.uint8), depth)
+    measured = {"camera_m": [0.0, 0.0, 2.0], "base_m": [2.0, 0.0, 0.0]}
+    clicked = {"frame": "00", "pixel": [160.0, 120.0], "base_m": [2.0, 0.0, 0.0]}
+    for name, points, std_m in (
+        ("alone", [measured], 2 * 2 / 1000),
+        ("beside", [measured, clicked], 2 * 2 / 400),
+    ):
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(yaml.safe_dump({"points": points}))
+        calibration = touched_points.TouchCalibration(
+            source=FrameFolder(
+                folder=str(tmp_path),
+                stereo=option("stereo", "sgbm"),
+                rate_hz=10.0,
+                least_known=0.01,
+                needs="depth",
+                base_from_camera=None,
+            ),
+            points=str(path),
+            tip_std_m=0.003,
+            click_px=2.0,
+            noise_per_m=0.0024,
+            window_px=6,
+            least_width_m=0.1,
+            work_m=2.5,
+            temperature_c=None,
+        )
+        pairs = calibration._collect_pairs(machine)[1]
+        for cov in pairs.cov_m2:
+            assert np.sqrt(np.diag(cov)[:2]) == pytest.approx([std_m, std_m])
+
+
 def log_of(path: Path, t_s: np.ndarray, poses: np.ndarray, named: bool = True) -> str:
     table = np.concatenate(
         [t_s[:, None], poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()], 1
