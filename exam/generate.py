@@ -127,7 +127,7 @@ class RecordingJob:
         )
 
 
-def _batch_by_make(makes: Sequence[str], size: int) -> list[list[int]]:
+def _split_by_make(makes: Sequence[str], size: int) -> list[list[int]]:
     """Return the places of runs in batches of one make and at most `size` runs."""
     by_make: dict[str, list[int]] = {}
     for i, make in enumerate(makes):
@@ -200,7 +200,7 @@ class CaseRecorder:
         """
         specimens = list(map(self._specimen, jobs))
         makes = self._plants.makes(self._machine, specimens)
-        batches = _batch_by_make(makes, min(SIDE_BY_SIDE, -(-len(jobs) // workers)))
+        batches = _split_by_make(makes, min(SIDE_BY_SIDE, -(-len(jobs) // workers)))
         found: dict[int, RecordedHalf] = {}
         with ExitStack() as stack:
             run = map if workers == 1 else stack.enter_context(ProcessPoolExecutor(workers)).map

@@ -155,7 +155,7 @@ def _is_called_none(score: CaseScore) -> bool:
     return score.verdict == "none"
 
 
-def _names_effect(score: CaseScore) -> bool:
+def _has_named_effect(score: CaseScore) -> bool:
     return score.verdict not in ("none", "failed")
 
 
@@ -165,7 +165,7 @@ def _is_exact(score: CaseScore) -> bool:
 
 def _compute_false_alarms(quiet: Sequence[CaseScore]) -> Metric:
     """Return the share of cases without a visible effect whose answer names one."""
-    return _rate_items(quiet, _names_effect)
+    return _rate_items(quiet, _has_named_effect)
 
 
 def list_labels(score: CaseScore) -> tuple[set[str], set[str]]:
