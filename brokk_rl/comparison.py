@@ -35,6 +35,7 @@ HEADINGS = {
     "valve_travel": "travel, 1/s",
 }
 SCALES = {"lateral_error_m": 1e3, "peak_force_n": 1e-3}
+"""Factors of shown figures: mm and kN."""
 SUCCESS = "episode/success_strict"
 REACHED = 0.95
 """Success rate whose first crossing is reported and drawn, the goal of one insertion in 20
@@ -42,6 +43,7 @@ failing."""
 LABEL_WIDTH = 42
 """Characters of a row label before it wraps."""
 MOST_COLUMNS = 4
+"""Largest number of columns of differences. Chosen by hand; not searched."""
 UNLIKE_MOST, UNLIKE_MOST_WIDTH = "unlike most", 24
 """Above `MOST_COLUMNS` columns the table has one column with the values that most rows lack."""
 

@@ -17,6 +17,7 @@ from brokk_rl.split import group_by_run
 KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
 """Commands at which the static curve bends, on either side."""
 RESOLUTION_S = 0.01
+"""Step of the delays that are tried, s. Chosen by hand; not searched."""
 LONGEST_S = 1.0
 """Longest delay searched for; more than the history of any model here, so that a history too short
 shows."""
@@ -26,6 +27,7 @@ commands, would be preferred because averaging looks like the valve's lag."""
 AT_STOP = 0.005
 """A joint this close to its stop, as a part of its travel, tells nothing about the delay."""
 RESAMPLED = 200
+"""Bootstrap resamples over runs. Chosen by hand; not searched."""
 MIN_MOVING = 100
 """Samples with a command, in all recordings together, below which no delay is estimated."""
 

@@ -245,15 +245,8 @@ class GreyBoxFit:
         sure = estimate_uncertainty(runs, x, self.robust)
         found = self._rounded(machine, runs, x)
         fitted: Any = dataclasses.replace(self.actuator, **found)  # pyright: ignore[reportArgumentType, reportCallIssue]
-        facts = {
-            "schema": 1,
-            "machine": machine.name,
-            "recordings": len(train),
-            "runs": len({recording.run for recording in train}),
-            "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
-            "windows": len(runs.active),
-            "horizon_s": self.horizon_s,
-            "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
+        facts = self._describe(machine, train, runs, held, x)
+        facts |= {
             "seconds": round(search.before_s + time.monotonic() - began, 1),
             "created": record.format_now(),
             "parameters": tabulate_parameters(found, runs, x, sure),
@@ -262,6 +255,7 @@ class GreyBoxFit:
         try:
             write_json(folder / f"{self.name}.json", facts)
             write_text(folder / f"{self.name}.yaml", format_option(fitted, facts))
+            # the state of the search is of no use once the result is on disk
             place.unlink(missing_ok=True)
         except OSError as failure:
             raise StorageError(
@@ -269,6 +263,26 @@ class GreyBoxFit:
             ) from failure
         log_undetermined(facts)
         return fitted
+
+    def _describe(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        runs: CandidateRuns,
+        held: CandidateRuns,
+        x: np.ndarray,
+    ) -> dict[str, Any]:
+        """Return the facts on the data of a fit, and its error on the validation runs `held`."""
+        return {
+            "schema": 1,
+            "machine": machine.name,
+            "recordings": len(train),
+            "runs": len({recording.run for recording in train}),
+            "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
+            "windows": len(runs.active),
+            "horizon_s": self.horizon_s,
+            "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
+        }
 
     def _nominal(self, machine: Machine, device: torch.device) -> np.ndarray:
         """Return the actuator's own parameters in units of their ranges, `(P, J)`.

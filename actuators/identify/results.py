@@ -291,16 +291,7 @@ def build_results(
         RecordingError: no recording is long enough to search for a dead time in.
     """
     machine, model = identified.machine, identified.model
-    judging = [
-        (cut, done)
-        for cut, done in zip(identified.cuts, identified.done, strict=True)
-        if cut is not None
-    ]
-    cut = open_loop.join_windows([cut for cut, _ in judging])
-    predicted = {}
-    for name in judging[0][1]:
-        predicted[name] = np.concatenate([done[name].predicted for _, done in judging])
-    scores = FreeRunScores(predicted, cut, machine, resampling)
+    scores = _join_stages(identified, resampling)
     kept = identified.done[-1][model]
     last = identified.stages[-1]
     fitted_to = list_recordings(last.train) + list_recordings(last.validation)
@@ -314,16 +305,7 @@ def build_results(
         "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
     }  # fmt: skip
     result |= _tabulate_errors(scores, identified)
-    result["delay_s"] = {
-        joint: delay
-        and {
-            "value": delay.value_s,
-            "ci95": list(delay.ci95_s),
-            "explained": delay.explained,
-            "found": delay.is_found,
-        }
-        for joint, delay in delays.items()
-    }
+    result["delay_s"] = {joint: _tabulate_delay(delay) for joint, delay in delays.items()}
     result["regimes"] = score_regimes(scores, acting_s)
     result["data"] = _describe_data(identified, fitted_to, scores)
     findings = write_verdict(result, machine)
@@ -331,10 +313,34 @@ def build_results(
     drawings = {
         "prediction": pictures.draw_prediction(scores, model),
         "error_over_horizon": pictures.draw_error_over_horizon(scores, model),
-        "regimes": pictures.draw_regimes(result["regimes"], machine, model, list(predicted)),
+        "regimes": pictures.draw_regimes(result["regimes"], machine, model, list(scores.predicted)),
         "dead_time": pictures.draw_dead_times(delays, machine),
     }
     return result, findings, drawings
+
+
+def _join_stages(identified: IdentificationRun, resampling: np.random.Generator) -> FreeRunScores:
+    """Return the scores over the windows of all stages that judge something."""
+    cuts, judging = [], []
+    for cut, done in zip(identified.cuts, identified.done, strict=True):
+        if cut is not None:
+            cuts.append(cut)
+            judging.append(done)
+    predicted = {}
+    for name in judging[0]:
+        predicted[name] = np.concatenate([done[name].predicted for done in judging])
+    return FreeRunScores(predicted, open_loop.join_windows(cuts), identified.machine, resampling)
+
+
+def _tabulate_delay(delay: dead_time.DeadTimeEstimate | None) -> dict[str, Any] | None:
+    if delay is None:
+        return None
+    return {
+        "value": delay.value_s,
+        "ci95": list(delay.ci95_s),
+        "explained": delay.explained,
+        "found": delay.is_found,
+    }
 
 
 def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> dict[str, Any]:

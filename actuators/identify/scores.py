@@ -19,6 +19,7 @@ from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.split import COMMANDED
 
 RESAMPLED = 1000
+"""Bootstrap resamples over runs; the usual number for 95 % intervals."""
 TAILS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
 """Percentiles that bound the interval."""
 
@@ -182,6 +183,7 @@ def _compare_errors(
 
 
 SECOND_S = 1.0
+"""Length of the pieces into which free runs are cut, s. Chosen by hand; not searched."""
 NEAR_STOP = 0.05
 """Part of the travel that counts as near a stop."""
 SMALL, LARGE = 0.3, 0.7

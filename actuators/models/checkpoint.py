@@ -18,6 +18,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 SCHEMA = 1
+"""Version of the format; another one is refused."""
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the checkpoints that come with the package."""
 
