@@ -39,7 +39,7 @@ def choose_unit(machine: Machine) -> str:
 
 
 def compute_squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -> np.ndarray:
-    """Return the mean square error of each window, all joints together, `(W,)`, in the square of `unit_of`."""
+    """Return the mean square error of each window, all joints together, `(W,)`, in the square of `choose_unit`."""
     size = machine.upper - machine.lower if choose_unit(machine) == "travel" else 1.0
     return np.square((paths - measured) / size).mean((1, 2))
 
