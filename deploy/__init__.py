@@ -1,1 +1,1 @@
-"""Deployment: what runs on the computer of the machine, without simulator or trainer."""
+"""Deployment: the programs on the computer of the machine, without simulator or trainer."""

@@ -90,8 +90,11 @@ def measure_joint_response(
         flow: Flow of its valve, `(T,)`, of full.
         travel: Length of its travel.
     """
+    # Flow marks the beginning of a response: levers move earlier, valves answer later.
     is_flowing = np.abs(flow) >= SMALLEST_FLOW
     began = np.flatnonzero(is_flowing[1:] & ~is_flowing[:-1]) + 1
+    # Both signs are kept apart: a joint that moved one way only proves neither its sign nor its
+    # valve.
     found: dict[int, list[tuple[bool, float]]] = {1: [], -1: []}
     for row in began:
         # at rest before; otherwise the motion answers something else
@@ -108,8 +111,10 @@ def measure_joint_response(
             found[sign].append((agrees, onset_s - float(t_s[row])))
     if not found[1] or not found[-1]:
         return None
+    # Both directions count alike, though an operator may have moved one of them more often.
     both = [*found[1], *found[-1]]
     period_s = max(1e-3, float(np.median(np.diff(t_s))))  # of a log that is not empty
+    # Differences over a longer step: noise over one sample would look like speed.
     step = max(1, round(SPEED_S / period_s))
     speed = np.abs(q[step:] - q[:-step]) / np.maximum(t_s[step:] - t_s[:-step], 1e-6)
     return JointResponse(
@@ -121,6 +126,8 @@ def measure_joint_response(
 
 def _estimate_onset_s(t_s: np.ndarray, moved: np.ndarray, row: int) -> float:
     """Return the beginning of a motion noticed at `row`: a line through the motion, back to zero."""
+    # A line through two points of the motion: the threshold itself is passed only after the
+    # onset.
     later = min(len(t_s) - 1, int(np.searchsorted(t_s, t_s[row] + ONSET_S)))
     speed = (moved[later] - moved[row]) / max(1e-6, t_s[later] - t_s[row])
     return float(t_s[row] - (moved[row] / speed if speed * moved[row] > 0 else 0.0))
@@ -184,6 +191,7 @@ class BringupChecklist(BusAndPolicySettings):
         """
         self.check_machine(machine)
         memory = LoopMemory.new(machine.num_joints, commands=False)
+        # The bring-up never commands: without `commands` there is no request slot at all.
         group = ProcessGroup(memory, self.realtime)
         try:
             self.start_processes(group, machine, target_s=math.inf, pitch_rad=None)
@@ -192,8 +200,10 @@ class BringupChecklist(BusAndPolicySettings):
             group.start("log", "deploy.recorder.capture:run", (capture,))
             results = _StateChecks(self, machine, group, say).run()
         finally:
+            # The processes must end before the capture is read: its index is written at the end.
             group.end()
             memory.close()
+        # Rates come from the capture, which holds every message with its own time.
         results.insert(0, self._check_rates(machine, session))
         write_json(
             session.folder / REPORT,
@@ -210,6 +220,7 @@ class BringupChecklist(BusAndPolicySettings):
         values, faults = {}, []
         for layout in (*description.sent_by(GATEWAY), *description.sent_by(REMOTE)):
             name, rate_hz = layout.name, 0.0
+            # A message that came once has no rate.
             if name in messages and len(times := messages[name].series("t_s")) > 1:
                 rate_hz = (len(times) - 1) / (times[-1] - times[0])
             nominal_hz = 1 / layout.period_s if layout.period_s else None
@@ -263,6 +274,7 @@ class _StateChecks:
 
     def _check_positions(self) -> BringupResult:
         self._say("leave the machine at rest")
+        # Noise is measured at rest; the largest position error then comes from the sensor alone.
         self._collect(self._checklist.listen_s)
         q, machine = np.array([one.q for one in self._samples]), self._machine
         scatter, last = q.std(0), self._memory.state.read()
@@ -288,6 +300,8 @@ class _StateChecks:
         self._say(task)
         patience_s, missing = self._checklist.patience_s, "pressed"
         pressed_s = self._wait_until(lambda state: getattr(state, field))
+        # Pressed and released are seen separately: a switch that is stuck would pass a single
+        # look.
         if pressed_s is not None:
             missing = "released"
             released_s = self._wait_until(lambda state: not getattr(state, field))
@@ -302,7 +316,10 @@ class _StateChecks:
             f"move one joint after the other, both ways, a second or more each: {', '.join(names)}"
         )
         found = self._watch_joints()
-        missing = [name for name in names if name not in found]
+        missing = []
+        for name in names:
+            if name not in found:
+                missing.append(name)
         turned = [name for name, response in found.items() if not response.agrees]
         dead_s = [response.dead_time_s for response in found.values()]
         faults = []
@@ -310,6 +327,8 @@ class _StateChecks:
             faults.append(f"not seen to move both ways: {', '.join(missing)}")
         if turned:
             faults.append(f"sign turned: {', '.join(turned)}")
+        # The policy sees only its history: a longer dead time hides the effect of its own
+        # commands.
         if dead_s and max(dead_s) > (machine.num_history - 1) * machine.period_s:
             faults.append(
                 f"dead time of up to {max(dead_s):.2f} s is longer than the policy's history"
@@ -324,6 +343,7 @@ class _StateChecks:
         """Return the responses of the joints that the operator moves in time."""
         machine, found = self._machine, dict[str, JointResponse]()
         travel = machine.upper - machine.lower
+        # Samples of the earlier checks hold motion that was not asked for.
         self._samples.clear()
         end_s = time.monotonic() + self._checklist.patience_s
         while time.monotonic() < end_s and len(found) < machine.num_joints:
@@ -333,6 +353,7 @@ class _StateChecks:
             flow = np.array([one.flow for one in self._samples])
             for j, name in enumerate(machine.joint_names):
                 response = measure_joint_response(t_s, q[:, j], flow[:, j], travel[j])
+                # The first complete response counts, so that a joint is reported once.
                 if response is not None and name not in found:
                     found[name] = response
                     self._say(f"{name}: {response.text}")
@@ -341,8 +362,10 @@ class _StateChecks:
     def _run_shadow(self) -> BringupResult:
         self._say("shadow run: the policy runs along, nothing is shown")
         target = self._checklist.target.build()
+        # The target is chosen once: it must not jump during the shadow run.
         TargetSelector(target, self._memory.target, self._memory.holes).refresh()
         counts: Counter[AdviceStatus] = Counter()
+        # Advices have numbers, so that none is counted twice.
         end_s, number = time.monotonic() + self._checklist.shadow_s, -1
         while time.monotonic() < end_s:
             advice = self._memory.advice.read()
@@ -351,6 +374,7 @@ class _StateChecks:
                 counts[advice.reason] += 1
             time.sleep(POLL_S)
         count = counts.total()
+        # At least 1, so that a policy that never spoke gives 0 % and no error.
         share = counts[AdviceStatus.VALID] / max(1, count)
         others = sorted(one.value for one in counts if one is not AdviceStatus.VALID)
         text = f"{share:.0%} of {count} advices valid"
@@ -363,8 +387,10 @@ class _StateChecks:
         """Collect samples of the state for some time."""
         end_s = time.monotonic() + seconds
         while time.monotonic() < end_s:
+            # A dead process would otherwise look like a machine at rest.
             self._group.check()
             state = self._memory.state.read()
+            # The state is read faster than it changes; doubles would bias the noise to zero.
             if state is not None and (not self._samples or state.t_s > self._samples[-1].t_s):
                 self._samples.append(_Sample(state.t_s, state.q, state.flow))
             time.sleep(POLL_S)

@@ -68,7 +68,10 @@ def find_full_angles_rad(levers: Sequence[Lever]) -> np.ndarray:
     """Return the angle at full deflection of each of the four `AXES`, `(4,)`; 1 without a joint."""
     full_rad = np.ones(len(AXES))
     for index, axis in enumerate(AXES):
-        angles_rad = [one.max_angle_rad for one in levers if (one.side, one.axis) == axis]
+        angles_rad = []
+        for one in levers:
+            if (one.side, one.axis) == axis:
+                angles_rad.append(one.max_angle_rad)
         if angles_rad:
             full_rad[index] = max(angles_rad)
     return full_rad

@@ -8,7 +8,7 @@ NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is 
   `axis_in_base`, `radius_m`, `depth_m`, `hidden`: the part of the rim that cannot be seen,
   `in_view`), `decoys` (likewise), `block` (`center_m`, `rotation`, `half_m`). Axes point out of the
   hole; coordinates without a frame in their name are the left camera's.
-* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (what is seen through the rim of a
+* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (all that is seen through the rim of a
   hole), `ARM`.
 """
 
@@ -115,9 +115,9 @@ def read_truth(stem: Path) -> SceneTruth:
     path = _build_path(stem, TRUTH)
     try:
         told = json.loads(path.read_text())
-        circles = {
-            name: tuple(TrueCircle(**entry) for entry in told[name]) for name in ("holes", "decoys")
-        }
+        circles = {}
+        for name in ("holes", "decoys"):
+            circles[name] = tuple(TrueCircle(**entry) for entry in told[name])
         return SceneTruth(
             told["scene"], told["conditions"], circles["holes"], circles["decoys"], told["block"]
         )

@@ -161,6 +161,7 @@ class StagedFinder:
             frame = rectify(frame)
         with _time_stage(ms, "segment"):
             masks = self._segmenter.segment(frame)
+        # The share decides before the dear search begins.
         on_block = masks.block > s.block_probability
         share = cv2.countNonZero(on_block.view(np.uint8)) / on_block.size
         if share < s.smallest_block:
@@ -172,6 +173,7 @@ class StagedFinder:
         with _time_stage(ms, "pose"):
             found: list[tuple[Ellipse, HolePose]] = []
             rejected: list[Rejection] = []
+            # Every ellipse is judged alone: holes do not compete until all are known.
             for ellipse in ellipses:
                 pose = self._pose.estimate(frame, masks, ellipse)
                 if isinstance(pose, Rejection):
@@ -181,9 +183,12 @@ class StagedFinder:
             found, doubles = self._remove_inner_rims(found)
         if not ellipses:
             rejected = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
+        # Doubles are holes too; they are told apart from rejected candidates only by their
+        # reason.
         rejected += doubles
         judged = [ellipse for ellipse, _ in found]
         judged += [one.ellipse for one in rejected if one.ellipse is not None]
+        # The stages so far; what follows is negligible.
         ms["total"] = sum(ms.values())
         detections = FrameDetections([pose for _, pose in found], rejected, judged, masks, ms)
         return detections.in_base_frame(frame)
@@ -226,9 +231,9 @@ class StagedFinder:
             return one[0].score >= STRONG_SCORE * best, one[1].radius_m
 
         for ellipse, pose in sorted(found, key=rank, reverse=True):
-            distances_m = [
-                float(np.linalg.norm(pose.center_m - other.center_m)) for _, other in kept
-            ]
+            distances_m = []
+            for _, other in kept:
+                distances_m.append(float(np.linalg.norm(pose.center_m - other.center_m)))
             nearest_m = min(distances_m, default=np.inf)
             if nearest_m < limit_m:
                 reason = "distance to a larger rim, m"
@@ -240,6 +245,7 @@ class StagedFinder:
 
 def rectify(frame: Frame) -> Frame:
     """Return the frame without lens distortion; depth is moved, never interpolated."""
+    # Most cameras deliver rectified pictures: nothing is copied then.
     if frame.distortion is None or not np.any(frame.distortion):
         return frame
     height, width = frame.depth_m.shape
@@ -251,7 +257,9 @@ def rectify(frame: Frame) -> Frame:
         (width, height),
         cv2.CV_32FC1,
     )
+    # Cubic for colour: edges keep their place to a fraction of a pixel.
     color = cv2.remap(frame.color, *maps, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    # Nearest for depth: a mean of two surfaces is a place where nothing is.
     depth = cv2.remap(
         frame.depth_m,
         *maps,
@@ -285,6 +293,7 @@ def _remove_duplicates(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
     """Return the ellipses, the best first, without near copies of a better one."""
     kept: list[Ellipse] = []
     for one in sorted(ellipses, key=lambda one: -one.score):
+        # The geometric mean semi-axis, as everywhere for the size.
         size = (one.a * one.b) ** 0.5
         if not any(_is_same_ellipse(one, other, size) for other in kept):
             kept.append(one)

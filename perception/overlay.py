@@ -100,7 +100,8 @@ class OverlayDrawing:
         if min(center[2], tip[2]) <= 0:
             return
         cov = rotation @ hole.cov_m2 @ rotation.T
-        start, end = (_project_point(frame.camera_matrix, point) * scale for point in (center, tip))
+        start = _project_point(frame.camera_matrix, center) * scale
+        end = _project_point(frame.camera_matrix, tip) * scale
         cv2.arrowedLine(
             picture, _round_point(start), _round_point(end), AXIS, 2, cv2.LINE_AA, tipLength=0.2
         )

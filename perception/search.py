@@ -72,12 +72,12 @@ class SearchLevel:
         """Return whether a hole in the face around an ellipse can look as large; true for unknown depth."""
         if self.sizes_px is None:
             return True
+        # An ellipse may lie on the border of two depths; one of them must allow its size.
         reach = AROUND * one.a
-        rows, columns = (
-            slice(max(0, int((at - reach) / STEP)), int((at + reach) / STEP) + 1)
-            for at in (one.y, one.x)
-        )
+        rows = slice(max(0, int((one.y - reach) / STEP)), int((one.y + reach) / STEP) + 1)
+        columns = slice(max(0, int((one.x - reach) / STEP)), int((one.x + reach) / STEP) + 1)
         near = self.sizes_px[rows, columns]
+        # No depth near the ellipse: nothing speaks against its size.
         near = near[np.isfinite(near)]
         return not near.size or near.min() / (1.0 + self.slack) <= one.a <= near.max() * (
             1.0 + self.slack
@@ -85,24 +85,26 @@ class SearchLevel:
 
     def _detect_all(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
         """Return the ellipses of the region, whatever their size at their place."""
+        # Only the bounding box is searched: the cost of the detector is proportional to its area.
         x, y, wide, high = cv2.boundingRect(self.region)
         left, top = x * STEP, y * STEP
-        height, width = (
-            min(size * STEP, whole - start) // self.shrink
-            for size, whole, start in ((high, len(gray), top), (wide, len(gray[0]), left))
-        )
+        height = min(high * STEP, len(gray) - top) // self.shrink
+        width = min(wide * STEP, len(gray[0]) - left) // self.shrink
         if min(height, width) < 1:
             return []
         part = gray[top : top + height * self.shrink, left : left + width * self.shrink]
+        # Area interpolation averages, so that grain does not alias into edges.
         small = (
             cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA)
             if self.shrink > 1
             else part
         )
+        # Rounded up, so that every cell has pixels; the surplus is cut off below.
         finer = (-(-wide * STEP // self.shrink), -(-high * STEP // self.shrink))
         roi = cv2.resize(
             self.region[y : y + high, x : x + wide], finer, interpolation=cv2.INTER_NEAREST
         )[:height, :width]
+        # The grid of occluders is cut to the same box as the picture.
         part_m = None if self.nearest_m is None else self.nearest_m[y : y + high, x : x + wide]
         if self.depth_m is not None and part_m is not None and part_m.any():
             nearest = cv2.resize(part_m, finer, interpolation=cv2.INTER_NEAREST)[:height, :width]
@@ -116,6 +118,8 @@ class SearchLevel:
             before = cv2.morphologyEx(
                 (depth < nearest).view(np.uint8), cv2.MORPH_OPEN, _make_square(1)
             )
+            # A wide occluder hides holes only at its border: its own surface is searched like any
+            # other.
             inner = cv2.erode(before, _make_square(-(-SPREAD_PX // step)))
             roi = roi & ((cv2.dilate(before, _make_square(DRAWN_PX)) == 0) | (inner > 0))
         prior = self.prior and SizePrior(
@@ -144,12 +148,18 @@ def plan_search_levels(
         slack: Allowed relative error of their size.
         comfortable_px: Least semi-axis in the chosen resolution.
     """
+    # The geometric mean serves for pixels that are not quite square.
     focal_px = float(np.sqrt(frame.camera_matrix[0, 0] * frame.camera_matrix[1, 1]))
+    # The middle of each cell stands for the cell: reading every pixel would take 64 times as
+    # long.
     depth = frame.depth_m[STEP // 2 :: STEP, STEP // 2 :: STEP]
     inside = mask[STEP // 2 :: STEP, STEP // 2 :: STEP]
     known = inside & np.isfinite(depth)
     if np.count_nonzero(known) < LEAST:
+        # Without depth any size is possible, so the whole block is searched at full resolution. A
+        # margin of 3 % of the width covers a ragged mask. Chosen by hand; not searched.
         return [SearchLevel(1, _dilate(inside, 0.03 * inside.shape[1]), None)]
+    # Division only where depth is known: NaN would spread through the filters below.
     size_px = np.divide(
         focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=known
     )
@@ -157,13 +167,16 @@ def plan_search_levels(
     seen_px = np.divide(
         focal_px * radius_m, depth, out=np.zeros(depth.shape, np.float32), where=~unknown
     )
+    # Occluders are found by size too: inverse depth and size are proportional.
     before_px = _measure_occluders(seen_px, known)
     # Beside an occluder a hole may show only half of itself: search there in a finer resolution.
+    # Dilated by one cell: the border of an occluder falls between two cells.
     beside = cv2.dilate(np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _make_square(1))
     behind = size_px < beside
     nearest_m = np.where(before_px < NOWHERE, focal_px * radius_m / before_px, np.float32(0.0))
     found, rest = [], known.copy()
     shown_px = np.where(behind, size_px / HALF, size_px)
+    # Each octave suits a range of sizes; a cell may suit two of them.
     suited = [
         _select_sizes(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)
     ]
@@ -174,9 +187,13 @@ def plan_search_levels(
         here = rest & suited[number]
         if np.count_nonzero(here) < LEAST:
             break
+        # Cells that have found their resolution are not searched again in another.
         rest &= ~here
+        # The upper percentile and not the maximum: one wrong depth must not enlarge the region.
         reach = float(np.percentile(size_px[here], SIZE_PERCENTILES[1])) * (1.0 + slack) / STEP
         hidden = (_dilate(here, UNSEEN * reach) > 0) & unknown
+        # Separate regions get separate ranges of size: two blocks at two distances do not share
+        # one.
         count, pieces = cv2.connectedComponents(_dilate(here | hidden, reach))
         for piece in range(1, count):
             part = pieces == piece
@@ -194,10 +211,15 @@ def plan_search_levels(
 
 def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[SearchLevel]:
     """Return one level of full resolution: the bounding box of the mask, with all possible sizes."""
+    # The box and not the mask: a detector without depth must also see gaps of the mask.
     x, y, wide, high = cv2.boundingRect(mask.view(np.uint8))
+    # Rounded up: the last row of cells may reach beyond the picture.
     region = np.zeros([-(-size // STEP) for size in mask.shape], np.uint8)
     region[y // STEP : (y + high - 1) // STEP + 1, x // STEP : (x + wide - 1) // STEP + 1] = 1
-    priors = [level.prior for level in whole if level.prior]
+    priors = []
+    for level in whole:
+        if level.prior:
+            priors.append(level.prior)
     prior = None
     if priors:
         prior = SizePrior(min(p.lowest_px for p in priors), max(p.highest_px for p in priors))
@@ -212,7 +234,10 @@ def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
         face: Cells of the faces, bool.
     """
     reach = _make_square(round(float(np.percentile(seen_px[face], SIZE_PERCENTILES[1])) / STEP))
+    # The median removes single cells; an occluder is wider than two of them.
     rough_px, seen_px = seen_px, cv2.medianBlur(seen_px, 5)
+    # 1.4826 turns the median of absolute values into the standard deviation of a normal
+    # distribution.
     noise = 1.4826 * float(np.median(np.abs(rough_px[face] / np.maximum(seen_px[face], 1.0) - 1.0)))
     # A closing over the size of a hole: depth inside a hole is not that of the face. Only on the
     # face: beyond it nothing but the inside of a half-hidden hole may be in reach.
@@ -243,5 +268,6 @@ def _dilate(small: np.ndarray, reach: float) -> np.ndarray:
 
 
 def _enlarge(one: Ellipse, factor: int, left: int, top: int) -> Ellipse:
-    x, y = ((place + 0.5) * factor - 0.5 + start for place, start in ((one.x, left), (one.y, top)))
+    x = (one.x + 0.5) * factor - 0.5 + left
+    y = (one.y + 0.5) * factor - 0.5 + top
     return replace(one, x=x, y=y, a=one.a * factor, b=one.b * factor, rms_px=one.rms_px * factor)

@@ -78,12 +78,13 @@ class Stereo:
             focal_px: Focal length.
             baseline_m: Distance between the cameras.
         """
-        one, other = (
-            np.asarray(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)) for picture in (left, right)
-        )
+        # Matching is done on grey values; colour adds time and little information.
+        one = np.asarray(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY))
+        other = np.asarray(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
         found = self._matched(one, other, focal_px * baseline_m / self.nearest_m)
         if self.refinements:
             found = self._refined(one, other, found)
+        # No disparity is infinitely far; the limits below remove it.
         with np.errstate(divide="ignore", invalid="ignore"):
             depth = focal_px * baseline_m / found
         return np.where(
@@ -92,6 +93,7 @@ class Stereo:
 
     def _matched(self, left: np.ndarray, right: np.ndarray, largest_px: float) -> np.ndarray:
         """Return disparities, NaN where there is none."""
+        # The matcher wants a multiple of 16, and no more than the picture is wide.
         count = min(-(-int(np.ceil(largest_px)) // 16), max(1, (left.shape[1] - 1) // 16)) * 16
         step = self.smoothness * self.window_px**2
         matcher = cv2.StereoSGBM.create(
@@ -101,10 +103,9 @@ class Stereo:
         )  # fmt: skip
         # The matcher leaves out a border as wide as the largest disparity: pad the pictures, and
         # discard the matches of the padding.
-        wide = [
-            cv2.copyMakeBorder(picture, 0, 0, count, 0, cv2.BORDER_REPLICATE)
-            for picture in (left, right)
-        ]
+        wide = []
+        for picture in (left, right):
+            wide.append(cv2.copyMakeBorder(picture, 0, 0, count, 0, cv2.BORDER_REPLICATE))
         found = matcher.compute(*wide)[:, count:].astype(np.float32) / 16.0
         columns = np.arange(left.shape[1], dtype=np.float32)
         return np.where((found > 0) & (columns[None] - found >= 0), found, np.nan).astype(
@@ -113,10 +114,8 @@ class Stereo:
 
     def _refined(self, left: np.ndarray, right: np.ndarray, start: np.ndarray) -> np.ndarray:
         """Return disparities refined by registration of windows, free in brightness and contrast."""
-        one, other = (
-            cv2.GaussianBlur(picture.astype(np.float32), (0, 0), _SMOOTH_PX)
-            for picture in (left, right)
-        )
+        one = cv2.GaussianBlur(left.astype(np.float32), (0, 0), _SMOOTH_PX)
+        other = cv2.GaussianBlur(right.astype(np.float32), (0, 0), _SMOOTH_PX)
         slope = cv2.Sobel(other, cv2.CV_32F, 1, 0, ksize=3, scale=1 / 8)
         x, y = np.meshgrid(*[np.arange(size, dtype=np.float32) for size in left.shape[::-1]])
         known = np.isfinite(start).astype(np.float32)
@@ -129,9 +128,8 @@ class Stereo:
         mine = mean(one)
         mine_spread = mean(one * one) - mine * mine
         for _ in range(self.refinements):
-            seen, rise = (
-                cv2.remap(picture, x - found, y, cv2.INTER_CUBIC) for picture in (other, slope)
-            )
+            seen = cv2.remap(other, x - found, y, cv2.INTER_CUBIC)
+            rise = cv2.remap(slope, x - found, y, cv2.INTER_CUBIC)
             theirs, mean_rise = mean(seen), mean(rise)
             spread = mean(seen * seen) - theirs * theirs
             gain = np.sqrt(np.clip(spread / np.maximum(mine_spread, 1e-3), 0.25, 4.0))

@@ -66,10 +66,10 @@ def estimate_dead_times(
     if not usable:
         raise RecordingError(f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s")
     grid_s = np.arange(0.0, LONGEST_S + 1e-9, RESOLUTION_S)
-    return {
-        name: _estimate_dead_time(usable, joint, grid_s, machine, generator)
-        for joint, name in enumerate(machine.joint_names)
-    }
+    estimates = {}
+    for joint, name in enumerate(machine.joint_names):
+        estimates[name] = _estimate_dead_time(usable, joint, grid_s, machine, generator)
+    return estimates
 
 
 def _estimate_dead_time(
@@ -79,9 +79,10 @@ def _estimate_dead_time(
     machine: Machine,
     generator: np.random.Generator,
 ) -> DeadTimeEstimate | None:
-    moving = [
-        recording for recording in recordings if (np.abs(recording.u[:, joint]) > KNOTS[1]).any()
-    ]
+    moving = []
+    for recording in recordings:
+        if (np.abs(recording.u[:, joint]) > KNOTS[1]).any():
+            moving.append(recording)
     if (
         sum(int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum()) for recording in moving)
         < MIN_MOVING

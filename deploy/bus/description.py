@@ -85,16 +85,17 @@ class BusDescription:
     def __init__(self, name: str, machine: Machine) -> None:
         self.name = name
         self._database = _load_database(name)
-        self._messages: dict[str, Message] = {
-            message.name: message for message in self._database.messages
-        }
-        self.layouts = {
-            message.name: _build_layout(message, name) for message in self._database.messages
-        }
-        self.by_id = {layout.frame_id: layout for layout in self.layouts.values()}
+        self._messages: dict[str, Message] = {}
+        self.layouts: dict[str, MessageLayout] = {}
+        self.by_id: dict[int, MessageLayout] = {}
         self._home: dict[str, str] = {}
         for message in self._database.messages:
-            self._home |= {signal.name: message.name for signal in message.signals}
+            layout = _build_layout(message, name)
+            self._messages[message.name] = message
+            self.layouts[message.name] = layout
+            self.by_id[layout.frame_id] = layout
+            for signal in message.signals:
+                self._home[signal.name] = message.name
         required = []
         for kind in ("Command", "Position", "Valid", "Flow"):
             required += [f"{kind}_{joint}" for joint in machine.joint_names]
@@ -130,11 +131,11 @@ class BusDescription:
 
     def signals(self, message: str) -> list[str]:
         """Return the names of the signals of `message`, without counter and CRC."""
-        return [
-            signal.name
-            for signal in self._messages[message].signals
-            if signal.name not in (COUNTER, CRC)
-        ]
+        names = []
+        for signal in self._messages[message].signals:
+            if signal.name not in (COUNTER, CRC):
+                names.append(signal.name)
+        return names
 
     def unit(self, message: str, signal: str) -> str:
         """Return the unit of a signal, '' for none."""

@@ -213,11 +213,10 @@ class Guard:
             -full <= value <= full for value in request.u
         ):
             return GuardTrip.REQUEST_INVALID
-        moved = {
-            exclusive
-            for exclusive, value in zip(self._bounds.exclusive, request.u, strict=True)
-            if value != 0
-        }
+        moved = set()
+        for exclusive, value in zip(self._bounds.exclusive, request.u, strict=True):
+            if value != 0:
+                moved.add(exclusive)
         alone = sum(value != 0 for value in request.u) == 1
         if True in moved and not alone:
             return GuardTrip.REQUEST_EXCLUSIVE

@@ -57,6 +57,7 @@ class GuardLimits:
     def check(self) -> None:
         if not 0 < self.max_command <= 1:
             raise ConfigError(f"guard.max_command: expected (0, 1], got {self.max_command}")
+        # Zero and infinity would switch a check off, which nobody may do by a number.
         positive = (
             "max_rate_1_s",
             "joints_s",
@@ -108,6 +109,7 @@ def build_joint_bounds(
 ) -> JointBounds:
     """Return the bounds of the joints, from arrays of length `J`."""
     return JointBounds(
+        # Plain floats, since the guard must not depend on numpy.
         tuple(map(float, lower)),
         tuple(map(float, upper)),
         tuple(map(float, max_speed)),

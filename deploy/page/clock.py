@@ -56,9 +56,9 @@ class PageClock:
         """
         try:
             number, came_ms, drawn_ms, said_ms = json.loads(text)
-            came_s, drawn_s, said_s = (
-                float(value) / 1000.0 for value in (came_ms, drawn_ms, said_ms)
-            )
+            came_s = float(came_ms) / 1000.0
+            drawn_s = float(drawn_ms) / 1000.0
+            said_s = float(said_ms) / 1000.0
             sent_s, advice = self._sent.pop(number)
         except (ValueError, TypeError, KeyError):
             return None

@@ -122,6 +122,7 @@ class DemoFeed:
 
     def read_advice_number(self) -> int:
         """See `PageFeed`."""
+        # Advices come at the control rate, as a policy's would.
         return int((self._clock() - self._began_s) / self._machine.period_s)
 
     def read_state(self) -> PageState:
@@ -129,6 +130,7 @@ class DemoFeed:
         now_s, machine = self._clock(), self._machine
         t_s = now_s - self._began_s
         number = int(t_s / machine.period_s)
+        # The advice changes from period to period, not continuously.
         levers, due_s = self._run_programme(number * machine.period_s)
         targets = tuple(replace(target, chosen=target.name == self._chosen) for target in TARGETS)
         state = self._build_state(now_s, t_s)
@@ -150,6 +152,7 @@ class DemoFeed:
     def read_frame(self, after_s: float) -> Frame | None:
         """See `PageFeed`."""
         number = int((self._clock() - self._began_s) * self._demo.rate_hz)
+        # Frames are numbered by the clock, so that every page sees the same one.
         t_s = self._began_s + number / self._demo.rate_hz
         return self._camera.take_frame(number, t_s) if self._camera and t_s > after_s else None
 
@@ -169,6 +172,7 @@ class DemoFeed:
         """See `PageFeed`; nothing is recorded."""
 
     def _build_state(self, now_s: float, t_s: float) -> OperatorState:
+        # The operator follows the same programme a little later.
         own, _ = self._run_programme(max(0.0, t_s - self._demo.lag_s))
         lever = np.array([own.left_theta, own.left_psi, own.right_theta, own.right_psi])
         return replace(
@@ -183,6 +187,7 @@ class DemoFeed:
 
     def _measure_ages(self, t_s: float, number: int) -> tuple[SourceAge, ...]:
         ages_s: dict[str, float | None] = {
+            # Ages saw between 0 and the period, as those of a cyclic sender do.
             "positions": t_s % BUS_PERIOD_S,
             "levers": t_s % REMOTE_PERIOD_S,
             "advice": t_s - number * self._machine.period_s,
@@ -194,6 +199,7 @@ class DemoFeed:
     def _plan_path(self, q: np.ndarray, targets: tuple[BoreholeChoice, ...]) -> tuple[Vector, ...]:
         if not self._machine.has_bodies or not self._guiding:
             return ()
+        # There is always a chosen one: the demo begins with the first.
         chosen = next(target for target in targets if target.chosen)
         tip_m = compute_tool_kinematics(self._machine, q).tip_in_base_m
         center_m, axis = np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base)
@@ -201,6 +207,7 @@ class DemoFeed:
 
     def _choose_at(self, x: float, y: float) -> bool:
         """Choose the borehole at a point of the picture; return whether there is one."""
+        # The touch means the newest picture, whatever was drawn before.
         frame = self.read_frame(-1.0)
         found = frame and locate_borehole(frame, x, y, TARGETS[0].radius_m)
         if not found:
@@ -220,12 +227,14 @@ class DemoFeed:
         at_s, number = t_s % cycle, int(t_s // cycle)
         alone = at_s < EXCLUSIVE_S and bool(self._exclusive.any())
         if alone:
+            # Half a sine: the joint starts and ends at rest; every second time it goes back.
             u[self._exclusive] = (
                 self._demo.amplitude
                 * np.sin(np.pi * at_s / EXCLUSIVE_S)
                 * (1 if number % 2 == 0 else -1)
             )
         else:
+            # Others follow full sines, so that they end where they began.
             phase = 2 * np.pi * (at_s - EXCLUSIVE_S) / OTHERS_S
             joints = np.arange(self._machine.num_joints)
             u = np.where(
@@ -243,8 +252,10 @@ class DemoFeed:
         """Return the joint positions after these commands, kept within their limits."""
         machine, cycle = self._machine, EXCLUSIVE_S + OTHERS_S
         at_s, number = t_s % cycle, int(t_s // cycle)
+        # Half of full speed: the drawn arm moves slowly enough to be followed.
         speed = 0.5 * self._demo.amplitude * machine.max_speed
         done = min(at_s, EXCLUSIVE_S) / EXCLUSIVE_S
+        # The integral of the commands above: positions belong to the levers that are shown.
         forth = (1 - np.cos(np.pi * done)) / np.pi * EXCLUSIVE_S
         alone = speed * (forth if number % 2 == 0 else 2 * EXCLUSIVE_S / np.pi - forth)
         phase = 2 * np.pi * max(0.0, at_s - EXCLUSIVE_S) / OTHERS_S
@@ -287,11 +298,13 @@ class DemoCamera:
         self, width: int, height: int, block: tuple[Vector, Vector], holes: Sequence[BoreholeChoice]
     ) -> None:
         ahead = (LOOK_AT_M - EYE_M) / np.linalg.norm(LOOK_AT_M - EYE_M)
+        # The camera is level: its right is horizontal.
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         right /= np.linalg.norm(right)
         self._pose = np.eye(4)
         self._pose[:3, :3] = np.stack([right, np.cross(ahead, right), ahead], 1)
         self._pose[:3, 3] = EYE_M
+        # Pinhole camera by its field of view across the width.
         focal = width / 2 / np.tan(FOV_RAD / 2)
         self._matrix = np.array(
             [[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]]
@@ -307,6 +320,7 @@ class DemoCamera:
         coarse = cells.repeat(GRAIN_PX, 0).repeat(GRAIN_PX, 1)[:height, :width, None]
         grain = fine + coarse
         self._color = (shade + grain).clip(0, 255).astype(np.uint8)
+        # Twice as wide: a shifted window of it serves each frame as fresh noise.
         self._noise = chance.normal(0.0, NOISE, (height, 2 * width)).astype(np.float32)
 
     def take_frame(self, number: int, t_s: float) -> Frame:

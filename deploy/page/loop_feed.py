@@ -108,6 +108,7 @@ class LoopFeed:
         memory: LoopMemory,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        # Guidance is on at the start: a page that opens late must not find it switched off.
         self._config, self._memory, self._clock = config, memory, clock
         self._guiding = True
         machine = config.machine
@@ -144,6 +145,8 @@ class LoopFeed:
 
     def read_frame(self, after_s: float) -> Frame | None:
         """See `PageFeed`."""
+        # The time alone is read first: copying a picture that has not changed would cost
+        # milliseconds.
         slot, taken_s = self._memory.frame, self._read_frame_t_s()
         if slot is None or taken_s is None or taken_s <= after_s:
             return None
@@ -155,6 +158,7 @@ class LoopFeed:
         facts: dict[str, Any] = {}
         if request.kind in ("target", "point"):
             targets = self._list_targets(self._memory.target.read())
+            # A borehole that is chosen already is granted without moving the target.
             if any(one.chosen and one.name == request.value for one in targets):
                 return True
             find = self._find_named if request.kind == "target" else self._find_pointed
@@ -167,6 +171,7 @@ class LoopFeed:
                 "t_s": place.t_s,
             }
         values = {"kind": request.kind, "value": request.value}
+        # The request goes through a pipe: this process may not touch the loop's slots.
         taken = self._memory.requests.put(json.dumps(values | facts).encode())
         self._log_text("wish", values | {"taken": taken} | facts)
         if request.kind in ("start", "stop"):
@@ -221,7 +226,9 @@ class LoopFeed:
     def _describe_recording(self, snapshot: LoopSnapshot) -> RecordingStatus:
         controls = self._memory.controls.read()
         on = controls is not None and controls.recording
+        # `since` of an ended recording is old and means nothing.
         seconds = snapshot.t_s - controls.recording_t_s if controls is not None and on else 0.0
+        # Before the first state nothing can have been lost.
         dropped = snapshot.log_dropped if snapshot.state is not None else 0
         return RecordingStatus(on, seconds, dropped)
 
@@ -231,6 +238,8 @@ class LoopFeed:
     def _list_targets(self, aim: Any | None) -> tuple[BoreholeChoice, ...]:
         """Return the boreholes that perception knows, and the one that the advice is for."""
         holes = read_holes(self._memory.holes)
+        # The target may be perception's own or one from a file; the nearest known hole is shown
+        # as chosen.
         chosen = None if aim is None else find_nearest(holes, np.array(aim["center_in_base_m"]))
         found = []
         for hole in holes:
@@ -250,6 +259,7 @@ class LoopFeed:
                 center_in_base_m=_to_vector(aim["center_in_base_m"]),
                 axis_in_base=UP,
                 radius_m=self._config.page.borehole_radius_m,
+                # 0 stands for "not known" in shared memory.
                 std_m=float(aim["std_m"]) or None,
                 confidence=None,
                 chosen=True,
@@ -266,6 +276,7 @@ class LoopFeed:
 
     def _find_pointed(self, value: str) -> TargetPosition | None:
         """Return the borehole at a point of the picture: one of perception's, else as measured."""
+        # The newest picture is meant, whatever was drawn before.
         frame = self.read_frame(-1.0)
         if frame is None:
             return None
@@ -273,6 +284,7 @@ class LoopFeed:
         found = locate_borehole(frame, x, y, self._config.page.borehole_radius_m)
         if found is None:
             return None
+        # A hole that perception knows is better measured than one touch.
         known = find_nearest(read_holes(self._memory.holes), found[0])
         return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
 

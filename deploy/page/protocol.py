@@ -142,7 +142,7 @@ class PageState:
 
     @property
     def safety(self) -> dict[str, Any] | None:
-        """Plain data on what stands between the loop and the valves."""
+        """Return the state of guard, dead-man and emergency stop as plain data."""
         state = self.state
         if state is None:
             return None

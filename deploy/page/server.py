@@ -118,6 +118,7 @@ def serve_page(
 
     def begin(port: int) -> None:
         address = build_link(page, port, token)
+        # The token stands in a file that only its owner can read, not in the log.
         write_link(session, address)
         announce(address)
 
@@ -136,6 +137,8 @@ def build_link(page: PageSettings, port: int, token: str) -> str:
 def write_link(session: Session, address: str) -> None:
     """Write the link into the run folder, readable for its owner alone."""
     path = session.folder / LINK
+    # The mode is given at creation: changing it later would leave the token readable for a
+    # moment.
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
         file.write(address + "\n")
 
@@ -184,6 +187,8 @@ class SendWindow:
 
     def note_drawn(self, number: int) -> None:
         """Note that message `number` was drawn; those before it are of no use any more."""
+        # A page draws the newest message and skips older ones, so a later number answers for all
+        # before it.
         self._undrawn = [one for one in self._undrawn if one > number]
         if len(self._undrawn) < self._limit:
             self._free.set()
@@ -213,6 +218,7 @@ class PageServer:
         extension: PageExtension | None = None,
     ) -> None:
         self._page, self._feed, self._token, self._extension = page, feed, token, extension
+        # The setup never changes during a run, so it is encoded once and served like a file.
         self._files = load_files(json.dumps(page.describe_setup(machine)).encode())
         self._handlers = {
             STATE: self._send_states,
@@ -222,6 +228,7 @@ class PageServer:
         if extension is not None:
             self._files |= extension.files
             self._handlers[extension.path] = self._serve_extension
+        # Filled when the port is known; until then every host name is refused.
         self._hosts: frozenset[str] = frozenset()
         self._state: LatestValue[tuple[PageState | None, str]] = LatestValue((None, ""))
         self._frame = LatestValue(b"")
@@ -242,11 +249,16 @@ class PageServer:
                 page.host,
                 page.port,
                 process_request=self._answer,
+                # Compression would delay each small message by more than it saves on a local
+                # network.
                 compression=None,
                 server_header=None,
+                # Requests are short; a longer message is an error or an attack.
                 max_size=2 * access.LONGEST,
                 max_queue=4,
                 write_limit=BUFFER_BYTES,
+                # A tablet that leaves the network sends no goodbye: without pings its connection
+                # would count as open.
                 ping_interval=5,
                 ping_timeout=10,
                 close_timeout=1,
@@ -267,6 +279,7 @@ class PageServer:
             begin(port)
             while not stop():
                 await asyncio.sleep(STOP_POLL_S)
+            # The tasks wait for ever; without this the group would never end.
             for task in tasks:
                 task.cancel()
 
@@ -280,8 +293,12 @@ class PageServer:
         before = advised = None
         while True:
             now_s, number = time.monotonic(), self._feed.read_advice_number()
+            # Advices come at the control rate: the interval of the last two predicts the next
+            # one.
             until_s = advised_s + apart_s - now_s
             expected = -POLL_S < until_s < DRAW_S
+            # A page that hears nothing for long cannot tell a calm machine from a dead
+            # connection.
             silent = now_s - sent_s >= HEARTBEAT_S
             is_due = now_s - looked_s >= 1.0 / self._page.rate_hz and not expected
             if number != advised or silent or is_due:
@@ -295,6 +312,7 @@ class PageServer:
                     message = {"number": self._state.number + 1, "shown": state.to_plain()}
                     text = json.dumps(message, separators=(",", ":"))
                     await self._state.put((state, text))
+            # Short sleeps only around the expected moment: polling costs processor time.
             await asyncio.sleep(EXPECTED_POLL_S if abs(until_s) < POLL_S else POLL_S)
 
     async def _watch_frames(self) -> None:
@@ -302,6 +320,7 @@ class PageServer:
         taken_s, due_s = -1.0, 0.0
         page = self._page
         while True:
+            # Pictures are large; they are encoded only while somebody looks.
             await asyncio.sleep(FRAME_POLL_S)
             if not self._num_open or time.monotonic() < due_s:
                 continue
@@ -309,6 +328,7 @@ class PageServer:
             if frame is None:
                 continue
             taken_s, due_s = frame.t_s, time.monotonic() + EARLY / page.frames_hz
+            # In a thread: the event loop must go on sending states.
             message = await asyncio.to_thread(
                 frame_codec.encode_frame, frame, page.picture_px, page.jpeg_quality
             )
@@ -318,6 +338,8 @@ class PageServer:
         """Answer requests for files; `None` lets a WebSocket in."""
         path, host = request.path.partition("?")[0], request.headers.get("Host")
         if host not in self._hosts:
+            # A browser that is led to this server by a foreign name (DNS rebinding) still sends
+            # that name.
             return _build_refusal(
                 HTTPStatus.MISDIRECTED_REQUEST, "unknown host name; see page.names"
             )
@@ -342,6 +364,7 @@ class PageServer:
     async def _handle_connection(self, connection: ServerConnection) -> None:
         assert connection.request is not None
         handle = self._handlers[connection.request.path.partition("?")[0]]
+        # Counted before the handler runs, so that many slow handshakes cannot exceed the limit.
         self._num_open += 1
         try:
             with contextlib.suppress(ConnectionClosed):

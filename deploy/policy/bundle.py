@@ -42,7 +42,7 @@ class PolicyBundle:
         contract: Contents of `policy.json`.
 
     Raises:
-        CheckpointError: see the module; the message says what differs.
+        CheckpointError: see the module; the message names the difference.
     """
 
     def __init__(self, folder: str, machine: Machine) -> None:

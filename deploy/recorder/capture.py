@@ -243,9 +243,8 @@ class CaptureWriter:
         title = topic
         if topic == PICTURES:
             title = "foxglove.CompressedImage"
-            properties |= {"timestamp": TIME, "data": BINARY} | {
-                key: {"type": "string"} for key in ("frame_id", "format")
-            }
+            text = {"type": "string"}
+            properties |= {"timestamp": TIME, "data": BINARY, "frame_id": text, "format": text}
         schema = {"title": title, "type": "object", "properties": properties}
         return self._mcap.register_schema(title, "jsonschema", json.dumps(schema).encode())
 

@@ -79,6 +79,7 @@ class BusProcess:
         self._bus: OpenCanBus | OpenBusReplay | None = None
         self._was_down, self._reopen_s = False, 0.0
         self._log: list[bytes] = []
+        # Counters and due times are kept by message name, since each has its own cycle.
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
         self._decision: GuardDecision | None = None
@@ -94,6 +95,7 @@ class BusProcess:
 
     def receive(self) -> None:
         """Take frames until the deadline."""
+        # The computer was asleep: old frames in the queue would be taken for present ones.
         late_s = time.monotonic() - self._timer.next_s
         if self._bus is not None and late_s > self._gap_s:
             log.warning(
@@ -107,6 +109,7 @@ class BusProcess:
             self._timer.wait()
             return
         try:
+            # The rest of the cycle is spent receiving, so that a stop takes effect at once.
             while self._bus is not None and (left_s := self._timer.next_s - time.monotonic()) > 0:
                 frame = self._bus.recv(left_s)
                 if frame is not None:
@@ -121,6 +124,8 @@ class BusProcess:
         if fault is not None:
             self._log_text("fault", now_s, {"frame_id": frame.frame_id, "fault": fault.value})
         is_active = self._decision is not None and self._decision.state is GuardState.ACTIVE
+        # Only while commanding: otherwise there is no motion to end, and the cycle keeps its
+        # time.
         if is_active and self._guard.stops(self._receiver.build_guard_input(now_s, True)):
             self.run_cycle()
 
@@ -134,6 +139,7 @@ class BusProcess:
             self._read_request(now_s),
         )
         before, self._decision = self._decision, decision
+        # Only changes are logged: the state itself stands in every record.
         if before is None or (decision.state, decision.trip) != (before.state, before.trip):
             values = {
                 "state": decision.state.name,
@@ -142,6 +148,7 @@ class BusProcess:
             }
             self._log_text("guard", now_s, values)
         if decision.sends and self._memory.request is not None:
+            # A fall to zero goes out at once; other commands wait for their turn.
             stops = before is not None and any(before.u) and not any(decision.u)
             self._send_command(decision, now_s, at_once=stops)
         state = self._receiver.build_state(
@@ -170,6 +177,7 @@ class BusProcess:
             values[f"Command_{joint}"] = u
         values["CommandMode"] = COMMAND if decision.state is GuardState.ACTIVE else IDLE
         self._send(self._description.command.name, values, now_s, at_once)
+        # The gateway expects a heartbeat only where its DBC has one.
         if "PcHeartbeat" in self._description.layouts:
             overruns = min(LARGEST_OVERRUNS, self._timer.missed)
             state = {"PcState": decision.state.value, "Overruns": overruns}
@@ -185,6 +193,7 @@ class BusProcess:
         counter = self._counters[name] = self._counters.get(name, -1) + 1
         data = self._description.encode(name, values, counter)
         frame = CanFrame(layout.frame_id, data, layout.extended)
+        # Remembered before sending: the bus may deliver it back before `send` returns.
         if name == self._description.command.name:
             self._receiver.note_own_command(frame.data)
         try:
@@ -213,6 +222,7 @@ class BusProcess:
         """Send zero, report on timing, and close the bus."""
         now_s = time.monotonic()
         if self._bus is not None and self._decision is not None and self._decision.sends:
+            # Going down is the strictest input: no request can override it.
             # to the guard the bus is going down, and it answers with zero
             closing = self._receiver.build_guard_input(now_s, False)
             last = self._guard.decide(now_s, True, closing, None)

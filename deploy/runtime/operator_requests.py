@@ -45,6 +45,7 @@ class RecordingControl:
         self._memory, self._folder, self._start = memory, folder, start
         self._child: ChildProcess | None = None
         self._asked_to_stop, self._number = False, 0
+        # Set by the supervisor and by requests; `refresh` acts on it.
         self.wanted = False
         self.next_folder: Path | None = None
         self.since_s = 0.0
@@ -66,11 +67,13 @@ class RecordingControl:
         """
         child = self._child
         if child is not None and child.code is not None:
+            # An exit that was not asked for loses data, and the operator must know.
             if not self._asked_to_stop:
                 log.error(
                     "ALARM: the log has died (exit code %s); nothing is recorded any more",
                     child.code,
                 )
+                # Otherwise it would be started again and hide the fault.
                 self.wanted = False
             self._child = child = None
         if child is None and self.wanted:
@@ -80,6 +83,7 @@ class RecordingControl:
         elif child is not None and not self.wanted and not self._asked_to_stop:
             child.ask_to_stop()
             self._asked_to_stop = True
+        # The pipes fill while nothing is recorded; their writers would count losses.
         elif child is None:
             for pipe in self._memory.logs:
                 for _ in pipe.take():
@@ -91,6 +95,7 @@ class RecordingControl:
             self._child.end(patience_s)
 
     def _choose_folder(self) -> Path:
+        # Numbered from 1: the first recording has the run folder itself.
         self._number += 1
         chosen, self.next_folder = self.next_folder, None
         if chosen is not None:
@@ -145,5 +150,6 @@ class RequestHandler:
             place = TargetPosition(center_m, request["std_m"], request["t_s"])
             self._selector.choose(place)
         else:
+            # `commands` is a promise of the run's configuration that no request can break.
             self._armed = self._commands and request["kind"] == "start"
         log.info("requested: %s %s", request["kind"], request["value"])

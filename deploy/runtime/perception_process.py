@@ -132,16 +132,18 @@ def write_holes(slot: Slot, tracked: Sequence[TrackedHole], t_s: float) -> None:
 
 def _list_holes(tracked: Sequence[TrackedHole]) -> list[dict[str, Any]]:
     """Return the known boreholes as plain data for the log."""
-    return [
-        {
-            "name": hole.name,
-            "center_in_base_m": np.round(hole.pose.center_m, 4).tolist(),
-            "std_m": round(hole.std_m, 5),
-            "score": round(float(hole.pose.score), 3),
-            "seen_t_s": hole.seen_s,
-        }
-        for hole in tracked
-    ]
+    plain = []
+    for hole in tracked:
+        plain.append(
+            {
+                "name": hole.name,
+                "center_in_base_m": np.round(hole.pose.center_m, 4).tolist(),
+                "std_m": round(hole.std_m, 5),
+                "score": round(float(hole.pose.score), 3),
+                "seen_t_s": hole.seen_s,
+            }
+        )
+    return plain
 
 
 def _publish_frame(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:

@@ -74,6 +74,7 @@ class BusReceiver:
         )
         self.plausibility = PlausibilityFilter(self.limits, self.bounds)
         count = machine.num_joints
+        # Ages start at infinity: nothing is known before the first message.
         self.q, self.q_valid = np.zeros(count), np.zeros(count, dtype=bool)
         self.q_t_s = np.full(count, -math.inf)
         self.flow, self.flow_sum = np.zeros(count), np.zeros(count)
@@ -101,6 +102,7 @@ class BusReceiver:
         """Decode a frame and use its values; return its fault, if any."""
         layout = self._layouts.get(frame.frame_id)
         if layout is None:
+            # A command that this process did not send comes from a second commander.
             if frame.frame_id == self.description.command.frame_id and frame.data not in self._own:
                 self._stranger_s = now_s
             return None
@@ -108,6 +110,7 @@ class BusReceiver:
         channel = self.channels.get(layout.name)
         values = self.description.decode(layout, frame.data)
         if isinstance(values, MessageFault):
+            # A refused frame still moves the channel towards "invalid".
             fault = channel.refuse(values) if channel else values
         else:
             fault = channel.take(int(values[COUNTER])) if channel else None
@@ -121,9 +124,11 @@ class BusReceiver:
         """Return the values that the guard decides by."""
         return GuardInput(
             q=tuple(self.q.tolist()),
+            # The oldest position counts: the guard needs all joints.
             joints_age_s=now_s - float(self.q_t_s.min()) + self.held_up_s,
             joints_plausible=self.plausible,
             trusted=self.trusted,
+            # A remote that is off is as good as one that never came.
             levers_age_s=now_s - self.levers_t_s if self.remote_on else math.inf,
             lever=float(np.abs(self.lever).max()),
             deadman=self.deadman,
@@ -148,6 +153,7 @@ class BusReceiver:
         return OperatorState(
             t_s=now_s,
             q=self.q.copy(),
+            # Infinite ages become 0, since a record has no infinity.
             q_t_s=max(0.0, float(self.q_t_s.min()) - self.held_up_s),
             q_plausible=self.plausible,
             flow=self.flow,
@@ -197,12 +203,15 @@ class BusReceiver:
         for j, joint in enumerate(machine.joint_names):
             position = values.get(f"Position_{joint}")
             if position is not None:
+                # A sensor without a validity signal is taken at its word.
                 self.q_valid[j] = values.get(f"Valid_{joint}", 1.0) == 1.0
+                # The filter is asked first, so that it also learns of positions called invalid.
                 if self.plausibility.accept(j, now_s, position) and self.q_valid[j]:
                     self.q[j], self.q_t_s[j] = position, now_s
         if f"Flow_{machine.joint_names[0]}" in values:
             self.followed = values["FlowSource"] == FROM_PC
             self.flow = np.array([values[f"Flow_{joint}"] for joint in machine.joint_names])
+            # Sums and counts, so that a reader can form the mean flow of any period.
             self.flow_sum, self.flow_number = self.flow_sum + self.flow, self.flow_number + 1
             self.flow_t_s = now_s
         if "DeadMan" in values:
@@ -224,12 +233,14 @@ class _TransitTime:
 
     def measure_delay_s(self, stamp_s: float, now_s: float) -> float:
         """Return the delay of a message with the gateway's `stamp_s` that came at `now_s`."""
+        # Transit time with an unknown constant: the two clocks share no origin.
         raw_s = now_s - stamp_s
         if self._offset_s is None:
             self._offset_s = raw_s
         # clocks differ by a constant and whole turns of the stamp
         half_s = STAMP_MODULUS_S / 2
         transit_s = (raw_s - self._offset_s + half_s) % STAMP_MODULUS_S - half_s
+        # The best of the last minute replaces the best ever, so that drift is forgotten.
         if now_s - self._since_s > FORGET_S:
             self._best_s = min(self._recent_s, transit_s)
             self._recent_s, self._since_s = transit_s, now_s

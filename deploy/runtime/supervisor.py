@@ -116,10 +116,12 @@ class DeploymentLoop(BusAndPolicySettings):
         group = ProcessGroup(memory, self.realtime)
         recorder = self._build_recorder(memory, machine, session.folder)
         try:
+            # Companions first: the loop then finds its bus in use from the beginning.
             for one in companions:
                 group.start(one.name, one.target, one.arguments, one.realtime)
             self._start(group, machine, session)
             recorder.refresh()
+            # Process ids are written before the loop runs, for tools that watch it from outside.
             write_json(session.folder / PROCESSES, group.pids | recorder.pids)
             selector = TargetSelector(self.target.build(), memory.target, memory.holes)
             handler = RequestHandler(memory, recorder, selector, self.armed, self.commands)
@@ -128,8 +130,10 @@ class DeploymentLoop(BusAndPolicySettings):
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
+            # The order matters: the log is ended last, so that it records how the others ended.
             group.end()
             recorder.end(PATIENCE_S)
+            # Also after an error: the timing often explains it.
             _write_timing_report(memory, session)
             memory.close()
 
@@ -159,6 +163,7 @@ class DeploymentLoop(BusAndPolicySettings):
     def _build_recorder(
         self, memory: LoopMemory, machine: Machine, folder: Path
     ) -> RecordingControl:
+        # These facts go into every recording, so that it can be read without the run folder.
         facts = {"policy": self.policy, "source": f"{self.wire.interface} {self.wire.channel}"}
         pictures_hz = self.camera.record_hz if self.camera else 0.0
 
@@ -179,8 +184,10 @@ class DeploymentLoop(BusAndPolicySettings):
         with contextlib.ExitStack() as stack:
             live = None
             if self.show:
+                # On stderr: stdout belongs to the command's result.
                 console = Console(stderr=True)
                 live = stack.enter_context(Live(console=console, refresh_per_second=TERMINAL_HZ))
+            # Times are monotonic: a clock that is set must not end a run.
             while end_s is None or time.monotonic() < end_s:
                 handler.refresh()
                 group.check()
@@ -240,6 +247,7 @@ def build_table(snapshot: LoopSnapshot, full_rad: np.ndarray) -> Table:
         snapshot: State and advice.
         full_rad: Angles of the four axes at full deflection, `(4,)`.
     """
+    # The terminal's table is a stand-in; see `deploy.page` for the real one.
     grid = Table.grid(padding=(0, 2))
     state, advice = snapshot.state, snapshot.advice
     own = state.levers if state else None
@@ -260,6 +268,7 @@ def build_table(snapshot: LoopSnapshot, full_rad: np.ndarray) -> Table:
     grid.add_row("advice", reason, f"safety: {safety}")
     if state is not None:
         joints = "  ".join(f"{q:+.3f}" for q in state.q)
+        # An age of many digits would make the columns jump.
         age_s = min(snapshot.t_s - state.q_t_s, LARGEST_AGE_S)
         grid.add_row("joints", joints, f"{1e3 * age_s:.0f} ms old")
     return grid
@@ -267,6 +276,7 @@ def build_table(snapshot: LoopSnapshot, full_rad: np.ndarray) -> Table:
 
 def _draw_bar(part: float, color: str) -> Text:
     """Draw a bar from the middle to `part` of full, in [-1, 1]."""
+    # NaN is a lever that is not known; it is drawn in neutral.
     shown = max(-1.0, min(1.0, part)) if math.isfinite(part) else 0.0
     filled = round(shown * BAR_WIDTH)
     cells = [" "] * (2 * BAR_WIDTH + 1)

@@ -1,4 +1,4 @@
-"""From a study's folder to what it says: every trial measured, means of each person and condition, effects, and what to beware of.
+"""From a study's folder to its results: every trial measured, means of each person and condition, effects, and warnings.
 
 Axes: `P` participants in the order of the plan.
 """
@@ -33,7 +33,7 @@ class MeasuredTrial:
     """A trial with its numbers.
 
     Attributes:
-        facts: What stands in its file.
+        facts: Contents of its file.
         values: By measure, NaN where the recording does not tell.
         tip_in_base_m: Path of the tool until the trial ended, `(T, 3)`; empty where there is no
             recording.
@@ -61,7 +61,7 @@ class Analysis:
             scales.
         primary: Name of the measure that decides.
         alpha: Level.
-        remarks: What a reader must know.
+        remarks: Warnings to the reader.
     """
 
     participants: list[str]
@@ -77,10 +77,10 @@ class Analysis:
 
 
 def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] = iter) -> Analysis:
-    """Return what the study says.
+    """Return the results of the study.
 
     Args:
-        data: What is there.
+        data: Contents of the study's folder.
         machine: The machine of the plan.
         progress: Wraps the list of trials while their recordings are read.
     """
@@ -97,24 +97,28 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
         alpha=design["alpha"],
         remarks=list(data.remarks),
     )
-    everything = [(trial, bool(trial["period"])) for trial in data.trials.values()] + [
-        (trial, False) for trial in data.spare
-    ]
+    everything = []
+    for trial in data.trials.values():
+        everything.append((trial, bool(trial["period"])))
+    for trial in data.spare:
+        everything.append((trial, False))
+    # Said in the results: a twin is no machine.
     if at_twin := sum(bool(trial.get("twin")) for trial, counts in everything if counts):
         found.remarks.append(
             Remark(
                 "study", f"{at_twin} trials that count were done at a simulated machine, the twin"
             )
         )
+    # The criterion of the plan, not of today's configuration.
     success = Success(**design["success"])
     for trial, counts in progress(everything):
         found.trials.append(
             _measure_trial(data.folder, trial, counts, machine, success, found.remarks)
         )
-    found.means = {
-        each.name: {which: _average_participants(found, each.name, which) for which in CONDITIONS}
-        for each in MEASURES
-    }
+    for each in MEASURES:
+        found.means[each.name] = {}
+        for which in CONDITIONS:
+            found.means[each.name][which] = _average_participants(found, each.name, which)
     _note_few(found)
     _add_loads(found, data)
     for name, by_condition in (
@@ -125,9 +129,11 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
             found.effects[name] = estimate_effect(
                 by_condition["guided"], by_condition["unguided"], found.guided_first
             )
-    secondary = [
-        each.name for each in MEASURES if each.name in found.effects and each.name != found.primary
-    ]
+    secondary = []
+    for each in MEASURES:
+        if each.name in found.effects and each.name != found.primary:
+            secondary.append(each.name)
+    # Holm within each family: the scales are no more tests of the recordings.
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
         p = [get_deciding_p(found.effects[name]) for name in family]
         found.holm |= dict(
@@ -159,6 +165,7 @@ def _measure_trial(
     empty = MeasuredTrial(
         trial, dict.fromkeys((each.name for each in MEASURES), math.nan), np.zeros((0, 3)), counts
     )
+    # Without a recording the outcome is still evidence.
     where = trial.get("hole")
     if not trial.get("recording") or not isinstance(where, dict):
         why = f" ({trial['recording_problem']})" if trial.get("recording_problem") else ""
@@ -178,6 +185,7 @@ def _measure_trial(
         return _keep_outcome(empty)
     values = measure(recording, machine, hole, success, float(trial["limit_s"]))
     said = trial.get("outcome")
+    # The recording is the measurement; the note of the outcome may be wrong.
     if said in ("inserted", "time limit") and (said == "inserted") != bool(values["success"]):
         seen = "an insertion" if values["success"] else "none"
         remarks.append(
@@ -186,6 +194,7 @@ def _measure_trial(
                 f"written down as '{said}', but the recording shows {seen}; the recording counts",
             )
         )
+    # Only the path up to the end: afterwards the arm is moved away.
     num = int(np.searchsorted(recording.t_s - recording.t_s[0], values["time_s"], side="right"))
     return MeasuredTrial(
         trial, values, compute_tool_kinematics(machine, recording.q[:num]).tip_in_base_m, counts
@@ -207,9 +216,12 @@ def _average_participants(found: Analysis, measure_name: str, condition: str) ->
     """Return each participant's mean over the trials that tell, `(P,)`."""
     means = np.full(len(found.participants), np.nan)
     for index, name in enumerate(found.participants):
-        values = np.array(
-            [t.values[measure_name] for t in found.trials if _is_of(t, name, condition)]
-        )
+        told = []
+        for trial in found.trials:
+            if _is_of(trial, name, condition):
+                told.append(trial.values[measure_name])
+        values = np.array(told)
+        # A trial that does not tell is left out of the mean.
         values = values[~np.isnan(values)]
         means[index] = values.mean() if len(values) else math.nan
     return means
@@ -234,13 +246,14 @@ def _note_few(found: Analysis) -> None:
 
 def _add_loads(found: Analysis, data: StudyData) -> None:
     keys = (*tlx.SCALES, "raw", "weighted")
-    found.loads = {
-        key: {which: np.full(len(found.participants), np.nan) for which in CONDITIONS}
-        for key in keys
-    }
+    for key in keys:
+        found.loads[key] = {}
+        for which in CONDITIONS:
+            found.loads[key][which] = np.full(len(found.participants), np.nan)
     for (name, period), answers in data.questionnaires.items():
         if name not in found.participants:
             continue
+        # The condition of the period follows from the plan.
         condition = data.plan["participants"][name][PERIODS.index(period)]
         values = tlx.read_ratings(answers) | {
             "raw": tlx.compute_raw_tlx(answers),
@@ -248,7 +261,5 @@ def _add_loads(found: Analysis, data: StudyData) -> None:
         }
         for key, value in values.items():
             found.loads[key][condition][found.participants.index(name)] = value
-        found.remarks += [
-            Remark(f"{name} period {period}", f"questionnaire: {text}")
-            for text in tlx.check(answers)
-        ]
+        for text in tlx.check(answers):
+            found.remarks.append(Remark(f"{name} period {period}", f"questionnaire: {text}"))

@@ -1,6 +1,6 @@
-"""Leads a participant through a sitting: takes what is said on the page, watches the machine, writes everything down at once.
+"""Leads a participant through a sitting: takes the page's messages, watches the machine, writes everything down at once.
 
-What was done stands in the study's folder (`deploy.study.study_folder`) before the next thing
+Each finished step stands in the study's folder (`deploy.study.study_folder`) before the next thing
 begins, so that an interruption at any time costs at most the trial that was under way; that one is
 kept as aborted, and done again.
 """
@@ -36,7 +36,7 @@ class Words:
 
     Attributes:
         version: Of the text, kept with each consent.
-        consent: What is agreed to, one paragraph each.
+        consent: Text of the consent, one paragraph each.
     """
 
     version: str
@@ -50,9 +50,9 @@ class Conductor:
         folder: The study's.
         machine: The machine.
         stage: Where trials take place.
-        words: What the lab says.
+        words: Texts of the lab.
         times: Countdown and the like.
-        facts: What every trial says of itself besides: `simulated`, `twin`.
+        facts: Further fields of every trial: `simulated`, `twin`.
         seed: From which the order of pairs comes: of participant and period.
         operators: Who is simulated, by condition; empty where people take part.
         clock: Monotonic time, s.
@@ -131,7 +131,7 @@ class Conductor:
             self._fall_back(error)
 
     def take(self, said: dict[str, Any]) -> str:
-        """Take what a page says; returns why it was not taken, empty where it was."""
+        """Take a message of a page; return the reason of a refusal, else an empty string."""
         do, step = said.get("do"), self._step
         try:
             if do == "choose" and isinstance(said.get("who"), str) and not self.running:
@@ -169,7 +169,7 @@ class Conductor:
         return ""
 
     def view(self) -> dict[str, Any]:
-        """Return what pages show, as plain data."""
+        """Return the view of the pages, as plain data."""
         found: dict[str, Any] = {
             "kind": "choose",
             "who": self._who,
@@ -193,12 +193,12 @@ class Conductor:
         return found | (self._form.view() if self._form is not None else {})
 
     def close(self) -> None:
-        """End what is under way, at once."""
+        """End trial or questionnaire at once."""
         if self._attempt is not None:
             self._attempt.leave()
 
     def _fall_back(self, error: BrokkError) -> None:
-        """Go back to the list of participants, and says what went wrong there; what stands on the disk is gone on with later."""
+        """Go back to the list of participants, and show the error there; the files on the disk are continued later."""
         log.error("%s", error)
         self._stage.record(None)
         self._who, self._step, self._attempt, self._form, self.problem = (
@@ -221,7 +221,7 @@ class Conductor:
         return "not now"
 
     def _go_on(self) -> None:
-        """Read the folder again, and begins what comes next."""
+        """Read the folder again, and begin the next step."""
         self._data, self._step, self._form = folders.read_study(self._folder), None, None
         self.problem = ""
         if self._who is None:
@@ -275,11 +275,10 @@ class Conductor:
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
-        known = {
-            key: value
-            for key, value in self._data.participants.get(self._who, {}).items()
-            if key != "participant"
-        }
+        known = {}
+        for key, value in self._data.participants.get(self._who, {}).items():
+            if key != "participant":
+                known[key] = value
         folders.write_participant(
             self._folder, self._who, known | facts | {"simulated": self._facts["simulated"]}
         )

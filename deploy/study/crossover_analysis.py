@@ -31,7 +31,7 @@ class GuidanceEffect:
         num_guided_first: Of those, who were guided in the first period.
         guided: Mean with guidance.
         unguided: Mean without.
-        difference: Mean difference, paired; what practice did is in it where sequences are unequal.
+        difference: Mean difference, paired; it holds the effect of practice where sequences are unequal.
         paired_ci95: Student's interval of it.
         paired_dz: Mean difference over its standard deviation.
         paired_dz_ci95: Interval from the noncentral t distribution.
@@ -45,11 +45,11 @@ class GuidanceEffect:
         dz: The adjusted difference over the standard deviation within sequences.
         dz_ci95: Interval from the noncentral t distribution.
         p: Exact test over sequences: the one that counts. `None` where all had the same sequence.
-        period: What the second period is above the first, by practice or fatigue.
+        period: Second period minus first, by practice or fatigue.
         period_p: Student's test of it.
-        carry_over_p: Student's test of unequal sums of the sequences: what the first period left
-            behind differs. It sees little at such sizes and decides nothing here (Freeman, Stat.
-            Med. 8 (1989) 1421-1432).
+        carry_over_p: Student's test of unequal sums of the sequences: an after-effect of the first period
+            that differs. It sees little at such sizes and decides nothing here (Freeman, Stat. Med.
+            8 (1989) 1421-1432).
     """
 
     num_persons: int
@@ -77,7 +77,7 @@ class GuidanceEffect:
 def estimate_effect(
     guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray
 ) -> GuidanceEffect:
-    """Return what one measure says.
+    """Return the effect of guidance on one measure.
 
     Args:
         guided: One figure a person, `(P,)`; NaN where there is none.
@@ -145,9 +145,9 @@ def _adjust_for_period(period_difference: np.ndarray, total: np.ndarray, first: 
 
 def _pool_variance(values: np.ndarray, first: np.ndarray) -> float:
     """Return the standard deviation within sequences, 0 where it is rounding only."""
-    squares = sum(
-        float(((part - part.mean()) ** 2).sum()) for part in (values[first], values[~first])
-    )
+    squares = 0.0
+    for part in (values[first], values[~first]):
+        squares += float(((part - part.mean()) ** 2).sum())
     std = math.sqrt(squares / (len(values) - 2))
     return std if std > ROUNDING * float(np.abs(values).max()) else 0.0
 

@@ -1,4 +1,4 @@
-"""Who does what when: sequences drawn by lot, holes and starts in Latin squares, practice before.
+"""Plan of the trials: sequences drawn by lot, holes and starts in Latin squares, practice before.
 
 A participant does a few trials in each of two periods, one with guidance and one without. Which
 comes first is drawn, in pairs of participants, so that at no time one sequence is two ahead. Within
@@ -145,13 +145,13 @@ def make_pseudonyms(count: int) -> list[str]:
 def draw_sequences(design: Design, generator: np.random.Generator) -> dict[str, tuple[str, str]]:
     """Return the two conditions of each participant in order, drawn in blocks of two."""
     drawn: list[tuple[str, str]] = []
+    # Pairs of participants, so that at no time one sequence is two ahead.
     for _ in range(math.ceil(design.num_participants / 2)):
         guided_first = bool(generator.integers(2)) or design.order == "fixed"
+        # The second of a pair gets the other sequence.
         second_first = guided_first if design.order == "fixed" else not guided_first
-        drawn += [
-            CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0])
-            for first in (guided_first, second_first)
-        ]
+        for first in (guided_first, second_first):
+            drawn.append(CONDITIONS if first else (CONDITIONS[1], CONDITIONS[0]))
     return dict(zip(make_pseudonyms(design.num_participants), drawn, strict=False))
 
 
@@ -162,6 +162,7 @@ def make_latin_squares(size: int) -> tuple[np.ndarray, np.ndarray]:
     itself, they are orthogonal (every pair of hole and start occurs once over the rows); for even
     `K` they cannot be made so by shifts, and pairs repeat.
     """
+    # Shifts of one row make a Latin square.
     row, place = np.mgrid[:size, :size]
     factor = next(
         (m for m in range(2, size) if math.gcd(m, size) == math.gcd(m - 1, size) == 1), size - 1
@@ -181,6 +182,7 @@ def plan_trials(design: Design, generator: np.random.Generator) -> list[Trial]:
         for number in range(design.practice_trials):
             condition = CONDITIONS[number % 2]
             place = (index + number) % len(holes)
+            # Practice goes through the holes in another order for each participant.
             found.append(
                 Trial(
                     participant,
@@ -210,18 +212,20 @@ def format_plan(
     design: Design, machine: Machine, seed: int, planned: list[Trial]
 ) -> dict[str, Any]:
     """Return the plan as it stands in `plan.json`."""
+    # The order of participants is that of the plan.
     conditions = {trial.participant: {} for trial in planned}
     for trial in planned:
         if trial.period:
             conditions[trial.participant][trial.period] = trial.condition
+    ordered = {}
+    for name, found in conditions.items():
+        ordered[name] = [found[period] for period in PERIODS]
     return {
         "schema": 1,
         "machine": machine.name,
         "fingerprint": machine.fingerprint(),
         "seed": seed,
         "design": asdict(design),
-        "participants": {
-            name: [found[period] for period in PERIODS] for name, found in conditions.items()
-        },
+        "participants": ordered,
         "trials": [asdict(trial) for trial in planned],
     }

@@ -13,7 +13,7 @@ from deploy.study import tlx
 
 NUM_RATINGS, NUM_PAIRS = len(tlx.SCALES), len(tlx.PAIRS)
 LAST = NUM_RATINGS + NUM_PAIRS
-"""Number of the screen on which what is missing is shown: after the scales and the pairs."""
+"""Number of the screen that lists the open questions: after the scales and the pairs."""
 
 
 class Form:
@@ -24,7 +24,7 @@ class Form:
         who: Participant.
         period: After which.
         seed: Of the order of pairs.
-        facts: What it says of itself besides.
+        facts: Further fields of its file.
     """
 
     def __init__(
@@ -38,12 +38,10 @@ class Form:
         entry = json.loads(path.read_text())
         self._path = path
         self._ratings: dict[str, int] = dict(entry.get("ratings") or {})
-        self._shown: list[list[str]] = entry.get("shown_pairs") or [
-            list(pair) for pair in tlx.PAIRS
-        ]
-        self._chosen = {
-            frozenset(answer["pair"]): answer["chosen"] for answer in entry.get("pairs") or []
-        }
+        self._shown: list[list[str]] = entry.get("shown_pairs") or list(map(list, tlx.PAIRS))
+        self._chosen = {}
+        for answer in entry.get("pairs") or []:
+            self._chosen[frozenset(answer["pair"])] = answer["chosen"]
         self.finished = bool(entry.get("finished"))
         self._at = min([*self._missing(), LAST])
 
@@ -70,7 +68,7 @@ class Form:
         return ""
 
     def view(self) -> dict[str, Any]:
-        """Return what pages show of it."""
+        """Return the questionnaire as plain data for the pages."""
         chosen = [self._chosen.get(frozenset(pair)) for pair in self._shown]
         return {
             "at": self._at, "last": LAST, "scales": list(tlx.SCALES), "step": tlx.STEP, "ratings": self._ratings,
@@ -88,21 +86,21 @@ class Form:
 
     def _missing(self) -> list[int]:
         """Return the screens that have no answer."""
-        scales = [
-            index for index, scale in enumerate(tlx.SCALES) if self._ratings.get(scale) is None
-        ]
-        return scales + [
-            NUM_RATINGS + i
-            for i, pair in enumerate(self._shown)
-            if frozenset(pair) not in self._chosen
-        ]
+        scales = []
+        for index, scale in enumerate(tlx.SCALES):
+            if self._ratings.get(scale) is None:
+                scales.append(index)
+        pairs = []
+        for index, pair in enumerate(self._shown):
+            if frozenset(pair) not in self._chosen:
+                pairs.append(NUM_RATINGS + index)
+        return scales + pairs
 
     def _write(self) -> None:
-        answers = [
-            {"pair": pair, "chosen": self._chosen[frozenset(pair)]}
-            for pair in self._shown
-            if frozenset(pair) in self._chosen
-        ]
+        answers = []
+        for pair in self._shown:
+            if frozenset(pair) in self._chosen:
+                answers.append({"pair": pair, "chosen": self._chosen[frozenset(pair)]})
         folders.rewrite(
             self._path, {"ratings": self._ratings, "pairs": answers, "finished": self.finished}
         )

@@ -1,6 +1,6 @@
 """A simulated participant at the twin, in real time: a browser's connections, a remote on the bus, a person's hands between them.
 
-The participant sees what the page is sent and nothing else, presses what a person would press, and
+The participant sees only the messages to the page, presses the buttons of a person, and
 moves the remote's levers as the simulated operators of `conf/operator` do. Everything that comes of
 it is marked as simulated.
 """
@@ -25,7 +25,7 @@ from brokk_rl.contracts.link import Connection
 from brokk_rl.contracts.operator import Operator, OperatorModel, OperatorView
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
 from deploy.guidance import AXES, LeverGuidance, LeverMap, find_full_angles_rad
@@ -42,7 +42,7 @@ log = logging.getLogger(__name__)
 STARTING_S = 60.0
 """Longest wait for the page, s."""
 AGAIN_S = 2.0
-"""Time after which what was pressed without effect is pressed again."""
+"""Time after which a button that had no effect is pressed again."""
 
 
 @spec
@@ -69,10 +69,7 @@ class Participant:
     @property
     def operators(self) -> dict[str, str]:
         """Who is at the levers, by condition."""
-        return {
-            "guided": type(self.guided).__name__.lower(),
-            "unguided": type(self.unguided).__name__.lower(),
-        }
+        return {"guided": name_spec(self.guided), "unguided": name_spec(self.unguided)}
 
     def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
         """Return the processes to run beside the loop."""
@@ -120,15 +117,19 @@ class _Taking:
         self._person, self._bench, self._machine = person, bench, machine
         levers = bench.guidance.levers or machine.levers
         self._shown_map, self._own = LeverMap(levers, machine), LeverMap(machine.levers, machine)
-        self._shown_full = [
-            max((one.max_angle_rad for one in levers if (one.side, one.axis) == axis), default=1.0)
-            for axis in AXES
-        ]
+        self._shown_full = []
+        for axis in AXES:
+            angles_rad = []
+            for one in levers:
+                if (one.side, one.axis) == axis:
+                    angles_rad.append(one.max_angle_rad)
+            self._shown_full.append(max(angles_rad, default=1.0))
         self._shown: dict[str, Any] = {}
         self._study: dict[str, Any] = {}
         self._model: OperatorModel | None = None
         self._left = math.inf if bench.sittings is None else bench.sittings
         self._began_s, self._took_s = 0.0, list[float]()
+        # Set when the parent has been asked to stop, so that it is asked once.
         self._finished = False
 
     async def run(self, stop: Stop) -> None:
@@ -142,11 +143,13 @@ class _Taking:
                 close_timeout=0.5,
             ) as study,
         ):
+            # The server lets nobody lead a sitting without it.
             await study.send(json.dumps({"token": token}))
             tasks = [
                 asyncio.create_task(self._look(state)),
                 asyncio.create_task(self._press(study)),
             ]
+            # Ends too when a connection breaks: its task is then done.
             try:
                 await self._hold(stop, self._bench.twin.wire, tasks)
             finally:
@@ -155,6 +158,7 @@ class _Taking:
 
     async def _address(self, stop: Stop) -> tuple[str, str]:
         end_s = time.monotonic() + STARTING_S
+        # The server writes the file once it listens; it starts in another process.
         while not self._person.link.exists() and not stop():
             if time.monotonic() > end_s:
                 raise TimeoutError(f"no page after {STARTING_S:g} s ({self._person.link})")
@@ -165,20 +169,22 @@ class _Taking:
         return host, token
 
     async def _look(self, state: ClientConnection) -> None:
-        """See what the page is sent, and says that it is drawn."""
+        """Read the messages to the page, and report them as drawn."""
         async for text in state:
             said, now_ms = json.loads(text), 1000 * time.monotonic()
             self._shown = said["shown"]
+            # All three times are the same: nothing is painted here.
             await state.send(json.dumps([said["number"], now_ms, now_ms, now_ms]))
 
     async def _press(self, study: ClientConnection) -> None:
-        """Press what a person would press next."""
+        """Press the next button, as a person would."""
         pressed, pressed_s = list[Any](), 0.0
         async for text in study:
             said = json.loads(text)
             if "study" not in said:
                 continue
             shown = self._study = said["study"]
+            # A person waits until the arm is at its start and the advice is valid.
             if shown.get("phase") == "ready" and not self._ready(shown):
                 continue
             screen = [
@@ -194,9 +200,11 @@ class _Taking:
     def _presses(self, study: dict[str, Any]) -> list[dict[str, Any]]:
         kind, phase = study["kind"], study.get("phase")
         if kind == "choose":
-            waiting = [
-                one["name"] for one in study["participants"] if one["state"] in ("new", "begun")
-            ]
+            waiting = []
+            for one in study["participants"]:
+                if one["state"] in ("new", "begun"):
+                    waiting.append(one["name"])
+            # Participants are taken in the order of the plan.
             if waiting and self._left > 0:
                 return [{"do": "choose", "who": waiting[0]}]
             self._end()
@@ -215,28 +223,29 @@ class _Taking:
         return []
 
     def _ready(self, study: dict[str, Any]) -> bool:
+        # No joints: the state is not known yet.
         there = bool(study["joints"]) and all(joint["there"] for joint in study["joints"])
         return there and (study["condition"] == "unguided" or study["advised"] == "valid")
 
     def _answers(self, study: dict[str, Any]) -> list[dict[str, Any]]:
         """Return a whole questionnaire, made up from how long the trials took."""
+        # Seeded by person and period: the same answers come again after an interruption.
         generator = np.random.default_rng((self._person.seed, self._number, study["period"]))
+        # 100 s make a load of 1. Chosen by hand; not searched.
         made = answer_questionnaire(float(np.mean(self._took_s or [0.0])) / 100.0, 0.0, generator)
         chosen = {frozenset(answer["pair"]): answer["chosen"] for answer in made["pairs"]}
         self._took_s.clear()
-        found = [
-            {"do": "rate", "scale": scale, "value": value}
-            for scale, value in made["ratings"].items()
-        ]
-        found += [
-            {"do": "pair", "pair": i, "chosen": chosen[frozenset(pair)]}
-            for i, pair in enumerate(study["pairs"])
-        ]
+        found = []
+        for scale, value in made["ratings"].items():
+            found.append({"do": "rate", "scale": scale, "value": value})
+        for number, pair in enumerate(study["pairs"]):
+            found.append({"do": "pair", "pair": number, "chosen": chosen[frozenset(pair)]})
         return [*found, {"do": "to", "to": study["last"]}, {"do": "finish"}]
 
     @property
     def _number(self) -> int:
         """Number of the participant whose sitting it is."""
+        # Pseudonyms end in the number of the participant.
         return int("".join(filter(str.isdigit, self._study.get("who") or "0")))
 
     async def _hold(self, stop: Stop, wire: CanBus, tasks: list[asyncio.Task[None]]) -> None:
@@ -251,8 +260,10 @@ class _Taking:
         )
         with wire.open([]) as bus:
             while not stop() and not any(task.done() for task in tasks):
+                # The time until the next message belongs to the event loop.
                 await asyncio.sleep(max(0.0, pace.next_s - time.monotonic()))
                 pace.begin()
+                # Levers are moved once a control period, the remote sends more often.
                 if cycle % every == 0:
                     angles_rad, remote.button_right = self._own.levers(self._given())
                     remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
@@ -260,9 +271,10 @@ class _Taking:
                 bus.send(remote.build_frame())
 
     def _given(self) -> np.ndarray:
-        """Return what the hands give in the coming period, `(J,)`; nothing but in a trial."""
+        """Return the hands' command of the coming period, `(J,)`; zero outside a trial."""
         shown, study, num = self._shown, self._study, self._machine.num_joints
         if study.get("phase") != "running" or shown.get("q") is None or not shown.get("targets"):
+            # A new trial begins with fresh eyes and hands.
             self._model = None
             return np.zeros(num)
         if self._model is None:
@@ -281,6 +293,7 @@ class _Taking:
     def _advice(self, shown: dict[str, Any]) -> np.ndarray:
         advice = shown.get("advice")
         if advice is None:
+            # Without advice a person sees nothing; NaN says so to the models.
             return np.full(self._machine.num_joints, np.nan)
         parts = np.array([advice["levers"][f"{side}_{axis}"] for side, axis in AXES])
         return self._shown_map.command(

@@ -1,4 +1,4 @@
-"""The plan as a page to print: what the numbers can show, the rules, everybody's order of trials with room for notes."""
+"""The plan as a page to print: the power of the design, the rules, everybody's order of trials with room for notes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def build_plan_page(
     """Return the page.
 
     Args:
-        design: What was planned with.
+        design: The design of the plan.
         machine: Name of the machine.
         seed: Seed of the draw.
         planned: All trials.
@@ -38,6 +38,7 @@ def build_plan_page(
         notice: Said on top.
     """
     num, num_trials, inside = design.num_participants, len(design.holes), design.success
+    # Everything is computed for this plan, so that the page can be judged before the study.
     can = sample_size.evaluate_size(num, design.alpha)
     paired_least, sequence_least = sample_size.find_smallest_sizes(design.alpha)
     wanted = sample_size.find_sufficient_size(design.alpha)
@@ -54,6 +55,7 @@ def build_plan_page(
         )
     else:
         summary = f"{num} participants find an effect of dz 0.8 in {100 * can.power[1]:.0f} of 100 studies."
+        # Four of five is the usual power; less is a warning.
         tone = "good" if can.power[1] >= 0.8 else "warn"
         summary += "" if tone == "good" else f" {wanted} would find it in four of five."
     found = Report(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
@@ -106,6 +108,7 @@ def _add_sample_sizes(
         "with the period in the model",
         *(f"dz {dz:g}" for dz in sample_size.EFFECTS_DZ),
     ]
+    # The plan's own number stands among the usual ones.
     sizes = sorted({*sample_size.SIZES, design.num_participants})
     rows = []
     for size in (sample_size.evaluate_size(num, design.alpha) for num in sizes):
@@ -149,8 +152,12 @@ def _add_error_rates(found: Report, errors: dict[str, Any]) -> None:
 
 
 def _add_schedule(found: Report, planned: list[Trial]) -> None:
+    # In the order of the plan, without repetition.
     for participant in dict.fromkeys(trial.participant for trial in planned):
-        mine = [trial for trial in planned if trial.participant == participant]
+        mine = []
+        for trial in planned:
+            if trial.participant == participant:
+                mine.append(trial)
         found.add_heading(participant, 3)
         columns = [
             "",
@@ -165,6 +172,7 @@ def _add_schedule(found: Report, planned: list[Trial]) -> None:
                 cells = [
                     Cell(f"{trial.hole} from {trial.start}", trial.condition) for trial in here
                 ]
+            # Empty cells leave room for notes by hand.
             rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
             rows.append(["notes", *[""] * (len(columns) - 1)])
         found.add_table(columns, rows)

@@ -1,4 +1,4 @@
-"""The pictures of a study: the paper's two (tool paths, radar), and what those cannot show (each person, intervals).
+"""The pictures of a study: the paper's two (tool paths, radar), each person, and intervals.
 
 Guided is always blue and solid, unguided orange and dotted.
 """
@@ -26,7 +26,10 @@ COLUMNS = 3
 
 def draw_paths(found: Analysis) -> Figure:
     """Draw the tool's paths from above and from the side, a panel a hole; a star is where a trial begins, a sphere the hole."""
-    drawn = [trial for trial in found.trials if trial.counts and len(trial.tip_in_base_m)]
+    drawn = []
+    for trial in found.trials:
+        if trial.counts and len(trial.tip_in_base_m):
+            drawn.append(trial)
     holes = sorted({_name_hole(trial) for trial in drawn})
     figure = Figure(figsize=(3.6 * max(1, len(holes)), 6.8), layout="constrained")
     for column, name in enumerate(holes):
@@ -50,6 +53,7 @@ def draw_radar(found: Analysis) -> Figure:
     figure = Figure(figsize=(6.2, 5.6), layout="constrained")
     axis = figure.add_subplot(projection="polar")
     angles = np.linspace(0, 2 * math.pi, len(tlx.SCALES), endpoint=False)
+    # The two conditions are drawn slightly apart, so that their intervals do not hide each other.
     for shift, condition in ((-0.02, "guided"), (0.02, "unguided")):
         values = [found.loads[scale][condition] for scale in tlx.SCALES]
         means = np.array(
@@ -57,6 +61,7 @@ def draw_radar(found: Analysis) -> Figure:
         )
         halves = np.array([_compute_half_width(value) for value in values])
         colour, line = LOOK[condition]
+        # Closed by repeating the first point.
         closed = np.append(angles, angles[0]) + shift
         axis.plot(
             closed, np.append(means, means[0]), line, color=colour, label=condition, linewidth=2
@@ -68,6 +73,7 @@ def draw_radar(found: Analysis) -> Figure:
         angles, [title.replace(" (", "\n(") for title in tlx.SCALES.values()], fontsize=9
     )
     axis.tick_params(axis="x", pad=16)
+    # The full scale, so that small differences look small.
     axis.set_ylim(0, 100)
     axis.set_yticks([20, 40, 60, 80], ["20", "40", "60", "80"], fontsize=7, color=GREY)
     add_legend(figure, axis)
@@ -87,6 +93,7 @@ def draw_pairs(found: Analysis, names: Sequence[str]) -> Figure:
         for first, colour, label in ((True, GREEN, "guided first"), (False, RED, "unguided first")):
             mine = both[:, found.guided_first == first]
             axis.plot([0, 1], mine, "-o", color=colour, markersize=3, linewidth=0.9, alpha=0.7)
+            # An empty line gives the legend its entry, however many participants there are.
             axis.plot([], [], "-o", color=colour, markersize=3, label=label)
         for place, value in ((-0.15, both[0]), (1.15, both[1])):
             if not np.isnan(value).all():
@@ -121,10 +128,12 @@ def draw_effects(found: Analysis, names: Sequence[str]) -> Figure:
         if dz is None or interval is None:
             axis.text(0.0, row, "  too few", va="center", fontsize=8, color=GREY)
             continue
+        # Scales of workload: less is better.
         better = {each.name: each.better for each in MEASURES}.get(name, -1)
         colour = GREY if not better else BLUE if dz * better > 0 else RED
         axis.plot(interval, [row, row], color=colour, linewidth=2)
         axis.plot([dz], [row], "o", color=colour)
+    # The first measure stands on top.
     axis.set_yticks(range(len(names)), [get_title(name) for name in names], fontsize=8)
     axis.invert_yaxis()
     axis.set_xlabel("guided minus unguided, dz (blue: better with guidance, red: worse)")
@@ -133,7 +142,7 @@ def draw_effects(found: Analysis, names: Sequence[str]) -> Figure:
 
 
 def get_title(name: str) -> str:
-    """Return what a measure or scale is called."""
+    """Return the title of a measure or scale."""
     if name.startswith("tlx_"):
         scale = name.removeprefix("tlx_")
         return f"TLX: {tlx.SCALES.get(scale, scale)}"
@@ -158,6 +167,7 @@ def _draw_condition_paths(
         tip = trial.tip_in_base_m
         x = np.hypot(tip[:, 0], tip[:, 1]) if horizontal is None else tip[:, horizontal]
         colour, line = LOOK[trial.facts["condition"]]
+        # One entry in the legend for each condition.
         label = None if trial.facts["condition"] in labelled else trial.facts["condition"]
         labelled.add(trial.facts["condition"])
         axis.plot(x, tip[:, vertical], line, color=colour, linewidth=0.9, alpha=0.75, label=label)

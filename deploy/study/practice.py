@@ -4,7 +4,7 @@
 
 Practice follows the power law (Newell and Rosenbloom 1981); a trial longer than the limit counts
 with the limit. Thousands of studies can be drawn in a second, so that a plan can say how often it
-would find what is not there, and miss what is.
+would find effects that are not there, and miss real ones.
 Axes: `S` studies, `P` persons, `K` trials in a period.
 """
 
@@ -34,7 +34,7 @@ class Practice:
         hole_sd: Differences between holes.
         learning: Exponent of practice: twice as many trials make a trial 2**-learning as long.
         learning_sd: Differences between persons in it.
-        guidance_sd: Differences between persons in what guidance does.
+        guidance_sd: Differences between persons in the effect of guidance.
         chance_sd: From trial to trial.
     """
 
@@ -69,7 +69,7 @@ class Practice:
             num_trials: Trials in a period, `K`.
             practised: Trials before the first period.
             limit_s: Time after which a trial ends.
-            effect: What guidance adds to the logarithm of the time; below 0 it helps.
+            effect: Added to the logarithm of the time by guidance; below 0 it helps.
             seed: The same seed gives the same persons whatever the effect.
             studies: Number of studies.
         """
@@ -94,7 +94,7 @@ class Practice:
     def effect_of(self, dz: float, num_trials: int, practised: int, limit_s: float) -> float:
         """Return the effect with which guidance shortens times by `dz` standard deviations of a person's difference.
 
-        The standard deviation is that within sequences, without what practice does to all.
+        The standard deviation is that within sequences, without the effect of practice that all share.
 
         Raises:
             ConfigError: the limit is so short that no such effect could be seen.
@@ -139,7 +139,7 @@ def share_significant(
         num_trials: Trials in a period.
         practised: Trials before.
         limit_s: Time after which a trial ends.
-        dz: What guidance really does; 0: nothing, and every finding is false.
+        dz: True standardised effect of guidance; 0: none, and every finding is false.
         alpha: Level of the test.
         studies: Number of studies.
         seed: Of the draws.

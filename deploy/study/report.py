@@ -46,6 +46,7 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
             "simulated": data.is_simulated,
             "participants": found.participants,
         }
+        # JSON has no NaN, so missing figures are null.
         write_json(
             folder / "report.json",
             _convert_plain(
@@ -60,6 +61,7 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
         }
         for name, figure in drawn.items():
             if data.is_simulated:
+                # Every picture says so by itself: pictures leave the report.
                 figure.suptitle(
                     "SIMULATED OPERATORS", fontsize=9, color="#b3261e", x=0.02, ha="left"
                 )
@@ -74,10 +76,12 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
 
 
 def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str]:
-    """Return what the primary measure says, in words, and whether that is good, bad or no news."""
+    """Return the result of the primary measure in words, and whether it is good, bad or no news."""
     effect, title = found.effects[found.primary], plots.get_title(found.primary)
+    # Measures differ in which direction is better.
     better = next(each.better for each in MEASURES if each.name == found.primary)
     if effect.adjusted is None or effect.p is None or effect.adjusted_ci95 is None:
+        # Four persons are the least for a test over sequences.
         why = (
             "all had the same order, so guidance and order cannot be told apart"
             if effect.num_persons >= 4
@@ -91,6 +95,7 @@ def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str
             f"No effect of guidance is shown on the primary measure. {size}; {effect.num_persons} participants.",
             "warn",
         )
+    # The sign says whether the change is for the better.
     helps = effect.adjusted * better > 0
     who = "In this simulation guidance" if is_simulated else "Guidance"
     return (
@@ -106,6 +111,7 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
     if data.is_simulated:
         page.add_text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
     num, num_first = len(found.participants), int(found.guided_first.sum())
+    # Both tests bound the attainable p: with few people no result can be significant.
     least = max(
         get_smallest_paired_p(num),
         get_smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0,
@@ -115,7 +121,10 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
             f"With {num} participants no test here can reach p = {found.alpha:g}: the smallest possible is {least:.3g}.",
             "bad",
         )
-    counted = [trial for trial in found.trials if trial.counts]
+    counted = []
+    for trial in found.trials:
+        if trial.counts:
+            counted.append(trial)
     page.add_facts(
         {
             "participants": f"{num}, {num_first} of them guided first",
@@ -177,6 +186,7 @@ def _build_table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list
     columns = ["measure", "guided", "unguided", "difference", "dz", "p", "p, Holm"]
     rows: list[list[str | Cell]] = []
     for name in names:
+        # The primary measure decides alone and is not corrected.
         e, is_primary = found.effects[name], name == found.primary
         note = f"{e.num_persons} people" + ", the primary measure" * is_primary
         means = [
@@ -237,7 +247,11 @@ def _build_paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cel
 
 
 def _format_mean(found: Analysis, name: str) -> str:
-    values = [value for value in found.means[name]["guided"] if not math.isnan(value)]
+    values = []
+    for value in found.means[name]["guided"]:
+        if not math.isnan(value):
+            values.append(value)
+    # Participants without a value are left out, not counted as 0.
     return _format_number(sum(values) / len(values) if values else None)
 
 
@@ -268,52 +282,57 @@ def _format_interval(value: tuple[float, float] | None) -> str:
 def _format_trials(found: Analysis) -> str:
     keys = ("participant", "period", "condition", "number", "outcome", "simulated", "operator")
     head = [*keys, "hole", "start", "counts", *(each.name for each in MEASURES)]
-    rows = [
-        [
-            *(trial.facts.get(key, "") for key in keys),
-            (trial.facts.get("hole") or {}).get("name", ""),
-            trial.facts.get("start", ""),
-            trial.counts,
-            *(_blank(trial.values[each.name]) for each in MEASURES),
-        ]
-        for trial in found.trials
-    ]
+    rows = []
+    for trial in found.trials:
+        rows.append(
+            [
+                *(trial.facts.get(key, "") for key in keys),
+                (trial.facts.get("hole") or {}).get("name", ""),
+                trial.facts.get("start", ""),
+                trial.counts,
+                *(_blank(trial.values[each.name]) for each in MEASURES),
+            ]
+        )
     return _format_csv(head, rows)
 
 
 def _format_means(found: Analysis, is_simulated: bool) -> str:
     columns = found.means | {f"tlx_{name}": values for name, values in found.loads.items()}
-    rows = [
-        [
-            name,
-            is_simulated,
-            condition,
-            "first" if (condition == "guided") == bool(first) else "second",
-            *(_blank(values[condition][i]) for values in columns.values()),
-        ]
-        for i, (name, first) in enumerate(zip(found.participants, found.guided_first, strict=True))
-        for condition in ("guided", "unguided")
-    ]
+    rows = []
+    for i, (name, first) in enumerate(zip(found.participants, found.guided_first, strict=True)):
+        for condition in ("guided", "unguided"):
+            rows.append(
+                [
+                    name,
+                    is_simulated,
+                    condition,
+                    "first" if (condition == "guided") == bool(first) else "second",
+                    *(_blank(values[condition][i]) for values in columns.values()),
+                ]
+            )
     return _format_csv(["participant", "simulated", "condition", "period", *columns], rows)
 
 
 def _format_effects(found: Analysis, is_simulated: bool) -> str:
     head: list[str] = []
+    # Intervals take two columns.
     for key in asdict(GuidanceEffect(num_persons=0, num_guided_first=0)):
         head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
     rows = []
     for name, effect in found.effects.items():
-        values = [
-            (None, None) if value is None and key.endswith("_ci95") else value
-            for key, value in asdict(effect).items()
-        ]
+        values = []
+        for field, value in asdict(effect).items():
+            values.append((None, None) if value is None and field.endswith("_ci95") else value)
         rows.append([name, is_simulated, *_flatten(values), _blank(found.holm.get(name, math.nan))])
     return _format_csv(["measure", "simulated", *head, "p_holm"], rows)
 
 
 def _flatten(values: Iterable) -> list:
-    """Return numbers and the ends of intervals in one row; '' for what there is none of."""
-    row = [part for value in values for part in (value if isinstance(value, tuple) else (value,))]
+    """Return numbers and the ends of intervals in one row; '' for missing ones."""
+    row = []
+    for value in values:
+        for part in value if isinstance(value, tuple) else (value,):
+            row.append(part)
     return ["" if part is None else part for part in row]
 
 

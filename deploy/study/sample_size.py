@@ -48,19 +48,22 @@ def evaluate_size(num: int, alpha: float) -> SampleSize:
     first = np.arange(num) < num_first
     smallest = permutation_tests.get_smallest_sequence_p(num_first, num)
     ways = permutation_tests.count_sequences(num_first, num)
+    # Fewer studies where a test counts many ways, so that the time stays bounded.
     studies = min(STUDIES, MOST_COUNTED // ways) if ways <= permutation_tests.MOST_WAYS else STUDIES
+    # Seeded by the size: the table is the same each time.
     chance = np.random.default_rng(num).standard_normal((studies, num))
-    power = [
-        float(
-            (
-                permutation_tests.compute_sequence_p(chance + np.where(first, dz, -dz), first)
-                <= alpha
-            ).mean()
+    power = []
+    for dz in EFFECTS_DZ:
+        power.append(
+            float(
+                (
+                    permutation_tests.compute_sequence_p(chance + np.where(first, dz, -dz), first)
+                    <= alpha
+                ).mean()
+            )
+            if smallest <= alpha
+            else 0.0
         )
-        if smallest <= alpha
-        else 0.0
-        for dz in EFFECTS_DZ
-    ]
     return SampleSize(num, permutation_tests.get_smallest_paired_p(num), smallest, tuple(power))
 
 
@@ -68,10 +71,11 @@ def find_sufficient_size(
     alpha: float, power: float = 0.8, effect: int = 1, most: int = 40
 ) -> int | None:
     """Return the smallest even number of participants that reaches `power`, or `None`."""
-    return next(
-        (num for num in range(6, most + 1, 2) if evaluate_size(num, alpha).power[effect] >= power),
-        None,
-    )
+    # Even numbers: both sequences then have as many people.
+    for num in range(6, most + 1, 2):
+        if evaluate_size(num, alpha).power[effect] >= power:
+            return num
+    return None
 
 
 def find_smallest_sizes(alpha: float) -> tuple[int, int]:

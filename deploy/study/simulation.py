@@ -19,7 +19,7 @@ from brokk_rl.contracts.operator import (
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 from deploy.study import study_folder as folders
 from deploy.study import tlx
 from deploy.study.design import Design, Trial
@@ -53,7 +53,7 @@ def simulate(
 
     Args:
         folder: The study's folder, with its plan.
-        design: What was planned with.
+        design: The design of the plan.
         planned: Its trials; practice is left out, since these operators do not learn.
         machine: The machine.
         session: Gives the seed.
@@ -61,7 +61,9 @@ def simulate(
         guided: Operators with advice.
         unguided: The same persons without.
     """
+    # Practice has period 0.
     todo = [trial for trial in planned if trial.period]
+    # A dictionary keeps the order of the plan, in which a set would not.
     names = list(dict.fromkeys(trial.participant for trial in todo))
     persons = np.array([names.index(trial.participant) for trial in todo])
     is_guided = np.array([trial.condition == "guided" for trial in todo])
@@ -74,9 +76,11 @@ def simulate(
         depth_m=design.success.depth_m,
         clearance_m=design.success.clearance_m,
     )
+    # The seed is that of the study: the same persons take part in both conditions.
     operators = Divided(
         machine, persons, is_guided, guided, unguided, session.stream("study operators")
     )
+    # The load of each period, from which the questionnaire is made up.
     loads: dict[tuple[str, int], list[float]] = {}
     for trial, recording in zip(todo, ground.run(machine, session, batch, operators), strict=True):
         path = folder / folders.RECORDINGS / f"{trial.name}.parquet"
@@ -84,7 +88,7 @@ def simulate(
         found = measure(
             recording, machine, design.holes[trial.hole], design.success, design.limit_s
         )
-        kind = type(guided if trial.condition == "guided" else unguided).__name__.lower()
+        kind = name_spec(guided if trial.condition == "guided" else unguided)
         facts: dict[str, Any] = {
             **asdict(trial),
             "hole": {"name": trial.hole, **asdict(design.holes[trial.hole])},
@@ -99,10 +103,13 @@ def simulate(
             "operator": kind,
         }
         folders.write_trial(folder, trial.name, facts)
+        # Time and effort together: a made-up workload only has to vary with both. Chosen by hand;
+        # not searched.
         loads.setdefault((trial.participant, trial.period), []).append(
             found["time_s"] / design.limit_s + 0.1 * found["control_effort"]
         )
     generator = session.generator("study questionnaires")
+    # Persons differ in how high they rate altogether: 10 points. Chosen by hand; not searched.
     own = {name: generator.normal(0.0, 10.0) for name in names}
     for (participant, period), load in loads.items():
         answers = answer_questionnaire(float(np.mean(load)), own[participant], generator)
@@ -113,17 +120,18 @@ def answer_questionnaire(
     load: float, habit: float, generator: np.random.Generator
 ) -> dict[str, Any]:
     """Return a questionnaire as made up from how long and busy the trials were; it has the form of answers, no more."""
+    # A middle of 25 to 85 points leaves room for the habit at both ends. Chosen by hand; not
+    # searched.
     middle = 25.0 + 60.0 * load + habit
-    ratings = {
-        scale: int(
+    ratings = {}
+    for scale in tlx.SCALES:
+        # Ratings have steps of 5 points, as on the form (Hart and Staveland, 1988).
+        ratings[scale] = int(
             np.clip(tlx.STEP * round((middle + generator.normal(0.0, 8.0)) / tlx.STEP), 0, 100)
         )
-        for scale in tlx.SCALES
-    }
-    chosen = [
-        {"pair": list(pair), "chosen": pair[int(generator.integers(2))]}
-        for pair in tlx.list_pairs(generator)
-    ]
+    chosen = []
+    for pair in tlx.list_pairs(generator):
+        chosen.append({"pair": list(pair), "chosen": pair[int(generator.integers(2))]})
     return {"ratings": ratings, "pairs": chosen, "note": NOTICE}
 
 
@@ -149,14 +157,12 @@ class Divided:
         seed: int,
     ) -> None:
         self._shape = (len(persons), machine.num_joints)
-        self._parts: list[tuple[np.ndarray, OperatorModel]] = [
-            (rows, operator.build(machine, persons[rows], seed))
-            for rows, operator in (
-                (np.flatnonzero(is_guided), guided),
-                (np.flatnonzero(~is_guided), unguided),
-            )
-            if len(rows)
-        ]
+        self._parts: list[tuple[np.ndarray, OperatorModel]] = []
+        # A study may have one condition only; an operator without trials is not built.
+        for chosen, operator in ((is_guided, guided), (~is_guided, unguided)):
+            rows = np.flatnonzero(chosen)
+            if len(rows):
+                self._parts.append((rows, operator.build(machine, persons[rows], seed)))
 
     def step(self, view: OperatorView) -> np.ndarray:
         """See `brokk_rl.contracts.operator.OperatorModel`."""

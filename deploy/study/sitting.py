@@ -55,7 +55,7 @@ class Sitting:
         bench: The twin, and a simulated participant, in place of machine and person; `null` on a
             machine.
         page: The operator's page.
-        consent: What is agreed to.
+        consent: Text of the consent.
         times: How a trial begins and ends.
     """
 
@@ -86,7 +86,10 @@ class Sitting:
         """
         data = folders.read_study(folder)
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {folder}")
-        there = [who for who in data.plan["participants"] if who not in data.plan.get("erased", {})]
+        there = []
+        for who in data.plan["participants"]:
+            if who not in data.plan.get("erased", {}):
+                there.append(who)
         if participant is not None and participant not in there:
             raise ConfigError(
                 f"study.participant={participant}: nobody of the plan; {list_choices(participant, there)}"

@@ -1,4 +1,4 @@
-"""Where a participant's sitting stands, read from the study's folder alone: what comes next after any interruption stands there.
+"""The state of a participant's sitting, read from the study's folder alone: the next step after any interruption stands there.
 
 Consent, practice, the trials of the first period, its questionnaire, the trials of the second, its
 questionnaire.
@@ -39,18 +39,17 @@ class Step:
 
 
 def find_next_step(data: StudyData, who: str) -> Step:
-    """Return what a participant, known to the plan, has to do next."""
+    """Return the next step of a participant who is known to the plan."""
     known = data.participants.get(who, {})
     if known.get("stopped"):
         return Step("stopped")
     if not (known.get("consent") or {}).get("agreed"):
         return Step("consent")
     for period in (0, *PERIODS):
-        planned = [
-            Trial(**trial)
-            for trial in data.plan["trials"]
-            if trial["participant"] == who and trial["period"] == period
-        ]
+        planned = []
+        for trial in data.plan["trials"]:
+            if trial["participant"] == who and trial["period"] == period:
+                planned.append(Trial(**trial))
         lacking = [trial for trial in planned if (who, period, trial.number) not in data.trials]
         if lacking and not (period == 0 and is_practised(data, who)):
             return Step(
@@ -70,11 +69,10 @@ def find_next_step(data: StudyData, who: str) -> Step:
 
 def is_practised(data: StudyData, who: str) -> bool:
     """Return whether practice is over before all of it was done: by success, by time, or because the experimenter said so."""
-    done = [
-        trial
-        for (name, period, _), trial in sorted(data.trials.items())
-        if name == who and not period
-    ]
+    done = []
+    for (name, period, _), trial in sorted(data.trials.items()):
+        if name == who and not period:
+            done.append(trial)
     row = [trial.get("outcome") == "inserted" for trial in done[-ENOUGH:]]
     minutes = sum(float(trial.get("seconds", 0.0)) for trial in done) / 60.0
     ended = bool(data.participants.get(who, {}).get("practice_ended"))

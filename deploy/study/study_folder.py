@@ -1,14 +1,14 @@
 """A study on disk: plan, trials, questionnaires, who stopped; and everything of it that is not as it should be, in words.
 
-    plan.json                          what was planned
+    plan.json                          the plan
     trials/<P>_<period>_<nn>.json      one trial: who, when, where, how it ended, and the name of
     its recording recordings/<P>_<period>_<nn>.parquet
-    captures/<P>_<period>_<nn>/        what the loop recorded, whole: messages and frames of the bus
+    captures/<P>_<period>_<nn>/        the loop's whole recording: messages and frames of the bus
     questionnaires/<P>_<period>.json   NASA-TLX after a period
-    participants/<P>.json              what is known of a participant: whether they stopped, and why
+    participants/<P>.json              a participant's record: whether they stopped, and why
     reports.json                       where reports were written, for who wants to be forgotten
 
-Nothing that is there is passed over in silence: what cannot be used, is there twice or is missing
+Nothing that is there is passed over in silence: a file that cannot be used, stands twice or is missing
 becomes a remark.
 """
 
@@ -53,7 +53,7 @@ class Remark:
 
     Attributes:
         where: Participant or file.
-        text: What is the matter, and what was done about it.
+        text: The problem, and how it was handled.
     """
 
     where: str
@@ -69,10 +69,10 @@ class StudyData:
         plan: `plan.json`.
         trials: Trials that count, by participant, period and number.
         questionnaires: By participant and period.
-        participants: What is known of participants, by pseudonym.
+        participants: Records of participants, by pseudonym.
         spare: Trials that are kept but do not count: doubled ones, those of the unknown, those
             whose condition was not the planned one.
-        remarks: What is not as it should be.
+        remarks: Deviations from the plan and from the expected files.
     """
 
     folder: Path
@@ -86,6 +86,7 @@ class StudyData:
     @property
     def is_simulated(self) -> bool:
         """True if any trial comes from a simulated operator."""
+        # One simulated entry marks the whole study: nobody must take it for evidence.
         entries = [*self.trials.values(), *self.spare, *self.questionnaires.values()]
         return any(entry.get("simulated") for entry in entries)
 
@@ -110,6 +111,7 @@ def read_plan(folder: Path) -> dict[str, Any]:
 
 def read_study(folder: Path) -> StudyData:
     """Read a study with all that is wrong with it."""
+    # Problems are collected, not raised: a study in the field cannot be repeated.
     data = StudyData(folder, read_plan(folder))
     for name, entry in _iterate_entries(folder / PARTICIPANTS, data):
         data.participants[str(entry.get("participant", name))] = entry
@@ -120,8 +122,9 @@ def read_study(folder: Path) -> StudyData:
 
 
 def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
-    """Write what is known of a trial; one that is there already stays, and this becomes a second one beside it."""
+    """Write the record of a trial; one that is there already stays, and this becomes a second one beside it."""
     path = folder / TRIALS / f"{name}.json"
+    # A hundred repetitions of one trial are an error elsewhere.
     for again in range(2, 100):
         if not path.exists():
             break
@@ -130,7 +133,7 @@ def write_trial(folder: Path, name: str, trial: dict[str, Any]) -> Path:
 
 
 def rewrite(path: Path, changes: dict[str, Any]) -> None:
-    """Change what is known of a trial, participant or questionnaire that is still going on."""
+    """Change the record of a trial, participant or questionnaire that is still going on."""
     _write(path, _read(path) | changes)
 
 
@@ -142,12 +145,13 @@ def write_questionnaire(
     entry: dict[str, Any] = {"schema": 1, "participant": participant, "period": period}
     entry |= {"created": datetime.now().astimezone().isoformat(), **answers}
     if path.exists():
+        # The earlier answers stay inside, since nothing that a participant said is thrown away.
         entry["before"] = _read(path)
     return _write(path, entry)
 
 
 def write_participant(folder: Path, participant: str, facts: dict[str, Any]) -> Path:
-    """Write what is known of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
+    """Write the record of a participant, such as `{"stopped": true, "reason": …}`; no name, no address."""
     return _write(
         folder / PARTICIPANTS / f"{participant}.json",
         {"schema": 1, "participant": participant, **facts},
@@ -158,6 +162,7 @@ def note_report(folder: Path, report: Path) -> None:
     """Remember where a report of this study was written."""
     path = folder / REPORTS
     known = _read(path) if path.exists() else []
+    # Absolute paths: reports may be written anywhere.
     if str(report.resolve()) not in known:
         _write(path, [*known, str(report.resolve())])
 
@@ -166,7 +171,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     """Delete every file about a participant; the plan keeps an empty place that says so.
 
     Returns:
-        What was deleted, and folders with reports that were made with the participant's data, to be
+        Deleted paths, and folders with reports that were made with the participant's data, to be
         deleted and made again.
 
     Raises:
@@ -180,6 +185,7 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     gone = []
     for part in (TRIALS, RECORDINGS, CAPTURES, QUESTIONNAIRES, PARTICIPANTS):
         for path in sorted((folder / part).glob("*")):
+            # Also files that were renamed by hand: their content tells whose they are.
             if (
                 path.stem == participant
                 or path.stem.startswith(f"{participant}_")
@@ -195,13 +201,14 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
                         f"cannot delete {path}: {error.strerror}; {len(gone)} files are gone, run it again"
                     ) from error
                 gone.append(path)
+    # The plan keeps the place, so that the sequences of the others still make sense.
     plan.setdefault("erased", {})[participant] = (
         datetime.now().astimezone().isoformat(timespec="seconds")
     )
     _write(folder / PLAN, plan)
-    reports = [
-        Path(name) for name in (_read(folder / REPORTS) if (folder / REPORTS).exists() else [])
-    ]
+    reports = []
+    for name in _read(folder / REPORTS) if (folder / REPORTS).exists() else []:
+        reports.append(Path(name))
     return gone, [report for report in reports if report.exists()]
 
 
@@ -217,20 +224,23 @@ def _is_of_participant(path: Path, participant: str) -> bool:
 
 
 def _read_trials(data: StudyData) -> None:
+    # In the order of their making, so that the first of two counts.
     found = sorted(
         _iterate_entries(data.folder / TRIALS, data),
         key=lambda item: str(item[1].get("created", "")),
     )
     for name, trial in found:
-        lacking = [
-            key for key, kind in TRIAL_FIELDS.items() if not isinstance(trial.get(key), kind)
-        ]
+        lacking = []
+        for key, kind in TRIAL_FIELDS.items():
+            if not isinstance(trial.get(key), kind):
+                lacking.append(key)
         if lacking:
             data.remarks.append(
                 Remark(name, f"the trial lacks {', '.join(lacking)}; it does not count")
             )
             data.spare.append(trial)
             continue
+        # Checks from the gravest to the mildest: one problem is reported for a trial.
         who, period, condition = trial["participant"], trial["period"], trial["condition"]
         key = (who, period, trial["number"])
         if who not in data.plan["participants"]:
@@ -284,6 +294,7 @@ def _read_questionnaires(data: StudyData) -> None:
 
 
 def _note_missing(data: StudyData) -> None:
+    # Practice has period 0 and need not be complete.
     planned: dict[str, set[tuple[int, int]]] = {}
     for trial in data.plan["trials"]:
         if trial["period"]:
@@ -342,6 +353,7 @@ def _write(path: Path, value: Any) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(path, value)
     except OSError as error:
+        # `write_json` writes beside and renames, so that no half file is left.
         raise StorageError(
             f"cannot write {path}: {error.strerror or error}; nothing was left behind"
         ) from error

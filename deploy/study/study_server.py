@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 
 TICK_S = 0.05
 SHOW_S = 0.1
-"""Between looks at what to show; pages get what has changed."""
+"""Between two looks at the view; pages get changes only."""
 HEAD = (
     b'<link rel="stylesheet" href="study.css"><script type="module" src="study.js"></script></head>'
 )
@@ -46,9 +46,9 @@ class StudyServerConfig:
         page: The page, and how the loop is shown.
         folder: The study's.
         participant: Who comes first; `None`: chosen on the page.
-        words: What the lab says to participants.
+        words: Texts of the lab for participants.
         times: Countdown and the like.
-        facts: What every trial says of itself besides.
+        facts: Further fields of every trial.
         operators: Who is simulated, by condition; empty where people take part.
         target: File that says to the loop where the hole is.
         port: Where the twin can be put elsewhere; `None` on a machine.
@@ -141,7 +141,7 @@ class StudyFeed:
 class StudyPages:
     """The study's pages and their WebSocket; see `deploy.page.server.PageExtension`.
 
-    What is asked of the participant lies over the operator's page; in a trial it is a bar at its
+    Questions to the participant lie over the operator's page; in a trial it is a bar at its
     upper edge.
 
     Args:
@@ -164,7 +164,7 @@ class StudyPages:
             await asyncio.sleep(TICK_S)
 
     async def talk(self, connection: ServerConnection) -> None:
-        """Send what is to be shown whenever that changes, and takes what is said; see `PageExtension`."""
+        """Send the view whenever it changes, and take answers; see `PageExtension`."""
         speaking = asyncio.create_task(self._speak(connection))
         try:
             async for text in connection:

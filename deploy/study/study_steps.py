@@ -37,7 +37,7 @@ class Steps:
         do: `plan`, `run`, `simulate`, `report` or `erase`.
         folder: The study's folder; `null`: the run folder, where `plan` and `simulate` begin one.
         participant: Whom to erase, or whose sitting to begin with.
-        design: What is planned with.
+        design: The design of the plan.
         practice: A fast model of people, from which the plan's errors are worked out.
         num_studies: How many studies are drawn from it.
         sitting: How participants are led through it.
@@ -164,7 +164,7 @@ def plan_study(design: Design, machine: Machine, session: Session) -> list[desig
 
 
 def study_errors(design: Design, practice: Practice, num_studies: int, seed: int) -> dict[str, Any]:
-    """Return how often studies like this one find what is not there and miss what is, beside those with a fixed order."""
+    """Return rates of false findings and misses of studies like this one, beside those with a fixed order."""
     num, trials = design.num_participants, len(design.holes)
     cases = [
         ("no effect, counterbalanced, period in the model", num, 0.0, False),

@@ -30,15 +30,19 @@ PAIRS = tuple(combinations(SCALES, 2))
 
 def list_pairs(generator: np.random.Generator) -> list[tuple[str, str]]:
     """Return the 15 pairs in random order, each in random order, as they are to be shown."""
+    # Pairs in random order, and each pair in random order, against habits of the finger.
     shuffled = [PAIRS[index] for index in generator.permutation(len(PAIRS))]
     return [pair if generator.integers(2) else pair[::-1] for pair in shuffled]
 
 
 def check(answers: Mapping) -> list[str]:
-    """Return what is missing or wrong in a questionnaire, in words; empty where it is whole."""
+    """Return the faults and gaps of a questionnaire, in words; empty where it is whole."""
     found = []
     ratings, chosen = answers.get("ratings") or {}, answers.get("pairs") or []
-    lacking = [scale for scale in SCALES if ratings.get(scale) is None]
+    lacking = []
+    for name in SCALES:
+        if ratings.get(name) is None:
+            lacking.append(name)
     if lacking:
         found.append(f"{', '.join(lacking)} not answered: no raw score")
     for scale, value in ratings.items():
@@ -55,10 +59,12 @@ def read_ratings(answers: Mapping) -> dict[str, float]:
     """Return the rating of each scale, NaN where there is none that makes sense."""
     given = answers.get("ratings") or {}
     values = {scale: given.get(scale) for scale in SCALES}
-    return {
-        scale: float(value) if isinstance(value, (int, float)) and 0 <= value <= 100 else math.nan
-        for scale, value in values.items()
-    }
+    # NaN and not 0: a missing rating is no light workload.
+    ratings = dict.fromkeys(SCALES, math.nan)
+    for scale, value in values.items():
+        if isinstance(value, (int, float)) and 0 <= value <= 100:
+            ratings[scale] = float(value)
+    return ratings
 
 
 def compute_raw_tlx(answers: Mapping) -> float:

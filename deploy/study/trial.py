@@ -53,13 +53,13 @@ class Attempt:
     Args:
         folder: The study's.
         design: The plan's design, as plain data.
-        trial: What is planned.
+        trial: The planned trial.
         hole: Its hole, as plain data.
         start: Joint positions to begin from, `(J,)`.
         machine: The machine.
         stage: Where it takes place.
         times: Countdown and the like.
-        facts: What the trial says of itself besides.
+        facts: Further fields of the trial.
         clock: Monotonic time, s.
     """
 
@@ -90,10 +90,12 @@ class Attempt:
         self._success, self._limit_s = Success(**design["success"]), float(design["limit_s"])
         self._facts, self._clock = facts, clock
         self._phase: Phase = "ready"
+        # All clocks begin now, so that nothing has timed out before the first tick.
         self._since_s = self._began_s = self._seen_s = clock()
         self._path: Path | None = None
         self._outcome, self._reason, self._seconds = "", "", 0.0
         self._saving: Future[None] | None = None
+        # One worker: recordings are converted beside the page, one after the other.
         self._worker = ThreadPoolExecutor(1)
         stage.prepare(self._hole, start)
 
@@ -125,6 +127,7 @@ class Attempt:
             "outcome": "aborted",
             "reason": "interrupted: the sitting ended during the trial",
         }
+        # On the disk before the recording begins: no capture is without a trial.
         self._path = folders.write_trial(self._folder, self.trial.name, facts | unfinished)
         self._stage.record(self._captured)
         self._enter("starting")
@@ -148,6 +151,7 @@ class Attempt:
         """Let it go on."""
         now_s, sight = self._clock(), self._stage.sight()
         in_phase_s = now_s - self._since_s
+        # The time at which positions were last known.
         self._seen_s = now_s if sight.q is not None else self._seen_s
         if self._phase in ("countdown", "running") and now_s - self._seen_s > LOST_S:
             self.abort("positions stopped coming")
@@ -158,6 +162,7 @@ class Attempt:
         elif self._phase == "countdown" and in_phase_s >= self._times.countdown_s:
             self._began_s = now_s
             if self._path is not None and sight.q is not None:
+                # The start error tells later how well the start was met.
                 folders.rewrite(
                     self._path, {"start_error": np.round(sight.q - self._start, 4).tolist()}
                 )
@@ -171,6 +176,7 @@ class Attempt:
                 )
                 is not None
             )
+            # Inserted wins where both happen in one tick.
             if inside or in_phase_s >= self._limit_s:
                 self._end("inserted" if inside else "time limit", "")
         elif self._phase == "settling" and in_phase_s >= self._times.settle_s:
@@ -179,7 +185,7 @@ class Attempt:
             self._enter("over")
 
     def view(self) -> dict[str, Any]:
-        """Return what pages show of it, as plain data."""
+        """Return the trial as plain data for the pages."""
         now_s, sight = self._clock(), self._stage.sight()
         away = None if sight.q is None else sight.q - self._start
         joints = [] if away is None else [
@@ -202,7 +208,7 @@ class Attempt:
         self._worker.shutdown(wait=True)
 
     def leave(self) -> None:
-        """End it now; what is not on the disk yet is made of the capture the next time."""
+        """End it now; the recording, if missing, is made of the capture the next time."""
         self.abort("the program ended")
         self._worker.shutdown(wait=False, cancel_futures=True)
 
@@ -216,6 +222,7 @@ class Attempt:
 
     def _end(self, outcome: str, reason: str) -> str:
         ran = self._phase == "running"
+        # A trial that never ran took no time.
         self._seconds = self._clock() - self._began_s if ran else 0.0
         self._outcome, self._reason = outcome, reason
         assert self._path is not None
@@ -223,6 +230,7 @@ class Attempt:
             self._path, {"outcome": outcome, "reason": reason, "seconds": round(self._seconds, 2)}
         )
         self._enter("settling")
+        # Nothing to settle where nothing moved.
         if not ran:
             self._save()
         return ""
@@ -231,6 +239,7 @@ class Attempt:
         end_s = self._clock()
         self._stage.record(None)
         assert self._path is not None
+        # Without a window there is nothing to keep: the trial never ran.
         if self._seconds:
             window_s = [self._began_s, end_s]
             folders.rewrite(
@@ -238,18 +247,24 @@ class Attempt:
                 {"capture": f"{folders.CAPTURES}/{self._path.stem}", "window_s": window_s},
             )
         self._saving = self._worker.submit(
-            keep, self._folder, self._path, self._machine, self._stage
+            # The conversion takes seconds; the page must go on.
+            keep,
+            self._folder,
+            self._path,
+            self._machine,
+            self._stage,
         )
         self._enter("saving")
 
 
 def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
-    """Make a recording of what was captured of the trial in the file `path`; what cannot be used is said in that file.
+    """Write the captured trial as a recording to the file `path`; faults are reported in that file.
 
     A trial that began has a `window_s`, so that this can be done again where it was interrupted:
     the clock is that of the capture.
     """
     trial = json.loads(path.read_text())
+    # Already kept, or found impossible: this makes the call safe to repeat.
     if "window_s" not in trial or "recording" in trial or "recording_problem" in trial:
         return
     changes: dict[str, Any] = {}
@@ -269,11 +284,11 @@ def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
 def _describe_target(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
     """Return the recording with the hole, and without advice that was not shown."""
     guided = trial["condition"] == "guided"
-    extra = {
-        name: values
-        for name, values in found.extra.items()
-        if guided or not name.startswith("advice_")
-    }
+    extra = {}
+    for name, values in found.extra.items():
+        if guided or not name.startswith("advice_"):
+            extra[name] = values
+    # The hole stands in the recording as constant columns, as in recordings of other tools.
     at = zip("xyz", trial["hole"]["center_in_base_m"], strict=True)
     extra |= {f"target_{axis}_m": np.full(len(found.t_s), value, np.float32) for axis, value in at}
     return replace(found, extra=extra)

@@ -52,7 +52,7 @@ class Stage(Protocol):
     """Where trials take place."""
 
     def sight(self) -> MachineView:
-        """Return what is known now."""
+        """Return the current state."""
         ...
 
     def prepare(self, hole: Hole, start: np.ndarray) -> None:
@@ -64,7 +64,7 @@ class Stage(Protocol):
         ...
 
     def keep(self, folder: Path, begin_s: float, end_s: float) -> Recording:
-        """Return what was recorded in `folder` between two times, once the recording has been closed.
+        """Return the recording in `folder` between two times, once the recording has been closed.
 
         Where the bus was silent for a moment, positions go straight from one end of it to the
         other; the metadata `filled` says so.

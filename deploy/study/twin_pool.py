@@ -1,4 +1,4 @@
-"""Twins spread over processes, period by period; what comes of them does not depend on how many there are.
+"""Twins spread over processes, period by period; results do not depend on the number of processes.
 
 The operators stay in one process, since their chance is drawn for all of them at once; here only
 the machines are divided.
@@ -77,19 +77,17 @@ class Crew:
 
 
 def run_worker(stop: Stop, file: int, build: str, part: tuple[Any, ...]) -> None:
-    """Do what the crew is asked, until nobody asks any more."""
+    """Serve requests of the crew until the channel closes."""
     from pkgutil import resolve_name
 
     channel, desks = Channel(file), resolve_name(build)(*part)
     while True:
         try:
             method, places, arguments = channel.recv()
-            channel.send(
-                [
-                    getattr(desks[place], method)(*given)
-                    for place, given in zip(places, arguments, strict=True)
-                ]
-            )
+            answers = []
+            for place, given in zip(places, arguments, strict=True):
+                answers.append(getattr(desks[place], method)(*given))
+            channel.send(answers)
         except (EOFError, BrokenPipeError, ConnectionResetError):
             return
 

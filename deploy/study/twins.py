@@ -3,7 +3,7 @@
 Each trial has a twin (`deploy.twin`: plant, gateway, its messages), a remote, and of the loop the
 receiver and the adviser with
 policy and lever display. Frames go through the bus description both ways: coded, counted, checked.
-What is not there: a bus with latencies, processes and their scheduling, guard and page. A simulated
+Not simulated are a bus with latencies, processes and their scheduling, guard and page. A simulated
 person sees an advice in the control period in which it is made, a real one some tens of
 milliseconds later.
 Axes: `N` trials, `J` joints.
@@ -53,7 +53,7 @@ class Twins:
     Attributes:
         plant: The machine beside its block.
         dbc: Description of the bus.
-        limits: Of what the loop believes.
+        limits: Plausibility limits of the loop.
         guidance: How advice is shown.
         policy: Policy bundle that advises.
         settle_s: Time for which a recording goes on after the insertion.
@@ -77,32 +77,44 @@ class Twins:
     ) -> list[Recording]:
         """See `brokk_rl.contracts.operator.TrialGround`."""
         num, nothing = len(trials.q), np.full(machine.num_joints, np.nan)
-        places = [
-            (
-                session.stream(f"twin {n}"),
-                trials.q[n],
-                trials.rim_in_base_m[n],
-                bool(trials.guided[n]),
+        places = []
+        for n in range(num):
+            places.append(
+                (
+                    # A stream for each trial: results do not depend on how trials are spread over
+                    # processes.
+                    session.stream(f"twin {n}"),
+                    trials.q[n],
+                    trials.rim_in_base_m[n],
+                    bool(trials.guided[n]),
+                )
             )
-            for n in range(num)
-        ]
+        # Never more processes than twins.
         processes = min(self.num_processes or count_cores(), num)
+        # Dealt out in turn: long and short trials mix, so that processes end at about the same
+        # time.
         rows = [np.arange(first, num, processes) for first in range(processes)]
-        parts = [(self, machine, session, [places[n] for n in mine]) for mine in rows]
+        parts = []
+        for mine in rows:
+            parts.append((self, machine, session, [places[n] for n in mine]))
         steps, left = (
             round(trials.limit_s / machine.period_s),
             np.full(num, round(self.settle_s / machine.period_s)),
         )
+        # Trials end at different times; those that ended take no more steps.
         running = np.ones(num, bool)
         with Crew("deploy.study.twins:make_desks", parts, rows, num) as crew:
             now, found = crew.ask("seen", running), dict[int, Recording]()
             for _ in track(range(steps), "simulated operators at the twin", transient=True):
+                # Operators are models over all trials at once, so their inputs are stacked.
                 q = np.stack([now[n][0] for n in range(num)])
                 advice = np.stack([now[n][1] if trials.guided[n] else nothing for n in range(num)])
                 given = operators.step(
                     OperatorView(q=q, rim_in_base_m=trials.rim_in_base_m, advice=advice)
                 )
                 now |= crew.ask("period", running, given)
+                # The recording goes on for a while after the insertion, as that of a real trial
+                # does.
                 left -= _detect_insertion(machine, q, trials) & running
                 found |= crew.ask("end", running & (left <= 0))
                 running &= left > 0
@@ -120,10 +132,11 @@ def make_desks(
 ) -> list[_Desk]:
     """Return a desk for each of `places`: seed, start, rim, and whether advice is shown there."""
     bundle, description = PolicyBundle(ground.policy, machine), BusDescription(ground.dbc, machine)
-    made = [
-        _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided)
-        for seed, q, rim, guided in places
-    ]
+    made = []
+    for seed, q, rim, guided in places:
+        made.append(
+            _Desk(ground, machine, description, bundle, replace(session, seed=seed), q, rim, guided)
+        )
     for desk in made:
         desk.wait(BEFORE_S)
     return made
@@ -131,6 +144,7 @@ def make_desks(
 
 def _detect_insertion(machine: Machine, q: np.ndarray, trials: TrialBatch) -> np.ndarray:
     away = compute_tool_kinematics(machine, q).tip_in_base_m - trials.rim_in_base_m
+    # The clearance tells a chisel inside the hole from one beside it at the same depth.
     return (np.hypot(away[:, 0], away[:, 1]) <= trials.clearance_m) & (
         away[:, 2] <= -trials.depth_m
     )
@@ -188,6 +202,7 @@ class _Desk:
         self._seed, self._guided = session.seed, guided
         self._machine, self._rim_m, self._now_s = machine, rim_m, BEGIN_S
         start, hole = tuple(q.tolist()), tuple(rim_m.tolist())
+        # A plant that cannot be placed has no such fields; `link=site` has.
         placed = replace(ground.plant, start=start, hole_in_base_m=hole)  # type: ignore[type-var]
         self._link, self._air = placed.build(machine, 1, session), _Air()
         twin = Twin(
@@ -205,13 +220,16 @@ class _Desk:
             RadioRemote(description),
             BusReceiver(description, machine, ground.limits),
         )
+        # The operator holds the dead-man throughout: the twin is driven by hand.
         self._remote.deadman = True
         target = np.zeros((), TARGET)
         target["t_s"], target["center_in_base_m"] = BEGIN_S, rim_m
         self._shared = _Shared(_Newest(), _Newest(), _Newest(target), None, _NoLog())
+        # Nothing is ever commanded in a study: the guard stays silent.
         self._silent = GuardDecision(
             GuardState.SILENT, (0.0,) * machine.num_joints, GuardTrip.NONE, GuardTrip.NONE
         )
+        # 1e9 s: the borehole never grows old, as the study says where it is.
         counsel = PolicyProcessConfig(
             machine, ground.policy, ground.guidance, ground.limits.joints_s, 1e9, None
         )
@@ -232,11 +250,13 @@ class _Desk:
         """Let time go by before the trial, levers in neutral."""
         for _ in range(round(seconds / self._machine.period_s)):
             self.period(np.zeros(self._machine.num_joints))
+        # Time before the trial is no part of its recording.
         self._rows.clear()
 
     def period(self, given: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Let a control period go by in which the levers stand as `given`, `(J,)`, wants them; returns what is `seen` then."""
+        """Step one control period with the levers at `given`, `(J,)`; return `seen` at its end."""
         receiver, before = self._receiver, (self._receiver.flow_sum, self._receiver.flow_number)
+        # Before the first message the position is that of the plant.
         q = receiver.q.copy() if receiver.frames else self.seen()[0]
         force = getattr(self._link, "extra", dict)().get("force_n", np.zeros(1))
         angles_rad, self._remote.button_right = self._own.levers(given)
@@ -247,6 +267,7 @@ class _Desk:
             advice = np.array(advised.u)
         for _ in range(round(self._machine.period_s / CYCLE_S)):
             self._cycle()
+        # The mean flow of the period, as the recorder computes it from the counters.
         u = (receiver.flow_sum - before[0]) / max(1, receiver.flow_number - before[1])
         self._rows.append((q, u, advice, float(force[0])))
         self._advise()
@@ -254,6 +275,7 @@ class _Desk:
 
     def _cycle(self) -> None:
         self._now_s += CYCLE_S
+        # The remote sends more slowly than the gateway.
         if self._cycles % round(self._remote.period_s / CYCLE_S) == 0:
             frame = self._remote.build_frame()
             self._twin.hear(frame, self._now_s)
@@ -265,7 +287,7 @@ class _Desk:
         self._air.frames.clear()
 
     def _advise(self) -> None:
-        """Publish what is known, as the bus process does, and lets the policy speak."""
+        """Publish the state as the bus process does, and let the policy propose a command."""
         now_s = self._now_s
         state = self._receiver.build_state(now_s, bus_up=True, decision=self._silent, missed=0)
         self._shared.state.write(state)
@@ -276,24 +298,26 @@ class _Desk:
     def end(self) -> Recording:
         """Return the recording, and lets go of the twin: its memory is wanted for nothing any more."""
         found = self.recording()
+        # Hundreds of twins would fill the memory until the last trial ends.
         del self._twin, self._link
         return found
 
     def recording(self) -> Recording:
         """Return the trial at the control rate, commands as the valves got them."""
         machine = self._machine
-        q, u, advice = (
-            np.stack([row[i] for row in self._rows]).astype(np.float32) for i in range(3)
-        )
+        columns = []
+        for column in range(3):
+            stacked = np.stack([row[column] for row in self._rows])
+            columns.append(stacked.astype(np.float32))
+        q, u, advice = columns
         extra = {"force_n": np.array([row[3] for row in self._rows], np.float32)}
-        extra |= {
-            f"target_{axis}_m": np.full(len(q), self._rim_m[i], np.float32)
-            for i, axis in enumerate("xyz")
-        }
+        for index, axis in enumerate("xyz"):
+            extra[f"target_{axis}_m"] = np.full(len(q), self._rim_m[index], np.float32)
         if self._guided:
             extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
         return Recording(
             machine=machine.name,
+            # Flow may exceed full by rounding.
             joints=machine.joint_names,
             units=tuple(joint.unit for joint in machine.joints),
             rate_hz=1.0 / machine.period_s,

@@ -155,7 +155,10 @@ class ActiveFaults:
 
     def due(self, now_s: float) -> list[CanFrame]:
         """Return the frames that were held up until now."""
-        ripe = [frame for at_s, frame in self._late if at_s <= now_s]
+        ripe = []
+        for at_s, frame in self._late:
+            if at_s <= now_s:
+                ripe.append(frame)
         self._late = [(at_s, frame) for at_s, frame in self._late if at_s > now_s]
         return ripe
 

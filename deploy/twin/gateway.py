@@ -63,9 +63,9 @@ class Gateway:
         self._description, self._machine = description, machine
         self._command = description.command
         self._remote = description.layouts[description.message_of("DeadMan")]
-        self._channels = {
-            one.name: ProtectedChannel(one.modulus) for one in (self._command, self._remote)
-        }
+        self._channels = {}
+        for layout in (self._command, self._remote):
+            self._channels[layout.name] = ProtectedChannel(layout.modulus)
         self._map = LeverMap(machine.levers, machine)
         self._axis_full_rad = find_full_angles_rad(machine.levers)
         self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0

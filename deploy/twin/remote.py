@@ -43,9 +43,9 @@ class RadioRemote:
 
     def build_frame(self, frozen: int | None = None) -> CanFrame:
         """Return the next message; `frozen` is a counter that stands still, a fault."""
-        values: dict[str, float] = {
-            f"Lever_{axis}": value for axis, value in zip(LEVER_AXES, self.levers, strict=True)
-        }
+        values: dict[str, float] = {}
+        for axis, value in zip(LEVER_AXES, self.levers, strict=True):
+            values[f"Lever_{axis}"] = value
         values |= {"ButtonRight": self.button_right, "DeadMan": self.deadman, "RemoteOn": self.on}
         self._counter = self._counter + 1 if frozen is None else frozen
         return CanFrame(

@@ -96,8 +96,11 @@ class Twin:
         Raises:
             LinkError: the bus cannot be opened.
         """
+        # The twin stands for a machine, which is never late because of the computer.
         if self.realtime:
             ask_for_priority(TWIN_PRIORITY)
+        # The header describes the bus to the firmware of a real gateway; it must fit this very
+        # run.
         session.folder.mkdir(parents=True, exist_ok=True)
         write_text(session.folder / HEADER, generate_c_header(BusDescription(self.dbc, machine)))
         with (
@@ -156,9 +159,11 @@ class RunningTwin:
         self._faults, self._timer = ActiveFaults(), CycleTimer(CYCLE_S)
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
+        # Both ends of the first period are the start: the machine is at rest.
         self._q = self._before = np.asarray(link.read().q, dtype=float)
         self._flow, self._oil_c = np.zeros(machine.num_joints), _read_oil_c(link)
         self._source, self._grip_s = NOBODY, -np.inf
+        # The first cycle begins a period at once.
         self._period_began_s = -np.inf
         self._stuck: np.ndarray | None = None
         remote = self._description.layouts[self._description.message_of("DeadMan")]
@@ -167,6 +172,7 @@ class RunningTwin:
 
     def run(self, stop: Stop) -> None:
         """Run in real time until told to stop, or until its time is over."""
+        # The shortest wait is that to the next cycle, so frames take effect when they arrive.
         end_s = np.inf if self._twin.seconds is None else time.monotonic() + self._twin.seconds
         while not stop() and time.monotonic() < end_s:
             try:
@@ -176,6 +182,7 @@ class RunningTwin:
                         self.hear(frame, time.monotonic())
                 self._timer.begin()
                 self.cycle(time.monotonic())
+            # A bus that goes down is no reason to end: a real machine goes on too.
             except LinkError as error:
                 log.warning("%s", error)
                 self._timer.wait()
@@ -190,6 +197,7 @@ class RunningTwin:
         """Let `CYCLE_S` go by: valves, motion, messages."""
         if (text := self._port.poll(self._faults)) is not None:
             log.debug("fault: %s", text)
+        # A study puts the machine elsewhere between two cycles, never within one.
         if (place := self._faults.take_place()) is not None:
             self._place(*place)
         faults, gateway = self._faults, self._gateway
@@ -197,9 +205,13 @@ class RunningTwin:
         if self._twin.remote:
             self._play_remote(now_s)
         flow, values = self._apply_flow(now_s)
+        # Half a cycle early is on time: the next chance would be half a cycle late.
         if now_s - self._period_began_s >= self._machine.period_s - CYCLE_S / 2:
+            # After a pause the periods start anew; they are not made up for.
             late = now_s - self._period_began_s > 1.5 * self._machine.period_s
             self._period_began_s = now_s if late else self._period_began_s + self._machine.period_s
+            # Sensors interpolate between the two, as the positions are sent more often than
+            # computed.
             self._before = self._q
             self._link.send(Command(flow))
             self._q = np.asarray(self._link.read().q, dtype=float)
@@ -210,6 +222,7 @@ class RunningTwin:
             self._send(layout.name, values, now_s)
         for frame in faults.due(now_s):
             self._bus.send(frame)
+        # A second sender of valve commands: the loop must notice that it is not alone.
         if faults.on("second_sender", "", now_s):
             command = self._description.command
             self._bus.send(
@@ -218,6 +231,7 @@ class RunningTwin:
                     self._description.encode(command.name, {}, self._counters.get("JointPos1", 0)),
                 )
             )
+        # Identifier of lowest priority: arbitration lets every other frame pass first.
         if faults.on("flood", "", now_s):
             for _ in range(FLOOD):
                 self._bus.send(CanFrame(FLOOD_ID, bytes(8)))
@@ -246,6 +260,7 @@ class RunningTwin:
         }
         for name, u in zip(self._machine.joint_names, self._flow, strict=True):
             values[f"Flow_{name}"] = float(u)
+        # A stop is reported at once: it must not wait for the message's cycle.
         if before.any() and not self._flow.any():
             for signal in ("FlowSource", "EStop"):
                 self._send(self._description.message_of(signal), values, now_s, at_once=True)
@@ -258,6 +273,8 @@ class RunningTwin:
         released = remote.deadman and not held  # a release does not wait for its turn
         if now_s < self._due_s.get(layout.name, now_s) and not released:
             return
+        # The schedule keeps its phase after a delay, and does not send the missed ones in a
+        # burst.
         self._due_s[layout.name] = (
             max(self._due_s.get(layout.name, now_s), now_s - layout.period_s) + layout.period_s
         )
@@ -280,6 +297,7 @@ class RunningTwin:
         released = self._faults.on("deadman_released", "", now_s)
         pressed = self._twin.deadman and heard and not released
         again_s = self._twin.again_s
+        # Not held, or the PC has the valves: the patience of `again_s` begins anew.
         if not pressed or self._source == PC:
             self._grip_s = now_s
         elif again_s is not None and now_s - self._grip_s > again_s:
@@ -293,8 +311,10 @@ class RunningTwin:
         due_s = self._due_s.get(name, now_s)
         if now_s < due_s - CYCLE_S / 2 and not at_once:
             return
+        # See `_play_remote`: phase is kept, missed messages are not sent in a burst.
         self._due_s[name] = max(due_s, now_s - layout.period_s) + layout.period_s
         counter = self._counters[name] = self._counters.get(name, -1) + 1
+        # A frozen counter is a fault that only the end-to-end protection can see.
         if self._faults.on("freeze_counter", name, now_s):
             counter = FROZEN
         data = self._description.encode(name, values, counter)
@@ -305,13 +325,16 @@ class RunningTwin:
     def _measure_positions(self, now_s: float) -> dict[str, float]:
         """Return positions and validities as the sensors report them, faults included."""
         faults, machine = self._faults, self._machine
+        # The share of the period that has gone by; a late cycle stays at its end.
         part = min(1.0, max(0.0, (now_s - self._period_began_s) / machine.period_s))
         q = self._before + part * (self._q - self._before)
+        # The value at which it got stuck must be kept as long as the fault is on.
         if faults.on("stuck", "", now_s):
             self._stuck = q if self._stuck is None else self._stuck
             q = self._stuck
         else:
             self._stuck = None
+        # The plant's own array must not change with the faults.
         q = q.copy()
         if faults.on("jump", "", now_s):
             q[0] += JUMP_RAD
@@ -324,6 +347,7 @@ class RunningTwin:
         valid = 0.0 if faults.on("invalid", "", now_s) else 1.0
         names = machine.joint_names
         values = {f"Valid_{name}": valid for name in names}
+        # The signal's range ends here; the encoder refuses larger values.
         clipped = np.clip(q, -SENSOR_RANGE_RAD, SENSOR_RANGE_RAD).tolist()
         for name, position in zip(names, clipped, strict=True):
             values[f"Position_{name}"] = position
@@ -335,5 +359,6 @@ def _read_oil_c(link: Link) -> float:
     extra = getattr(link, "extra", dict)()
     if "oil_c" not in extra:
         return USUAL_OIL_C
+    # The signal has a resolution of one degree.
     oil_c = np.round(np.asarray(extra["oil_c"]).mean())
     return float(np.clip(oil_c, *OIL_RANGE_C))

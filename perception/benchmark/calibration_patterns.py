@@ -160,9 +160,8 @@ def compute_ellipse_overlap(first: np.ndarray, second: np.ndarray) -> float:
     if np.hypot(first[0] - second[0], first[1] - second[1]) > first[2] + second[2]:
         return 0.0
     angles = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-    one, two = (
-        conic.sample_ellipses(e[None], angles)[0][0].astype(np.float32) for e in (first, second)
-    )
+    one = conic.sample_ellipses(first[None], angles)[0][0].astype(np.float32)
+    two = conic.sample_ellipses(second[None], angles)[0][0].astype(np.float32)
     shared = cv2.intersectConvexConvex(one, two)[0]
     return float(shared / (cv2.contourArea(one) + cv2.contourArea(two) - shared))
 

@@ -103,9 +103,10 @@ class FinderScore:
 
     def __add__(self, other: FinderScore) -> FinderScore:
         """Return the sum of both."""
-        both: dict[str, Any] = {
-            name: getattr(self, name) + getattr(other, name) for name in vars(self) if name != "ms"
-        }
+        both: dict[str, Any] = {}
+        for name in vars(self):
+            if name != "ms":
+                both[name] = getattr(self, name) + getattr(other, name)
         stages = dict.fromkeys((*self.ms, *other.ms))
         return FinderScore(
             **both, ms={stage: self.ms.get(stage, []) + other.ms.get(stage, []) for stage in stages}

@@ -75,6 +75,7 @@ def estimate_board_pose(
         FrameError: the corners fit no pose.
     """
     matrix, distortion = np.asarray(frame.camera_matrix, float), frame.distortion
+    # IPPE gives both poses of a flat board that fit about equally well.
     fits = []
     count, turns, shifts, _ = cv2.solvePnPGeneric(
         corners_m, corners_px, matrix, distortion, flags=cv2.SOLVEPNP_IPPE
@@ -82,6 +83,7 @@ def estimate_board_pose(
     for turn, shift in zip(turns[:count], shifts[:count], strict=True):
         turn, shift = cv2.solvePnPRefineLM(corners_m, corners_px, matrix, distortion, turn, shift)
         pose = transforms.make_transform(np.asarray(cv2.Rodrigues(turn)[0]), np.ravel(shift))
+        # A pose behind the camera reproduces the picture too.
         depth_m = (corners_m @ pose[:3, :3].T + pose[:3, 3])[:, 2]
         if not np.isfinite(pose).all() or depth_m.min() <= 0:
             continue  # behind the camera
@@ -96,8 +98,10 @@ def estimate_board_pose(
             f"{frame.name}: the board's corners miss by {best_px:.1f} px, {max_error_px:g} are "
             "allowed"
         )
+    # A second pose that fits much worse is no doubt.
     largest_px = MAX_ERROR_RATIO * max(best_px, corner_px)
     kept = [pose for error_px, pose in fits[:NUM_CANDIDATES] if error_px <= largest_px]
+    # The first pose stands in where there is no second, so that shapes stay the same.
     poses = np.stack([*kept, *kept[:1]][:NUM_CANDIDATES])
     # two numbers a corner, six of them spent on the pose
     freedom = max(2 * len(corners_m) - 6, 1)
@@ -123,6 +127,7 @@ def _compute_pose_information(
     shift = np.broadcast_to(np.eye(3), (len(point), 3, 3))
     motion = np.concatenate([shift, -transforms.build_cross_matrices(corners_m)], 2)
     rows = (slope @ pose[:3, :3] @ motion).reshape(-1, 6)
+    # The small addition keeps a board seen edge-on invertible.
     return rows.T @ rows + 1e-9 * np.eye(6)
 
 
@@ -212,6 +217,7 @@ class BoardCalibration:
         trajectory = arm.read_joint_positions(Path(self.joints), machine)
         observations, refused = self._find_boards()
         clock = self._estimate_clock(machine, trajectory, observations)
+        # Joint positions are read at the time of the exposure.
         shift_s = 0.0 if clock is None else clock.applied_s
         known, positions = [], []
         for one in observations:
@@ -230,6 +236,7 @@ class BoardCalibration:
                 f"{'; '.join(reasons) or 'none'}"
             )
         if len(known) > self.max_poses:
+            # Evenly over the recording: neighbouring frames show nearly the same pose.
             chosen = np.linspace(0, len(known) - 1, self.max_poses).round().astype(int)
             known, positions = [known[k] for k in chosen], [positions[k] for k in chosen]
         q = np.stack(positions)
@@ -237,6 +244,7 @@ class BoardCalibration:
         solution = solve_hand_eye(views)
         assert solution is not None  # there are enough
         used = np.flatnonzero(solution.used)
+        # Only poses that were used can determine the camera.
         turns, _ = evaluation.measure_rotation_ranges(views.base_from_link[used])
         missing = self._check_coverage(machine, views, solution, q, float(turns[1]))
         more = {
@@ -268,6 +276,7 @@ class BoardCalibration:
                     )
                     found.append(BoardObservation(Path(frame.name).name, frame.t_s, pose))
                 except FrameError as error:
+                    # The message begins with the path of the frame.
                     name = str(error).split(":")[0].split("/")[-1]
                     refused.append(PoseResidual(name, None, None, str(error)))
 
@@ -277,9 +286,11 @@ class BoardCalibration:
         trajectory: arm.JointTrajectory,
         observations: list[BoardObservation],
     ) -> clock_offset.ClockEstimate | None:
+        # A few frames fit any offset.
         is_enough = len(observations) >= clock_offset.MIN_SPEEDS
         if trajectory.t_s is None or not is_enough or not self.clock_s:
             return None
+        # Speeds of the link and of the board are compared; both are known without calibration.
         links = arm.compute_link_poses(machine, trajectory.q)
         return clock_offset.estimate_clock_offset(
             np.array([one.t_s for one in observations]),
@@ -344,6 +355,7 @@ class BoardCalibration:
             np.linalg.norm(board[:, :3, 3], axis=1),
             self.least_turn_rad,
         )
+        # The problem is singular: more poses of the same kind would not help.
         if second_turn_rad < MIN_TURN_SHARE * self.least_turn_rad or len(used) < MIN_VIEWS:
             raise FrameError(
                 "calibration: the poses do not determine where the camera is: "

@@ -153,7 +153,10 @@ def build_calibration(
         distance_m: Working distance, at which the uncertainty of a point is stated.
         more: Entries of this kind alone.
     """
-    used = [one for one in residuals if one.left_out is None]
+    used = []
+    for one in residuals:
+        if one.left_out is None:
+            used.append(one)
     return {
         "schema": SCHEMA,
         "kind": kind,
@@ -180,5 +183,8 @@ def build_calibration(
 
 
 def _compute_rms(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
+    known = []
+    for value in values:
+        if value is not None:
+            known.append(value)
     return round(float(np.sqrt(np.mean(np.square(known)))), 6) if known else None

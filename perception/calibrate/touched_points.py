@@ -188,7 +188,7 @@ def _refine_pose(
 
 @dataclass(frozen=True)
 class TouchedPoint:
-    """A point as the file gives it; what is not given is `None`.
+    """A point as the file gives it; a missing value is `None`.
 
     Attributes:
         name: For messages.
@@ -249,7 +249,7 @@ class TouchCalibration:
 
         Raises:
             ConfigError: the file of points cannot be read.
-            FrameError: the points do not determine the camera; says what is missing.
+            FrameError: the points do not determine the camera; the message names the lack.
         """
         names, points, refused = self._collect_pairs(machine)
         fit = fit_camera_to_points(points, self.tip_std_m) if names else None

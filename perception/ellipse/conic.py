@@ -23,7 +23,8 @@ def fit_ellipses(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     total = np.maximum(weights.sum(1), 1e-12)
     center = (weights[:, None] @ points)[:, 0] / total[:, None]
     counts = weights > 0
-    x, y = (np.where(counts, points[..., k] - center[:, k, None], 0.0) for k in (0, 1))
+    x = np.where(counts, points[..., 0] - center[:, 0, None], 0.0)
+    y = np.where(counts, points[..., 1] - center[:, 1, None], 0.0)
     scale = np.sqrt(((x * x + y * y) * weights).sum(1) / total) + 1e-12
     x, y = x / scale[:, None], y / scale[:, None]
     powers = np.empty((len(x), 6, x.shape[1]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -14,8 +13,15 @@ from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.ellipse import edges as ellipse_edges
 from perception.ellipse import support as ellipse_support
+from perception.ellipse.candidate_fit import (
+    CandidateFit,
+    FoundEllipse,
+    is_centre_inside,
+    is_other_side_of_line,
+    measure_wholeness,
+)
 from perception.ellipse.edges import Edges
-from perception.ellipse.support import ANGLES, NUM_SAMPLES, STROKE_PX, EllipseCandidates
+from perception.ellipse.support import ANGLES, NUM_SAMPLES, EllipseCandidates
 
 
 @spec
@@ -109,8 +115,6 @@ FAINT, SMALL_PX = 0.12, 6.0
 size. Faint stains are round all over."""
 ROUNDING_PX = 2
 """Addition to the reach within which the nearest edge is looked up, for rounding to pixels."""
-SAME_AREA = 0.6
-"""Least ratio of areas of the two edges of one thin line."""
 LEAST_ARC, HALFWAY = 0.2, 0.3
 """Part of an ellipse from which the rest can be told, and part with support after refinement."""
 PRECISE_PX, ROUGH_PX = (1.0, 0.5, 0.3, 0.2), (1.0, 0.5, 0.3)
@@ -126,48 +130,6 @@ SHARED = 0.4
 """Part of its support that an ellipse may share with better ones."""
 SEARCH_SLACK = 1.5
 """Factor on the size limits before refinement."""
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Quality of fit of `C` candidates.
-
-    Attributes:
-        candidates: Ellipses and polarity.
-        support: Number of the edge point at each place, `(C, NUM_SAMPLES)`, -1 for none.
-        length: Arc length per radian at each place, `(C, NUM_SAMPLES)`.
-        coverage: Part of the circumference with support, `(C,)`.
-        off_px: Distance of the support at each place, `(C, NUM_SAMPLES)`.
-        rms_px: Root mean square of these distances.
-        spread_px: Robust standard deviation of these distances.
-        spread_limit_px: Its limit.
-        angle_rad: Robust standard deviation of the angles between gradient and normal.
-        angle_limit_rad: Its limit.
-    """
-
-    candidates: EllipseCandidates
-    support: np.ndarray
-    length: np.ndarray
-    coverage: np.ndarray
-    off_px: np.ndarray
-    rms_px: np.ndarray
-    spread_px: np.ndarray
-    spread_limit_px: np.ndarray
-    angle_rad: np.ndarray
-    angle_limit_rad: np.ndarray
-
-    def __getitem__(self, keep: np.ndarray) -> _Fit:
-        return _Fit(*(getattr(self, field.name)[keep] for field in fields(self)))
-
-
-@dataclass(frozen=True)
-class FoundEllipse:
-    """An accepted ellipse: its row `(5,)` and the figures of `Ellipse`."""
-
-    row: np.ndarray
-    rms_px: float
-    coverage: float
-    score: float
 
 
 class ArcDetector:
@@ -190,6 +152,7 @@ class ArcDetector:
     ) -> list[Ellipse]:
         """Return ellipses, the best first; see `EllipseDetector`."""
         s = self.settings
+        # Only the box of the region is searched: time is proportional to its area.
         left, top, width, height = (
             (0, 0, *gray.shape[::-1]) if roi is None else cv2.boundingRect(roi.view(np.uint8))
         )
@@ -197,17 +160,21 @@ class ArcDetector:
         part = gray[top:bottom, left:right]
         if min(part.shape) < SMALLEST_PICTURE_PX:
             return []
+        # Without a prior the picture bounds the size.
         limits = prior or SizePrior(0.0, float(max(part.shape)))
         where = None if roi is None else roi[top:bottom, left:right]
+        # The map of nearest edges must cover the reach of the largest ellipse.
         near_px = int(np.ceil(self._limit_reach(limits.highest_px))) + ROUNDING_PX
         edges = ellipse_edges.detect_edges(
             part, where, s.sigma_px, PERCENTILE, NOISE, LOW, s.arc_points, near_px
         )
         if not len(edges.points):
             return []
+        # An arc of a large ellipse must be long; a short one fits any curvature.
         least = max(s.arc_points, int(0.5 * limits.lowest_px))
         edges = edges.cut(s.arc_tolerance_px, s.corner_rad, least)
         proposals = self._propose(part) if self._propose else NO_ELLIPSES
+        # Back to the coordinates of the whole picture.
         shift = np.array([left, top, 0.0, 0.0, 0.0])
         return [
             Ellipse(
@@ -238,6 +205,7 @@ class ArcDetector:
             np.concatenate([first.ellipses, known]),
             np.concatenate([first.polarity, np.tile([1.0, -1.0], len(known) // 2)]),
         )
+        # With a known size few shapes compete, so rough rounds are enough.
         rounds_px = ROUGH_PX if limits.lowest_px > 0 else PRECISE_PX
         refined = self._refine(first, edges, rounds_px)
         return sorted(self._judge(refined, edges, limits), key=lambda one: -one.score)
@@ -246,10 +214,13 @@ class ArcDetector:
         """Return seed points `(C, NUM_SEEDS)` of spans, arcs and groups, and their lengths `(C,)`."""
         spans = self._select_compact(edges.spans, edges, limits)
         arcs = self._select_compact(edges.arcs, edges, limits)
+        # An arc that is a whole span would be fitted twice.
         whole = set(map(tuple, spans.tolist()))
         parts = np.array([arc for arc in arcs.tolist() if tuple(arc) not in whole], int)
         parts = parts.reshape(-1, 2)
+        # Longer groups first: more arcs determine the ellipse better.
         groups = [arcs[group] for group in ellipse_edges.group_arcs(arcs, edges, (4, 3, 2))]
+        # Pieces of arcs only where the size is unknown: elsewhere they add nothing but time.
         if limits.lowest_px == 0:
             parts = np.concatenate(
                 [parts, ellipse_edges.split_arcs(arcs, self.settings.arc_points)]
@@ -268,8 +239,10 @@ class ArcDetector:
         circumference.
         """
         least_px = limits.lowest_px / SEARCH_SLACK
+        # The smallest ellipse of the flattest form bounds the length of any arc from below.
         flat_px = least_px * self._choose_flattest(limits)
         smallest = conic.compute_perimeter(np.array(least_px), np.array(flat_px))
+        # Cut before the fit: most seeds are too short, and the fit is the dear part.
         is_long = lengths >= LEAST_ARC * smallest
         seeds, lengths = seeds[is_long], lengths[is_long]
         if not len(seeds):
@@ -281,7 +254,10 @@ class ArcDetector:
         possible &= lengths >= LEAST_ARC * np.nan_to_num(perimeter)
         ellipses, points, seeds = ellipses[possible], points[possible], seeds[possible]
         off, outward = conic.measure_sampson_distance(ellipses, points)
+        # Gradients along the normal on one side: edges of an ellipse are bright all inside or all
+        # outside.
         along = conic.sum_products(outward, edges.directions[seeds])
+        # More than half of the points, so that one wrong arc of a group does not carry it.
         near = (np.abs(off) < self._reach(ellipses)[:, None]).mean(1) > 0.5
         keep = near & (np.abs(along.mean(1)) > 0.5)
         return EllipseCandidates(ellipses[keep], np.sign(along.mean(1))[keep])
@@ -301,11 +277,17 @@ class ArcDetector:
             # All places in the last precise round only; every second one is enough before.
             angles = ANGLES[:: 1 if scale_px == PRECISE_PX[-1] else 2]
             support, off, along = self._gather(candidates, edges, angles)
+            # The geometric mean semi-axis: it scales with the picture and does not favour flat
+            # ellipses.
             size = np.sqrt(e[:, 2] * e[:, 3])
+            # Division by the gradient of the form turns its value into a distance (Sampson).
             slope = conic.measure_form_gradients(e, edges.points[support]) * size[:, None]
+            # The square makes far points count by the fourth power less.
             robust = 1.0 / (1.0 + (off / scale_px) ** 2 + ((1.0 - along) / ANGLE_WEIGHT) ** 2) ** 2
+            # The bound guards degenerate forms, whose gradient vanishes.
             weights = np.where(support >= 0, robust / np.maximum(slope, 1e-3) ** 2, 0.0)
             ellipses = conic.fit_ellipses(edges.points[support], weights)
+            # After the first round an ellipse should have found half of its own edge.
             least = HALFWAY if number else LEAST_ARC
             keep = np.isfinite(ellipses).all(1) & ((support >= 0).mean(1) >= least)
             candidates = EllipseCandidates(ellipses[keep], candidates.polarity[keep])
@@ -315,37 +297,44 @@ class ArcDetector:
         self, candidates: EllipseCandidates, edges: Edges, limits: SizePrior
     ) -> list[FoundEllipse]:
         """Return the candidates with enough support of the right kind, each rim once."""
+        # Sized without slack now: the refined ellipse is final.
         sized = self._is_sized(candidates.ellipses, limits, 1.0)
-        candidates = candidates[sized & _is_centre_inside(candidates.ellipses, edges)]
+        candidates = candidates[sized & is_centre_inside(candidates.ellipses, edges)]
         if not len(candidates.ellipses):
             return []
         s, slack = self.settings, self._choose_slack(limits)
         fit = self._measure_fit(candidates, edges, slack)
         good = self._has_good_shape(fit, edges, slack)
+        # Coverage, distance and angle each scale the score, so that none can make up for another.
         score = (
             fit.coverage
             * np.clip(1 - 0.5 * fit.spread_px / fit.spread_limit_px, 0, 1)
             * np.clip(1 - 0.5 * fit.angle_rad / fit.angle_limit_rad, 0, 1)
         )
         fit, score = fit[good], score[good]
+        # Costly gates come last and see only the candidates that passed the others.
         good = self._has_own_edges(fit, edges, limits, slack)
         # A whole ellipse must fit well to count; of half of one its limits are nearly enough.
         share = np.maximum(np.clip(3 * fit.coverage - 1.5, 0.0, 1.0), 0.9 * fit.coverage)
         good &= score * slack**2 >= s.score * share
         return self._choose(fit[good], score[good], edges)
 
-    def _measure_fit(self, candidates: EllipseCandidates, edges: Edges, slack: float) -> _Fit:
+    def _measure_fit(
+        self, candidates: EllipseCandidates, edges: Edges, slack: float
+    ) -> CandidateFit:
         """Return how well the edges around the candidates fit, with the limits of that."""
         s, e = self.settings, candidates.ellipses
         support, off, along = self._gather(candidates, edges, ANGLES, TIGHT)
+        # No support has index -1, which must not count as the last edge point.
         there = support >= 0
         length = conic.sample_ellipses(e, ANGLES)[2]
         coverage = (length * there).sum(1) / length.sum(1)
         count = np.maximum(there.sum(1), 1)
-        size, whole = np.sqrt(e[:, 2] * e[:, 3]), _measure_wholeness(coverage)
+        # At least one, so that an unsupported candidate gives zeros and no error.
+        size, whole = np.sqrt(e[:, 2] * e[:, 3]), measure_wholeness(coverage)
         seen = np.maximum(coverage, FULL_ANGLE_COVERAGE)
         angles = np.arccos(np.clip(along, -1, 1))
-        return _Fit(
+        return CandidateFit(
             candidates=candidates,
             support=support,
             length=length,
@@ -358,10 +347,10 @@ class ArcDetector:
             angle_limit_rad=slack * (s.angle_rms_rad * seen**1.5 + s.angle_rms_small / size * seen),
         )
 
-    def _has_good_shape(self, fit: _Fit, edges: Edges, slack: float) -> np.ndarray:
+    def _has_good_shape(self, fit: CandidateFit, edges: Edges, slack: float) -> np.ndarray:
         """Find candidates whose support is long and close enough, and no accident, `(C,)`."""
         s, e = self.settings, fit.candidates.ellipses
-        size, whole = np.sqrt(e[:, 2] * e[:, 3]), _measure_wholeness(fit.coverage)
+        size, whole = np.sqrt(e[:, 2] * e[:, 3]), measure_wholeness(fit.coverage)
         good = fit.coverage >= s.coverage
         good &= fit.spread_px <= fit.spread_limit_px
         good &= fit.rms_px <= TAIL * fit.spread_limit_px
@@ -370,22 +359,28 @@ class ArcDetector:
             fit.candidates, edges, fit.support, fit.off_px
         )
         waviness = np.hypot(
+            # A fixed part for noise, and a share of the size for rims that are not quite round.
             wave_px / (s.wave_px + s.rms_relative * size * whole),
             wave_rad / (s.wave_rad + s.wave_small / size),
         )
         good &= waviness <= slack * (1 + whole)
         perimeter = conic.compute_perimeter(e[:, 2], e[:, 3])
         evidence = ellipse_support.compute_evidence(
-            fit.coverage, fit.angle_rad, perimeter, s.angle_rad
+            fit.coverage,
+            fit.angle_rad,
+            perimeter,
+            s.angle_rad,
+            # The odds grow with the perimeter: a longer support is less of an accident.
         )
         return good & (evidence >= s.evidence)
 
     def _has_own_edges(
-        self, fit: _Fit, edges: Edges, limits: SizePrior, slack: float
+        self, fit: CandidateFit, edges: Edges, limits: SizePrior, slack: float
     ) -> np.ndarray:
         """Find candidates whose edges are theirs alone: those of no spiral, heart or stain, `(C,)`."""
         s, candidates, support, length = self.settings, fit.candidates, fit.support, fit.length
         good = ellipse_support.measure_largest_gap(support >= 0, length) <= s.gap
+        # An occluder explains a corner between the edge and the ellipse.
         occluded = ellipse_support.find_occluded(candidates, edges, support, length)
         purity = ellipse_support.measure_purity(edges, support, length)
         good &= occluded | (purity >= s.purity / slack)
@@ -393,6 +388,8 @@ class ArcDetector:
             # A known size excludes the shapes that these three gates are for.
             size = np.sqrt(candidates.ellipses[:, 2] * candidates.ellipses[:, 3])
             faintest = (
+                # The strongest edges tell the contrast of the picture; small ellipses are blurred
+                # more.
                 FAINT * np.percentile(edges.strength, 95.0) * np.minimum(SMALL_PX / size, 1.0)
             )
             good &= ellipse_support.measure_strength(edges, support) >= faintest
@@ -404,15 +401,17 @@ class ArcDetector:
             )
         return good
 
-    def _choose(self, fit: _Fit, score: np.ndarray, edges: Edges) -> list[FoundEllipse]:
+    def _choose(self, fit: CandidateFit, score: np.ndarray, edges: Edges) -> list[FoundEllipse]:
         """Return the candidates that share little support with better ones."""
+        # Points of a better ellipse are claimed: a second ellipse may not live on them.
         claimed = np.zeros(len(edges.points), bool)
         found: list[FoundEllipse] = []
+        # A stable order, so that equal scores give the same result everywhere.
         for k in np.argsort(-score, kind="stable"):
             own = fit.support[k][fit.support[k] >= 0]
             candidate = fit.candidates[k : k + 1]
             row = candidate.ellipses[0]
-            if claimed[own].mean() > SHARED or _is_other_side_of_line(row, found):
+            if claimed[own].mean() > SHARED or is_other_side_of_line(row, found):
                 continue
             claimed[own] = True
             # Twice as many places as pixels claim all edge points along the ellipse.
@@ -440,6 +439,7 @@ class ArcDetector:
     def _is_sized(self, ellipses: np.ndarray, limits: SizePrior, slack: float) -> np.ndarray:
         """Find ellipses of a possible size and flatness, `(C,)`."""
         a, b = ellipses[:, 2], ellipses[:, 3]
+        # A failed fit is NaN, compares false and is left out.
         with np.errstate(invalid="ignore"):
             return (
                 (a * slack >= limits.lowest_px)
@@ -462,6 +462,7 @@ class ArcDetector:
         steps = np.linspace(0, 1, 9) * (spans[:, 1:] - 1 - spans[:, :1])
         places = edges.points[(spans[:, :1] + steps).astype(int)]
         extent = np.ptp(places, axis=1)
+        # An ellipse of semi-axis `a` is at most 2 a long; 10 % allow for the error of the prior.
         fits = extent.max(1) <= 2.2 * limits.highest_px
         return spans[fits & (np.hypot(*extent.T) >= 0.5 * limits.lowest_px)]
 
@@ -471,30 +472,6 @@ class ArcDetector:
     def _limit_reach(self, size_px: np.ndarray | float) -> np.ndarray:
         """Return the reach of ellipses of a geometric mean semi-axis, px."""
         least_px = self.settings.reach_px
+        # Proportional to the size, since rims deviate by a share of it; bounded against other
+        # edges.
         return np.clip(REACH_RELATIVE * size_px, least_px, 4.0 * least_px)
-
-
-def _measure_wholeness(coverage: np.ndarray) -> np.ndarray:
-    """Return 1 at full coverage, falling to 0 at one half.
-
-    A part of an ellipse must fit better than a whole one: the lobe of a heart nearly fits.
-    """
-    return np.clip(2 * coverage - 1, 0.0, 1.0)
-
-
-def _is_centre_inside(ellipses: np.ndarray, edges: Edges) -> np.ndarray:
-    """Find ellipses with their centre in the picture, `(C,)`."""
-    height, width = edges.nearest.shape
-    x, y = ellipses[:, 0], ellipses[:, 1]
-    return (x >= 0) & (y >= 0) & (x < width) & (y < height)
-
-
-def _is_other_side_of_line(row: np.ndarray, others: list[FoundEllipse]) -> bool:
-    """Return whether an ellipse and one of the others are the two edges of a thin line."""
-    for other in others:
-        apart = np.abs(other.row - row)
-        areas = row[2] * row[3], other.row[2] * other.row[3]
-        is_near = apart[:2].max() < 0.5 * STROKE_PX and apart[2:4].max() < STROKE_PX
-        if is_near and min(areas) > SAME_AREA * max(areas):
-            return True
-    return False

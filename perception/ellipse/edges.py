@@ -64,10 +64,12 @@ class Edges:
         step = np.zeros(len(self.points))
         # Over four points, since single ones scatter.
         step[2:-2] = np.linalg.norm(self.points[4:] - self.points[:-4], axis=1) / 4
+        # At most 1.5 px a step: a jump between two chains is no way.
         way = np.cumsum(np.minimum(step, 1.5))
         run = np.full(len(self.points), -1)
         for number, (start, stop) in enumerate(runs.tolist()):
             run[start:stop] = number
+        # The blurred end of a run belongs to the edge that it meets.
         length = way[runs[:, 1] - 1] - way[runs[:, 0]] - END_PX
         # The point at which a closed line begins is no corner: both its runs are one.
         for start, stop in self._find_closed_spans().tolist():
@@ -88,8 +90,10 @@ class Edges:
 
     def _find_closed_spans(self) -> np.ndarray:
         """Return the spans that end where they begin, without a corner there, `(S, 2)`."""
+        # Too short a line has no two ends to compare.
         start, stop = self.spans[self.spans[:, 1] - self.spans[:, 0] > 4 * CLOSE].T
         near = np.linalg.norm(self.points[start] - self.points[stop - 1], axis=1) < 3
+        # A cosine of 0.8 allows a turn of 37 degrees. Chosen by hand; not searched.
         smooth = (self.directions[start + CLOSE] * self.directions[stop - 1 - CLOSE]).sum(1) > 0.8
         return np.column_stack([start, stop])[near & smooth]
 
@@ -121,33 +125,39 @@ def detect_edges(
         near_px: Largest distance at which `Edges.nearest` names an edge point.
     """
     smooth = cv2.GaussianBlur(gray.astype(np.float32), (0, 0), sigma_px)
-    gx, gy = (cv2.Sobel(smooth, cv2.CV_32F, dx, 1 - dx, ksize=3, scale=0.125) for dx in (1, 0))
+    gx = cv2.Sobel(smooth, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)
+    gy = cv2.Sobel(smooth, cv2.CV_32F, 0, 1, ksize=3, scale=0.125)
     magnitude = cv2.magnitude(gx, gy)
+    # A subsample of a regular grid gives the same quantiles at a fraction of the time.
     some = np.s_[::2, ::2] if magnitude.size < MANY else np.s_[::4, ::4]
     looked = magnitude[some].ravel() if roi is None else magnitude[some][roi[some]]
     if not looked.size:
         return _make_empty_edges(gray.shape)
     ranks = [round(part / 100.0 * (looked.size - 1)) for part in (50.0, percentile)]
     median, upper = np.partition(looked, ranks)[ranks]
+    # The median gradient is nearly all noise, since edges are rare.
     sigma = float(median) / RAYLEIGH_MEDIAN
     upper = max(float(upper), noise * sigma, 1.0)
+    # Below the lower threshold, chains of noise would connect edges.
     weak = max(low * upper, WEAK * sigma)
+    # Canny accepts own gradients as 16-bit integers only.
     whole = [cv2.addWeighted(g, SCALE, g, 0.0, 0.0, dtype=cv2.CV_16S) for g in (gx, gy)]
     canny = cv2.Canny(whole[0], whole[1], weak * SCALE, max(upper, weak) * SCALE, L2gradient=True)
     if roi is not None:
         canny = cv2.bitwise_and(canny, canny, mask=roi.view(np.uint8))
+    # The border has no neighbours for sub-pixel places.
     canny[[0, -1]] = canny[:, [0, -1]] = 0
-    contours = [
-        c
-        for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]
-        if len(c) >= least
-    ]
+    contours = []
+    for c in cv2.findContours(canny, cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE)[0]:
+        if len(c) >= least:
+            contours.append(c)
     if not contours:
         return _make_empty_edges(gray.shape)
     pixels, spans = _chain_pixels(contours, gray.shape, least)
     if not len(pixels):
         return _make_empty_edges(gray.shape)
     points, directions = _refine_points(pixels, gx, gy, magnitude)
+    # Strength of the pixel, not of the refined place: ratios of it are compared only roughly.
     strength = magnitude[pixels[:, 1], pixels[:, 0]]
     return Edges(
         points, directions, strength, _map_nearest_edges(pixels, gray.shape, near_px), spans, NO_SPANS,
@@ -173,18 +183,20 @@ def _split_chains(
     spans = edges.spans[edges.spans[:, 1] - edges.spans[:, 0] >= least]
     if not len(spans):
         return NO_SPANS, NO_SPANS
+    # Sixteenths of a pixel: the polygon's algorithm needs integers and keeps sub-pixel places.
     fine = np.round(edges.points * 16).astype(np.int32)
-    polygons = [
-        cv2.approxPolyDP(fine[start:stop, None], tolerance_px * 16, False)[:, 0]
-        for start, stop in spans.tolist()
-    ]
+    polygons = []
+    for start, stop in spans.tolist():
+        polygons.append(cv2.approxPolyDP(fine[start:stop, None], tolerance_px * 16, False)[:, 0])
     owner = np.repeat(np.arange(len(spans)), [len(polygon) for polygon in polygons])
     corners = np.concatenate(polygons)
     steps = np.diff(corners / 16.0, axis=0)
+    # The signed turn at each corner, in (-pi, pi].
     turn = np.arctan2(
         steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0], (steps[:-1] * steps[1:]).sum(1)
     )
     size = np.linalg.norm(steps, axis=1)
+    # Corners of two different polygons are no turn.
     inner = owner[2:] == owner[:-2]
     # Half the turn of a circle at the ends of a chord of this length.
     half = 4 * tolerance_px / np.maximum(size, 1.0)
@@ -194,15 +206,19 @@ def _split_chains(
     cut_off &= np.abs(turn[1:] + turn[:-1]) > corner_rad + half[2:] + half[:-2]
     sharp[:-1] |= cut_off
     sharp[1:] |= cut_off
+    # A long straight side next to a short one is a line that runs into a curve.
     straight = (np.maximum(size[1:], size[:-1]) > LONG_PX) & (
         np.maximum(size[1:], size[:-1]) > LONG * np.minimum(size[1:], size[:-1])
     )
+    # A change of sign of the turn: the arc bends the other way.
     back = np.concatenate([[False], (turn[1:] * turn[:-1] < 0) & inner[1:] & inner[:-1]])
     found = []
     place = _locate_corners(fine, spans, corners, owner)
+    # Arcs end at bends too, runs only at corners.
     for cuts in ((sharp | back | straight) & inner, (sharp | straight) & inner):
         bounds = np.unique(np.concatenate([spans.ravel(), place[np.flatnonzero(cuts) + 1]]))
         pieces = np.column_stack([bounds[:-1], bounds[1:]])
+        # The span of each piece: a piece must not reach across two of them.
         within = np.searchsorted(spans[:, 0], pieces[:, 0], side="right") - 1
         found.append(
             pieces[(pieces[:, 1] <= spans[within, 1]) & (pieces[:, 1] - pieces[:, 0] >= least)]
@@ -217,6 +233,7 @@ def _locate_corners(
     member = np.concatenate([np.arange(start, stop) for start, stop in spans.tolist()])
     span = np.repeat(np.arange(len(spans)), spans[:, 1] - spans[:, 0])
 
+    # One integer for span and place, so that all corners are found by a single sorted search.
     def key(number: np.ndarray, points: np.ndarray) -> np.ndarray:
         return (
             (number.astype(np.int64) << 40)
@@ -238,6 +255,7 @@ def _chain_pixels(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndar
     and branches. An open line whose topmost pixel is no end comes in two halves, which are joined.
     """
     lengths = np.array([len(c) for c in contours])
+    # Longest contours first: a pixel of two contours belongs to the longer one.
     order = np.argsort(-lengths, kind="stable")
     pixels = np.concatenate([contours[i][:, 0] for i in order])
     contour = np.repeat(np.arange(len(contours)), lengths[order])
@@ -245,16 +263,19 @@ def _chain_pixels(contours: Sequence, shape: tuple, least: int) -> tuple[np.ndar
         np.unique(pixels[:, 1].astype(np.int64) * shape[1] + pixels[:, 0], return_index=True)[1]
     )
     pixels, contour = pixels[first], contour[first]
+    # Neighbouring pixels differ by one at most; a larger step is a break.
     step = np.abs(np.diff(pixels.astype(int), axis=0)).max(1)
     cut = np.flatnonzero((step > 1) | (np.diff(contour) != 0)) + 1
     bounds = np.concatenate([[0], cut, [len(pixels)]])
     pieces = np.column_stack([bounds[:-1], bounds[1:]])
     pieces = pieces[pieces[:, 1] > pieces[:, 0]]
     start, following = pieces[:-1, 0], pieces[1:, 0]
+    # Both halves begin at the same pixel, and the first is turned round.
     halves = (contour[start] == contour[following]) & (
         np.abs(pixels[start].astype(int) - pixels[following]).max(1) <= 1
     )
     halves &= pieces[:-1, 1] - start > 1
+    # A piece is joined once at most.
     halves[1:] &= ~halves[:-1]
     place = np.arange(len(pixels))
     for begin, end in pieces[:-1][halves].tolist():
@@ -280,10 +301,13 @@ def _refine_points(
     x, y = pixels[:, 0], pixels[:, 1]
     here = np.maximum(magnitude[y, x], 1e-6)
     direction = np.column_stack([gx[y, x], gy[y, x]]) / here[:, None]
-    before, after = (_interpolate(magnitude, pixels + side * direction) for side in (-1.0, 1.0))
+    # A parabola needs a sample on each side of the maximum.
+    before = _interpolate(magnitude, pixels - direction)
+    after = _interpolate(magnitude, pixels + direction)
     bend = before - 2 * here + after
     with np.errstate(invalid="ignore", divide="ignore"):
         shift = np.where(bend < 0, 0.5 * (before - after) / bend, 0.0)
+    # Three quarters of a pixel: farther away the pixel beside it is the maximum.
     return pixels + np.clip(shift, -0.75, 0.75)[:, None] * direction, direction
 
 
@@ -293,12 +317,14 @@ def _map_nearest_edges(pixels: np.ndarray, shape: tuple, near_px: int) -> np.nda
     Each edge pixel writes its number around itself, the farthest place first. This costs less than
     a distance transform of the whole picture.
     """
+    # A margin of `near_px` spares the test for the border in the inner loop.
     height, width = shape[0] + 2 * near_px, shape[1] + 2 * near_px
     number = np.full(height * width, -1, np.int32)
     down, across = np.mgrid[-near_px : near_px + 1, -near_px : near_px + 1].reshape(2, -1)
     away = down**2 + across**2
     place = (pixels[:, 1].astype(np.intp) + near_px) * width + pixels[:, 0] + near_px
     mine = np.arange(len(pixels), dtype=np.int32)
+    # Nearest last: it overwrites the farther ones.
     for k in np.argsort(-away, kind="stable")[np.count_nonzero(away > near_px**2) :].tolist():
         number[place + (down[k] * width + across[k])] = mine
     return np.ascontiguousarray(number.reshape(height, width)[near_px:-near_px, near_px:-near_px])
@@ -307,11 +333,10 @@ def _map_nearest_edges(pixels: np.ndarray, shape: tuple, near_px: int) -> np.nda
 def _interpolate(picture: np.ndarray, points: np.ndarray) -> np.ndarray:
     """Return the picture at `(E, 2)` points away from its border, bilinear."""
     height, width = picture.shape
-    x0, y0 = (
-        np.floor(points[:, k]).astype(np.intp).clip(0, size - 2)
-        for k, size in ((0, width), (1, height))
-    )
+    x0 = np.floor(points[:, 0]).astype(np.intp).clip(0, width - 2)
+    y0 = np.floor(points[:, 1]).astype(np.intp).clip(0, height - 2)
     fx, fy = points[:, 0] - x0, points[:, 1] - y0
+    # Flat indices: one gather is faster than two-dimensional indexing.
     flat, here = picture.ravel(), y0 * width + x0
     top = flat.take(here) * (1 - fx) + flat.take(here + 1) * fx
     bottom = flat.take(here + width) * (1 - fx) + flat.take(here + width + 1) * fx
@@ -363,8 +388,10 @@ def group_arcs(arcs: np.ndarray, edges: Edges, numbers: Sequence[int]) -> list[n
     for number in numbers:
         groups = np.flatnonzero(following >= 0)[:, None]
         for _ in range(number - 1):
+            # Only arcs with a successor can continue a group.
             groups = groups[following[groups[:, -1]] >= 0]
             groups = np.column_stack([groups, following[groups[:, -1]]])
+        # Sorted, so that the same group found from two beginnings is one.
         groups = np.sort(groups, 1)
         groups = groups[(groups[:, 1:] > groups[:, :-1]).all(1)]
         key = groups @ (len(arcs) ** np.arange(number)[::-1])
@@ -378,6 +405,7 @@ def split_arcs(arcs: np.ndarray, least: int) -> np.ndarray:
     The ends of an arc may belong to something else.
     """
     start, length = arcs[:, 0], arcs[:, 1] - arcs[:, 0]
+    # Not shorter than an arc may be.
     part = np.maximum((PIECE * length).astype(int), least)
     is_long = length > part + 2
     start, part, left = start[is_long], part[is_long], (length - part)[is_long]
@@ -390,6 +418,7 @@ def split_arcs(arcs: np.ndarray, least: int) -> np.ndarray:
 def select_seed_points(groups: np.ndarray) -> np.ndarray:
     """Return evenly spread points of each group of spans `(C, G, 2)`, `(C, NUM_SEEDS)`."""
     ends = np.cumsum(groups[..., 1] - groups[..., 0], 1)
+    # Middles of equal stretches, so that no seed lies on an end.
     place = (np.arange(NUM_SEEDS) + 0.5) / NUM_SEEDS * ends[:, -1:]
     number = (place[..., None] >= ends[:, None]).sum(-1)
     rows = np.arange(len(groups))[:, None]
@@ -399,6 +428,7 @@ def select_seed_points(groups: np.ndarray) -> np.ndarray:
 
 def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     """Return the number of the best successor of each arc, `(A,)`, -1 for none."""
+    # A quarter of a short arc at most: it must keep its middle.
     inset = np.minimum(INSET, (arcs[:, 1] - arcs[:, 0]) // 4)
     first, last, middle = arcs[:, 0] + inset, arcs[:, 1] - 1 - inset, arcs.sum(1) // 2
     start, stop = edges.points[first], edges.points[last]
@@ -409,13 +439,16 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     start, stop = np.where(turned[:, None], stop, start), np.where(turned[:, None], start, stop)
     polarity = np.sign((edges.directions[middle] * towards).sum(1))
     depth, width = np.linalg.norm(towards, axis=1), np.linalg.norm(chord, axis=1)
+    # Curvature of the circle through chord and sagitta.
     bend = 8 * depth / np.maximum(width**2 + 4 * depth**2, 1e-9)
-    head, tail = (_compute_tangents(edges, place, polarity) for place in (first, last))
+    head = _compute_tangents(edges, first, polarity)
+    tail = _compute_tangents(edges, last, polarity)
     head, tail = np.where(turned[:, None], tail, head), np.where(turned[:, None], head, tail)
     usable = np.flatnonzero((depth > STRAIGHT_PX) & (width > 2))
     result = np.full(len(arcs), -1)
     if len(usable) < 2:
         return result
+    # Only near neighbours can follow: comparing all pairs would take the square of their number.
     near = KDTree(start[usable]).query(stop[usable], k=min(NEAREST, len(usable)))[1]
     other = usable[near]
     gap = start[other] - stop[usable][:, None]
@@ -424,6 +457,7 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     arriving = _measure_turn(gap, head[other])
     total = leaving + arriving
     mean_bend = (bend[usable][:, None] + bend[other]) / 2
+    # Ratios of curvature, as a circle seen obliquely bends unevenly.
     ratio = np.maximum(bend[usable][:, None], bend[other]) / np.maximum(
         np.minimum(bend[usable][:, None], bend[other]), 1e-9
     )
@@ -439,6 +473,7 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
     )
     good &= (leaving > BACKWARD_RAD) & (arriving > BACKWARD_RAD)
     good &= (total < TOTAL_RAD) & (strength < BEND_LOG)
+    # A weighted sum of the misfits. Weights chosen by hand; not searched.
     cost = np.where(good, uneven + 0.5 * strength + 0.2 * np.log(ratio), np.inf)
     best = np.argmin(cost, 1)
     rows = np.arange(len(usable))
@@ -448,6 +483,7 @@ def _find_successors(arcs: np.ndarray, edges: Edges) -> np.ndarray:
 
 def _compute_tangents(edges: Edges, place: np.ndarray, polarity: np.ndarray) -> np.ndarray:
     """Return the direction of each arc at a point, with its inside on the right hand, `(A, 2)`."""
+    # Over three points, since single gradients scatter.
     near = np.clip(place[:, None] + np.array([-1, 0, 1]), 0, len(edges.directions) - 1)
     inward = edges.directions[near].sum(1) * polarity[:, None]
     return np.column_stack([inward[:, 1], -inward[:, 0]])

@@ -58,6 +58,7 @@ def gather_support(
     off = conic.sum_products(apart, outward)
     along = conic.sum_products(edges.directions[found], outward) * candidates.polarity[:, None]
     side = np.abs(apart[..., 0] * outward[..., 1] - apart[..., 1] * outward[..., 0])
+    # The nearest edge point may lie far along the ellipse; it then belongs to another place.
     good = (np.abs(off) < reach_px[:, None]) & (side < 2.0)
     good &= along > np.cos(angle_rad)
     return np.where(good, found, -1), off, along
@@ -78,6 +79,7 @@ def measure_purity(edges: Edges, support: np.ndarray, length: np.ndarray) -> np.
     run = np.where(there, edges.run[support], -1)
     known = run >= 0
     ds = length * (2 * np.pi / support.shape[1])
+    # One key for ellipse and run, so that all are summed in one pass.
     key = np.arange(len(support))[:, None] * (len(edges.run_length) + 1) + run + 1
     _, number, inverse = np.unique(key[known], return_index=True, return_inverse=True)
     whole = edges.run_length[run[known]][number]
@@ -103,6 +105,7 @@ def measure_waviness(
         conic.sum_products(outward, bright),
     )
     known = _sum_windows(there)
+    # Windows with few points average too little noise away.
     enough = known >= 0.6 * WINDOW
     return tuple(
         np.sqrt(
@@ -125,6 +128,7 @@ def _sum_windows(values: np.ndarray) -> np.ndarray:
 def measure_largest_gap(there: np.ndarray, length: np.ndarray) -> np.ndarray:
     """Return the longest stretch without support, as a part of the circumference, `(C,)`."""
     twice = np.concatenate([there, there], 1)  # around twice: a stretch may run over the end
+    # Length along the ellipse, since equal angles are unequal stretches on a flat one.
     way = np.cumsum(np.concatenate([length, length], 1), 1)
     seen = np.maximum.accumulate(np.where(twice, way, 0.0), 1)
     return np.minimum((way - seen).max(1, initial=0.0) / length.sum(1), 1.0)
@@ -134,6 +138,7 @@ def estimate_spread(values: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Return a robust standard deviation of each row of `(C, P)`, from its smallest 70 %."""
     ordered = np.sort(np.where(there, values, np.inf), 1)
     place = np.maximum((0.7 * there.sum(1)).astype(int) - 1, 0)
+    # 1.036 is the 70 % quantile of the absolute values of a standard normal distribution.
     return ordered[np.arange(len(values)), place] / 1.036
 
 
@@ -144,6 +149,8 @@ def compute_evidence(
 
     Chernoff's bound on the chance that so many random gradients point along the normal.
     """
+    # The half-width of the angles that count, as a share of all directions; at least 0.1 rad, so
+    # that a perfect fit is no proof.
     chance = np.clip(2.0 * angle_rms_rad, 0.1, angle_rad) / np.pi
     with np.errstate(divide="ignore", invalid="ignore"):
         absent = np.where(
@@ -151,6 +158,7 @@ def compute_evidence(
         )
         return np.where(
             coverage > chance,
+            # Half of the pixels: neighbours are blurred together and no independent evidence.
             (coverage * np.log10(coverage / chance) + absent) * perimeter_px / 2,
             0.0,
         )
@@ -201,6 +209,7 @@ def find_smooth_continuations(
         hidden = _find_occluding_edges(
             candidates.ellipses[row], edges, support[row, end], support[row, other]
         )
+        # Back beyond the corner, where the blur has already turned the edge.
         back = (end - side * np.ceil(BACK_PX / ds[row, end]).astype(int)) % NUM_SAMPLES
         start = np.where(support[row, back] >= 0, back, end)
         e = candidates.ellipses[row]
@@ -209,7 +218,9 @@ def find_smooth_continuations(
         ]
         onward = side * np.column_stack([-outward[:, 1], outward[:, 0]])
         size = np.sqrt(e[:, 2] * e[:, 3])
+        # Limits of 6 and 16 px. Chosen by hand; not searched.
         reach = np.clip(0.35 * size, 6.0, 16.0) + BACK_PX
+        # Curvature of the ellipse at the end of the arc.
         bend = size**2 / length[row, end] ** 3
         goes_on = _follow_edges(edges, support[row, start], onward, reach, bend)
         result[row[goes_on & ~hidden]] = True
@@ -233,13 +244,17 @@ def find_inward_outlines(
             edges, last, side * np.column_stack([-outward[:, 1], outward[:, 0]])
         )
         off = conic.measure_sampson_distance(e, edges.points[number])[0]
+        # The median of the first points is the edge's own strength, before it leaves.
         usual = np.median(edges.strength[number[:, : BACK // 2]], axis=1)
         known &= (usual > whole[row] / ALIKE)[:, None]
+        # Logarithms make "twice as strong" and "half as strong" equal.
         alike = np.abs(np.log(edges.strength[number] / usual[:, None])) < np.log(SAME)
         way = np.gradient(edges.points[number], axis=1)
         bright = edges.directions[number]
+        # Sign of the bright side along the way: it changes where another edge is entered.
         hand = way[..., 0] * bright[..., 1] - way[..., 1] * bright[..., 0]
         known &= alike & (hand * hand[:, :1] > 0)
+        # Once within, remembered for the rest of the way.
         within = np.maximum.accumulate(known & (off < -DIP_PX), axis=1)
         result[row[(within & known & (off > CHORD_PX)).any(1)]] = True
     return result
@@ -259,6 +274,7 @@ def _trace_outlines(
         np.linalg.norm(edges.points[span[:, 0]] - edges.points[span[:, 1] - 1], axis=1) < CLOSED_PX
     )
     back = span[:, 0] + (last - span[:, 0] - BACK) % number[:, 0]
+    # The outline may run either way along its chain.
     forward = np.where(((edges.points[last] - edges.points[back]) * onward).sum(1) > 0, 1, -1)
     place = (last - span[:, 0])[:, None] + forward[:, None] * np.arange(-BACK, AHEAD)[None]
     known = closed[:, None] | ((place >= 0) & (place < number))
@@ -287,10 +303,13 @@ def _find_open_ends(
     Before and after are meant by increasing angle for `side` 1, by decreasing angle for -1.
     """
     there = support >= 0
+    # A place with support whose next one has none.
     row, end = np.nonzero(there & ~np.roll(there, -side, 1))
     ahead = (end[:, None] + side * np.arange(1, NUM_SAMPLES)) % NUM_SAMPLES
+    # Stops counting at the first place with support.
     free = np.cumprod(~there[row[:, None], ahead], axis=1)
     wide = (free * length[row[:, None], ahead]).sum(1) > OPEN * length.sum(1)[row]
+    # The first supported place behind the gap.
     return row[wide], end[wide], (end + side * (1 + free.sum(1)))[wide] % NUM_SAMPLES
 
 
@@ -308,6 +327,7 @@ def _find_occluding_edges(
         one: Number of the first edge point, `(M,)`.
         other: Number of the second one, `(M,)`.
     """
+    # The weaker of the two ends: the occluder must be fainter than both.
     usual = np.minimum(edges.strength[one], edges.strength[other])
     one, other = edges.points[one], edges.points[other]
     chord = other - one
@@ -318,12 +338,12 @@ def _find_occluding_edges(
     off = conic.sum_products(edges.points[number] - places, normal)
     near = (number >= 0) & (np.abs(off) < CHORD_PX)
     near &= np.abs(conic.sum_products(edges.directions[number], normal)) > CHORD_COSINE
+    # Positive inside the ellipse.
     deep = -conic.measure_sampson_distance(ellipses, edges.points[number])[0]
     near &= deep > CHORD_PX  # nearer it may be the ellipse's own edge
-    middle, ends = (
-        (off * near)[:, part].sum(1) / np.maximum(near[:, part].sum(1), 1)
-        for part in (np.s_[2:-2], np.array([0, 1, -2, -1]))
-    )
+    inner, outer = np.s_[2:-2], np.array([0, 1, -2, -1])
+    middle = (off * near)[:, inner].sum(1) / np.maximum(near[:, inner].sum(1), 1)
+    ends = (off * near)[:, outer].sum(1) / np.maximum(near[:, outer].sum(1), 1)
     near &= edges.strength[number] < usual[:, None] / ALIKE
     return (
         (near.mean(1) >= CHORD_PART)
@@ -352,6 +372,7 @@ def _follow_edges(
     seen, alive = [first], np.ones(len(start), bool)
     strength = np.zeros(len(start))
     for step in range(int(np.ceil(reach_px.max(initial=0.0) / STRIDE_PX))):
+        # One stride ahead, then to the nearest edge there.
         onto = place + STRIDE_PX * along
         number = edges.at(onto)
         came, place, bright = (
@@ -362,6 +383,7 @@ def _follow_edges(
         along = np.column_stack([bright[:, 1], -bright[:, 0]]) * hand[:, None]
         needed = step * STRIDE_PX < reach_px
         near = (np.linalg.norm(place - onto, axis=1) < NEAR_PX) & (came > LEAST_PX)
+        # The direction some strides ago: a corner is a turn over a length, not at a point.
         earlier = seen[max(0, len(seen) - round(KINK_PX / STRIDE_PX))]
         turn = np.arccos(np.clip(conic.sum_products(bright, earlier), -1.0, 1.0))
         alive &= ~needed | (near & (turn < KINK_PX * bend + KINK_RAD))

@@ -81,6 +81,7 @@ class BoardTracker:
             FrameError: too few are seen.
         """
         found, numbers = self._detect(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))[:2]
+        # OpenCV gives one array for each marker, or one for all corners.
         count = 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
         if count < self._min_corners:
             raise FrameError(
@@ -98,6 +99,7 @@ class BoardTracker:
         """
         corners_m, corners_px = self.find_corners(frame)
         matrix, distortion = np.asarray(frame.camera_matrix, float), frame.distortion
+        # SQPNP needs no start and finds the global optimum.
         done, turn, shift = cv2.solvePnP(
             corners_m, corners_px, matrix, distortion, flags=cv2.SOLVEPNP_SQPNP
         )
@@ -113,6 +115,7 @@ class BoardTracker:
             )
         rotation = np.asarray(cv2.Rodrigues(turn)[0])
         pose = np.eye(4)
+        # OpenCV gives the board in the camera; the inverse is wanted.
         pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ np.ravel(shift)
         return CameraPose(pose, error_px)
 
@@ -205,6 +208,7 @@ class TagGrid:
         markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         board = cv2.aruco.GridBoard((self.columns, self.rows), self.marker_m, self.gap_m, markers)
         parameters = cv2.aruco.DetectorParameters()
+        # Corners of tags are found to the pixel only, unless refined.
         parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
         detect = cv2.aruco.ArucoDetector(markers, parameters).detectMarkers
         return BoardTracker(board, detect, self.min_corners, self.max_error_px)
@@ -260,5 +264,6 @@ def _is_pose(pose: np.ndarray) -> bool:
     if pose.shape != (4, 4) or not np.allclose(pose[3], [0, 0, 0, 1]):
         return False
     rotation = pose[:3, :3]
+    # Rounded matrices pass; a reflection has determinant -1 and does not.
     is_orthonormal = np.allclose(rotation @ rotation.T, np.eye(3), atol=ROTATION_TOLERANCE)
     return bool(is_orthonormal and np.linalg.det(rotation) > 0)

@@ -117,7 +117,7 @@ class CuboidView:
     """A cuboid as a camera sees it; all `(h, w)`.
 
     Attributes:
-        depth_m: Depth along z of what is seen of it, infinite beside it.
+        depth_m: Depth along z of its visible part, infinite beside it.
         face: Number of the face that is seen (`FACES`), -1 beside it.
         mouth: Where a mouth is seen, bool.
     """

@@ -313,7 +313,7 @@ def _build_truth(
 def _draw_overlay(
     cuboid: Cuboid, frame: Frame, pose: np.ndarray, found: FrameLabel, good: bool
 ) -> np.ndarray:
-    """Return the frame with block, mouths and what hides them in colour, and the block's edges."""
+    """Return the frame with block, mouths and their occluders in colour, and the block's edges."""
     picture = frame.color.astype(np.float32)
     for mask, colour in ((found.block, GREEN), (found.arm, ORANGE), (found.hole_mask, RED)):
         picture[mask] = 0.6 * picture[mask] + 0.4 * np.array(colour, np.float32)

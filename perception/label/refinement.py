@@ -354,7 +354,10 @@ def _select_depths(
     for number, (axis, side) in enumerate(FACES):
         bound = (cuboid.high_m if side > 0 else cuboid.low_m)[axis]
         away = np.abs(points[:, axis] - bound)
-        others = [k for k in range(3) if k != axis]
+        others = []
+        for k in range(3):
+            if k != axis:
+                others.append(k)
         room = np.minimum(points - cuboid.low_m, cuboid.high_m - points)[:, others].min(1)
         on_face = (away < nearest) & (room > slack) & (side * (eye[axis] - bound) > 0)
         face[on_face], nearest[on_face] = number, away[on_face]

@@ -44,7 +44,7 @@ class Calibrate:
             Standard deviation of a point at the working distance, by the calibration alone, m.
 
         Raises:
-            FrameError: the recorded data do not determine the camera; names what is missing.
+            FrameError: the recorded data do not determine the camera; the message names the lack.
             ConfigError, RecordingError: an input cannot be read.
             StorageError: the file cannot be written.
         """

@@ -46,10 +46,8 @@ def _show(result: dict[str, Any]) -> None:
     for name in ("frame", "board [px]", "outline [px]", "depth agrees", "left out because"):
         table.add_column(name, justify="left" if name in ("frame", "left out because") else "right")
     for name, entry in result["frames"].items():
-        board, outline = (
-            f"{entry[key]:.2f}" if entry[key] is not None else "–"
-            for key in ("board_px", "outline_px")
-        )
+        board = f"{entry['board_px']:.2f}" if entry["board_px"] is not None else "–"
+        outline = f"{entry['outline_px']:.2f}" if entry["outline_px"] is not None else "–"
         share = "–" if entry["depth_share"] is None else f"{entry['depth_share']:.0%}"
         table.add_row(name, board, outline, share, entry["left_out"] or "")
     Console().print(table)

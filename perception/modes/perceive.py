@@ -134,6 +134,7 @@ class Perceive:
             StorageError: a file could not be written.
         """
         finder = self.perception.build()
+        # Refused before the first frame is read.
         if self.perceive.until == "ellipses":
             results = self._list_ellipses(_require_whole_picture_finder(finder))
         else:
@@ -144,12 +145,15 @@ class Perceive:
             for entry, frame in results:
                 entries.append(entry)
                 if frame is not None and entry.found is not None and self.perceive.pictures:
+                    # Only now: a run without a usable frame leaves no folder.
                     (folder / "overlays").mkdir(exist_ok=True)
                     path = folder / "overlays" / f"{entry.name}.png"
                     self.overlay.write(path, frame, entry.found)
+        # Also after an interruption: found holes are not lost.
         finally:
             if any(entry.found for entry in entries):
                 self._write(folder, entries, finder)
+        # One refused frame is a warning, only refused frames are an error.
         if entries and not any(entry.found for entry in entries):
             raise FrameError(
                 f"none of {len(entries)} frames can be used. The first: {entries[0].refused}"
@@ -171,6 +175,7 @@ class Perceive:
                 log.warning("%s", error)
                 yield FrameEntry(name, None, None, str(error)), frame
                 continue
+            # Holes of a refused frame are unknown, not absent: the tracker is not told.
             target = _choose_target(tracker.update(found.holes, frame.t_s), frame.t_s)
             yield FrameEntry(name, found, target, None), frame
 
@@ -192,6 +197,7 @@ class Perceive:
     ) -> Iterator[tuple[str, Frame | None, str | None]]:
         """Yield name, frame and, in place of a frame that cannot be used, the reason."""
         with source_spec.build() as source, Progress(transient=True) as progress:
+            # A live source has no number of frames.
             counts = [source.num_frames, self.perceive.frames]
             total = min((count for count in counts if count is not None), default=None)
             task = progress.add_task("looking", total=total)
@@ -225,7 +231,10 @@ class Perceive:
 
     def _show(self, entries: list[FrameEntry]) -> None:
         """Print a table of counts, refusals, the target and the durations."""
-        used = [entry.found for entry in entries if entry.found]
+        used = []
+        for entry in entries:
+            if entry.found:
+                used.append(entry.found)
         table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
         table.add_row("frames", f"{len(used)} used, {len(entries) - len(used)} refused")
         if self.perceive.until == "ellipses":

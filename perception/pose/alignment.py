@@ -70,6 +70,7 @@ class StereoPatch:
 
     def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return columns `(1, w)` and rows `(h, 1)` of the picture for those of `left`."""
+        # Pixel centres: a shrunk pixel covers `shrink` pixels, and its centre lies between them.
         u, v = (
             (some + 0.5) * self.shrink - 0.5 + corner
             for some, corner in zip((columns, rows), self.corner, strict=True)
@@ -102,6 +103,7 @@ class StereoPatch:
     def inside(self, u: np.ndarray, v: np.ndarray, m: np.ndarray) -> np.ndarray:
         """Find points of a plane that the right picture shows too, with room for its gradient."""
         x = self.on_plane(u, v, m)
+        # Cubic interpolation and the gradient need three pixels on each side.
         return (x > 3) & (x < self.right.shape[1] - 4)
 
 
@@ -113,15 +115,20 @@ def crop_pair(
         return None
     height, width = gray.shape
     x, y, reach = ellipse[0], ellipse[1], ellipse[2] * outer
+    # The picture ends where it ends: the ellipse may reach beyond it.
     left, right = max(0, int(x - reach)), min(width, int(x + reach) + 2)
     top, bottom = max(0, int(y - reach)), min(height, int(y + reach) + 2)
+    # 16 px: less has no room for the window of the means. Chosen by hand; not searched.
     if right - left < 16 or bottom - top < 16:
         return None
+    # Rounded up: the part is then at most `WIDE_PX` wide.
     shrink = max(1, -(-(right - left) // WIDE_PX))
     pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
+    # The corners bound the disparity, since inverse depth is linear on a plane.
     shift = pull_px * compute_inverse_depth(
         m, frame.camera_matrix, np.array([[left, right]]), np.array([[top], [bottom]])
     )
+    # 8 px of room: the plane from depth may be off by a pixel, and interpolation needs some more.
     first = max(0, int(left - shift.max()) - 8 * shrink)
     last = min(width, int(right - shift.min()) + 8 * shrink)
     rows, columns = (bottom - top) // shrink, (right - left) // shrink
@@ -135,6 +142,7 @@ def crop_pair(
         cv2.COLOR_RGB2GRAY,
     )
     mine = gray[top : top + rows * shrink, left : left + columns * shrink]
+    # Area interpolation keeps the sub-pixel position of edges; nearest pixels would shift them.
     small = [cv2.resize(picture, (size, rows), interpolation=cv2.INTER_AREA) if shrink > 1 else picture
              for picture, size in ((mine, columns), (partner, others))]  # fmt: skip
     one, other = (
@@ -174,6 +182,7 @@ def align_plane(
         bias_per_m: Standard deviation of inverse depth that `face` may be off as a whole, 1/m.
     """
     height, width = both.left.shape
+    # Rows are left out and columns kept: disparity is read along rows.
     stride = max(1, round(height * width / MOST))
     lines = np.arange(0, height, stride)
     u, v = both.places(np.arange(width), lines)
@@ -183,17 +192,23 @@ def align_plane(
     )
     depth = frame.depth_m[pixel]
     radii = conic.measure_radii(ellipse, u, v)
+    # Unknown depth is NaN and compares false, which leaves those pixels out.
     with np.errstate(invalid="ignore"):
+        # In inverse depth the noise of a matcher is the same at all distances.
         off = np.abs(1.0 / depth - face.inverse_depth(both.camera_matrix, u, v))
         on = allowed[pixel] & (off < 3.0 * face.sigma) & (radii > inner) & (radii < face.extent)
         other = (off > 8.0 * face.sigma).astype(np.uint8)
+    # Single far pixels are matching errors; an occluder is wider. With rows left out, three rows
+    # would be many.
     other = cv2.morphologyEx(other, cv2.MORPH_OPEN, np.ones((1 if stride > 1 else 3, 3), np.uint8))
     margin = np.ones((2 * round(MARGIN_PX / stride) + 1, 2 * MARGIN_PX + 1), np.uint8)
     on &= (
+        # Margins are wide, since a single edge of an occluder outweighs many pixels of grain.
         (cv2.dilate(np.asarray(other), margin) == 0)
         & both.inside(u, v, face.m)
         & (both.left[::stride] < SATURATED)
     )
+    # Closed first, so that single missing pixels are no borders.
     whole = cv2.morphologyEx(on.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 5), np.uint8))
     on &= (
         cv2.erode(whole, np.ones((2 * round(BORDER_PX / stride) + 1, 2 * BORDER_PX + 1), np.uint8))
@@ -204,6 +219,7 @@ def align_plane(
         return face
     weight = on.astype(np.float32)
     window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
+    # Not zero: windows without a pixel of the face divide by it.
     counted = np.maximum(cv2.boxFilter(weight, -1, window), 1e-3)
     weight, counted = weight[..., None], counted[..., None]
 
@@ -212,39 +228,48 @@ def align_plane(
         departs = values - cv2.boxFilter(values * weight, -1, window) / counted
         return departs.reshape(-1, 2)[at].T.astype(float)
 
-    left, right = (
-        cv2.merge([picture, cv2.Sobel(picture, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
-        for picture in (both.left, both.right)
-    )
+    # Grey value and its gradient share one filter pass.
+    left = cv2.merge([both.left, cv2.Sobel(both.left, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
+    right = cv2.merge([both.right, cv2.Sobel(both.right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
     mine, instrument = departing(left[::stride])
     row = np.repeat(lines.astype(np.float32)[:, None], width, 1)
     line, column = np.divmod(at, width)
     u_on, v_on = u[0, column], v[line, 0]
     ray = np.linalg.inv(both.camera_matrix) @ np.stack([u_on, v_on, np.ones(len(at))])
     m, seen = face.m, mine
+    # Gauss-Newton steps with the warped picture: the plane changes, so the picture is warped
+    # anew.
     for _ in range(ROUNDS):
         seen, rise = departing(both.seen(u, v, row, m, right))
-        push, heavy = (
-            np.vstack([ray * (-both.pull_px / both.shrink * slope), -mine])
-            for slope in (rise, instrument)
-        )
+        push = np.vstack([ray * (-both.pull_px / both.shrink * rise), -mine])
+        heavy = np.vstack([ray * (-both.pull_px / both.shrink * instrument), -mine])
+        # Exposure may differ between the cameras by a factor.
         gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
         off = seen - gain * mine
+        # The median is robust to occluders that depth did not show; 1e-6 guards a noiseless
+        # picture.
         scale = 1.4826 * compute_upper_median(np.abs(off)) + 1e-6
+        # Tukey's weights (95 % efficiency for normal errors) leave gross errors out altogether.
         heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
+        # The last unknown is the gain, which only has to be estimated along.
         step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
         m = m - step
+        # The largest shift on the face decides: a tilt moves its border most.
         if both.pull_px * np.abs(step @ ray).max() < SETTLED_PX:
             break
     likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
+    # Pictures of different scenes correlate little, whatever the plane.
     if likeness < ALIKE:
         return None
+    # A step beyond the uncertainty of depth follows another surface, or a repeated pattern.
     moved_px = both.pull_px * np.abs((m - face.m) @ ray).max()
     if (
         not np.isfinite(m).all()
         or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px
     ):
         return face
+    # Pixels of one cell share their error; a cell's number joins its row and column, which stay
+    # below 10,000.
     cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
     slopes = (push[:3] * compute_psi_slope(off / (TUKEY * scale))).T
     cov = estimate_sandwich_covariance(slopes, heavy[:3].T, off, number_cells(cell))
@@ -253,6 +278,7 @@ def align_plane(
 
 def merge_planes(first: FacePlane, second: FacePlane, bias_per_m: float) -> FacePlane:
     """Return the mean of two planes, weighted by their covariances; the first one may have a bias."""
+    # A bias of a matcher shifts the whole face, so it enters the constant term alone.
     doubt = first.cov + np.diag([0.0, 0.0, bias_per_m**2])
     weights = [np.linalg.inv(cov) for cov in (doubt, second.cov)]
     cov = np.linalg.inv(weights[0] + weights[1])
@@ -288,6 +314,7 @@ def measure_parallax(
             (both.column(ellipse[0]), both.row(ellipse[1])), both.left.shape[::-1], strict=True
         )
     )
+    # The same part serves for both pictures, since their rows correspond.
     part = np.s_[down[0] : down[1], across[0] : across[1]]
     if down[1] <= down[0] or across[1] <= across[0]:
         return float("nan"), 0.0
@@ -303,6 +330,7 @@ def measure_parallax(
             1.0 / depth - face.inverse_depth(both.camera_matrix, u, v) > 4 * face.sigma
         ).astype(np.uint8)
     shown = both.inside(u, v, face.m) & (cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0)
+    # Occlusion by the arm looks like depth: pixels that the right camera cannot see are left out.
     hidden = shown & (radii < inner) & _find_hidden_from_right(both, face, depth_m, u, v)
     covered = float(hidden.sum() / max(np.count_nonzero(shown & (radii < inner)), 1))
     shown &= ~hidden
@@ -316,6 +344,7 @@ def measure_parallax(
     if within.sum() < LEAST_INSIDE:
         return float("nan"), covered
     off = mine - seen * (np.median(mine[around]) / max(float(np.median(seen[around])), 1.0))
+    # Not below 0.1 grey levels: a saturated face has no scatter at all.
     usual = 1.4826 * float(np.median(np.abs(off[around] - np.median(off[around]))))
     return float(np.std(off[within])) / max(usual, 0.1), covered
 
@@ -328,12 +357,14 @@ def _find_hidden_from_right(
     # Such an occluder lies to their right in the left picture.
     columns = np.arange(max(0, int(u[0, 0])), depth_m.shape[1])
     depth = depth_m[rows, columns[0] :]
+    # Float32 halves the memory of a whole row of the picture.
     here = face.inverse_depth(both.camera_matrix, columns[None, :], rows[:, None]).astype(
         np.float32
     )
     with np.errstate(invalid="ignore", divide="ignore"):
         row, column = np.nonzero(1.0 / depth - here > 4 * face.sigma)
     shadow = np.zeros((len(rows), depth_m.shape[1]), np.uint8)
+    # A point of the occluder hides the face where both fall on one column of the right picture.
     place = np.rint(columns[column] - both.pull_px / depth[row, column]).astype(int)
     on = (place >= 0) & (place < shadow.shape[1])
     shadow[row[on], place[on]] = 1

@@ -139,10 +139,8 @@ def _measure_darkest_around(
     """
     x, y, wide = ellipse[0], ellipse[1], WIDE * ellipse[2]
     step = max(2, int(wide / 60))
-    rows, columns = (
-        np.arange(max(0, int(middle - wide)), min(size, int(middle + wide)), step)
-        for middle, size in ((y, len(gray)), (x, len(gray[0])))
-    )
+    rows = np.arange(max(0, int(y - wide)), min(len(gray), int(y + wide)), step)
+    columns = np.arange(max(0, int(x - wide)), min(len(gray[0]), int(x + wide)), step)
     near = gray[np.ix_(rows, columns)]
     if plane is not None:
         here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])

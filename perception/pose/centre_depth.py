@@ -47,6 +47,7 @@ class CentreDepthEstimator:
         s = self.settings
         half = s.window_px // 2
         u, v = round(ellipse.x), round(ellipse.y)
+        # The slice ends at the border by itself; its start must not be negative.
         window = frame.depth_m[max(v - half, 0) : v + half + 1, max(u - half, 0) : u + half + 1]
         if not np.isfinite(window).any():
             return Rejection("pose", "known depth at the centre", 0.0, 1.0, ellipse)
@@ -56,7 +57,9 @@ class CentreDepthEstimator:
             return Rejection(
                 "pose", "local normals around the rim", float(len(normals)), 3.0, ellipse
             )
+        # The bound guards normals that cancel.
         mean = normals.mean(0) / max(float(np.linalg.norm(normals.mean(0))), 1e-9)
+        # The median: one wrong normal must not refuse the hole.
         worst = float(np.median(np.arccos(np.clip(normals @ mean, -1, 1))))
         if worst > s.normal_rad:
             return Rejection(
@@ -68,6 +71,7 @@ class CentreDepthEstimator:
             axis=mean,
             radius_m=s.radius_m,
             cov_m2=np.eye(3) * s.std_m**2,
+            # The mean of K normals is more exact than each by their number.
             axis_cov_rad2=across * worst**2 / len(normals),
             frame="camera",
             score=ellipse.score,

@@ -56,6 +56,7 @@ class FacePlane:
     def normal_cov_rad2(self) -> np.ndarray:
         """Return the covariance of the normal, `(3, 3)`, singular along it."""
         length = np.linalg.norm(self.m)
+        # Only the direction of `m` matters for the normal, not its length.
         project = (np.eye(3) - np.outer(self.normal, self.normal)) / length
         return project @ self.cov @ project
 
@@ -91,6 +92,7 @@ def compute_inverse_depth(
     m: np.ndarray, camera_matrix: np.ndarray, u: np.ndarray, v: np.ndarray
 ) -> np.ndarray:
     """Return inverse depth on the plane `m · P = 1` at columns and rows, which are broadcast."""
+    # The plane in pixel coordinates: solved once for all pixels.
     across, down, middle = np.linalg.solve(camera_matrix.T, m)
     return across * u + (down * v + middle)
 
@@ -129,6 +131,7 @@ def collect_support(
     left, right = max(0, int(x - a)), min(width, int(x + a) + 2)
     top, bottom = max(0, int(y - a)), min(height, int(y + a) + 2)
     area = max(right - left, 0) * max(bottom - top, 0)
+    # A regular grid keeps the coverage and limits the number of pixels.
     step = max(1, int(np.sqrt(area / most)))
     rows, columns = np.ogrid[top:bottom:step, left:right:step]
     depth = depth_m[top:bottom:step, left:right:step]
@@ -138,19 +141,27 @@ def collect_support(
         & np.isfinite(depth)
         & (depth > 0)
     )
+    # The size of the circle in units of the focal length gives its distance roughly.
     size = ellipse[2] / float(np.sqrt(camera_matrix[0, 0] * camera_matrix[1, 1]))
+    # The axes' ratio bounds the slope of the face.
     lean = np.sqrt(max((ellipse[2] / ellipse[3]) ** 2 - 1.0, 0.0)) + LEAN
     with np.errstate(divide="ignore", invalid="ignore"):
         good &= np.abs(radius_m / (size * depth) - 1.0) < NEARNESS + radii * size * lean
     ring = (radii > inner) & (radii < certain)
+    # Share of the innermost ring with known depth, the evidence for "without depth".
     known = float(np.isfinite(depth[ring]).mean()) if ring.any() else 0.0
     good &= (radii > inner) & (radii < outer)
     line, place = np.nonzero(good)
     radii, inverse = radii[good], 1.0 / depth[good].astype(float)
     v, u = top + step * line, left + step * place
+    # A number for each cell: row times columns plus column.
     cell = number_cells(v // cell_px * (width // cell_px + 1) + u // cell_px)
     outwards = np.argsort(radii)
-    u, v, radii, inverse, cell = (some[outwards] for some in (u, v, radii, inverse, cell))
+    u = u[outwards]
+    v = v[outwards]
+    radii = radii[outwards]
+    inverse = inverse[outwards]
+    cell = cell[outwards]
     rays = np.column_stack([u, v, np.ones(len(u))]) @ np.linalg.inv(camera_matrix).T
     return FaceSupport(rays, inverse, radii, cell, known)
 
@@ -174,6 +185,7 @@ def fit_plane(
     if not rings:
         return None
     number = int(np.searchsorted(points.radii, rings[0]))
+    # A robust start: least squares would follow an occluder.
     m = _guess_plane(points.rays[:number], points.inverse[:number], generator)
     extent = rings[0]
     first = sigma = reach = floor
@@ -181,12 +193,15 @@ def fit_plane(
     for ring in rings:
         number = int(np.searchsorted(points.radii, ring))
         rays, inverse = points.rays[:number], points.inverse[:number]
+        # Three rounds of reweighting; more change the plane by less than its uncertainty. Chosen
+        # by hand; not searched.
         for _ in range(3):
             residual = inverse - rays @ m
             tight = np.abs(residual)
             scale = max(
                 1.4826
                 * compute_upper_median(
+                    # Gross errors are left out of the scale, or they would widen their own limit.
                     tight[tight < max(8 * sigma, compute_upper_median(tight) * 1.5)]
                 ),
                 floor,
@@ -195,15 +210,18 @@ def fit_plane(
             sigma = scale if ring == rings[0] else min(scale, 1.2 * first)
             reach = (TUKEY if ring == rings[0] else GROWING) * sigma
             weight = np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2
+            # Half of the least number: with fewer the plane rests on an accident.
             if np.count_nonzero(weight) < LEAST // 2:
                 return None
             heavy = rays.T * weight
+            # Weighted normal equations, three by three.
             sums = heavy @ rays
             if np.linalg.cond(sums) > DEGENERATE:
                 return None
             m = np.linalg.solve(sums, heavy @ inverse)
         first = sigma if ring == rings[0] else first
         extent = ring
+    # Residuals of the last ring, to which the weights belong.
     residual = points.inverse[:number] - rays @ m
     cov = estimate_sandwich_covariance(
         rays * compute_psi_slope(residual / reach)[:, None],
@@ -226,14 +244,17 @@ def _guess_plane(
     rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40
 ) -> np.ndarray:
     """Return the plane through three points with the least median residual (Rousseeuw 1984)."""
+    # 400 points judge a plane as well as all do.
     judge = generator.integers(len(rays), size=min(len(rays), 400))
     triples = generator.integers(len(rays), size=(trials, 3))
+    # Points nearly on a line determine no plane.
     triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-9]
     if not len(triples):
         return np.linalg.lstsq(rays, inverse, rcond=None)[0]
     planes = np.linalg.solve(rays[triples], inverse[triples][..., None])[..., 0]
     off = np.abs(inverse[judge, None] - rays[judge] @ planes.T)
     middle = len(judge) // 2
+    # The least median tolerates half of the points being wrong.
     return planes[np.argmin(np.partition(off, middle, axis=0)[middle])]
 
 
@@ -254,6 +275,7 @@ def compute_psi_slope(off: np.ndarray) -> np.ndarray:
     fit varies more than its weights alone tell: by a fifth with a reach of 4.7 standard
     deviations, by a half with one of 3.
     """
+    # Just below 1, where the derivative has its pole.
     square = np.minimum(off**2, 1.0 - 1e-9)
     return (1.0 - 5.0 * square) / (1.0 - square)
 
@@ -276,6 +298,7 @@ def estimate_sandwich_covariance(
     parts = np.stack(
         [np.bincount(cell, heavy[:, j] * slopes[:, k]) for j in range(3) for k in range(3)], -1
     )
+    # The sums without each cell, all at once.
     without = (parts.sum(0) - parts).reshape(-1, 3, 3)
     try:
         moved = np.linalg.solve(without, sums[..., None])[..., 0]

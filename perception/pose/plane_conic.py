@@ -152,12 +152,17 @@ class PlaneConicEstimator:
         """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s = self.settings
         row = as_row(ellipse)
+        # Depth for the plane comes from a ring around the ellipse: inside the hole it shows no
+        # face.
         gray, allowed = self._prepare(frame, masks)
         reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
         points = plane.collect_support(
             frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
         )
+        # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
         face = plane.fit_plane(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
+        # No depth on the face at all: the ellipse alone gives a pose if the camera's place is
+        # known.
         if face is None:
             if (
                 self._without_depth is not None
@@ -172,23 +177,37 @@ class PlaneConicEstimator:
                 float(plane.LEAST),
                 ellipse,
             )
+        # Noise above that of any matcher: the surroundings are no single plane.
         if face.sigma > s.noise_limit_per_m:
             return Rejection(
                 "pose", "depth noise on the face, 1/m", face.sigma, s.noise_limit_per_m, ellipse
             )
+        # Errors of neighbouring pixels are alike, so the count of pixels overstates the
+        # precision.
         face = replace(face, cov=face.cov * s.matcher_alike)
         shape = self._check_shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
+        # The right picture gives the plane again, without the bias of the matcher.
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
             agreed = alignment.align_plane(
-                both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m
+                both,
+                face,
+                frame,
+                allowed,
+                row,
+                s.inner,
+                s.cell_px,
+                s.matcher_bias_per_m,
+                # `None` says that the pictures disagree: then parallax means nothing either.
             )
             both, face = (None, face) if agreed is None else (both, agreed)
             shape = self._check_shape(face, row, frame, ellipse)
+            # A refined plane may turn a plausible ellipse into an implausible one.
             if isinstance(shape, Rejection):
                 return shape
+        # The rim is fitted on the final plane: its circle has only three unknowns there.
         circle = rim.fit_rim_circle(
             gray,
             row,
@@ -199,6 +218,8 @@ class PlaneConicEstimator:
             s.center_px,
             s.shape_px,
         )
+        # An ellipse of wrong shape may still belong to a rim, but then most of the circle must be
+        # seen.
         least = s.coverage if shape else max(s.coverage, FORGIVEN)
         if circle is None or circle.coverage < least:
             return Rejection(
@@ -212,6 +233,8 @@ class PlaneConicEstimator:
             limit = s.radius_m * (1.0 + np.sign(circle.radius_m - s.radius_m) * s.radius_tolerance)
             return Rejection("pose", "radius, m", circle.radius_m, float(limit), ellipse)
         row = circle.ellipse
+        # Appearance is measured in the fitted circle: the first ellipse may follow the shade
+        # within.
         inside = appearance.measure_interior(gray, frame.depth_m, row, frame.camera_matrix, face)
         parallax, covered = (
             alignment.measure_parallax(both, face, frame.depth_m, row, *s.looks.parts)
@@ -241,6 +264,7 @@ class PlaneConicEstimator:
         """Return the grey picture and the pixels of the face, cached for all ellipses of a frame."""
         if self._seen is None or self._seen[0] is not frame or self._seen[1] is not masks:
             allowed = masks.block > 0.5
+            # A mouth shows the inside of the hole, whose depth is not that of the face.
             if masks.hole_mask is not None:
                 allowed &= masks.hole_mask < 0.5
             self._seen = frame, masks, convert_to_gray(frame), allowed
@@ -251,12 +275,14 @@ class PlaneConicEstimator:
     ) -> bool | Rejection:
         """Return whether an ellipse has size and shape of a whole rim, or the gate that it misses."""
         s = self.settings
+        # The angle at the centre of the ellipse: across a close face it varies by some degrees.
         ray = np.linalg.solve(frame.camera_matrix, np.array([row[0], row[1], 1.0]))
         cosine = -float(face.normal @ ray) / float(np.linalg.norm(ray))
         tilt = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         if tilt > s.tilt_rad:
             return Rejection("pose", "tilt of the face, rad", tilt, s.tilt_rad, ellipse)
         _, axes = conic.project_onto_plane(row, frame.camera_matrix, face.m)
+        # The face is seen edge-on: the projection of the ellipse onto it is no ellipse.
         if not np.isfinite(axes).all():
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
@@ -286,15 +312,19 @@ class PlaneConicEstimator:
         def refuse(reason: str, value: float, limit: float) -> Rejection:
             return Rejection("pose", reason, value, limit, ellipse)
 
+        # Written as a negation so that NaN, an inside without pixels, is refused too.
         if not inside.darkness <= looks.darkness:
             return refuse("brightness inside over outside", inside.darkness, looks.darkness)
         has_mask = masks.hole_mask is not None
         mouth = 0.0 if masks.hole_mask is None else average_inside(masks.hole_mask, row)
         if has_mask and mouth < looks.mouth:
+            # A mouth probability of 0 with no mask means "not asked", not "no mouth".
             return refuse("mouth probability inside", mouth, looks.mouth)
         is_sure = mouth >= looks.sure_mouth
         evidence = 0.0
         for value in (inside.slope / looks.slope, inside.deeper / looks.deeper):
+            # NaN: too little is visible for this measure, which is then evidence neither for nor
+            # against.
             if np.isfinite(value):
                 evidence += max(value, 0.0)
         # A flat disc differs between the pictures as little as the face: below 1 the parallax is
@@ -302,6 +332,7 @@ class PlaneConicEstimator:
         from_parallax = (parallax - 1.0) / (looks.parallax - 1.0)
         has_parallax = bool(np.isfinite(from_parallax))
         evidence += from_parallax if has_parallax else 0.0
+        # Dust and haze brighten the inside; there darkness alone does not decide.
         if inside.darkness > looks.veiled:
             if is_sure:
                 return None
@@ -310,6 +341,7 @@ class PlaneConicEstimator:
             if inside.contrast >= looks.contrast or (has_parallax and evidence >= 1.0):
                 return None
             return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
+        # Nothing can be seen that would decide: the hole passes with a lower score.
         if undecided and not has_parallax and (is_sure or not has_mask):
             return None
         return None if evidence >= 1.0 else refuse("evidence of depth inside", evidence, 1.0)
@@ -318,6 +350,7 @@ class PlaneConicEstimator:
 def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: float) -> np.ndarray:
     """Return the covariance of a centre, `(3, 3)` m²: plane along the ray, circle on the plane."""
     center = circle.center_m
+    # The ray of unit depth: a small error of inverse depth moves the point by depth squared.
     ray = center / center[2]
     depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
     return np.outer(ray, ray) * depth_var + circle.cov_m2
@@ -330,6 +363,7 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
     the edge of an occluder.
     """
     height, width = frame.depth_m.shape
+    # A step of 5 degrees. Chosen by hand; not searched.
     nearer = np.zeros(72, bool)
     for scale in BESIDE:
         points = conic.sample_ellipses(
@@ -342,6 +376,7 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
         rays = (
             np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
         )
+        # Four standard deviations: of 72 points none is nearer by chance.
         nearer |= on & (
             1.0 / depth - rays @ face.m > 4 * face.sigma
         )  # false where depth is unknown
@@ -360,9 +395,11 @@ def convert_to_gray(frame: Frame) -> np.ndarray:
 
 def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
     """Return the mean of a picture within 0.8 of an ellipse."""
+    # The semi-major axis bounds the ellipse, however it is turned.
     x, y, a = row[:3]
     top, left = max(0, int(y - a)), max(0, int(x - a))
     part = picture[top : int(y + a) + 2, left : int(x + a) + 2]
     rows, columns = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
+    # 0.8 leaves out the blurred edge of the rim. Chosen by hand; not searched.
     inside = conic.measure_radii(row, columns, rows) < 0.8
     return float(part[inside].mean()) if inside.any() else 0.0

@@ -139,14 +139,18 @@ def fit_rim_circle(
     """
     ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
     normal = m / np.linalg.norm(m)
+    # The axis that is least parallel to the normal, so that the cross product is well
+    # conditioned.
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     chart = PlaneChart(ray / (m @ ray), first, np.cross(normal, first), m, camera_matrix)
+    # The search reaches a quarter of the size: the first ellipse may be that wrong.
     size = float(np.sqrt(ellipse[2] * ellipse[3]))
     profiles = _find_profile_edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
     if profiles is None:
         return None
     found, fit = _vote_for_circle(*profiles, radius_m, tolerance), None
+    # Twice: profiles across the better circle find the rim more exactly.
     for _ in range(2):
         if found is None:
             return None
@@ -158,6 +162,7 @@ def fit_rim_circle(
             return None
         fit = _fit_circle(found, *profiles, center_px, shape_px)
         found = None if fit is None else fit.circle
+        # Half as much more than the final limit, which the caller checks.
         if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
             return None
     if fit is None or found is None:
@@ -182,46 +187,56 @@ def _find_profile_edges(
         Places, m, `(P, PEAKS, 2)`, NaN where there are fewer; and the length of a pixel on the
         plane along each profile, `(P,)`.
     """
+    # At most 144 profiles limit the time; their edges are correlated beyond that number.
     number = int(np.clip(2 * conic.compute_perimeter(ellipse[2], ellipse[3]), 48, 144))
     points, outward, _ = (
         value[0]
         for value in conic.sample_ellipses(ellipse[None], np.arange(number) * (2 * np.pi / number))
     )
+    # Two pixels more on each side for the blur and the gradient.
     offset = np.arange(-reach_px - 2.0, reach_px + 2.0 + 1e-9, STEP_PX)
     place = points[:, None] + offset[None, :, None] * outward[:, None]
     height, width = gray.shape
     x, y = place[..., 0], place[..., 1]
+    # Only the part around the ellipse is sampled, since `remap` is proportional to its sources.
     left, top = int(np.floor(x.min())) - 2, int(np.floor(y.min())) - 2
     part = gray[max(top, 0) : int(y.max()) + 4, max(left, 0) : int(x.max()) + 4]
     if min(part.shape) < 4:
         return None
-    map_x, map_y = (
-        (some - max(corner, 0)).astype(np.float32) for some, corner in ((x, left), (y, top))
-    )
+    map_x = (x - max(left, 0)).astype(np.float32)
+    map_y = (y - max(top, 0)).astype(np.float32)
     profile = cv2.remap(
         part, map_x, map_y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     ).astype(np.float32)
     smooth = cv2.GaussianBlur(profile, (0, 0), SIGMA_PX / STEP_PX, sigmaY=SIGMA_Y)
     slope = np.zeros_like(smooth)
+    # Central differences along the profile.
     slope[:, 1:-1] = 0.5 * (smooth[:, 2:] - smooth[:, :-2])
     inner = slope[:, 1:-1]
+    # Only rises count: a rim is dark inside.
     peak = (inner >= slope[:, :-2]) & (inner > slope[:, 2:]) & (np.abs(offset[1:-1]) <= reach_px)
     peak &= ((x > 1) & (y > 1) & (x < width - 2) & (y < height - 2))[:, 1:-1]
     strength = np.where(peak, inner, 0.0)
     steepest = strength.max(1)
+    # The median of the steepest edges is the rim's; faint texture lies far below it.
     usual = float(np.median(steepest[steepest > 0])) if (steepest > 0).any() else 0.0
     chosen = np.argsort(-strength, 1)[:, :PEAKS]
     rows = np.arange(number)[:, None]
     good = strength[rows, chosen] > FAINT * usual
     at = chosen + 1
-    before, here, after = (slope[rows, at + shift] for shift in (-1, 0, 1))
+    before = slope[rows, at - 1]
+    here = slope[rows, at]
+    after = slope[rows, at + 1]
+    # A parabola through three samples gives the place between them.
     bend = before - 2 * here + after
     shift = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0).clip(
         -0.5, 0.5
     )
     way = offset[at] + STEP_PX * shift
     edges = chart.flat(points[:, None] + way[..., None] * outward[:, None])
+    # NaN marks the missing edges, which comparisons leave out.
     edges[~good] = np.nan
+    # Pixels on the plane are longer where the face is seen obliquely.
     pixel_m = np.linalg.norm(
         chart.flat(points + 0.5 * outward) - chart.flat(points - 0.5 * outward), axis=1
     )
@@ -236,9 +251,11 @@ def _vote_for_circle(
     places = places[np.isfinite(places[:, 0])]
     if len(places) < LEAST:
         return None
+    # A fixed seed: the same picture gives the same circle.
     triples = places[np.random.default_rng(0).integers(len(places), size=(TRIPLES, 3))]
     with np.errstate(all="ignore"):
         one, two = triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0]
+        # Twice the area of the triangle; zero for three points on a line.
         double = 2 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
         square_one, square_two = (one**2).sum(1), (two**2).sum(1)
         x = (two[:, 1] * square_one - one[:, 1] * square_two) / double
@@ -250,10 +267,12 @@ def _vote_for_circle(
     ]
     if not len(circles):
         return None
-    dx, dy = (edges[None, ..., k] - circles[:, k, None, None] for k in (0, 1))
+    dx = edges[None, ..., 0] - circles[:, 0, None, None]
+    dy = edges[None, ..., 1] - circles[:, 1, None, None]
     off = np.abs(np.sqrt(dx * dx + dy * dy) - circles[:, 2, None, None])
     # `fmin` leaves out the NaN of profiles with fewer edges.
     near = np.fmin.reduce(off, 2, initial=np.inf) / pixel_m
+    # A smooth vote: points near the limit count little, so that the best circle does not jump.
     return circles[np.argmax(np.maximum(1 - (near / NEAR_PX) ** 2, 0.0).sum(1))]
 
 

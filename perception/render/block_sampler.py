@@ -60,10 +60,9 @@ def draw_block(
         float(generator.uniform(*kind.decoy_radius_m)) for _ in range(num_discs)
     ]
     places = _scatter_discs(half[:2], radii, edge, generator)
-    holes = [
-        _draw_hole(kind, np.array([*place, half[2]]), radius, FRONT, generator)
-        for place in places[:num_holes]
-    ]
+    holes = []
+    for place in places[:num_holes]:
+        holes.append(_draw_hole(kind, np.array([*place, half[2]]), radius, FRONT, generator))
     for _ in range(int(generator.integers(kind.side_holes[0], kind.side_holes[1] + 1))):
         holes.append(_draw_side_hole(kind, half, radius, edge, generator))
     discs = tuple(

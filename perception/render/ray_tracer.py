@@ -57,6 +57,7 @@ class Pinhole:
     def rays(self, pixel: np.ndarray) -> np.ndarray:
         """Return directions with z = 1, `(M, 3)` float32, through pixels, `(M, 2)`."""
         flat = (pixel - self.matrix[:2, 2]) / self.focal_px
+        # z = 1: the ray's parameter is then the depth along z.
         return np.concatenate([flat, np.ones((len(flat), 1))], 1).astype(np.float32)
 
 
@@ -108,6 +109,7 @@ class _RayEnds:
     @property
     def label(self) -> np.ndarray:
         """A number for each surface, lit or not: where it changes, there is an edge."""
+        # Powers of two keep the four parts of the label apart.
         return (
             self.solid.astype(np.int32) * 4096 + self.part * 4 + self.mouth * 2 + self.sunlit
         ).astype(np.int32)
@@ -135,6 +137,7 @@ class Tracer:
     def view(self, camera: Pinhole) -> RenderedView:
         """Return the ideal picture of `camera`."""
         size = (camera.height, camera.width)
+        # Bands of rows, so that the rays of one band stay in the cache.
         rows = max(1, CHUNK // camera.width)
         columns = np.arange(camera.width, dtype=np.float64)
         bands = []
@@ -149,7 +152,9 @@ class Tracer:
             )
         )
         radiance = whole.radiance
+        # Only pixels at edges are oversampled: everywhere else one ray is enough.
         edges = np.flatnonzero(_find_edges(whole.label.reshape(size)).ravel())
+        # Centres of the sub-pixels, relative to the pixel's centre.
         offsets = (
             np.stack(np.meshgrid(*[np.arange(OVER)] * 2), -1).reshape(-1, 2) + 0.5
         ) / OVER - 0.5
@@ -160,6 +165,7 @@ class Tracer:
                 .radiance.reshape(len(part), OVER**2, 3)
                 .mean(1)
             )
+        # NaN, as a camera reports missing depth.
         depth = np.where(whole.solid == NOTHING, np.nan, whole.depth_m).astype(np.float32)
         return RenderedView(
             radiance.reshape(*size, 3),
@@ -184,6 +190,7 @@ class Tracer:
         for number, thing in enumerate(self.solids):
             rows = _select_rays(thing, camera, direction)
             hits = thing.hit(origin_m, direction if rows is None else direction[rows])
+            # Only hits nearer than those so far; the order of the solids does not matter.
             nearer = np.flatnonzero(hits.t < (t if rows is None else t[rows]))
             if not len(nearer):
                 continue
@@ -200,6 +207,7 @@ class Tracer:
         t, solid, part, mouth = self._cast(camera.origin_m, direction, camera)
         radiance = np.broadcast_to(self.sky, (len(t), 3)).copy()
         lit = np.zeros(len(t), bool)
+        # Points in float32: a scene of 80 m is then exact to some micrometres.
         point = camera.origin_m.astype(np.float32) + t[:, None] * direction
         for number, thing in enumerate(self.solids):
             rows = np.flatnonzero(solid == number)
@@ -219,6 +227,7 @@ class Tracer:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the radiance of points of one solid, `(M, 3)`, and which are sunlit, `(M,)`."""
         surface = thing.surface(point, part, self.light.to_sun)
+        # Surfaces have two sides; the one towards the camera is seen.
         along = np.einsum("ij,ij->i", surface.normal, direction)
         away = np.sign(along)
         facing = np.abs(along) / np.sqrt(np.einsum("ij,ij->i", direction, direction))
@@ -227,11 +236,13 @@ class Tracer:
         if surface.sunlit is not None:
             lit &= surface.sunlit
         for caster in self._casters:
+            # A solid's own shadow is already in the slope of its surface.
             if lit.any() and caster.solid is not thing:
                 caster.darken(point, lit)
         ambient = self.light.ambient * (1.0 if surface.openness is None else surface.openness)
         bright = ambient + self.light.sun * np.where(lit, slope, 0.0)
         albedo = np.empty((len(part), 3), np.float32)
+        # Obliquely seen texture is filtered more, but not without bound.
         size_m = pixel_m / np.sqrt(np.maximum(facing, 0.1))
         for number in np.flatnonzero(np.bincount(part)):
             rows = np.flatnonzero(part == number)
@@ -248,6 +259,7 @@ class Caster:
         first = np.cross(to_sun, np.eye(3)[np.argmin(np.abs(to_sun))])
         first /= np.linalg.norm(first)
         self._across = np.stack([first, np.cross(to_sun, first)], 1).astype(np.float32)
+        # The silhouette's box is a cheap test before the exact one.
         corners = solid.corners_m @ self._across  # type: ignore[operator]
         self._low, self._high = corners.min(0).astype(np.float32), corners.max(0).astype(np.float32)
 
@@ -272,9 +284,11 @@ def _select_rays(thing: Solid, camera: Pinhole | None, direction: np.ndarray) ->
     if camera is None or corners is None:
         return None
     away = corners - camera.origin_m
+    # A solid that reaches behind the camera has no box in the picture.
     if (away[:, 2] < 0.05).any():
         return None
     flat = away[:, :2] / away[:, 2:]
+    # A little larger than the box, for rounding.
     low, high = flat.min(0) - 1e-5, flat.max(0) + 1e-5
     x, y = direction[:, 0], direction[:, 1]
     return np.flatnonzero((x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1]))

@@ -33,8 +33,11 @@ def place_arm(
     """Return an arm from a random side that hides the part `hidden` of a rim, `(P, 3)`."""
     middle = rim.mean(0)
     ray = middle / np.linalg.norm(middle)
+    # The arm comes in from a random side.
     angle = generator.uniform(-np.pi, np.pi)
     sideways = build_frame(ray, float(angle))[:, 0]
+    # Between the camera and the rim, nearer to the rim: an arm at the lens would hide everything.
+    # Chosen by hand; not searched.
     nearness = float(generator.uniform(0.45, 0.8))
     parts = _build_arm(nearness * middle, ray, sideways, generator)
 
@@ -44,11 +47,14 @@ def place_arm(
             shut |= solid.hit(np.zeros(3), rim.astype(np.float32)).t < 1.0
         return float(shut.mean())
 
+    # The size of the rim as it looks at the arm's distance.
     size = float(np.linalg.norm(rim - middle, axis=1).max()) * nearness
     if hidden <= 0:
+        # Beyond the rim by a margin, and up to three sizes more.
         low = -_CLEAR * size
         return _shift_solids(parts, -(low - generator.uniform(0.0, 3.0) * size) * sideways)
     low, high = -2.0 * size, 2.0 * size
+    # The hidden part grows with the push, so bisection finds it.
     for _ in range(_BISECTIONS):
         middle_push = (low + high) / 2
         low, high = (middle_push, high) if covered(middle_push) < hidden else (low, middle_push)
@@ -62,6 +68,8 @@ def _build_arm(
     along = np.cross(ray, sideways)
     wide = float(generator.uniform(0.06, 0.16))
     thick = float(generator.uniform(0.05, 0.12))
+    # The yellow of a demolition machine, faded and dirty to a varying degree. Chosen by hand; not
+    # searched.
     yellow = np.clip(
         np.array([0.75, 0.45, 0.08]) * generator.uniform(0.3, 1.2)
         + 0.05 * generator.standard_normal(3),
@@ -78,6 +86,7 @@ def _build_arm(
     steel = Material((grey, grey, grey), 0.15, 0.001, int(generator.integers(4)))
     length = float(generator.uniform(0.6, 1.5))
     pose = np.stack([sideways, along, np.cross(sideways, along)], 1)
+    # Booms are boxes or tubes; both look alike to no network.
     if generator.random() < 0.5:
         boom: Solid = Box(
             "arm",
@@ -96,6 +105,7 @@ def _build_arm(
         length,
         (steel,),
     )
+    # The chisel leans towards the camera, as a tool over the block does.
     chisel_axis = 0.8 * ray + 0.6 * along
     chisel_place = start + 3.2 * wide * sideways + 0.1 * along
     chisel = Cylinder(
@@ -164,6 +174,7 @@ def add_surroundings(
     """
     down = rig.down_in_camera
     if ground_m is None:
+        # The block stands on the ground; without one the ground lies a little below the aim.
         ground_m = (
             max(0.5, float((block.corners_m @ down).max())) if block else float(target @ down) + 0.2
         )
@@ -174,6 +185,7 @@ def add_surroundings(
     solids += _draw_clutter(kind, rig, block, down, ground_m, generator)
     light = _draw_light(kind, down, target, generator)
     exposure, level = _draw_exposure(kind, light, normal, target, generator)
+    # The sky is a little darker than its light on a surface. Chosen by hand; not searched.
     sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
     hidden_parts = (
         tuple(compute_hidden_share(solids, block, hole) for hole in block.holes) if block else ()
@@ -212,11 +224,13 @@ def compute_hidden_share(
     outward = block.pose.rotation @ (
         circle.outward if isinstance(circle, DrilledHole) else np.array([0.0, 0.0, 1.0])
     )
+    # A face that looks away hides its rim, whatever stands before it.
     if (outward @ rim.mean(0)) >= 0:  # on a face that looks away
         return 1.0
     shut = np.zeros(len(rim), bool)
     for solid in solids:
         if solid is not block:
+            # Slightly less than 1, so that the face itself does not hide its rim.
             shut |= solid.hit(np.zeros(3), rim.astype(np.float32)).t < 0.999
     return float(shut.mean())
 
@@ -225,17 +239,20 @@ def _draw_target(
     kind: SceneRanges, rig: StereoRig, generator: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the aimed point and the face's normal, `(3,)` each, and the turn about it."""
+    # Not at the border of the picture, where half a block would be out of sight.
     inner = 1.0 - 2.0 * kind.sight.margin
     size = np.array([rig.width, rig.height])
     pixel = (0.5 + inner * (generator.random(2) - 0.5)) * (size - 1)
     ray = rig.left.rays(pixel[None])[0].astype(np.float64)
     ray /= np.linalg.norm(ray)
+    # Up in the picture is the negative y axis of the camera.
     up = -np.array([0.0, 1.0, 0.0])
     up -= ray * (up @ ray)
     up /= np.linalg.norm(up)
     side = np.cross(ray, up)
     azimuth, obliquity = (
         draw_uniform(kind.sight.azimuth_rad, generator),
+        # The normal leans from the line of sight by the obliquity.
         draw_uniform(kind.sight.obliquity_rad, generator),
     )
     lean = math.cos(azimuth) * up + math.sin(azimuth) * side
@@ -311,8 +328,10 @@ def _draw_clutter(
             break
         pixel = generator.random((1, 2)) * [rig.width, rig.height]
         ray = rig.left.rays(pixel)[0].astype(np.float64)
+        # Rays above the horizon meet no ground: the thing hangs somewhere ahead.
         way = lowest_m / (ray @ down) if ray @ down > 0.05 else generator.uniform(2.0, 8.0)
         half = generator.uniform(0.03, 0.25, 3) * [1.0, 1.0, 0.7]
+        # Just above the ground, so that it does not sink in.
         place = ray * way * generator.uniform(0.9, 1.0) - down * half[2]
         if not 0.8 < place[2] < 12.0:
             continue
@@ -328,6 +347,7 @@ def _draw_clutter(
             block.half_m
         ):
             continue
+        # Clutter must not change the labels of the holes.
         if block and any(compute_hidden_share([thing], block, hole) > 0 for hole in block.holes):
             continue
         found.append(thing)
@@ -351,7 +371,9 @@ def _draw_light(
     shade = []
     for _ in range(draw_integer(kind.light.shadows, generator)):
         beam = build_frame(
-            to_sun + 0.3 * generator.standard_normal(3), float(generator.uniform(-np.pi, np.pi))
+            to_sun + 0.3 * generator.standard_normal(3),
+            float(generator.uniform(-np.pi, np.pi)),
+            # About 3 m towards the sun, out of sight of the camera.
         )
         beside = beam[:, :2] @ generator.uniform(-0.25, 0.25, 2)
         half = np.array([generator.uniform(0.03, 0.25), 1.5, 0.02])
@@ -374,9 +396,11 @@ def _draw_exposure(
 ) -> tuple[CameraExposure, float]:
     """Return the exposure, set for the lit face without dust, and the level of light."""
     ranges = kind.light
+    # The exposure is set for the face, as a camera's own control would.
     lit = light.ambient + light.sun * max(0.0, float(normal @ light.to_sun))
     face = lit * float(np.mean(kind.block.brightness))
     level = draw_log_uniform(ranges.level, generator)
+    # Lambert and Beer: transmission over the distance of the target.
     extinction = -math.log(draw_uniform(ranges.transmission, generator)) / float(target[2])
     exposure = CameraExposure(
         gain=draw_uniform(ranges.exposure, generator) / face * level,

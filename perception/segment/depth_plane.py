@@ -58,9 +58,8 @@ class SightGrid:
     @cached_property
     def powers(self) -> tuple[np.ndarray, np.ndarray]:
         """1, x and x², `(3, w)`, and 1, y and y², `(3, h)`: sums over pixels are products with both."""
-        across, down = (
-            np.stack([np.ones_like(some), some, some * some]) for some in (self.x, self.y)
-        )
+        across = np.stack([np.ones_like(self.x), self.x, self.x * self.x])
+        down = np.stack([np.ones_like(self.y), self.y, self.y * self.y])
         return across, down
 
     def inverse(self, plane: np.ndarray) -> np.ndarray:
@@ -234,7 +233,8 @@ class PlaneSegmenter:
             inverse[corner_rows, corner_columns],
         )  # (3 pixels, trials)
         usable = rest[corner_rows, corner_columns].all(0)
-        dx, dy = (some[1:] - some[0] for some in (x, y))
+        dx = x[1:] - x[0]
+        dy = y[1:] - y[0]
         rise = value[1:] - value[0]
         area = dx[0] * dy[1] - dx[1] * dy[0]
         usable &= np.abs(area) > 1e-5
@@ -272,11 +272,10 @@ class PlaneSegmenter:
         support = cv2.morphologyEx(support, cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
         support = cv2.morphologyEx(support, cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
         count, labels, stats, _ = cv2.connectedComponentsWithStats(support, connectivity=4)
-        large = [
-            label
-            for label in range(1, count)
-            if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size
-        ]
+        large = []
+        for label in range(1, count):
+            if stats[label, cv2.CC_STAT_AREA] >= settings.min_area * support.size:
+                large.append(label)
         nearer = (known & (excess > self._tolerance)).astype(np.uint8)
         nearer = np.asarray(cv2.morphologyEx(nearer, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)))
         pieces = [_fill_holes((labels == label).astype(np.uint8), nearer) for label in large]
@@ -317,7 +316,8 @@ class PlaneSegmenter:
 
     def _front(self, piece: np.ndarray, excess: np.ndarray, known: np.ndarray) -> float:
         """Return the part of a piece's surroundings behind its plane, one half without evidence."""
-        near, far = (cv2.dilate(piece, np.ones((size, size), np.uint8)) for size in (5, 9))
+        near = cv2.dilate(piece, np.ones((5, 5), np.uint8))
+        far = cv2.dilate(piece, np.ones((9, 9), np.uint8))
         ring = (far > near) & known
         behind = np.count_nonzero(excess[ring] < -self._tolerance)
         before = np.count_nonzero(excess[ring] > self._tolerance)

@@ -85,11 +85,10 @@ class Onnx:
                 f"{path}: corrupt or no ONNX file ({error}); copy it again or train a new one"
             ) from error
         meta = session.get_modelmeta().custom_metadata_map
-        header = {
-            key.removeprefix(PREFIX): json.loads(value)
-            for key, value in meta.items()
-            if key.startswith(PREFIX)
-        }
+        header = {}
+        for key, value in meta.items():
+            if key.startswith(PREFIX):
+                header[key.removeprefix(PREFIX)] = json.loads(value)
         size_px = check_size(path, header)
 
         def infer(picture: np.ndarray) -> np.ndarray:

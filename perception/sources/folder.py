@@ -86,9 +86,10 @@ def read_camera(path: Path) -> CameraModel:
             f"{path}: expected a mapping with K, dist, baseline_m and T_base_cam, K is missing"
         )
     where = str(path)
-    optional: dict[str, Any] = {
-        name: told[name] for name in ("baseline_m", "T_base_cam") if told.get(name) is not None
-    }
+    optional: dict[str, Any] = {}
+    for name in ("baseline_m", "T_base_cam"):
+        if told.get(name) is not None:
+            optional[name] = told[name]
     return CameraModel(
         validation.check_matrix(told["K"], where),
         validation.check_distortion(told.get("dist"), where),
@@ -162,9 +163,9 @@ class FolderSource:
         return self._read(stem, number / self._settings.rate_hz)
 
     def _read(self, stem: Path, t_s: float) -> Frame:
-        paths = {
-            ending: stem.with_name(stem.name + ending) for ending in (dataset.COLOR, dataset.RIGHT)
-        }
+        paths = {}
+        for ending in (dataset.COLOR, dataset.RIGHT):
+            paths[ending] = stem.with_name(stem.name + ending)
         picture = read_picture(paths[dataset.COLOR])
         if self._settings.needs == "nothing" and picture.ndim == 2:
             picture = np.repeat(picture[..., None], 3, 2)
@@ -190,9 +191,8 @@ class FolderSource:
         self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
     ) -> np.ndarray:
         """Return the stored depth of a frame, else that of its two pictures."""
-        stored, millimetres = (
-            stem.with_name(stem.name + ending) for ending in (dataset.DEPTH, dataset.DEPTH_MM)
-        )
+        stored = stem.with_name(stem.name + dataset.DEPTH)
+        millimetres = stem.with_name(stem.name + dataset.DEPTH_MM)
         least = self._settings.least_known
         if stored.exists() or millimetres.exists():
             where = stored if stored.exists() else millimetres

@@ -58,7 +58,7 @@ class RealSenseDevice:
         """Open the camera.
 
         Raises:
-            FrameError: there is no library, no camera, or it cannot do what is asked of it.
+            FrameError: there is no library, no camera, or it cannot run as configured.
         """
         try:
             rs = importlib.import_module("pyrealsense2")

@@ -135,7 +135,7 @@ class SimulatedSource:
         )  # fmt: skip
 
     def shot(self, noise: np.random.Generator) -> RenderedFrame:
-        """Return what is shown now, with its truth."""
+        """Return the current frame, with its truth."""
         settings, kind = self._settings, self._settings.surroundings
         chance = np.random.default_rng(settings.seed)  # the same stains and light for every frame
         x, y, z, yaw, scale, radius_m = self._scene

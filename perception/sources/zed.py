@@ -84,7 +84,7 @@ class ZedDevice:
         """Open the camera.
 
         Raises:
-            FrameError: there is no SDK, no camera, or it cannot do what is configured.
+            FrameError: there is no SDK, no camera, or it cannot run as configured.
         """
         try:
             sl = importlib.import_module("pyzed.sl")
@@ -145,10 +145,8 @@ class ZedDevice:
         self._camera.retrieve_image(self._right, sl.VIEW.RIGHT)
         self._camera.retrieve_measure(self._depth, sl.MEASURE.DEPTH)
         t_s = self._camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds() * 1e-9
-        color, right = (
-            validation.convert_color(np.asarray(mat.get_data()), "ZED camera")
-            for mat in (self._picture, self._right)
-        )
+        color = validation.convert_color(np.asarray(self._picture.get_data()), "ZED camera")
+        right = validation.convert_color(np.asarray(self._right.get_data()), "ZED camera")
         return RawCapture(
             color, np.array(self._depth.get_data(), np.float32), t_s, right
         )  # the SDK reuses its memory

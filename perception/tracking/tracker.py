@@ -83,6 +83,7 @@ class FusionTracker:
         """Take the holes of the frame at `t_s`; return all known ones by name; see `HoleTracker`."""
         for hole in holes:
             self._add(hole, t_s)
+        # A list, since tracks are deleted on the way.
         for name, track in list(self._tracks.items()):
             if t_s - track.seen_s > self.settings.forget_s:
                 del self._tracks[name]
@@ -91,6 +92,7 @@ class FusionTracker:
     def _add(self, hole: HolePose, t_s: float) -> None:
         """Average a detection into the nearest track, or begin a new one."""
         shared_m2 = _take_mean_variance(hole.shared_m2)
+        # The shared part is no noise of this detection and must not weigh.
         weight = 1.0 / max(SMALLEST_VARIANCE_M2, float(np.trace(hole.cov_m2)) / 3 - shared_m2)
         own_cov_m2 = hole.cov_m2 if hole.shared_m2 is None else hole.cov_m2 - hole.shared_m2
         name = self._find_nearest(hole)
@@ -103,17 +105,20 @@ class FusionTracker:
         before = min(old.weight, self.settings.memory * weight)
         total = before + weight
         center_m = (before * old.pose.center_m + weight * hole.center_m) / total
+        # The cap on the old weight inflates the old covariance by the same factor.
         faded_cov_m2 = old.own_cov_m2 * (old.weight / before)
         own_cov_m2 = (before**2 * faded_cov_m2 + weight**2 * own_cov_m2) / total**2
+        # Axis and radius are the newest: they are not averaged.
         pose = replace(hole, center_m=center_m)
         self._tracks[name] = _Track(pose, total, own_cov_m2, old.num_frames + 1, t_s)
 
     def _find_nearest(self, hole: HolePose) -> int | None:
         """Return the name of the track at the place of a detection, `None` for none."""
-        distances_m = {
-            name: float(np.linalg.norm(track.pose.center_m - hole.center_m))
-            for name, track in self._tracks.items()
-        }
+        distances_m: dict[int, float] = {}
+        for number, track in self._tracks.items():
+            away_m = track.pose.center_m - hole.center_m
+            distances_m[number] = float(np.linalg.norm(away_m))
+        # The nearest track wins: two holes are farther apart than `near_m`.
         name = min(distances_m, key=distances_m.__getitem__, default=None)
         return name if name is not None and distances_m[name] <= self.settings.near_m else None
 
@@ -123,6 +128,7 @@ class FusionTracker:
         return TrackedHole(
             name=name,
             pose=replace(track.pose, cov_m2=cov_m2),
+            # The shared error comes back in: it is part of the position's uncertainty.
             std_m=math.sqrt(1.0 / track.weight + _take_mean_variance(shared_m2)),
             num_frames=track.num_frames,
             seen_s=track.seen_s,

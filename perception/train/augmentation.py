@@ -284,9 +284,8 @@ class MotionBlur:
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures smeared along a line, centred on where they were."""
         half = math.ceil(self.length_px[1] / 2.0) + 1
-        length, angle_rad = (
-            _draw_uniform(one, pictures, generator) for one in (self.length_px, (0.0, math.pi))
-        )
+        length = _draw_uniform(self.length_px, pictures, generator)
+        angle_rad = _draw_uniform((0.0, math.pi), pictures, generator)
         way = (
             length * torch.linspace(-0.5, 0.5, 8 * half + 1, device=pictures.device)[:, None, None]
         )
@@ -325,9 +324,8 @@ class PictureNoise:
         noise = _filter_pictures(
             _filter_pictures(noise, kernel), kernel.transpose(2, 3)
         ) / kernel.square().sum((2, 3), keepdim=True)
-        constant, photon = (
-            _draw_uniform(one, pictures, generator) for one in (self.constant, self.photon)
-        )
+        constant = _draw_uniform(self.constant, pictures, generator)
+        photon = _draw_uniform(self.photon, pictures, generator)
         return (
             pictures
             + noise * (constant.square() + photon.square() * pictures.clamp(0.0, 1.0)).sqrt()

@@ -46,9 +46,9 @@ def write_checkpoint(path: Path, network: UNet, header: Mapping[str, Any]) -> No
     Raises:
         StorageError: it could not be written.
     """
-    tensors = {
-        name: value.detach().cpu().contiguous() for name, value in network.state_dict().items()
-    }
+    tensors = {}
+    for name, value in network.state_dict().items():
+        tensors[name] = value.detach().cpu().contiguous()
     write_bytes(path, save(tensors, metadata={"brokk": json.dumps(header)}))
 
 

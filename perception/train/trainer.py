@@ -119,12 +119,15 @@ class _Training:
     def __init__(self, settings: SegmenterTraining, session: Session, resume: bool) -> None:
         self._settings, self._session, self._folder = settings, session, session.folder
         self._device = session.torch_device()
+        # Before anything random: weights, views and samples follow from the session's seed.
         session.seed_all()
         self._train, self._unseen = self._views()
         self._network = self._build_network().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        # `fused` moves all weights in one kernel.
         self._optimizer = torch.optim.AdamW(
             self._network.parameters(), lr=settings.rate, weight_decay=settings.decay, fused=True
         )
+        # The running mean is the network that is judged and kept.
         self._mean = {name: value.clone() for name, value in self._network.state_dict().items()}
         self._update, self._best, self._curve = 0, {"score": -1.0, "update": 0}, []
         self._seconds = 0.0
@@ -143,11 +146,13 @@ class _Training:
             len(self._unseen),
             self._device,
         )
+        # Seconds of earlier runs count too.
         begun = time.monotonic() - self._seconds
         samples = Samples(
             self._train, settings.crop, settings.augment, settings.size_px, settings.closer, self._session.stream("samples"),
             self._device,
         )  # fmt: skip
+        # The start itself is judged, so that a training that only harms is noticed.
         if settings.start is not None and self._update == 0:
             self._validate(pictures, known, None)  # a training may make a good network worse
         with evaluation.show_progress(self._update, settings.updates) as advance:
@@ -155,11 +160,16 @@ class _Training:
                 before = self._spent()
                 total += self._step(*samples.batch(self._update, settings.batch))
                 self._update += 1
+                # The clock is read before judging: validation is part of the training's time.
                 self._seconds = time.monotonic() - begun
+                # The part that is spent, not the number of steps: the mean spans the same share
+                # however long it runs.
                 self._remember(1.0 - math.exp((before - self._spent()) / settings.average))
                 advance()
                 over = self._spent() >= 1.0
                 if self._update % settings.validate_every == 0 or over:
+                    # Updates since the last point of the curve, which may lie before an
+                    # interruption.
                     since = self._update - (self._curve[-1]["update"] if self._curve else 0)
                     self._validate(pictures, known, float(total) / since)
                     total.zero_()
@@ -182,11 +192,13 @@ class _Training:
     def _views(self) -> tuple[TrainingViews, TrainingViews]:
         settings, seed = self._settings, self._session.stream("views")
         stems = training_data.list_frames(settings.frames)
+        # Frames of a run resemble each other: the last ones are set aside together.
         if settings.validation is None:
             last = max(1, len(stems) // settings.hold_out)
             stems, unseen = stems[:-last], stems[-last:]
         else:
             unseen = training_data.list_frames(settings.validation)
+            # The same frame on both sides would make the network look better than it is.
             if shared := {path.resolve() for path in stems} & {path.resolve() for path in unseen}:
                 raise ConfigError(
                     f"training.validation: {min(shared)} is also among training.frames; judge by "
@@ -201,11 +213,13 @@ class _Training:
         self._network.train()
         for group in self._optimizer.param_groups:
             group["lr"] = self._rate()
+        # Sixteen bits only in the forward pass; loss and weights keep 32.
         with torch.autocast(self._device.type, torch.bfloat16, enabled=self._settings.bfloat16):
             logits = self._network(picture.to(memory_format=torch.channels_last))
         value = compute_loss(logits.float(), target)
         self._optimizer.zero_grad(set_to_none=True)
         value.backward()
+        # A norm of 1 tames the rare batch of extreme pictures. Chosen by hand; not searched.
         torch.nn.utils.clip_grad_norm_(self._network.parameters(), 1.0)
         self._optimizer.step()
         return value.detach()
@@ -214,7 +228,10 @@ class _Training:
     def _remember(self, part: float) -> None:
         """Move the mean network by a part of the way to the one under training."""
         now = self._network.state_dict()
-        moving = [name for name, value in now.items() if value.is_floating_point()]
+        moving = []
+        for name, value in now.items():
+            if value.is_floating_point():
+                moving.append(name)
         # all at once: a graphics card takes longer to be told of each of a hundred small tensors
         # than to move them
         torch._foreach_lerp_(
@@ -223,17 +240,20 @@ class _Training:
 
     def _spent(self) -> float:
         """Return which part of the training is over, by updates or by seconds, in [0, 1]."""
+        # Without a limit in time the share in time is 0.
         in_time = self._seconds / (self._settings.max_seconds or math.inf)
         return min(1.0, max(self._update / self._settings.updates, in_time))
 
     def _rate(self) -> float:
         fall = 0.5 * (1.0 + math.cos(math.pi * self._spent()))
+        # The learning rate rises over the first twentieth.
         rise = 20.0 * (self._spent() + 1.0 / self._settings.updates)
         return self._settings.rate * min(1.0, rise) * fall
 
     def _validate(
         self, pictures: torch.Tensor, known: torch.Tensor, mean_loss: float | None
     ) -> None:
+        # A separate network: the one under training must not change.
         network = UNet(self._settings.widths).to(self._device)
         network.load_state_dict(self._mean)
         probabilities = evaluation.predict(network, pictures, self._device)
@@ -248,6 +268,7 @@ class _Training:
             )
         if block + mouth > self._best["score"]:
             self._best = {"score": block + mouth, "update": self._update}
+            # On the processor: the best weights must not occupy the card twice.
             self._best_tensors = {name: value.cpu().clone() for name, value in self._mean.items()}
         passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
         log.info(
@@ -274,6 +295,7 @@ class _Training:
         }
         header = export.build_header(network, self._settings.size_px, facts)
         export.write_checkpoint(self._folder / export.TENSORS, network, header)
+        # Eight pictures show a wrong export as surely as all.
         compared = pictures[: min(len(pictures), 8)].flatten(0, 1).float() / 255.0
         parity = export.write_onnx(self._folder / export.ONNX, network, header, compared)
         evaluation.draw_curve(self._folder / "curve.png", self._curve)
@@ -294,9 +316,13 @@ class _Training:
 
     def _identity(self) -> dict[str, str]:
         """Return fingerprints of settings and data, which must be the same to resume."""
-        same = {name: value for name, value in vars(self._settings).items() if name not in FREE}
+        same = {}
+        for name, value in vars(self._settings).items():
+            if name not in FREE:
+                same[name] = value
         data = hashlib.sha256()
         for views in (self._train, self._unseen):
+            # About 50 views stand for the data: a fingerprint of all would take seconds.
             data.update(views.layers[:: max(1, len(views) // 50)].numpy().tobytes())
         return {
             "settings": hashlib.sha256(repr((same, self._session.seed)).encode()).hexdigest()[:16],
@@ -313,6 +339,7 @@ class _Training:
             },
             content,
         )  # fmt: skip
+        # Written beside and renamed: an interruption leaves the old state.
         export.write_bytes(self._folder / STATE, content.getvalue())
 
     def _load(self) -> None:
@@ -327,9 +354,10 @@ class _Training:
                 f"{path}: corrupt ({error}); delete it to begin the training again"
             ) from error
         if state["stamp"] != self._stamp:
-            differing = [
-                name for name, value in self._stamp.items() if state["stamp"].get(name) != value
-            ]
+            differing = []
+            for name, value in self._stamp.items():
+                if state["stamp"].get(name) != value:
+                    differing.append(name)
             raise CheckpointError(
                 f"{path}: an interrupted training that cannot go on: its {' and '.join(differing)} differ. Train with what it "
                 "began with, or choose another folder (session.out=…)."
@@ -337,7 +365,8 @@ class _Training:
         self._network.load_state_dict(state["network"])
         self._mean = state["mean"]
         self._optimizer.load_state_dict(state["optimizer"])
-        self._update, self._best, self._curve, self._seconds = (
-            state[key] for key in ("update", "best", "curve", "seconds")
-        )
+        self._update = state["update"]
+        self._best = state["best"]
+        self._curve = state["curve"]
+        self._seconds = state["seconds"]
         self._best_tensors = {name: value.cpu() for name, value in state["best_tensors"].items()}

@@ -21,10 +21,10 @@ class Crossover:
 
     Attributes:
         hands: How the levers are moved.
-        sight: What is seen.
+        sight: Model of the operator's sight.
         crossover_rad_s: Crossover frequency.
-        anticipation: Share of what is on its way that is reckoned with: 0 for who sees only what
-            is, 1 for who knows the machine.
+        anticipation: Share of the motion on its way that is reckoned with: 0 for who sees only
+            the present motion, 1 for who knows the machine.
         band: Command up to which valves stay shut, as the person knows it.
         creep: Smallest share of full speed that is asked for.
         good_rad: Error with which a joint is left alone, rad or m.

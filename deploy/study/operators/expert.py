@@ -10,5 +10,5 @@ from deploy.study.operators.crossover import Crossover
 class Expert(Crossover):
     """Simulated, unguided: reckons with everything that is on its way, and so works faster than the delay lets others.
 
-    The law is that of `Crossover` with all of what is on its way anticipated; fields are the same.
+    The law is that of `Crossover` that anticipates all motion still on its way; fields are the same.
     """

@@ -1,6 +1,8 @@
-"""An operator who does what is advised, as well as hands can."""
+"""An operator who follows the advice, as well as hands can."""
 
 from __future__ import annotations
+
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,6 +21,9 @@ class AdviceFollower:
     """
 
     hands: Hands
+
+    # Recordings and reports of earlier versions hold this name.
+    label: ClassVar[str] = "follower"
 
     def build(self, machine: Machine, persons: np.ndarray, seed: int) -> OperatorModel:
         """See `brokk_rl.contracts.operator.Operator`."""

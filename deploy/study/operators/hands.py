@@ -1,4 +1,4 @@
-"""A person's hands on the levers: what is wanted becomes what is given, late, sluggish, imprecise, a few levers at a time.
+"""A person's hands on the levers: they follow the wanted positions late, sluggishly and imprecisely, a few levers at a time.
 
 The law is that of `follower=person` (reaction delay, first-order lag integrated exactly over the
 period, amplitude, tremor, dead zone, a choice of levers that holds for a while), in numpy, for the
@@ -23,7 +23,7 @@ class Hands:
     """Motor properties of a person at the levers; ranges are drawn per person.
 
     Attributes:
-        delay_s: Reaction delay, from what is seen to the hand.
+        delay_s: Reaction delay, from eye to hand.
         lag_s: Time constant of the hand.
         gain: Deflection over the one wanted.
         tremor: Standard deviation of the deflection, as a part of it.
@@ -133,7 +133,7 @@ class HandsModel:
     def _reach(
         self, hand: np.ndarray, target: np.ndarray, part: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return where the hand is after `part` of a period on its way to `target`, and what that adds to the period's mean."""
+        """Return the hand's position after `part` of a period on its way to `target`, and its share of the period's mean."""
         left = np.exp(-part / self._lag)
         return target + (hand - target) * left, target * part + (hand - target) * self._lag * (
             1.0 - left

@@ -1,4 +1,4 @@
-"""An operator without guidance who does what a beginner does on a machine with dead time: one joint, look, move, wait."""
+"""An operator without guidance who handles dead time as a beginner: one joint, look, move, wait."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ bounds of their product."""
 class Novice:
     """Simulated, unguided: one joint at a time: deflects, lets go, waits until nothing moves, looks again.
 
-    Move and wait is what people do under delays (Ferrell, IEEE Trans. Hum. Factors Electron. 6,
+    People under delays move and wait (Ferrell, IEEE Trans. Hum. Factors Electron. 6,
     1965).
 
     Attributes:
         hands: How the levers are moved.
-        sight: What is seen.
+        sight: Model of the operator's sight.
         deflection: Deflection of a long move.
         fine: Deflection of a short one, and the time below which a move is short, s.
         band: Command up to which valves stay shut, as the person knows it.
         lost_s: Time for which a lever must be held before anything moves at all, as the person
             knows it.
         judgement: Length of a move over the right one; for short ones joint by joint corrected by
-            what the last one did.
+            the effect of the last one.
         scatter: Standard deviation of its logarithm, from move to move.
         wait_s: Pause after a move, beyond the time in which the machine comes to rest.
         good_rad: Error with which a joint is left alone, rad or m.
