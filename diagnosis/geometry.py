@@ -269,6 +269,8 @@ def _select_relevant(
         count: Coordinates, `D`.
     """
     relevant = []
+    if not chosen:
+        return ()
     for c, own in zip(chosen, _split(causes, chosen, fits[chosen].sizes), strict=True):
         rest = tuple(one for one in chosen if one != c)
         gain = fits[chosen].gain - fits[rest].gain

@@ -98,7 +98,7 @@ def find_sensor_effects(
     if len(reference) < 2:
         return []
     fits = []
-    seen = np.nanmean(_stack_statistics(case.field, machine), 0)
+    seen = _compute_mean(_stack_statistics(case.field, machine))
     plain = _stack_statistics(reference, machine)  # (P, J, F)
     for kind in kinds:
         if kind.target.side == "measurement" and (kind.target.stochastic or not kind.target.smooth):
@@ -109,7 +109,7 @@ def find_sensor_effects(
     highest = np.stack([fit.likelihood.max(0) for fit in fits])  # (kinds, J)
     gain = np.minimum(highest - none, MAX_GAIN)
     best = highest.argmax(0)
-    own = _measure_own_scatter(plain)
+    own = estimate_sensor_noise(reference)
     found = []
     for place, fit in enumerate(fits):
         relevant = fit.added >= MIN_ADDED_SCATTER * own
@@ -163,7 +163,7 @@ def _fit_sensor(
         measured = [_measure(kind, size, recording, machine) for recording in reference]
         drawn = np.stack([compute_scatter_statistics(one, machine) for one in measured])
         likelihood.append(_compute_likelihood(seen, drawn, plain))
-        means.append(drawn.mean(0))
+        means.append(_compute_mean(drawn))
         changes = [one - r.q for one, r in zip(measured, reference, strict=True)]
         added.append(np.sqrt(np.mean(np.square(np.concatenate(changes)), 0)))
     best = np.argmax(likelihood, 0)
@@ -173,12 +173,15 @@ def _fit_sensor(
     )
 
 
-def _measure_own_scatter(plain: np.ndarray) -> np.ndarray:
-    """Return the scatter of the reference's sensors, rad or m, `(J,)`: at rest, else in motion."""
-    scatter = np.exp(plain[..., :2]) / np.sqrt(WHITE_NOISE_FACTOR)
-    told = np.isfinite(scatter)
-    mean = np.where(told, scatter, 0.0).sum(0) / np.maximum(told.sum(0), 1)  # (J, 2)
-    return np.where(told.any(0)[:, 0], mean[:, 0], mean[:, 1])
+def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
+    """Return the standard deviation of the noise of each sensor, `(J,)`, from third differences.
+
+    The median makes edges of motions, which are few, count little. White noise of 1 has third
+    differences of sqrt(20).
+    """
+    third = [np.diff(recording.q.astype(float), 3, axis=0) for recording in recordings]
+    # 0.6745: median absolute value of a standard normal. 20 = 1 + 9 + 9 + 1, the squared weights.
+    return np.median(np.abs(np.concatenate(third)), 0) / 0.6745 / np.sqrt(20.0)
 
 
 def _estimate_parameters(
@@ -208,12 +211,25 @@ def _compute_likelihood(seen: np.ndarray, drawn: np.ndarray, plain: np.ndarray) 
     Parts scatter at least as they do without an effect, `plain` `(P, J, F)`: a few of them may
     agree by chance.
     """
-    variance = (
-        np.fmax(np.nanvar(drawn, 0, ddof=1), np.nanvar(plain, 0, ddof=1)) * (1.0 + 1.0 / len(drawn))
-        + STATISTICS_SIGMA**2
-    )
-    off = np.square(seen - np.nanmean(drawn, 0)) / variance
+    variance = np.fmax(_compute_variance(drawn), _compute_variance(plain))
+    variance = variance * (1.0 + 1.0 / len(drawn)) + STATISTICS_SIGMA**2
+    off = np.square(seen - _compute_mean(drawn)) / variance
     return -0.5 * np.nansum(off + np.where(np.isfinite(off), np.log(variance), 0.0), 1)
+
+
+def _compute_mean(values: np.ndarray) -> np.ndarray:
+    """Return the mean over parts `(P, …)` that have a value; NaN where none has."""
+    told = np.isfinite(values)
+    count = told.sum(0)
+    return np.where(count > 0, np.where(told, values, 0.0).sum(0) / np.maximum(count, 1), np.nan)
+
+
+def _compute_variance(values: np.ndarray) -> np.ndarray:
+    """Return the variance over parts `(P, …)` that have a value; NaN where fewer than two have."""
+    told = np.isfinite(values)
+    count = told.sum(0)
+    squares = np.square(np.where(told, values - _compute_mean(values), 0.0)).sum(0)
+    return np.where(count > 1, squares / np.maximum(count - 1, 1), np.nan)
 
 
 def _measure(kind: EffectType, size: float, recording: Recording, machine: Machine) -> np.ndarray:

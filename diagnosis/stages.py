@@ -28,6 +28,7 @@ from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points
 from diagnosis.probes import SPAN_S, Probe, probe_residuals
 from diagnosis.sanity import RecordingRemark, examine_recordings
+from diagnosis.sensors import estimate_sensor_noise
 from diagnosis.where import GapLocation, JointError, locate_gap
 
 
@@ -261,17 +262,6 @@ def _assess_sensing(
 def _compute_joint_excess(joint: JointError) -> float:
     """Return the mean squared error beyond the floor, never 0."""
     return max(joint.rmse**2 - joint.floor**2, 1e-18)
-
-
-def estimate_sensor_noise(recordings: Sequence[Recording]) -> np.ndarray:
-    """Return the standard deviation of the noise of each sensor, `(J,)`, from third differences.
-
-    The median makes edges of motions, which are few, count little. White noise of 1 has third
-    differences of sqrt(20).
-    """
-    third = [np.diff(recording.q.astype(float), 3, axis=0) for recording in recordings]
-    # 0.6745: median absolute value of a standard normal. 20 = 1 + 9 + 9 + 1, the squared weights.
-    return np.median(np.abs(np.concatenate(third)), 0) / 0.6745 / np.sqrt(20.0)
 
 
 def _assess_kinematics(known: StageEvidence) -> StageFinding | None:
