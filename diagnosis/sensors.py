@@ -20,8 +20,8 @@ from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel, estimate_interval
 
-SIZES = np.geomspace(0.05, 40.0, 34)
-"""Sizes that are tried, of typical; steps of 22 %, up to what a broken sensor shows. Steps chosen by
+SIZES = np.geomspace(0.05, 40.0, 40)
+"""Sizes that are tried, of typical; steps of 19 %, up to what a broken sensor shows. Steps chosen by
 hand."""
 MIN_ADDED_SCATTER = 1.0
 """Least scatter that an effect adds to the positions, over that of the reference's own sensor: what
