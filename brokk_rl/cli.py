@@ -167,7 +167,10 @@ def _drop_consumed_groups(cfg: DictConfig) -> DictConfig:
     An option can thus bring groups of its own: `link=simulated` brings the actuator that it
     simulates, which is chosen like any other.
     """
-    taken = {name for name in re.findall(r"\$\{(\w+)\}", OmegaConf.to_yaml(cfg)) if name in cfg}
+    taken = set()
+    for name in re.findall(r"\$\{(\w+)\}", OmegaConf.to_yaml(cfg)):
+        if name in cfg:
+            taken.add(name)
     if not taken:
         return cfg
     taken -= set(getattr(get_class(str(cfg._target_)), "__dataclass_fields__", ()))
@@ -339,7 +342,10 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
         if "No match in the defaults list" in text or key in {
             option.group for option in registry.list_options()
         }:
-            groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
+            groups = []
+            for k in cfg.hydra.runtime.choices:
+                if not str(k).startswith("hydra"):
+                    groups.append(str(k))
             return f"{source} '{key}', but mode={_read_mode_name(cfg)} does not use such a group; {list_choices(key, groups)}"
         parent, _, leaf = key.rpartition(".")
         while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
@@ -355,7 +361,10 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
 
 def _compose_mode() -> DictConfig:
     """Compose the mode of the command line without other overrides, to list its groups and fields."""
-    modes = [arg for arg in sys.argv[1:] if arg.startswith("mode=")]
+    modes = []
+    for arg in sys.argv[1:]:
+        if arg.startswith("mode="):
+            modes.append(arg)
     with hydra.initialize_config_module("conf", version_base="1.3"):
         return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
 

@@ -35,6 +35,7 @@ HEADINGS = {
     "valve_travel": "travel, 1/s",
 }
 SCALES = {"lateral_error_m": 1e3, "peak_force_n": 1e-3}
+"""Factors of shown figures: mm and kN."""
 SUCCESS = "episode/success_strict"
 REACHED = 0.95
 """Success rate whose first crossing is reported and drawn, the goal of one insertion in 20
@@ -42,6 +43,7 @@ failing."""
 LABEL_WIDTH = 42
 """Characters of a row label before it wraps."""
 MOST_COLUMNS = 4
+"""Largest number of columns of differences. Chosen by hand; not searched."""
 UNLIKE_MOST, UNLIKE_MOST_WIDTH = "unlike most", 24
 """Above `MOST_COLUMNS` columns the table has one column with the values that most rows lack."""
 
@@ -77,11 +79,10 @@ class EvaluatedRun:
     @property
     def choices(self) -> dict[str, Any]:
         """Chosen options of the config groups that describe the experiment."""
-        found = {
-            key: value
-            for key, value in self.record.get("choices", {}).items()
-            if key not in NOT_COMPARED
-        }
+        found = {}
+        for key, value in self.record.get("choices", {}).items():
+            if key not in NOT_COMPARED:
+                found[key] = value
         if "actuator" in self.evaluation:
             found.setdefault("actuator", self.evaluation["actuator"])
         return found
@@ -93,10 +94,13 @@ class EvaluatedRun:
     @property
     def overridden(self) -> set[str]:
         """Dotted keys that the command line or the sweep has set."""
-        keys = {
-            override.partition("=")[0].lstrip("+~") for override in self.record.get("overrides", ())
-        }
-        return {key for key in keys if "." in key and key.split(".")[0] not in NOT_COMPARED}
+        compared = set()
+        for override in self.record.get("overrides", ()):
+            key = override.partition("=")[0].lstrip("+~")
+            # a key without a dot is a group: `choices` has it
+            if "." in key and key.split(".")[0] not in NOT_COMPARED:
+                compared.add(key)
+        return compared
 
     def results(self, columns: Sequence[str]) -> list[dict[str, Any]]:
         """Return one entry with figures for each policy that this run evaluated."""
@@ -105,9 +109,10 @@ class EvaluatedRun:
         found = []
         for policy, figures in policies.items():
             made = self.training if self.training and policy == main else self
-            variation = {
-                column: made.get_setting(column) for column in columns if column != EVALUATED_ON
-            }
+            variation = {}
+            for column in columns:
+                if column != EVALUATED_ON:
+                    variation[column] = made.get_setting(column)
             if EVALUATED_ON in columns:
                 variation[EVALUATED_ON] = self.choices.get("actuator")
             seed = made.record.get("seed", self.evaluation.get("seed"))
@@ -186,16 +191,14 @@ def find_differences(runs: Sequence[EvaluatedRun]) -> list[str]:
     made = [run.training or run for run in runs]
     groups = sorted({key for run in made for key in run.choices})
     groups = [key for key in groups if len({repr(run.choices.get(key)) for run in made}) > 1]
-    above = {key for run in made for key in run.overridden}
-    keys = sorted(
-        {
-            key
-            for run in made
-            for key in run.values
-            if any(key == top or key.startswith(top + ".") for top in above)
-        }
-    )
-    keys = [key for key in keys if len({repr(run.values.get(key)) for run in made}) > 1]
+    above: set[str] = set()
+    for run in made:
+        above |= run.overridden
+    inside = tuple(f"{top}." for top in above)
+    touched: set[str] = set()
+    for run in made:
+        touched.update(key for key in run.values if key in above or key.startswith(inside))
+    keys = [key for key in sorted(touched) if len({repr(run.values.get(key)) for run in made}) > 1]
     elsewhere = [EVALUATED_ON] if any(run.training for run in runs) else []
     return groups + keys + elsewhere
 
@@ -224,29 +227,35 @@ def group_results(results: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     sets: dict[str, list[dict[str, Any]]] = {}
     for result in results:
         sets.setdefault(json.dumps([result["policy"], result["variation"]]), []).append(result)
-    return [
-        {
-            "policy": members[0]["policy"],
-            "variation": members[0]["variation"],
-            "seeds": [member["seed"] for member in members],
-            "runs": len(members),
-            **{
-                name: _average_seeds([member[name] for member in members], name in RATES)
-                for name in (*RATES, *MEASURES)
-            },
-        }
-        for members in sets.values()
-    ]
+    averaged = []
+    for members in sets.values():
+        averaged.append(
+            {
+                "policy": members[0]["policy"],
+                "variation": members[0]["variation"],
+                "seeds": [member["seed"] for member in members],
+                "runs": len(members),
+                **{
+                    name: _average_seeds([member[name] for member in members], name in RATES)
+                    for name in (*RATES, *MEASURES)
+                },
+            }
+        )
+    return averaged
 
 
 def format_csv(columns: Sequence[str], results: Sequence[dict[str, Any]]) -> str:
     """Return CSV text with one line for each run and policy."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    bounds = [f"{rate}_{bound}" for rate in RATES for bound in ("low", "high")]
+    bounds = []
+    for rate in RATES:
+        bounds += [f"{rate}_low", f"{rate}_high"]
     writer.writerow(["folder", "policy", "seed", *columns, "episodes", *RATES, *bounds, *MEASURES])
     for result in results:
-        ends = [bound for rate in RATES for bound in (result[rate]["ci95"] or (None, None))]
+        ends = []
+        for rate in RATES:
+            ends.extend(result[rate]["ci95"] or (None, None))
         setting = [result["variation"][column] for column in columns]
         rates, measures = ([result[name]["mean"] for name in names] for names in (RATES, MEASURES))
         writer.writerow(
@@ -302,11 +311,11 @@ def _average_seeds(figures: Sequence[dict[str, Any]], is_rate: bool) -> dict[str
 def _flatten(node: Any, prefix: str = "") -> dict[str, Any]:
     if not isinstance(node, dict):
         return {prefix: node}
-    return {
-        key: value
-        for name, child in node.items()
-        for key, value in _flatten(child, f"{prefix}.{name}" if prefix else str(name)).items()
-    }
+    flat = {}
+    for name, child in node.items():
+        for key, value in _flatten(child, f"{prefix}.{name}" if prefix else str(name)).items():
+            flat[key] = value
+    return flat
 
 
 def build_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Table:
@@ -334,32 +343,31 @@ def describe_differences(groups: Sequence[dict[str, Any]]) -> list[str]:
 
     Where no value of a column is the most frequent, every value counts as unusual.
     """
-    counts = {
-        column: Counter(repr(group["variation"][column]) for group in groups).most_common()
-        for column in groups[0]["variation"]
-    }
-    usual = {
-        column: found[0][0]
-        for column, found in counts.items()
-        if len(found) == 1 or found[0][1] > found[1][1]
-    }
+    counts = {}
+    for column in groups[0]["variation"]:
+        counts[column] = Counter(repr(group["variation"][column]) for group in groups).most_common()
+    usual = {}
+    for column, found in counts.items():
+        if len(found) == 1 or found[0][1] > found[1][1]:
+            usual[column] = found[0][0]
     names = _format_shortest(list(counts))
-    return [
-        ", ".join(
-            f"{names[key]} {value}"
-            for key, value in group["variation"].items()
-            if repr(value) != usual.get(key)
+    differences = []
+    for group in groups:
+        differences.append(
+            ", ".join(
+                f"{names[key]} {value}"
+                for key, value in group["variation"].items()
+                if repr(value) != usual.get(key)
+            )
         )
-        for group in groups
-    ]
+    return differences
 
 
 def draw_comparison(groups: Sequence[dict[str, Any]]) -> Figure:
     """Draw success with interval, peak force and valve travel, a row for each policy and variation."""
-    labels = [
-        ", ".join(filter(None, (group["policy"], text)))
-        for group, text in zip(groups, describe_differences(groups), strict=True)
-    ]
+    labels = []
+    for group, text in zip(groups, describe_differences(groups), strict=True):
+        labels.append(", ".join(filter(None, (group["policy"], text))))
     figure = Figure(figsize=(11.0, 1.4 + 0.42 * len(groups)), layout="constrained")
     success, *others = figure.subplots(1, 3, sharey=True, width_ratios=(2, 1, 1))
     rows = np.arange(len(groups))[::-1]
@@ -367,25 +375,11 @@ def draw_comparison(groups: Sequence[dict[str, Any]]) -> Figure:
         (0.14, "success_strict", "#1f5f8b", "o"),
         (-0.14, "success_paper", "#c27c2c", "s"),
     ):
-        _pick_marks(
-            success,
-            rows + shift,
-            [group[rate] for group in groups],
-            1.0,
-            color,
-            mark,
-            HEADINGS[rate],
-        )
+        rates = [group[rate] for group in groups]
+        _pick_marks(success, rows + shift, rates, 1.0, color, mark, HEADINGS[rate])
     for axes, name in zip(others, ("peak_force_n", "valve_travel"), strict=True):
-        _pick_marks(
-            axes,
-            rows,
-            [group[name] for group in groups],
-            SCALES.get(name, 1.0),
-            "#444444",
-            "o",
-            None,
-        )
+        measures = [group[name] for group in groups]
+        _pick_marks(axes, rows, measures, SCALES.get(name, 1.0), "#444444", "o", None)
         axes.set(xlabel=HEADINGS[name])
         axes.set_xlim(left=0.0)
     success.set(
@@ -448,20 +442,15 @@ def _pick_marks(
     label: str | None,
 ) -> None:
     """Draw means as marks and intervals as lines; figures without a mean are left out."""
-    known = [
-        (row, figure)
-        for row, figure in zip(rows, figures, strict=True)
-        if figure["mean"] is not None
-    ]
-    axes.plot(
-        [scale * figure["mean"] for _, figure in known],
-        [row for row, _ in known],
-        mark,
-        color=color,
-        label=label,
-    )
-    for row, figure in known:
-        if figure["ci95"]:
+    x, y = [], []
+    for row, figure in zip(rows, figures, strict=True):
+        if figure["mean"] is None:
+            continue
+        x.append(scale * figure["mean"])
+        y.append(row)
+    axes.plot(x, y, mark, color=color, label=label)
+    for row, figure in zip(rows, figures, strict=True):
+        if figure["mean"] is not None and figure["ci95"]:
             axes.plot(
                 scale * np.asarray(figure["ci95"]), [row] * 2, "-", color=color, linewidth=1.5
             )

@@ -5,6 +5,7 @@ import torch
 from brokk_rl.machine import Machine
 
 GRAVITY_M_S2 = 9.81
+"""Gravity, m/s²: standard gravity (9.80665), rounded."""
 
 
 class Gravity:

@@ -268,10 +268,14 @@ class _RecordingScan:
         """Find rows that repeat the row before although a joint moves visibly."""
         same = np.append(False, (np.diff(self._q, axis=0) == 0).all(1))
         seen = (np.abs(self._v) * self._period_s > self._visible).any(1)
-        return [
-            self._finding("repeated rows", None, row, count, f"{count} rows repeat the one before")
-            for row, count in find_stretches(same & seen)
-        ]
+        repeats = []
+        for row, count in find_stretches(same & seen):
+            repeats.append(
+                self._finding(
+                    "repeated rows", None, row, count, f"{count} rows repeat the one before"
+                )
+            )
+        return repeats
 
     def beyond(self) -> list[RecordingFinding]:
         """Find positions outside the limits, by more than the sensor's own noise and step."""

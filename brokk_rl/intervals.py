@@ -9,6 +9,7 @@ import numpy as np
 from scipy import stats
 
 CONFIDENCE = 0.95
+"""Level of all intervals; the usual one."""
 
 
 def compute_wilson_interval(successes: float, trials: int) -> tuple[float, float]:

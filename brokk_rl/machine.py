@@ -228,10 +228,11 @@ class Machine:
         positions do not.
         """
         bodies = [joint.body for joint in self.joints]
-        geometry = [
-            None if body is None else [d.value for d in body.origin_m] + [*body.axis]
-            for body in bodies
-        ]
+        geometry = []
+        for body in bodies:
+            geometry.append(
+                None if body is None else [d.value for d in body.origin_m] + [*body.axis]
+            )
         groups = {
             "name": self.name,
             "joints": [[joint.name, joint.kind] for joint in self.joints],
@@ -240,10 +241,10 @@ class Machine:
             "control": [self.period_s, self.num_history, list(self.exclusive)],
             "levers": [asdict(lever) for lever in self.levers],
         }
-        return {
-            key: hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
-            for key, value in groups.items()
-        }
+        hashes = {}
+        for key, value in groups.items():
+            hashes[key] = hashlib.sha256(json.dumps(value).encode()).hexdigest()[:12]
+        return hashes
 
     def check_fingerprint(self, other: dict[str, str], what: str) -> None:
         """Refuse a fingerprint `other` of the file `what` that differs.
@@ -252,7 +253,10 @@ class Machine:
             CheckpointError: Groups of fields differ; the message names them.
         """
         mine = self.fingerprint()
-        differing = [key for key in mine if other.get(key) != mine[key]]
+        differing = []
+        for key in mine:
+            if other.get(key) != mine[key]:
+                differing.append(key)
         if differing:
             raise CheckpointError(
                 f"{what} was made for another machine: {', '.join(differing)} differ from machine '{self.name}'. "

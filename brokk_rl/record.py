@@ -256,9 +256,9 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
         return None, [Breach("no such recording")]
     except (pa.ArrowException, OSError) as error:
         return None, [Breach(f"truncated or not a Parquet file ({error})")]
-    metadata = {
-        key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()
-    }
+    metadata = {}
+    for key, value in (table.schema.metadata or {}).items():
+        metadata[key.decode()] = value.decode()
     metadata = {
         key.removeprefix("brokk."): value
         for key, value in metadata.items()

@@ -137,7 +137,9 @@ class Report:
         for row in cells:
             if len(row) != len(columns):
                 raise ValueError(f"expected {len(columns)} cells a row, got {len(row)}: {row}")
-        numeric = [_is_numeric([row[i].value for row in cells]) for i in range(len(columns))]
+        numeric = []
+        for i in range(len(columns)):
+            numeric.append(_is_numeric([row[i].value for row in cells]))
         shown = []
         for row in cells:
             shown.append(
@@ -146,10 +148,9 @@ class Report:
                     for cell, is_number in zip(row, numeric, strict=True)
                 ]
             )
-        heads = [
-            {"name": name, "is_number": is_number}
-            for name, is_number in zip(columns, numeric, strict=True)
-        ]
+        heads = []
+        for name, is_number in zip(columns, numeric, strict=True):
+            heads.append({"name": name, "is_number": is_number})
         self._blocks.append(
             {
                 "kind": "table",

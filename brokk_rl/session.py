@@ -272,7 +272,11 @@ def write_text(path: Path, text: str) -> None:
 
 def list_missing_folders(folder: Path) -> list[Path]:
     """Return `folder` and its parents that do not exist yet, the innermost first."""
-    return [path for path in (folder, *folder.parents) if not path.exists()]
+    missing = []
+    for path in (folder, *folder.parents):
+        if not path.exists():
+            missing.append(path)
+    return missing
 
 
 def remove_empty_folders(folders: Sequence[Path]) -> None:

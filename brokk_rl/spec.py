@@ -62,15 +62,15 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
             raise ConfigError(
                 f"{where}: expected {len(inner)} values, got {len(value)}: {list(value)}"
             )
-        return tuple(
-            _convert(v, h, f"{where}[{i}]")
-            for i, (v, h) in enumerate(zip(value, inner, strict=True))
-        )
+        items = []
+        for i, (v, h) in enumerate(zip(value, inner, strict=True)):
+            items.append(_convert(v, h, f"{where}[{i}]"))
+        return tuple(items)
     if origin is dict and isinstance(value, dict):
-        return {
-            _convert(k, args[0], where): _convert(v, args[1], f"{where}.{k}")
-            for k, v in value.items()
-        }
+        table = {}
+        for k, v in value.items():
+            table[_convert(k, args[0], where)] = _convert(v, args[1], f"{where}.{k}")
+        return table
     plain = origin or hint
     if plain is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)

@@ -103,7 +103,10 @@ def check_commanded(
         sum(recording.duration_s for recordings in runs.values() for recording in recordings) / 60.0
     )
     for joint, name in enumerate(machine.joint_names):
-        where = [run for run, commanded in moving.items() if commanded[joint]]
+        where = []
+        for run, commanded in moving.items():
+            if commanded[joint]:
+                where.append(run)
         if len(where) >= needed:
             continue
         found = f"in {len(where)} ({', '.join(where)})" if where else "in none"

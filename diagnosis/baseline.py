@@ -45,12 +45,15 @@ from diagnosis.search import SubsetTable
 log = logging.getLogger(__name__)
 
 
+# Chosen by hand; not searched.
 TUNING_STEPS = 3
+"""Gauss-Newton steps."""
 TIME_STEP_S = 0.004
-"""Finite difference of a time; numbers without a unit: `PART`."""
+"""Finite difference of a time, s."""
 NUMBER_STEP = 0.01
+"""Finite difference of a number without a unit."""
 TUNING_PRIOR = 4.0
-"""Prior: numbers are off by so many finite differences."""
+"""Prior standard deviation of a number, in finite differences."""
 
 
 def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
@@ -72,6 +75,7 @@ def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
         total = compute_loss(errors, 1) + 0.5 * np.square((now - start) / size / TUNING_PRIOR).sum(
             0
         )
+        # Joint by joint: a step that fails on one joint is halved there alone.
         better = total < lowest
         best, lowest = np.where(better, now, best), np.minimum(total, lowest)
         step = np.zeros_like(now)
@@ -86,9 +90,11 @@ def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
             np.minimum(start, 0.0),
             np.maximum(start, most),
         )
-    return {
-        name: row for name, row in zip(names, best - start, strict=True) if np.abs(row).max() > 0
-    }
+    found = {}
+    for name, row in zip(names, best - start, strict=True):
+        if np.abs(row).max() > 0:
+            found[name] = row
+    return found
 
 
 def apply_changes(actuator: Actuator, by: dict[str, np.ndarray], machine: Machine) -> Actuator:
@@ -111,17 +117,17 @@ def _linearise_parameters(
         varied[p + 1, p] += size[p]
     errors, slopes = [], []
     for part in parts:
-        paths = part.simulator.simulate(
-            [], count + 1, {name: varied[:, p] for p, name in enumerate(names)}
-        )
+        values = {name: varied[:, p] for p, name in enumerate(names)}
+        paths = part.simulator.simulate([], count + 1, values)
         z = part.whiten(part.compute_error(paths))
         errors.append(z[:, 0])
         slopes.append(z[:, :1] - z[:, 1:])
     return np.concatenate(errors, 1), np.concatenate(slopes, 2)
 
 
+# Chosen by hand; not searched.
 FOLDS = 4
-"""Times that a part of the reference is left out."""
+"""Cross-validation folds of the reference; a fit takes time for each."""
 COVARIANCE_WINDOWS = 3
 """Windows in a row on which the noise is fitted."""
 
@@ -301,9 +307,8 @@ def _cross_validate(
 ) -> tuple[Actuator, list[SimulatorComparison]]:
     """Return a fit, and fits that left out a part of the recordings' `pieces`, each held against that part, their noise known."""
     begun = _list_started(pieces)
-    fold = (
-        np.arange(len(pieces)) % FOLDS
-    )  # in turns: what is left out is of the same making as what is fitted to
+    # In turns: the pieces left out are then of the same making as the others.
+    fold = np.arange(len(pieces)) % FOLDS
     refit: Any = getattr(fit, "refit", None)
     left_out = []
     if refit:
@@ -338,24 +343,24 @@ def fit_covariances(
     """Return the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
     found = []
     for j in range(machine.num_joints):
-        error, way = (
-            [_join_windows(getattr(one.residuals, name)[..., j]) for one in left_out]
-            for name in ("error", "increments")
-        )
-        found.append(fit_noise(np.concatenate(error), np.concatenate(way)))
+        error = [_join_windows(one.residuals.error[..., j]) for one in left_out]
+        increments = [_join_windows(one.residuals.increments[..., j]) for one in left_out]
+        found.append(fit_noise(np.concatenate(error), np.concatenate(increments)))
     return found
 
 
 def _join_windows(values: np.ndarray) -> np.ndarray:
-    """Return increments `(W, I)` with several windows in a row, `(W / TOGETHER, TOGETHER I)`."""
+    """Return increments `(W, I)` with several windows in a row, `(W / N, N I)`."""
     together = min(COVARIANCE_WINDOWS, len(values))
     return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
 
 
 def _find_known_windows(case: GapCase, field: SimulatorComparison) -> np.ndarray:
     """Return which field windows stay within the poses and commands that the reference visited, `(W, J)` bool."""
-    q, u = (np.concatenate([getattr(r, name) for r in case.reference]) for name in ("q", "u"))
+    q = np.concatenate([one.q for one in case.reference])
+    u = np.concatenate([one.u for one in case.reference])
     cut, travel = field.residuals.simulator.cut, case.machine.upper - case.machine.lower
+    # Beyond them the simulator extrapolates, and its errors say nothing about the machine.
     low, high = q.min(0) - 0.03 * travel, q.max(0) + 0.03 * travel
     outside = (cut.q < low) | (cut.q > high)
     most = np.abs(u).max(0) + 0.05
@@ -363,13 +368,15 @@ def _find_known_windows(case: GapCase, field: SimulatorComparison) -> np.ndarray
     return (outside.mean(1) < 0.1) & (beyond.mean(1) < 0.1)
 
 
+# Chosen by hand. SURE_GAIN was 8 before; no comparison is recorded.
 REFERENCE_SIZES = (0.12, 0.3, 0.45, 0.6, 1.0)
+"""Sizes over the typical one."""
 SURE_GAIN = 6.0
-"""Log of a Bayes factor, all parts together, from which an effect is there."""
+"""Log Bayes factor, all parts together, from which an effect is there."""
 AGREEING_SHARE = 0.75
-"""Share of the parts in which it must pay."""
+"""Share of the parts in which its gain must be positive."""
 REFERENCE_WINDOWS = 3
-"""This is looked for on one of so many stretches of each part."""
+"""One of so many stretches of each part is searched, which saves time."""
 
 RaysByTrial = Mapping[str, Sequence[ParameterRay]]
 
@@ -385,9 +392,10 @@ def add_reference_effects(
         kinds: The library.
         machine: The machine.
     """
-    ways = {
-        key: way for kind in kinds if _is_one_sided(kind) for key, way in _list_trials(kind).items()
-    }
+    ways: dict[str, list[ParameterRay]] = {}
+    for kind in kinds:
+        if _is_one_sided(kind):
+            ways |= _list_trials(kind)
     if len(base.left_out) < 2 or base.is_flexible:
         return base
     found = _find_effects(
@@ -416,9 +424,8 @@ def _list_trials(kind: EffectType) -> dict[str, list[ParameterRay]]:
     found = {}
     for place, trial in enumerate(trials):
         shape = {name: np.full(kind.num_joints, part) for name, part in trial.items()}
-        found[f"{kind.name} {place}"] = [
-            replace(ray, shape=shape) for ray in build_rays(kind, REFERENCE_SIZES)
-        ]
+        rays = build_rays(kind, REFERENCE_SIZES)
+        found[f"{kind.name} {place}"] = [replace(ray, shape=shape) for ray in rays]
     return found
 
 
@@ -426,9 +433,9 @@ def _find_effects(
     parts: Sequence[Residuals], ways: RaysByTrial, joint_names: Sequence[str]
 ) -> list[tuple[EffectType, EffectValues]]:
     """Return the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
-    responses = {
-        key: [[part.response(ray) for ray in way] for part in parts] for key, way in ways.items()
-    }
+    responses: dict[str, list[list[np.ndarray]]] = {}
+    for key, way in ways.items():
+        responses[key] = [[part.response(ray) for part in parts] for ray in way]
     of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
     found: dict[str, tuple[EffectType, dict[str, np.ndarray]]] = {}
     for j in range(parts[0].z.shape[0]):
@@ -438,21 +445,17 @@ def _find_effects(
         )
         shapes: dict[str, list[Response]] = {}
         for key, way in ways.items():
-            changes = [
-                np.concatenate([one[k][j] for one in responses[key]], 1) for k in range(len(way))
-            ]
+            changes = [np.concatenate([one[j] for one in own], 1) for own in responses[key]]
             if max(np.abs(change).max() for change in changes) >= MIN_RESPONSE:
-                shapes[key] = [
-                    Response(ray.sizes, change) for ray, change in zip(way, changes, strict=True)
-                ]
+                pairs = zip(way, changes, strict=True)
+                shapes[key] = [Response(ray.sizes, change) for ray, change in pairs]
         table = SubsetTable(joint, shapes, of_part)
         scored = {key: table.score(frozenset({key})) for key in shapes}
         best = max(scored, key=lambda key: scored[key].total, default=None)
-        if (
-            best is None
-            or scored[best].total < SURE_GAIN
-            or np.mean(np.bincount(of_part, scored[best].gain) > 0) < AGREEING_SHARE
-        ):
+        if best is None or scored[best].total < SURE_GAIN:
+            continue
+        # A fault of one recording is no property of the machine.
+        if np.mean(np.bincount(of_part, scored[best].gain) > 0) < AGREEING_SHARE:
             continue
         kind = ways[best][0].kind
         log.info("the reference shows %s on %s already", kind.name, joint_names[j])
@@ -473,9 +476,8 @@ def _expand_values(
     }
     for ray, size in zip(ways, sizes, strict=True):
         found |= ray.values(np.full((1, kind.num_joints), size))
-    return {
-        name: np.broadcast_to(value, (1, kind.num_joints)).copy() for name, value in found.items()
-    }
+    shape = (1, kind.num_joints)
+    return {name: np.broadcast_to(value, shape).copy() for name, value in found.items()}
 
 
 def _wrap_simulator(

@@ -21,31 +21,28 @@ from diagnosis.calibration import ProbabilityModel
 from diagnosis.detection import DetectionResult, Penalties, choose_by_penalties
 from diagnosis.effect_library import DetectedEffect, EffectType, list_shared_effects
 from diagnosis.refine import drop_effects
-from diagnosis.residuals import Residuals
+from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import fit_faults
 from diagnosis.search import EffectSet, Subset, SubsetScore, SubsetTable, list_promising_subsets
 
 
 def record_weights(result: DetectionResult, penalties: Penalties) -> dict[str, Any]:
     """Return all subsets with gains and penalties as plain JSON data."""
-    joints, common = (
-        [],
-        list_shared_effects(ways[0].kind for ways in result.rays.values() if ways),
-    )
+    joints: list[dict[str, Any]] = []
+    common = list_shared_effects(ways[0].kind for ways in result.rays.values() if ways)
     for j, table in enumerate(result.tables):
         priced = {*list_promising_subsets(table, penalties.joint, penalties.share, common)}
         rows = []
         for subset in sorted(table.scores, key=sorted):
             if subset in priced:
+                # The part of the penalty that does not depend on `penalties`, for other ones.
                 null = result.price(j, subset) - penalties.joint * len(subset - common)
-                rows.append(
-                    _record_subset(table, subset)
-                    | {"null": round(null / max(penalties.reference, 1e-9), 2)}
-                )
+                known = {"null": round(null / max(penalties.reference, 1e-9), 2)}
+                rows.append(_record_subset(table, subset) | known)
             elif subset and (len(subset) < 3 or any(subset < larger for larger in priced)):
-                rows.append(
-                    _record_subset(table, subset) | {"gain": round(table.scores[subset].total, 2)}
-                )
+                # A smaller subset shows the gain that each effect adds to a larger one.
+                known = {"gain": round(table.scores[subset].total, 2)}
+                rows.append(_record_subset(table, subset) | known)
         joints.append({"felt": sorted(table.shapes), "subsets": rows})
     return {
         "joints": joints,
@@ -79,9 +76,8 @@ def restore_result(
             gain = np.array(row["gain"]) if "null" in row else np.full(count, row["gain"] / count)
             table.scores[frozenset(row["effects"])] = SubsetScore(gain, sizes)
         tables.append(table)
-        left_out.append(
-            {frozenset(row["effects"]): row["null"] for row in joint["subsets"] if "null" in row}
-        )
+        priced = [row for row in joint["subsets"] if "null" in row]
+        left_out.append({frozenset(row["effects"]): row["null"] for row in priced})
 
     def price(j: int, subset: Subset) -> float:
         return penalties.joint * len(
@@ -110,7 +106,9 @@ def restore_result(
         "scatter": np.array(told["scatter"]),
         "strays": np.array(told["strays"]),
     }
-    rays = {name: [] for joint in told["joints"] for name in joint["felt"]}
+    rays = {}
+    for joint in told["joints"]:
+        rays |= {name: [] for name in joint["felt"]}
     return DetectionResult(
         residuals, tables, rays, price, chosen, None, others, tool_left=told["tool_left"], **arrays
     )
@@ -128,6 +126,9 @@ SAME_SHARE = 0.9
 SAME_NATS = 3.0
 """Difference in log likelihood that says nothing."""
 MAX_LISTED = 8
+"""Longest ranking. Chosen by hand; not searched."""
+MAX_EQUIVALENTS = 3
+"""Longest list of equivalent effects. Chosen by hand; not searched."""
 MIN_NAMED = 0.5
 """Probability from which a further effect is named: one that is missed costs what a wrong one
 does."""
@@ -164,22 +165,26 @@ def rank_substitutions(result: DetectionResult, name: str) -> list[Substitution]
     without = {j: result.tables[j].score(subsets[j] - {name}).total for j in places}
     own = sum(result.tables[j].score(subsets[j]).total - without[j] for j in places)
     for other in result.rays:
-        if other in result.chosen.names or not all(
-            other in result.tables[j].shapes for j in places
-        ):
+        # An effect that does nothing to one of the joints cannot take the place there.
+        felt = all(other in result.tables[j].shapes for j in places)
+        if other in result.chosen.names or not felt:
             continue
-        earned = sum(
-            result.tables[j].score(subsets[j] - {name} | {other}).total - without[j] for j in places
-        )
+        gains = []
+        for j in places:
+            swapped = result.tables[j].score(subsets[j] - {name} | {other})
+            gains.append(swapped.total - without[j])
+        earned = sum(gains)
         found.append(Substitution(other, earned, earned / max(own, 1e-9)))
     return sorted(found, key=lambda swap: -swap.earned)
 
 
 def list_equivalents(swaps: Sequence[Substitution], own: float) -> tuple[str, ...]:
     """Return the effects that cannot be told from one that earns `own`, at most three."""
-    return tuple(
-        swap.name for swap in swaps if swap.share > SAME_SHARE or own - swap.earned < SAME_NATS
-    )[:3]
+    found = []
+    for swap in swaps:
+        if swap.share > SAME_SHARE or own - swap.earned < SAME_NATS:
+            found.append(swap.name)
+    return tuple(found[:MAX_EQUIVALENTS])
 
 
 def look_up_values(result: DetectionResult, name: str, other: str) -> dict[str, np.ndarray]:
@@ -197,12 +202,16 @@ def look_up_values(result: DetectionResult, name: str, other: str) -> dict[str, 
 
 def compute_own_gain(result: DetectionResult, name: str) -> float:
     """Return the gain of a chosen effect over the rest of the set, on all joints that have it."""
-    subsets = [
-        (t, s) for t, s in zip(result.tables, result.chosen.subsets, strict=True) if name in s
-    ]
-    return sum(
-        table.score(subset).total - table.score(subset - {name}).total for table, subset in subsets
-    )
+    gains = []
+    for table, subset in _list_places(result, name):
+        gains.append(table.score(subset).total - table.score(subset - {name}).total)
+    return sum(gains)
+
+
+def _list_places(result: DetectionResult, name: str) -> list[tuple[SubsetTable, Subset]]:
+    """Return table and subset of each joint that has an effect."""
+    pairs = zip(result.tables, result.chosen.subsets, strict=True)
+    return [(table, subset) for table, subset in pairs if name in subset]
 
 
 def compute_margin(
@@ -214,9 +223,11 @@ def compute_margin(
 ) -> float:
     """Return the net gain of a chosen effect over the best alternative: no effect, or one that is not like it."""
     own, subsets = compute_own_gain(result, name), result.chosen.subsets
-    saved = sum(
-        result.price(j, s) - result.price(j, s - {name}) for j, s in enumerate(subsets) if name in s
-    )
+    prices = []
+    for j, subset in enumerate(subsets):
+        if name in subset:
+            prices.append(result.price(j, subset) - result.price(j, subset - {name}))
+    saved = sum(prices)
     others = [own - swap.earned for swap in swaps if swap.name not in like]
     return min([own - saved - penalties.name, *others])
 
@@ -230,9 +241,7 @@ def read_chosen_signs(
     like: Sequence[str],
 ) -> dict[str, float]:
     """Return the signs that a chosen effect is rightly named."""
-    places = [
-        (t, s) for t, s in zip(result.tables, result.chosen.subsets, strict=True) if name in s
-    ]
+    places = _list_places(result, name)
     whole = sum(table.score(subset).total for table, subset in places)
     size = max(float(np.abs(table.score(subset).sizes[name]).max()) for table, subset in places)
     adds = compute_own_gain(result, name) / max(whole, 1e-9)
@@ -258,13 +267,11 @@ def read_none_signs(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> dict[str, float]:
     """Return the signs that there is nothing to find."""
-    nearest = max(
-        (_score_alone(result, penalties, name)[0] for name in result.rays), default=-penalties.name
+    gains = [_score_alone(result, penalties, name)[0] for name in result.rays]
+    outside = calibration.compute_log_odds(
+        weights.outside, calibration.collect_outside_signs(result)
     )
-    return calibration.collect_none_signs(
-        nearest,
-        calibration.compute_log_odds(weights.outside, calibration.collect_outside_signs(result)),
-    )
+    return calibration.collect_none_signs(max(gains, default=-penalties.name), outside)
 
 
 def estimate_numbers(
@@ -282,10 +289,10 @@ def estimate_numbers(
         for name in (ray.name,) if ray.name else kind.fitted:
             number, unit = kind.numbers[name], kind.size(name)
             for j in np.flatnonzero(mask):
-                ends = number.none + unit * calibration.widen_interval(
-                    size[j] + np.array([-1.96, 0.0, 1.96]) * deviation[j], form
-                )
-                low, mean, high = (float(v) for v in np.sort(np.clip(ends, *number.bounds)))
+                interval = size[j] + np.array([-1.96, 0.0, 1.96]) * deviation[j]
+                ends = number.none + unit * calibration.widen_interval(interval, form)
+                # A unit below 0 turns the ends around.
+                low, mean, high = np.sort(np.clip(ends, *number.bounds)).tolist()
                 joint = machine.joint_names[j] if number.per_joint else "machine"
                 found.setdefault(name, {})[joint] = Estimate(mean, (low, high))
     for ray in fitted.rays:
@@ -301,10 +308,8 @@ def rank_chosen_effects(
     result: DetectionResult, kinds: Mapping[str, EffectType]
 ) -> list[EffectType]:
     """Return the chosen effects, the ones that earn most first."""
-    return [
-        kinds[name]
-        for name in sorted(result.chosen.names, key=lambda name: -compute_own_gain(result, name))
-    ]
+    names = sorted(result.chosen.names, key=lambda name: -compute_own_gain(result, name))
+    return [kinds[name] for name in names]
 
 
 def find_unexplained_joints(result: DetectionResult) -> np.ndarray:
@@ -330,22 +335,14 @@ def compute_effect_probabilities(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> dict[str, float]:
     """Return the probability of each effect that was found."""
-    found = {
-        one.kind.name: calibration.compute_probability(
-            weights.right, read_detected_signs(result, weights, one)
-        )
-        for one in result.detected
-    }
+    found: dict[str, float] = {}
+    for one in result.detected:
+        signs = read_detected_signs(result, weights, one)
+        found[one.kind.name] = calibration.compute_probability(weights.right, signs)
     for name in result.chosen.names:
         swaps = rank_substitutions(result, name)
-        signs = read_chosen_signs(
-            result,
-            penalties,
-            weights,
-            name,
-            swaps,
-            list_equivalents(swaps, compute_own_gain(result, name)),
-        )
+        like = list_equivalents(swaps, compute_own_gain(result, name))
+        signs = read_chosen_signs(result, penalties, weights, name, swaps, like)
         found[name] = calibration.compute_probability(weights.right, signs)
     return found
 
@@ -363,14 +360,8 @@ def is_unknown(result: DetectionResult, penalties: Penalties, weights: Probabili
         return False
     chances, least = list(named.values()), MIN_UNKNOWN
     if not chances:
-        chances, least = (
-            [
-                calibration.compute_probability(
-                    weights.none, read_none_signs(result, penalties, weights)
-                )
-            ],
-            0.5,
-        )
+        signs = read_none_signs(result, penalties, weights)
+        chances, least = [calibration.compute_probability(weights.none, signs)], 0.5
     return compute_unknown_probability(result, penalties, weights) > min(least, max(chances))
 
 
@@ -394,14 +385,13 @@ def drop_unlikely_effects(
         )
     subsets, fitted = kept.chosen.subsets, result.fitted
     if fitted and subsets != result.chosen.subsets:
-        ways = {
-            name: [ray for ray in fitted.rays if ray.kind.name == name]
-            for name in result.chosen.names
-        }
-        kept = replace(
-            kept,
-            fitted=drop_effects(result.residuals, ways, fitted, subsets) if any(subsets) else None,
-        )
+        ways: dict[str, list[ParameterRay]] = {name: [] for name in result.chosen.names}
+        for ray in fitted.rays:
+            ways[ray.kind.name].append(ray)
+        # The sizes of the others have grown beside the dropped effect, so they are fitted anew.
+        kept = replace(kept, fitted=None)
+        if any(subsets):
+            kept.fitted = drop_effects(result.residuals, ways, fitted, subsets)
     return kept
 
 
@@ -410,19 +400,15 @@ def describe_detected_effect(
 ) -> Selected:
     """Return the answer about an effect that sensors, frames or tool points show."""
     near = sorted(found.rivals, key=lambda name: -found.rivals[name])
-    like = tuple(
-        name
-        for name in near
-        if found.rivals[name] > max(SAME_SHARE * found.gain, found.gain - SAME_NATS)
-    )[:3]
+    least = max(SAME_SHARE * found.gain, found.gain - SAME_NATS)
+    like = tuple([name for name in near if found.rivals[name] > least][:MAX_EQUIVALENTS])
     form = weights.form[found.kind.stage]
-    parameters = {
-        name: {
-            joint: _widen_estimate(one, found.kind.numbers[name].none or 0.0, form)
-            for joint, one in estimates.items()
+    parameters: dict[str, dict[str, Estimate]] = {}
+    for name, estimates in found.parameters.items():
+        none = found.kind.numbers[name].none or 0.0
+        parameters[name] = {
+            joint: _widen_estimate(one, none, form) for joint, one in estimates.items()
         }
-        for name, estimates in found.parameters.items()
-    }
     return Selected(
         effect=found.kind.name,
         joints=tuple(

@@ -39,7 +39,7 @@ def choose_unit(machine: Machine) -> str:
 
 
 def compute_squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -> np.ndarray:
-    """Return the mean square error of each window, all joints together, `(W,)`, in the square of `unit_of`."""
+    """Return the mean square error of each window, all joints together, `(W,)`, in the square of `choose_unit`."""
     size = machine.upper - machine.lower if choose_unit(machine) == "travel" else 1.0
     return np.square((paths - measured) / size).mean((1, 2))
 
@@ -61,13 +61,11 @@ def compute_shares(
 ) -> np.ndarray:
     """Return the share of the gap that is closed, then the same of each draw, `(1 + B,)`."""
     found = [_compute_share(compute_rmse(before), compute_rmse(after), compute_rmse(floor))]
-    return np.array(
-        found
-        + [
-            _compute_share(compute_rmse(before[f]), compute_rmse(after[f]), compute_rmse(floor[g]))
-            for f, g in drawn
-        ]
-    )
+    # Before and after share the windows of a draw: hard windows are hard for both.
+    for f, g in drawn:
+        errors = (compute_rmse(before[f]), compute_rmse(after[f]), compute_rmse(floor[g]))
+        found.append(_compute_share(*errors))
+    return np.array(found)
 
 
 def summarise_draws(values: np.ndarray) -> Estimate:
@@ -104,11 +102,10 @@ def compute_shapley(
 ) -> dict[str, Any]:
     """Return the Shapley value of each effect, a number or an array: its mean contribution over all orders of adding."""
     count, found = len(names), dict.fromkeys(names, 0.0)
-    value = {
-        frozenset(s): closed_by(frozenset(s))
-        for size in range(count + 1)
-        for s in combinations(names, size)
-    }
+    value = {}
+    for size in range(count + 1):
+        for some in combinations(names, size):
+            value[frozenset(some)] = closed_by(frozenset(some))
     for name in names:
         for size in range(count):
             chance = factorial(size) * factorial(count - size - 1) / factorial(count)
@@ -118,9 +115,8 @@ def compute_shapley(
 
 
 def _compute_share(before: float, after: float, floor: float) -> float:
-    floor = min(
-        floor, after
-    )  # no repair is better than the floor: where it is, the floor was measured on harder recordings
+    # No repair is better than the floor: where it is, the floor comes from harder recordings.
+    floor = min(floor, after)
     return float((before - after) / max(before - floor, 0.02 * before + 1e-12))
 
 
@@ -165,10 +161,11 @@ class GapClosure:
         """Mean square errors at the floor, by window; `None` where it is unknown."""
         if not self.base.left_out:
             return None
-        parts = [one.residuals for one in self.base.left_out]
-        return np.concatenate(
-            [compute_squares(one.base, one.simulator.cut.measured, self.machine) for one in parts]
-        )
+        squares = []
+        for one in self.base.left_out:
+            measured = one.residuals.simulator.cut.measured
+            squares.append(compute_squares(one.residuals.base, measured, self.machine))
+        return np.concatenate(squares)
 
     @cached_property
     def draws(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -234,20 +231,16 @@ class GapClosure:
         if self.floor is None:
             return []
         left = np.square(self.after - self._measured).mean(1)  # (W, J)
-        parts = [one.residuals for one in self.base.left_out]
-        floor = np.concatenate(
-            [np.square(one.base - one.simulator.cut.measured).mean(1) for one in parts]
-        )
-        drawn = [
-            np.sqrt(left[f].mean(0) / np.maximum(floor[g].mean(0), 1e-18)) for f, g in self.draws
-        ]
+        squares, drawn = [], []
+        for one in self.base.left_out:
+            error = one.residuals.base - one.residuals.simulator.cut.measured
+            squares.append(np.square(error).mean(1))
+        floor = np.concatenate(squares)
+        for f, g in self.draws:
+            drawn.append(np.sqrt(left[f].mean(0) / np.maximum(floor[g].mean(0), 1e-18)))
         ratio = np.sqrt(left.mean(0) / np.maximum(floor.mean(0), 1e-18))
         beyond = (ratio > MIN_EXCESS_RATIO) & (np.quantile(drawn, 0.025, axis=0) > 1.0)
-        return [
-            name
-            for name, is_beyond in zip(self.machine.joint_names, beyond, strict=True)
-            if is_beyond
-        ]
+        return [self.machine.joint_names[j] for j in np.flatnonzero(beyond)]
 
     def _with(self, result: DetectionResult, names: frozenset[str]) -> np.ndarray:
         """Return free runs with some of the chosen effects, their sizes fitted anew."""
@@ -261,17 +254,12 @@ class GapClosure:
 
     def _joints(self) -> dict[str, JointClosed]:
         residuals = self.base.field.residuals
-        before, after = (
-            _compute_joint_rmse([paths], [self._measured]) for paths in (residuals.base, self.after)
-        )
-        parts = [one.residuals for one in self.base.left_out]
-        floor = (
-            _compute_joint_rmse(
-                [one.base for one in parts], [one.simulator.cut.measured for one in parts]
-            )
-            if parts
-            else None
-        )
+        before = _compute_joint_rmse([residuals.base], [self._measured])
+        after = _compute_joint_rmse([self.after], [self._measured])
+        floor = None
+        if parts := [one.residuals for one in self.base.left_out]:
+            measured = [one.simulator.cut.measured for one in parts]
+            floor = _compute_joint_rmse([one.base for one in parts], measured)
         return _describe_joints(self.machine, before, after, floor)
 
 
@@ -285,12 +273,11 @@ def evaluate_unseen(
     """
     assert result.fitted is not None, "there is something to carry"
     begun = estimate_running_s(recordings)
-    cuts = [
-        open_loop.cut_windows([one], machine, HORIZON_S, HORIZON_S)
-        for one in recordings
-        if _is_long(one, machine)
-    ]
-    running = [at for one, at in zip(recordings, begun, strict=True) if _is_long(one, machine)]
+    cuts, running = [], []
+    for one, at in zip(recordings, begun, strict=True):
+        if _is_long(one, machine):
+            cuts.append(open_loop.cut_windows([one], machine, HORIZON_S, HORIZON_S))
+            running.append(at)
     cut = (
         open_loop.join_windows(cuts)
         if cuts
@@ -313,10 +300,9 @@ def _is_long(recording: Recording, machine: Machine) -> bool:
 
 def _compute_joint_rmse(paths: Sequence[np.ndarray], measured: Sequence[np.ndarray]) -> np.ndarray:
     """Return the root mean square error of each joint, `(J,)`."""
-    squares = np.concatenate(
-        [np.square(one - other).mean(1) for one, other in zip(paths, measured, strict=True)]
-    )
-    return np.sqrt(squares.mean(0))
+    pairs = zip(paths, measured, strict=True)
+    squares = [np.square(one - other).mean(1) for one, other in pairs]
+    return np.sqrt(np.concatenate(squares).mean(0))
 
 
 def _describe_joints(

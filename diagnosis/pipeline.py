@@ -240,50 +240,18 @@ class DiagnosisPipeline:
         self, result: DetectionResult, weighed: Mapping[str, Any], foretold: Estimate | None
     ) -> dict[str, Any]:
         names = self.case.machine.joint_names
-        rivals = [
-            {
-                "name": f"{name} on {joint}",
-                "effect": name,
-                "joints": [joint],
-                "score": table.scores[subset].total,
-                "selected": name in result.chosen.subsets[j],
-            }
-            for j, (joint, table) in enumerate(zip(names, result.tables, strict=True))
-            for subset in table.scores
-            if len(subset) == 1 and (name := next(iter(subset)))
-        ]
-        rivals = sorted(rivals, key=lambda row: -row["score"])[:40]
-        clues = tuple(CLUES)
-        left = {
-            name: {
-                "clue": clues[best],
-                "earned": float(a[best]),
-                "null": float(b[best]),
-                "scatter": float(c),
-            }
-            for name, a, b, c in zip(
-                names,
-                result.clue_gains.T,
-                result.reference_clue_gains.T,
-                result.scatter,
-                strict=True,
-            )
-            for best in [int(np.argmax(a - b))]
-        }
-        null = [
-            row["null"]
-            for joint in weighed["joints"]
-            for row in joint["subsets"]
-            if len(row["effects"]) == 1 and "null" in row
-        ]
+        null = []
+        for joint in weighed["joints"]:
+            rows = [row for row in joint["subsets"] if len(row["effects"]) == 1]
+            null += [row["null"] for row in rows if "null" in row]
         return {
             "evidence": {
-                "rivals": rivals,
+                "rivals": _list_rivals(result, names),
                 "threshold": self.penalties.name + self.penalties.joint,
                 "null": null,
                 "unit": "log likelihood",
             },
-            "remainder": left,
+            "remainder": _describe_remainder(result, names),
             "weighed": weighed,
             "predicted_closed": foretold and {"mean": foretold.mean, "ci95": list(foretold.ci95)},
         }
@@ -329,6 +297,38 @@ class DiagnosisPipeline:
             next_experiment=None, reason=f"cannot tell, because {why}",
         )  # fmt: skip
         return Outcome(answer, runs, None, floor)
+
+
+MAX_RIVALS = 40
+"""Most single effects in `diagnosis.json`. Chosen by hand; not searched."""
+
+
+def _list_rivals(result: DetectionResult, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the gain of each single effect on each joint, the largest first."""
+    rivals = []
+    for joint, table, chosen in zip(names, result.tables, result.chosen.subsets, strict=True):
+        for subset in table.scores:
+            if len(subset) == 1:
+                (name,) = subset
+                row = {"name": f"{name} on {joint}", "effect": name, "joints": [joint]}
+                gain = table.scores[subset].total
+                rivals.append(row | {"score": gain, "selected": name in chosen})
+    return sorted(rivals, key=lambda row: -row["score"])[:MAX_RIVALS]
+
+
+def _describe_remainder(result: DetectionResult, names: Sequence[str]) -> dict[str, Any]:
+    """Return the clue of each joint that gains most beyond the reference."""
+    clues, left = tuple(CLUES), {}
+    for j, name in enumerate(names):
+        earned, null = result.clue_gains[:, j], result.reference_clue_gains[:, j]
+        best = int(np.argmax(earned - null))
+        left[name] = {
+            "clue": clues[best],
+            "earned": float(earned[best]),
+            "null": float(null[best]),
+            "scatter": float(result.scatter[j]),
+        }
+    return left
 
 
 EFFECTS_FILE = "effects.yaml"

@@ -40,7 +40,7 @@ def measure_onsets(
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Return the spread of the lateness of starts (s) and the ringing (rad or m), by joint.
 
-    Each with its standard error; joints with fewer than `FEWEST` starts or stops are left out.
+    Each with its standard error; joints with fewer than `MIN_EVENTS` starts or stops are left out.
     """
     _, label = _label_recordings(runs, machine, dead_time_s)
     found = {}

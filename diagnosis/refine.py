@@ -127,7 +127,7 @@ def fit_set(
     joints move at once.
 
     Args:
-        evidence: Errors of the simulator without them.
+        residuals: Residuals of the simulator without them.
         subsets: Effects of each joint.
         rays: Ways in which each effect can grow.
         start: Sizes of each effect along its rays, by joint and name.

@@ -1,6 +1,6 @@
 """Errors of a simulator on recordings, divided by the standard deviation that they have anyway.
 
-Errors are compared as increments over `SPAN` samples. Their covariance has three parts: the
+Errors are compared as increments over `INCREMENT_SAMPLES` samples. Their covariance has three parts: the
 sensor's (each increment by itself), one at changes of speed, and a speed that wanders by a few
 percent over some seconds. Whitening divides by the root of that covariance, so that all increments
 count alike
@@ -34,7 +34,7 @@ MIN_TYPICAL_ERROR = 0.1
 
 
 def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
-    """Return the ways in `SPAN` samples each of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
+    """Return the increments of positions `(…, W, K, J)` that begin at `start` `(W, J)`: `(…, W, I, J)`."""
     count = paths.shape[-2] // INCREMENT_SAMPLES
     ends = paths[..., INCREMENT_SAMPLES - 1 : count * INCREMENT_SAMPLES : INCREMENT_SAMPLES, :]
     first = np.broadcast_to(start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))

@@ -143,7 +143,7 @@ def _stack_slopes(shapes: Sequence[Response], lines: np.ndarray, size: np.ndarra
 
 
 def fit_single_size(z: np.ndarray, shape: Response, used: np.ndarray | None = None) -> float:
-    """Return the best of the simulated sizes and those `PARTS` of the way between them: some begin just there."""
+    """Return the best of the simulated sizes and those `BETWEEN` them: some begin just there."""
     used = np.ones(len(z)) if used is None else used
     between = [(1.0 - part) * shape.change[:-1] + part * shape.change[1:] for part in BETWEEN]
     sizes = [(1.0 - part) * shape.sizes[:-1] + part * shape.sizes[1:] for part in BETWEEN]

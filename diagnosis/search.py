@@ -4,7 +4,7 @@ A set is judged by its log-likelihood gain less its penalty, which depends on th
 effect on reference recordings, where there is nothing to find. A saturation may be worth its
 penalty only beside a dead band, so each joint keeps the best few subsets of each number of effects.
 An effect with one cause for all joints (a clock offset, a worn pump) is first sized joint by joint;
-once it is chosen, the joints share its size within `PLAY`.
+once it is chosen, the joints share its size within `SHARED_PLAY`.
 Axes: `J` joints, `E` entries, `S` sizes of a growth path.
 """
 

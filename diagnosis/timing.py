@@ -366,7 +366,7 @@ def _compute_scatter(values: np.ndarray) -> float:
 
 
 def _subsample_delays(drawn: np.ndarray) -> np.ndarray:
-    """Return delays that are distributed alike, at most `MOST`."""
+    """Return delays that are distributed alike, at most `MAX_DRAWN`."""
     return np.sort(drawn)[np.linspace(0, len(drawn) - 1, min(MAX_DRAWN, len(drawn))).astype(int)]
 
 

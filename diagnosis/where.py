@@ -52,7 +52,7 @@ class GroupSums:
         square: Part of the squared error.
         tested: Quantity that the tests compare: of a band, its part of the squared error; else the
             increment of the error
-            within `SPAN_S`: within a category its size (a few windows would decide its square), of
+            within `INCREMENT_S`: within a category its size (a few windows would decide its square), of
                 a joint as a whole its square
             (in the mean size a short regime would drown).
         count: Samples.

@@ -69,7 +69,7 @@ def build_single_answer(effect: str | None, joints: tuple[str, ...], probability
 
 SetScore = Callable[[JointErrors, frozenset[str]], float]
 MAX_EFFECTS = 4
-"""Effects that a joint gets at most."""
+"""Effects that a joint gets at most: as many as a set of the diagnosis (`diagnosis.search`)."""
 
 
 @spec
@@ -92,14 +92,10 @@ class ForwardSelection:
             RecordingError: the simulator cannot be fitted.
         """
         gains: dict[str, dict[str, float]] = {}
-        for joint, errors in zip(
-            machine.joint_names,
-            oracle.load_case_evidence(case, self.fit, machine).errors,
-            strict=True,
-        ):
-            for name, gain in select_forward(
-                errors, score_held_out if self.rule == "held_out" else score_bic
-            ).items():
+        score = score_held_out if self.rule == "held_out" else score_bic
+        evidence = oracle.load_case_evidence(case, self.fit, machine)
+        for joint, errors in zip(machine.joint_names, evidence.errors, strict=True):
+            for name, gain in select_forward(errors, score).items():
                 gains.setdefault(name, {})[joint] = gain
         out.mkdir(parents=True, exist_ok=True)
         _build_answer(gains).write(out / ANSWER_FILE)
@@ -111,9 +107,10 @@ def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
     found: dict[str, float] = {}
     before = 0.0
     while len(chosen) < MAX_EFFECTS:
-        worths = {
-            name: worth(errors, chosen | {name}) for name in errors.shapes if name not in chosen
-        }
+        worths = {}
+        for name in errors.shapes:
+            if name not in chosen:
+                worths[name] = worth(errors, chosen | {name})
         best = max(worths, key=worths.__getitem__, default=None)
         if best is None or worths[best] <= before:
             break
@@ -142,26 +139,19 @@ def score_bic(errors: JointErrors, names: frozenset[str]) -> float:
 
 def _build_answer(gains: dict[str, dict[str, float]]) -> Answer:
     """Return the answer: an effect is as probable as its worth in log likelihood makes it."""
-    chances = {
-        name: 1.0 / (1.0 + float(np.exp(-min(sum(by_joint.values()), 50.0))))
-        for name, by_joint in gains.items()
-    }
-    order = sorted(gains, key=lambda name: -sum(gains[name].values()))
-    selected = [
-        Selected(
-            effect=name,
-            joints=tuple(gains[name]),
-            probability=chances[name],
-            parameters={},
-            gap_closed=None,
+    selected, ranking = [], []
+    for name in sorted(gains, key=lambda name: -sum(gains[name].values())):
+        joints = tuple(gains[name])
+        # the logistic function of the gain; beyond 50 nats the exponential says 1.0 anyway
+        chance = 1.0 / (1.0 + float(np.exp(-min(sum(gains[name].values()), 50.0))))
+        selected.append(
+            Selected(effect=name, joints=joints, probability=chance, parameters={}, gap_closed=None)
         )
-        for name in order
-    ]
+        ranking.append(Ranked(name, joints, chance))
     return Answer(
         verdict="effects" if selected else "none",
         selected=tuple(selected),
-        ranking=tuple(Ranked(one.effect, one.joints, one.probability) for one in selected)
-        or (Ranked("none", (), 0.5),),
+        ranking=tuple(ranking) or (Ranked("none", (), 0.5),),
         where=Where({}, (), None),
         gap=None,
         next_experiment=None,

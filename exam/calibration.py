@@ -26,7 +26,7 @@ from diagnosis import answer, decision
 from diagnosis import calibration as certainty
 from diagnosis.answer import Answer, Selected, Where
 from diagnosis.calibration import ProbabilityModel
-from diagnosis.detection import Penalties
+from diagnosis.detection import DetectionResult, Penalties
 from diagnosis.effect_library import EffectType
 from exam import dataset, score
 from exam.score import QUIET_KINDS, CaseScore, ParameterScore
@@ -98,12 +98,15 @@ def split_by_family(cases: Sequence[WeighedCase]) -> tuple[list[WeighedCase], li
     """Return two halves of the cases that share no kind of cause."""
     families = sorted({item.family for item in cases} - {"none"})
     side = {name: number % 2 for number, name in enumerate(families)}
-    quiet = iter(range(len(cases)))
-    sides = [side[item.family] if item.family in side else next(quiet) % 2 for item in cases]
-    first, second = (
-        [item for item, other in zip(cases, sides, strict=True) if other == half] for half in (0, 1)
-    )
-    return first, second
+    halves: tuple[list[WeighedCase], list[WeighedCase]] = ([], [])
+    num_quiet = 0
+    for item in cases:
+        if item.family in side:
+            halves[side[item.family]].append(item)
+        else:  # cases without a cause alternate, so that both halves hold some
+            halves[num_quiet % 2].append(item)
+            num_quiet += 1
+    return halves
 
 
 @dataclass(frozen=True)
@@ -127,36 +130,18 @@ def answer_case(
         decision.restore_result(item.told, prices, kinds), prices, weights
     )
     unknown = decision.is_unknown(found, prices, weights)
-    selected = (
-        []
-        if unknown
-        else [
-            decision.describe_detected_effect(found, one, weights, machine)
-            for one in found.detected
-        ]
-    )
-    signs = [
-        (one.kind.name, decision.read_detected_signs(found, weights, one)) for one in found.detected
-    ]
-    for name in found.chosen.names:
-        swaps = decision.rank_substitutions(found, name)
-        like = decision.list_equivalents(swaps, decision.compute_own_gain(found, name))
-        signs.append((name, decision.read_chosen_signs(found, prices, weights, name, swaps, like)))
-        joints = tuple(
-            j
-            for j, subset in zip(machine.joint_names, found.chosen.subsets, strict=True)
-            if name in subset
-        )
-        chance = certainty.compute_probability(weights.right, signs[-1][1])
-        one = Selected(
-            effect=name,
-            joints=joints,
-            probability=chance,
-            parameters={},
-            gap_closed=None,
-            same_as=like,
-        )
-        selected += [] if unknown else [one]
+    selected: list[Selected] = []
+    signs: list[tuple[str, dict[str, float]]] = []
+    for one in found.detected:
+        # an unknown cause leaves all names out; their predictors still count for the fit
+        if not unknown:
+            selected.append(decision.describe_detected_effect(found, one, weights, machine))
+        signs.append((one.kind.name, decision.read_detected_signs(found, weights, one)))
+    for name in sorted(found.chosen.names):
+        named, predictors = _describe_chosen_effect(found, name, prices, weights, machine)
+        signs.append((name, predictors))
+        if not unknown:
+            selected.append(named)
     told = "unknown" if unknown else "effects" if selected else "none"
     chance = decision.compute_unknown_probability(found, prices, weights)
     ranked = tuple(decision.rank_hypotheses(found, selected, prices, weights, machine, chance))
@@ -168,6 +153,32 @@ def answer_case(
         signs,
         decision.read_none_signs(found, prices, weights),
     )
+
+
+def _describe_chosen_effect(
+    found: DetectionResult,
+    name: str,
+    prices: Penalties,
+    weights: ProbabilityModel,
+    machine: Machine,
+) -> tuple[Selected, dict[str, float]]:
+    """Return a chosen effect without parameters, and the predictors of its probability."""
+    swaps = decision.rank_substitutions(found, name)
+    like = decision.list_equivalents(swaps, decision.compute_own_gain(found, name))
+    signs = decision.read_chosen_signs(found, prices, weights, name, swaps, like)
+    joints = []
+    for joint, subset in zip(machine.joint_names, found.chosen.subsets, strict=True):
+        if name in subset:
+            joints.append(joint)
+    selected = Selected(
+        effect=name,
+        joints=tuple(joints),
+        probability=certainty.compute_probability(weights.right, signs),
+        parameters={},
+        gap_closed=None,
+        same_as=like,
+    )
+    return selected, signs
 
 
 def rate_answer(mark: CaseScore) -> tuple[float, float]:
@@ -216,17 +227,18 @@ class PenaltyFit:
     def _marked(
         self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
     ) -> list[tuple[CaseScore, ClaimSigns]]:
-        said = [answer_case(item, prices, weights, self.kinds, self.machine) for item in cases]
-        return [
-            (score.score_answer(i.label, one, self.classes, self.of_machine), claims)
-            for i, (one, claims) in zip(cases, said, strict=True)
-        ]
+        marked = []
+        for item in cases:
+            said, claims = answer_case(item, prices, weights, self.kinds, self.machine)
+            mark = score.score_answer(item.label, said, self.classes, self.of_machine)
+            marked.append((mark, claims))
+        return marked
 
     def value(
         self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
     ) -> float:
         """Return the mean worth of the answers."""
-        pairs = np.array([rate_answer(mark) for mark in self.marks(cases, prices, weights)])
+        pairs = np.array(list(map(rate_answer, self.marks(cases, prices, weights))))
         return float(pairs[:, 0].sum() / pairs[:, 1].sum())
 
     def fitted(
@@ -257,26 +269,23 @@ class PenaltyFit:
         self, cases: Sequence[WeighedCase], prices: Penalties, start: ProbabilityModel
     ) -> ProbabilityModel:
         """Return the weights with the largest likelihood, and the model-form errors."""
+        # "unknown" is fitted first: the other two depend on which answers say it
         is_outside = [item.label["kind"] == "outside" for item in cases]
-        outside = fit_logistic(
-            [claims.outside for _, claims in self._marked(cases, prices, start)],
-            is_outside,
-            start.outside,
-        )
+        signs = [claims.outside for _, claims in self._marked(cases, prices, start)]
+        outside = fit_logistic(signs, is_outside, start.outside)
         weights = replace(start, outside=outside)
         named, true = self._named(cases, prices, weights)
         found = {
             "right": fit_logistic(named, true, start.right) if len(set(true)) > 1 else start.right
         }
-        silent = [
-            (claims.none, mark.kind in QUIET_KINDS)
-            for mark, claims in self._marked(cases, prices, weights)
-            if mark.verdict == "none"
-        ]
-        if len({quiet for _, quiet in silent}) > 1:
-            found["none"] = fit_logistic(
-                [signs for signs, _ in silent], [quiet for _, quiet in silent], start.none
-            )
+        silent, quiet = [], []
+        for mark, claims in self._marked(cases, prices, weights):
+            if mark.verdict == "none":
+                silent.append(claims.none)
+                quiet.append(mark.kind in QUIET_KINDS)
+        # a regression needs both right and wrong statements
+        if len(set(quiet)) > 1:
+            found["none"] = fit_logistic(silent, quiet, start.none)
         return replace(weights, form=self.forms(cases, weights.form), **found)
 
     def _named(
@@ -287,8 +296,9 @@ class PenaltyFit:
         for mark, claims in self._marked(cases, prices, weights):
             if mark.verdict == "effects":
                 stand = {name for _, name in mark.hits}
-                signs += [one for _, one in claims.right]
-                true += [name in stand for name, _ in claims.right]
+                for name, predictors in claims.right:
+                    signs.append(predictors)
+                    true.append(name in stand)
         return signs, true
 
     def forms(self, cases: Sequence[WeighedCase], now: Mapping[str, float]) -> dict[str, float]:
@@ -298,21 +308,16 @@ class PenaltyFit:
         """
         stages, found = {kind.name: kind.stage for kind in self.kinds}, dict(now)
         for group in (("timing", "actuation"), ("sensing", "kinematics", "perception")):
-            errors = []
+            errors: list[tuple[ParameterScore, float]] = []
             for item in cases:
                 mark = score.score_answer(item.label, item.said, self.classes, self.of_machine)
-                errors += [
-                    (one, now[stages[one.effect]])
-                    for one in mark.numbers
-                    if stages[one.effect] in group
-                ]
-            holds = [
-                form
-                for form in FORM_ERRORS
-                if errors
-                and np.mean([_is_covered(one, was, form) for one, was in errors]) >= TARGET_COVERAGE
-            ]
-            found |= dict.fromkeys(group, round(float(holds[0]), 3)) if holds else {}
+                for one in mark.numbers:
+                    if stages[one.effect] in group:
+                        errors.append((one, now[stages[one.effect]]))
+            least = _find_form_error(errors)
+            # no parameter of the group, or no error that is enough: the present one stays
+            if least is not None:
+                found |= dict.fromkeys(group, round(least, 3))
         return found
 
     def _drawn(self, near: Penalties, half: int, generator: np.random.Generator) -> Penalties:
@@ -347,11 +352,10 @@ def fit_logistic(
 ) -> dict[str, float]:
     """Fit a logistic regression with a normal prior about the start; the constant is free."""
     names, y = list(signs[0]), np.array(true, dtype=float)
-    x, begin = (
-        np.array([[one[name] for name in names] for one in signs]),
-        np.array([start[name] for name in names]),
-    )
-    pull = np.array([0.0 if name == "constant" else PRIOR_PRECISION for name in names])
+    x = np.array([list(map(one.__getitem__, names)) for one in signs])
+    begin = np.array(list(map(start.__getitem__, names)))
+    # the share of true statements differs between exams: nothing pulls at the constant
+    pull = np.where(np.array(names) == "constant", 0.0, PRIOR_PRECISION)
 
     def loss(w: np.ndarray) -> tuple[float, np.ndarray]:
         at, off = x @ w, w - begin
@@ -360,6 +364,17 @@ def fit_logistic(
 
     found = minimize(loss, begin, jac=True, method="L-BFGS-B")
     return {name: round(float(value), 3) for name, value in zip(names, found.x, strict=True)}
+
+
+def _find_form_error(errors: Sequence[tuple[ParameterScore, float]]) -> float | None:
+    """Return the smallest model-form error that covers enough, `None` where none does."""
+    if not errors:
+        return None
+    for form in FORM_ERRORS:
+        covered = [_is_covered(number, was, form) for number, was in errors]
+        if np.mean(covered) >= TARGET_COVERAGE:
+            return float(form)
+    return None
 
 
 def _is_covered(number: ParameterScore, was: float, form: float) -> bool:

@@ -187,29 +187,20 @@ class CaseDistribution:
         self, machine: Machine, outside_faults: Sequence[str], generator: np.random.Generator
     ) -> list[CaseDesign]:
         """Return the cases in random order; effects and outside faults are equally frequent."""
-        kinds = [kind for kind, count in self._counts().items() for _ in range(count)]
-        effects, strange = (
-            _cycle_shuffled(list(self.troubles), generator),
-            _cycle_shuffled(list(outside_faults), generator),
-        )
+        kinds: list[str] = []
+        for kind, count in self._counts().items():
+            kinds += [kind] * count
+        effects = _cycle_shuffled(list(self.troubles), generator)
+        strange = _cycle_shuffled(list(outside_faults), generator)
         found = []
         for kind in kinds:
-            tracked, faults, outside_fault, size = (
-                bool(generator.random() < self.tracked_share),
-                [],
-                None,
-                None,
-            )
+            tracked = bool(generator.random() < self.tracked_share)
+            faults: list[CaseFault] = []
+            outside_fault, size = None, None
             joints: tuple[str, ...] = ()
             if kind in ("one", "faint"):
-                faults = [
-                    self._fault(
-                        next(effects),
-                        machine,
-                        self.faint_sizes if kind == "faint" else self.sizes,
-                        generator,
-                    )
-                ]
+                sizes = self.faint_sizes if kind == "faint" else self.sizes
+                faults = [self._fault(next(effects), machine, sizes, generator)]
             elif kind == "several":
                 names = self._distinct(effects, int(generator.integers(2, 4)))
                 faults = [self._fault(name, machine, self.sizes, generator) for name in names]
@@ -245,9 +236,10 @@ class CaseDistribution:
         found: list[str] = []
         while len(found) < count:
             name = next(effects)
-            taken = {
-                other for group in self.classes if any(f in group for f in found) for other in group
-            }
+            taken: set[str] = set()
+            for group in self.classes:
+                if not set(group).isdisjoint(found):
+                    taken.update(group)
             if name not in found and name not in taken:
                 found.append(name)
         return found
@@ -264,16 +256,16 @@ class CaseDistribution:
         generator: np.random.Generator,
     ) -> CaseFault:
         trouble, size = self.troubles[name], float(generator.uniform(*sizes))
-        able = np.flatnonzero([joint not in trouble.not_on for joint in machine.joint_names])
+        able = np.flatnonzero(~np.isin(machine.joint_names, trouble.not_on))
         chosen = able if trouble.joints == "all" else self._some(able, generator)
         has = np.isin(np.arange(machine.num_joints), chosen)
         drawn = tuple(trouble.numbers)
         if trouble.only_one:
             drawn = (drawn[int(generator.integers(len(drawn)))],)
         sign = float(generator.choice([-1.0, 1.0])) if trouble.mirrored else 1.0
-        parameters = {
-            key: np.full(machine.num_joints, value) for key, value in trouble.shape.items()
-        }
+        parameters = {}
+        for key, value in trouble.shape.items():
+            parameters[key] = np.full(machine.num_joints, value)
         for key, (none, typical) in trouble.numbers.items():
             # where nothing changes a threshold is not there at all, rather than where it begins to
             # count

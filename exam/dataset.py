@@ -18,7 +18,7 @@ import numpy as np
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
-from exam.case_distribution import CaseDesign
+from exam.case_distribution import CaseDesign, CaseFault
 from exam.generate import CaseRecorder, HalfPlan, RecordedHalf
 
 LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
@@ -70,6 +70,7 @@ def open_labels(folder: Path) -> dict[str, Any]:
 
 CASES_FOLDER = "cases"
 HORIZON_S = 5.0
+"""Window of `moved_rad`, s. Chosen by hand; not searched."""
 
 
 def write_cases(
@@ -85,15 +86,15 @@ def write_cases(
     """Record all cases into `folder/cases/<id>` and return their labels as plain JSON."""
     names = [f"{number:04d}" for number in range(len(questions))]
     folders = [folder / CASES_FOLDER / name for name in names]
-    halves = [
-        workshop.planned(questions, half, is_field)
-        for half, is_field in ((reference, False), (field, True))
-    ]
-    _, made = (workshop.record(jobs, folders, workers, advance) for jobs in halves)
-    return [
-        make_label(name, question, half, machine)
-        for name, question, half in zip(names, questions, made, strict=True)
-    ]
+    # both halves are planned before anything is recorded: a plan without room fails at once
+    reference_jobs = workshop.planned(questions, reference, is_field=False)
+    field_jobs = workshop.planned(questions, field, is_field=True)
+    workshop.record(reference_jobs, folders, workers, advance)
+    made = workshop.record(field_jobs, folders, workers, advance)
+    labels = []
+    for name, question, half in zip(names, questions, made, strict=True):
+        labels.append(make_label(name, question, half, machine))
+    return labels
 
 
 def make_label(
@@ -108,22 +109,7 @@ def make_label(
         "case": name,
         "kind": question.kind,
         "tracked": question.tracked,
-        "effects": [
-            {
-                "effect": fault.effect,
-                "joints": list(fault.joints),
-                "size": fault.size,
-                "parameters": {
-                    key: {
-                        joint: float(fault.parameters[key][machine.joint_names.index(joint)])
-                        for joint in fault.joints
-                    }
-                    for key in fault.drawn
-                },
-                "nothing": fault.drawn,
-            }
-            for fault in question.faults
-        ],
+        "effects": [_label_fault(fault, machine) for fault in question.faults],
         "outside": None
         if question.outside_fault is None
         else {
@@ -136,6 +122,21 @@ def make_label(
         ),
         "machine_seed": question.machine_seed,
         "chance": question.chance,
+    }
+
+
+def _label_fault(fault: CaseFault, machine: Machine) -> dict[str, Any]:
+    """Return the part of a label about one effect; only drawn parameters can be asked for."""
+    parameters: dict[str, dict[str, float]] = {}
+    for key in fault.drawn:
+        by_joint = dict(zip(machine.joint_names, fault.parameters[key].tolist(), strict=True))
+        parameters[key] = {joint: float(by_joint[joint]) for joint in fault.joints}
+    return {
+        "effect": fault.effect,
+        "joints": list(fault.joints),
+        "size": fault.size,
+        "parameters": parameters,
+        "nothing": fault.drawn,
     }
 
 

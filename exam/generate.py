@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -126,6 +127,23 @@ class RecordingJob:
         )
 
 
+def _split_by_make(makes: Sequence[str], size: int) -> list[list[int]]:
+    """Return the places of runs in batches of one make and at most `size` runs."""
+    by_make: dict[str, list[int]] = {}
+    for i, make in enumerate(makes):
+        by_make.setdefault(make, []).append(i)
+    batches = []
+    for make in sorted(by_make):
+        mine = by_make[make]
+        for begin in range(0, len(mine), size):
+            batches.append(mine[begin : begin + size])
+    return batches
+
+
+def _take(items: Sequence[Any], places: Sequence[int]) -> list[Any]:
+    return [items[i] for i in places]
+
+
 class CaseRecorder:
     """Record cases.
 
@@ -157,13 +175,12 @@ class CaseRecorder:
         Raises:
             ConfigError: an excitation is unknown, or finds no room in a file.
         """
-        jobs = [
-            RecordingJob(question, n, k, half, is_field)
-            for n, question in enumerate(questions)
-            for k in range(len(half.programs))
-        ]
-        for job in jobs:
-            job.plan = self._plan(job)
+        jobs = []
+        for n, question in enumerate(questions):
+            for k in range(len(half.programs)):
+                job = RecordingJob(question, n, k, half, is_field)
+                job.plan = self._plan(job)
+                jobs.append(job)
         return jobs
 
     def record(
@@ -181,21 +198,16 @@ class CaseRecorder:
             workers: Processes; files are the same however many there are.
             advance: Told how many files are done.
         """
-        specimens = [self._specimen(job) for job in jobs]
+        specimens = list(map(self._specimen, jobs))
         makes = self._plants.makes(self._machine, specimens)
-        size, batches = min(SIDE_BY_SIDE, -(-len(jobs) // workers)), []
-        for make in sorted(set(makes)):
-            mine = [i for i, other in enumerate(makes) if other == make]
-            batches += [mine[begin : begin + size] for begin in range(0, len(mine), size)]
+        batches = _split_by_make(makes, min(SIDE_BY_SIDE, -(-len(jobs) // workers)))
         found: dict[int, RecordedHalf] = {}
         with ExitStack() as stack:
             run = map if workers == 1 else stack.enter_context(ProcessPoolExecutor(workers)).map
-            parts = (
-                [[items[i] for i in batch] for batch in batches] for items in (jobs, specimens)
-            )
-            for batch, made in zip(
-                batches, run(self._batch, *parts, [folders] * len(batches)), strict=True
-            ):
+            batched_jobs = [_take(jobs, batch) for batch in batches]
+            batched_specimens = [_take(specimens, batch) for batch in batches]
+            results = run(self._batch, batched_jobs, batched_specimens, [folders] * len(batches))
+            for batch, made in zip(batches, results, strict=True):
                 found |= dict(zip(batch, made, strict=True))
                 advance(len(batch))
         done = [RecordedHalf([], [], []) for _ in folders]
@@ -253,45 +265,53 @@ class CaseRecorder:
         with link as opened, _mute_runner():
             samples = list(drive(opened, runner, machine, len(jobs), half.file_s))
         track = PlanTrack(samples)
-        extra = {
-            name: np.stack([sample.extra[name] for sample in samples], 1)
-            for name in samples[0].extra
-        }
+        extra = {}
+        for name in samples[0].extra:
+            extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)
         without = self._without(specimens, u, half) if is_field else q
+        t_s = track.t_s - track.t_s[0]
+        recorded = []
         for n, job in enumerate(jobs):
-            columns = (
-                {name: values[n] for name, values in extra.items()} if job.question.tracked else {}
-            )
-            recording = record.Recording(
-                machine=machine.name,
-                joints=machine.joint_names,
-                units=tuple(joint.unit for joint in machine.joints),
-                rate_hz=1.0 / machine.period_s,
-                t_s=track.t_s - track.t_s[0],
-                u=u[:, n],
-                q=q[:, n],
-                extra=columns,
-                metadata={
-                    "created": job.created,
-                    "fingerprint": record.format_fingerprint(machine),
-                },
-            )
-            path = (
-                folders[job.case]
-                / ("field" if is_field else "reference")
-                / f"{job.number:02d}.parquet"
-            )
-            record.write_recording(recording, path)
-            os.utime(path, (EPOCH_S, EPOCH_S))
-        return [RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]) for n in range(len(jobs))]
+            columns = {}
+            if job.question.tracked:
+                columns = {name: values[n] for name, values in extra.items()}
+            self._write(job, t_s, u[:, n], q[:, n], columns, folders[job.case])
+            recorded.append(RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]))
+        return recorded
+
+    def _write(
+        self,
+        job: RecordingJob,
+        t_s: np.ndarray,
+        u: np.ndarray,
+        q: np.ndarray,
+        columns: dict[str, np.ndarray],
+        folder: Path,
+    ) -> None:
+        """Write the file of a job into the folder of its case."""
+        machine = self._machine
+        recording = record.Recording(
+            machine=machine.name,
+            joints=machine.joint_names,
+            units=tuple(joint.unit for joint in machine.joints),
+            rate_hz=1.0 / machine.period_s,
+            t_s=t_s,
+            u=u,
+            q=q,
+            extra=columns,
+            metadata={"created": job.created, "fingerprint": record.format_fingerprint(machine)},
+        )
+        path = folder / ("field" if job.is_field else "reference") / f"{job.number:02d}.parquet"
+        record.write_recording(recording, path)
+        # the same time for all cases: the time of a file tells nothing about its case
+        os.utime(path, (EPOCH_S, EPOCH_S))
 
     def _without(self, specimens: Sequence[PlantRun], u: np.ndarray, half: HalfPlan) -> np.ndarray:
         """Return the positions of the same machines without faults, `(T, N, J)`."""
-        healthy = [
-            replace(specimen, faults={}, outside_fault=None, tracked=False)
-            for specimen in specimens
-        ]
+        healthy = []
+        for specimen in specimens:
+            healthy.append(replace(specimen, faults={}, outside_fault=None, tracked=False))
         link, path = self._plants.build(self._machine, healthy, half.file_s), []
         with link as opened:
             for command in u:

@@ -9,13 +9,15 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from importlib import import_module
 from itertools import pairwise
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import CONFIDENCE, compute_wilson_interval
-from exam.score import QUIET_KINDS, CaseScore, Claim
+from exam.case_distribution import KINDS
+from exam.score import QUIET_KINDS, CaseScore, Claim, ParameterScore
 
 NUM_DRAWS = 1000
 """Bootstrap draws; the usual number for 95 % intervals."""
@@ -70,7 +72,7 @@ def bootstrap_over_cases(
         rows = generator.integers(len(scores), size=len(scores))
         key = rows.tobytes()
         if key not in known:
-            known[key] = metric([scores[row] for row in rows])
+            known[key] = metric(list(map(scores.__getitem__, rows)))
         if known[key] is not None:
             drawn.append(known[key])
     tail = 50.0 * (1.0 - CONFIDENCE)
@@ -85,46 +87,76 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
         scores: Of the cases that somebody began.
         not_begun: Number of further cases; they are reported and count for nothing.
     """
-    one = [score for score in scores if score.kind == "one"]
-    several = [score for score in scores if score.kind == "several"]
-    quiet = [score for score in scores if score.kind in QUIET_KINDS]
-    outside = [score for score in scores if score.kind == "outside"]
+    by_kind: dict[str, list[CaseScore]] = {kind: [] for kind in KINDS}
+    for score in scores:
+        by_kind[score.kind].append(score)
+    one, several, outside = by_kind["one"], by_kind["several"], by_kind["outside"]
+    quiet = _select_kinds(scores, QUIET_KINDS)
     known = one + several
-    joints = [right for score in known for right in score.joints_right]
+    joints: list[bool] = []
+    for score in known:
+        joints.extend(score.joints_right)
     seconds = [score.seconds for score in scores if score.seconds is not None]
-    numbers = [number for score in scores for number in score.numbers]
-    kinds = ("none", "faint", "one", "several", "outside")
+    numbers = _collect_numbers(scores)
     return {
-        "cases": {kind: sum(score.kind == kind for score in scores) for kind in kinds},
+        "cases": {kind: len(of_kind) for kind, of_kind in by_kind.items()},
         "sat": {"value": len(scores), "of": len(scores) + not_begun},
         "failed": sum(score.verdict == "failed" for score in scores),
-        "top1": compute_rate([score.first for score in one]),
-        "top1_strictly": compute_rate([score.first_strictly for score in one]),
-        "exactly_one": compute_rate([_is_exact(score) for score in one]),
+        "top1": _rate_items(one, attrgetter("first")),
+        "top1_strictly": _rate_items(one, attrgetter("first_strictly")),
+        "exactly_one": _rate_items(one, _is_exact),
         "macro_f1": bootstrap_over_cases(one, partial(compute_f1, average="macro")),
         "joints": compute_rate(joints),
-        "exact_set": compute_rate([_is_exact(score) for score in several]),
+        "exact_set": _rate_items(several, _is_exact),
         "set_f1": bootstrap_over_cases(several, partial(compute_f1, average="micro")),
         "false_alarms": _compute_false_alarms(quiet),
-        "false_alarms_none": _compute_false_alarms([s for s in quiet if s.kind == "none"]),
-        "false_alarms_faint": _compute_false_alarms([s for s in quiet if s.kind == "faint"]),
-        "unknown_recall": compute_rate([score.verdict == "unknown" for score in outside]),
-        "unknown_wrongly": compute_rate([score.verdict == "unknown" for score in known]),
+        "false_alarms_none": _compute_false_alarms(by_kind["none"]),
+        "false_alarms_faint": _compute_false_alarms(by_kind["faint"]),
+        "unknown_recall": _rate_items(outside, _is_called_unknown),
+        "unknown_wrongly": _rate_items(known, _is_called_unknown),
         "unknown_auroc": bootstrap_over_cases(scores, compute_auroc),
         "ece": bootstrap_over_cases(scores, lambda drawn: compute_ece(collect_claims(drawn))),
         "reliability": compute_reliability(collect_claims(scores)),
         "parameter_error": bootstrap_over_cases(scores, compute_parameter_error),
-        "cover_90": compute_rate([number.in_90 for number in numbers]),
-        "cover_95": compute_rate([number.in_95 for number in numbers]),
+        "cover_90": _rate_items(numbers, attrgetter("in_90")),
+        "cover_95": _rate_items(numbers, attrgetter("in_95")),
         "closed_of_oracle": bootstrap_over_cases(known, compute_closed_of_oracle),
         "predicted_off": bootstrap_over_cases(known, compute_prediction_error),
         "seconds": {"median": _take_median(seconds), "most": max(seconds, default=None)},
         "by_effect": summarize_effects(scores),
         "confusion": count_confusions(one),
         "outside": count_outside_answers(outside),
-        "by_size": compute_detection_curve(one, [score.size for score in one], SIZES),
-        "by_motion": compute_detection_curve(one, [score.moved_rad for score in one], MOVED_RAD),
+        "by_size": compute_detection_curve(one, attrgetter("size"), SIZES),
+        "by_motion": compute_detection_curve(one, attrgetter("moved_rad"), MOVED_RAD),
     }
+
+
+def _rate_items(items: Sequence[Any], is_right: Callable[[Any], bool]) -> Metric:
+    """Return the rate of the items for which `is_right` holds."""
+    return compute_rate(list(map(is_right, items)))
+
+
+def _select_kinds(scores: Sequence[CaseScore], kinds: Sequence[str]) -> list[CaseScore]:
+    return [score for score in scores if score.kind in kinds]
+
+
+def _collect_numbers(scores: Sequence[CaseScore]) -> list[ParameterScore]:
+    numbers: list[ParameterScore] = []
+    for score in scores:
+        numbers.extend(score.numbers)
+    return numbers
+
+
+def _is_called_unknown(score: CaseScore) -> bool:
+    return score.verdict == "unknown"
+
+
+def _is_called_none(score: CaseScore) -> bool:
+    return score.verdict == "none"
+
+
+def _has_named_effect(score: CaseScore) -> bool:
+    return score.verdict not in ("none", "failed")
 
 
 def _is_exact(score: CaseScore) -> bool:
@@ -133,7 +165,7 @@ def _is_exact(score: CaseScore) -> bool:
 
 def _compute_false_alarms(quiet: Sequence[CaseScore]) -> Metric:
     """Return the share of cases without a visible effect whose answer names one."""
-    return compute_rate([score.verdict not in ("none", "failed") for score in quiet])
+    return _rate_items(quiet, _has_named_effect)
 
 
 def list_labels(score: CaseScore) -> tuple[set[str], set[str]]:
@@ -145,13 +177,16 @@ def list_labels(score: CaseScore) -> tuple[set[str], set[str]]:
 def build_indicators(scores: Sequence[CaseScore]) -> tuple[list[str], np.ndarray, np.ndarray]:
     """Return the effects that occur, and which are true and which are named in each case, `(N, E)`."""
     labels = [list_labels(score) for score in scores]
-    effects = sorted(set().union(*(true | named for true, named in labels)))
+    occurring: set[str] = set()
+    for is_true, is_named in labels:
+        occurring |= is_true | is_named
+    effects = sorted(occurring)
     column = {effect: number for number, effect in enumerate(effects)}
     # one empty column more: scikit-learn takes a single column for a binary target
     true, named = np.zeros((2, len(labels), len(effects) + 1), dtype=int)
     for row, (is_true, is_named) in enumerate(labels):
-        true[row, [column[effect] for effect in is_true]] = 1
-        named[row, [column[effect] for effect in is_named]] = 1
+        true[row, list(map(column.__getitem__, is_true))] = 1
+        named[row, list(map(column.__getitem__, is_named))] = 1
     return effects, true, named
 
 
@@ -177,12 +212,13 @@ def compute_f1(scores: Sequence[CaseScore], average: str) -> float | None:
 def summarize_effects(scores: Sequence[CaseScore]) -> dict[str, Metric]:
     """Return precision, recall and F1 of each effect over all cases."""
     effects, true, named = build_indicators(scores) if scores else ([], *np.zeros((2, 0, 0), int))
+    parameters = _collect_numbers(scores)
     found = {}
     for number, effect in enumerate(effects):
         right = int((true[:, number] & named[:, number]).sum())
         wrong, missed = int(named[:, number].sum()) - right, int(true[:, number].sum()) - right
         f1 = 2.0 * right / (2 * right + wrong + missed) if right + missed else None
-        errors = [n.error for score in scores for n in score.numbers if n.effect == effect]
+        errors = [one.error for one in parameters if one.effect == effect]
         found[effect] = {
             "right": right,
             "wrong": wrong,
@@ -218,21 +254,24 @@ def _count(row: dict[str, int], name: str) -> None:
 
 
 def compute_detection_curve(
-    scores: Sequence[CaseScore], at: Sequence[float], edges: Sequence[float]
+    scores: Sequence[CaseScore], measure: Callable[[CaseScore], float], edges: Sequence[float]
 ) -> list[Metric]:
     """Return, by bins of a size, the rate of right names and of the verdict `none`.
 
     Args:
         scores: Of cases with one effect.
-        at: Size of each.
+        measure: Size of one of them.
         edges: Edges of the bins; empty bins are left out.
     """
     found = []
     for low, high in pairwise(edges):
-        inside = [score for score, value in zip(scores, at, strict=True) if low <= value < high]
+        inside = []
+        for score in scores:
+            if low <= measure(score) < high:
+                inside.append(score)
         if inside:
-            right = compute_rate([score.first for score in inside])
-            none = compute_rate([score.verdict == "none" for score in inside])
+            right = _rate_items(inside, attrgetter("first"))
+            none = _rate_items(inside, _is_called_none)
             found.append({"from": low, "to": high, "right": right, "none": none})
     return found
 
@@ -243,12 +282,16 @@ def compute_auroc(scores: Sequence[CaseScore]) -> float | None:
     if len(set(is_outside)) < 2:
         return None
     metrics = import_sklearn("metrics", "exam.do=score")
-    return float(metrics.roc_auc_score(is_outside, [score.unknown for score in scores]))
+    chances = list(map(attrgetter("unknown"), scores))
+    return float(metrics.roc_auc_score(is_outside, chances))
 
 
 def collect_claims(scores: Sequence[CaseScore]) -> list[Claim]:
     """Return all statements with a probability."""
-    return [claim for score in scores for claim in score.claims]
+    claims: list[Claim] = []
+    for score in scores:
+        claims.extend(score.claims)
+    return claims
 
 
 def compute_reliability(made: Sequence[Claim]) -> list[Metric]:
@@ -257,14 +300,14 @@ def compute_reliability(made: Sequence[Claim]) -> list[Metric]:
     Not `sklearn.calibration.calibration_curve`: it gives no counts, which the intervals need, and
     puts a probability on an edge into the bin below it.
     """
+    bins: list[list[Claim]] = [[] for _ in range(NUM_BINS)]
+    for claim in made:
+        # a certain statement (1.0) belongs to the last bin
+        bins[min(int(claim.probability * NUM_BINS), NUM_BINS - 1)].append(claim)
     found = []
-    for k in range(NUM_BINS):
-        inside = [
-            claim for claim in made if min(int(claim.probability * NUM_BINS), NUM_BINS - 1) == k
-        ]
-        if inside:
-            stated = float(np.mean([claim.probability for claim in inside]))
-            found.append({"stated": stated, **compute_rate([claim.is_true for claim in inside])})
+    for inside in filter(None, bins):
+        stated = float(np.mean(list(map(attrgetter("probability"), inside))))
+        found.append({"stated": stated, **_rate_items(inside, attrgetter("is_true"))})
     return found
 
 
@@ -282,7 +325,7 @@ def compute_ece(made: Sequence[Claim]) -> float | None:
 
 def compute_parameter_error(scores: Sequence[CaseScore]) -> float | None:
     """Return the median relative error of the parameters."""
-    return _take_median(number.error for score in scores for number in score.numbers)
+    return _take_median(map(attrgetter("error"), _collect_numbers(scores)))
 
 
 def compute_closed_of_oracle(scores: Sequence[CaseScore]) -> float | None:

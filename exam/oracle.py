@@ -44,7 +44,10 @@ class JointErrors:
 
     def rays(self, names: frozenset[str]) -> list[Response]:
         """Return the shapes of several effects, in the order of their names."""
-        return [shape for name in sorted(names) for shape in self.shapes[name]]
+        found: list[Response] = []
+        for name in sorted(names):
+            found.extend(self.shapes[name])
+        return found
 
 
 @dataclass(frozen=True)
@@ -82,19 +85,16 @@ def load_case_evidence(
         ways = grown[kind.name] = build_rays(kind)
         responses = [residuals.response(ray) for ray in ways]
         for j, mine in enumerate(shapes):
-            if (
-                max((np.abs(response[j]).max() for response in responses), default=0.0)
-                > MIN_RESPONSE
-            ):
-                mine[kind.name] = [
-                    Response(ray.sizes, response[j])
-                    for ray, response in zip(ways, responses, strict=True)
-                ]
-    return CaseEvidence(
-        base,
-        grown,
-        [JointErrors(z, mine, residuals.fold) for z, mine in zip(residuals.z, shapes, strict=True)],
-    )
+            own, largest = [], 0.0
+            for ray, response in zip(ways, responses, strict=True):
+                own.append(Response(ray.sizes, response[j]))
+                largest = max(largest, np.abs(response[j]).max())
+            if largest > MIN_RESPONSE:
+                mine[kind.name] = own
+    errors = []
+    for z, mine in zip(residuals.z, shapes, strict=True):
+        errors.append(JointErrors(z, mine, residuals.fold))
+    return CaseEvidence(base, grown, errors)
 
 
 MIN_GAP_RATIO = 1.1
@@ -120,24 +120,23 @@ def close_gap(
     """
     found = load_case_evidence(folder, fit, machine, tuple(effects))
     residuals = found.base.field.residuals
-    subsets = [
-        frozenset(
-            name for name, joints in effects.items() if joint in joints and name in errors.shapes
-        )
-        for joint, errors in zip(machine.joint_names, found.errors, strict=True)
-    ]
+    subsets = []
+    for joint, errors in zip(machine.joint_names, found.errors, strict=True):
+        visible = set()
+        for name, joints in effects.items():
+            if joint in joints and name in errors.shapes:
+                visible.add(name)
+        subsets.append(frozenset(visible))
     measured = residuals.simulator.cut.measured
     before = gap.compute_squares(residuals.base, measured, machine)
-    floors = [
-        gap.compute_squares(one.residuals.base, one.residuals.simulator.cut.measured, machine)
-        for one in found.base.left_out
-    ]
+    floors = []
+    for one in found.base.left_out:
+        left_out = one.residuals
+        floors.append(gap.compute_squares(left_out.base, left_out.simulator.cut.measured, machine))
     floor = np.concatenate(floors)
     if not any(subsets) or gap.compute_rmse(before) < MIN_GAP_RATIO * gap.compute_rmse(floor):
         return None
-    start = [
-        _fit_start(errors, subset) for errors, subset in zip(found.errors, subsets, strict=True)
-    ]
+    start = list(map(_fit_start, found.errors, subsets))
     after = gap.compute_squares(
         fit_set(residuals, subsets, found.rays, start).after, measured, machine
     )

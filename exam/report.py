@@ -92,6 +92,7 @@ def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]
     for key, (label, more_is_better) in ROWS.items():
         found = [table[key] for table in tables.values()]
         known = [one["value"] for one in found if one["value"] is not None]
+        # where less is better the smallest is best; a single candidate is not the best of any
         best = None
         if more_is_better is not None and len(known) > 1:
             best = max(known) if more_is_better else min(known)
@@ -131,7 +132,7 @@ def format_markdown(tables: Mapping[str, Mapping[str, Any]]) -> str:
     """Return the table of all candidates as Markdown."""
     lines = [["", *tables], ["---"] * (1 + len(tables))]
     for row in build_rows(tables):
-        lines.append([format_cell(cell) for cell in row])
+        lines.append(list(map(format_cell, row)))
     return "".join(f"| {' | '.join(line)} |\n" for line in lines)
 
 
@@ -143,7 +144,7 @@ def write_report(
     The pictures are `confusion_<name>.png`, `reliability_<name>.png` and `size_<name>.png`.
     """
     cases = next(iter(tables.values()))["cases"]
-    kinds = ", ".join(f"{count} {kind}" for kind, count in cases.items() if count)
+    kinds = _join_counts({kind: count for kind, count in cases.items() if count})
     page = Report(
         f"Exam of {', '.join(tables)}",
         f"{exam['num_cases']} cases ({kinds}), roughness {exam['roughness']}, seed {exam['seed']}.",
@@ -172,6 +173,10 @@ def write_report(
     write_text(folder / TABLE_FILE, format_markdown(tables))
 
 
+def _join_counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
 def _add_candidate(page: Report, folder: Path, name: str, table: Mapping[str, Any]) -> None:
     page.add_heading(name)
     drawings = {
@@ -185,12 +190,14 @@ def _add_candidate(page: Report, folder: Path, name: str, table: Mapping[str, An
             figure.savefig(path, dpi=DPI)
             page.add_picture(path, CAPTIONS[stem])
     columns = ["right", "wrong", "missed", "precision", "recall", "f1", "parameter_error"]
-    rows = [[effect, *(row[key] for key in columns)] for effect, row in table["by_effect"].items()]
+    rows = []
+    for effect, row in table["by_effect"].items():
+        rows.append([effect, *map(row.__getitem__, columns)])
     with page.add_details("By effect, all cases"):
         page.add_table(["effect", *(column.replace("_", " ") for column in columns)], rows)
     answers = []
     for kind, row in table["outside"].items():
-        answers.append([kind, ", ".join(f"{count} {answer}" for answer, count in row.items())])
+        answers.append([kind, _join_counts(row)])
     with page.add_details("Faults outside the library, and the answers"):
         page.add_table(["outside", "said"], answers)
 
@@ -204,7 +211,10 @@ def draw_confusion(table: Mapping[str, Any]) -> Figure | None:
     there = sorted(found)
     names = set(there).union(*found.values())
     said = sorted(names - set(verdicts)) + [name for name in verdicts if name in names]
-    counts = np.array([[found[true].get(name, 0) for name in said] for true in there])
+    counts = np.zeros((len(there), len(said)), dtype=int)
+    for row, true in enumerate(there):
+        for name, count in found[true].items():
+            counts[row, said.index(name)] = count
     figure = make_figure(2.6 + 0.34 * len(said), 2.2 + 0.3 * len(there))
     axis = figure.add_subplot()
     shares = counts / counts.sum(1, keepdims=True)

@@ -25,6 +25,7 @@ log = logging.getLogger(__name__)
 
 NOTE_FILE = "sitting.json"
 LAST_CHARACTERS = 2000
+"""Last characters of a program's output that an error quotes. Chosen by hand; not searched."""
 
 
 class Candidate(Protocol):
@@ -66,13 +67,9 @@ class CommandCandidate:
         words = [word.format(case=case, out=out) for word in self.command]
         if words[0] == "brokk":
             words[:1] = [sys.executable, "-P", "-m", "brokk_rl"]
-        environment = {
-            **os.environ,
-            **{
-                name: str(self.threads)
-                for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-            },
-        }
+        threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+        environment = os.environ | dict.fromkeys(threads, str(self.threads))
+        # the folders of the exam must not be told: they lead to the labels
         for name in ("OLDPWD", "PWD"):
             environment.pop(name, None)
         with tempfile.TemporaryDirectory(prefix="brokk") as empty:
@@ -125,9 +122,9 @@ def answer_cases(
         candidate, CommandCandidate
     )  # a program has processes of its own
     with ThreadPoolExecutor(workers) if is_alone else ProcessPoolExecutor(workers) as pool:
-        pending = [
-            pool.submit(_answer_case, candidate, case, folder / case.name, machine) for case in todo
-        ]
+        pending = []
+        for case in todo:
+            pending.append(pool.submit(_answer_case, candidate, case, folder / case.name, machine))
         try:
             for done in as_completed(pending):
                 done.result()

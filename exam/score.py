@@ -9,12 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 from diagnosis.answer import Answer, Selected
 
 QUIET_KINDS = ("none", "faint")
 """Kinds of cases in which nothing can be seen."""
+CI95_OVER_SIGMA = 3.92
+"""Length of a 95 % interval of a normal distribution over its standard deviation: 2 times 1.96."""
 CI90_OVER_CI95 = 1.6449 / 1.9600
 """From half a 95 % interval to half a 90 % interval of a normal distribution."""
 
@@ -131,6 +134,7 @@ def score_answer(
     top = chosen[0] if chosen else None
     unknown = _get_probability(answer, "unknown")
     claims = [Claim(one.probability, id(one) in stands_for) for one in chosen]
+    # a verdict without names is a statement too, and a quiet kind makes "none" true
     if verdict in ("none", "unknown"):
         claims.append(
             Claim(
@@ -140,6 +144,14 @@ def score_answer(
         )
     outside = label["outside"]
     sizes = [one["size"] for one in label["effects"]] + ([outside["size"]] if outside else [])
+    joints_right: list[bool] = []
+    numbers: list[ParameterScore] = []
+    for effect, one in pairs:
+        if effect not in of_machine:
+            joints_right.append(set(one.joints) == set(true[effect]["joints"]))
+        # parameters of another effect of the class are other quantities
+        if effect == one.effect:
+            numbers.extend(_score_parameters(true[effect], one))
     gap = answer.gap if answer else None
     predicted = answer.more.get("predicted_closed") if answer else None
     return CaseScore(
@@ -151,19 +163,10 @@ def score_answer(
         verdict=verdict,
         first=top is not None and id(top) in stands_for,
         first_strictly=top is not None and top.effect in true,
-        joints_right=tuple(
-            set(one.joints) == set(true[effect]["joints"])
-            for effect, one in pairs
-            if effect not in of_machine
-        ),
+        joints_right=tuple(joints_right),
         unknown=unknown,
         claims=tuple(claims),
-        numbers=tuple(
-            number
-            for effect, one in pairs
-            if effect == one.effect
-            for number in _score_parameters(true[effect], one)
-        ),
+        numbers=tuple(numbers),
         size=max(sizes, default=0.0),
         moved_rad=max(label["moved_rad"].values()),
         closed=gap.closed.mean if gap and gap.closed else None,
@@ -181,8 +184,8 @@ def _match_effects(
     found, left = [], list(chosen)
     for stands in (_is_same, lambda effect, one: _is_equivalent(effect, one, classes)):
         for effect in true:
-            match = next((one for one in left if stands(effect, one)), None)
-            if match is not None and effect not in [other for other, _ in found]:
+            match = next(filter(partial(stands, effect), left), None)
+            if match is not None and effect not in dict(found):
                 found.append((effect, match))
                 left.remove(match)
     return found
@@ -193,9 +196,9 @@ def _is_same(effect: str, one: Selected) -> bool:
 
 
 def _is_equivalent(effect: str, one: Selected, classes: Sequence[Sequence[str]]) -> bool:
-    return effect in one.same_as or any(
-        effect in group and one.effect in group for group in classes
-    )
+    if effect in one.same_as:
+        return True
+    return any({effect, one.effect} <= set(group) for group in classes)
 
 
 def _get_probability(answer: Answer | None, name: str) -> float:
@@ -225,14 +228,13 @@ def _score_parameters(true: Mapping[str, Any], one: Selected) -> list[ParameterS
                 continue
             estimate, nothing = said[joint], true["nothing"][name]
             size, (low, high) = max(abs(value - nothing), 1e-9), estimate.ci95
-            short, long = (
-                estimate.mean + CI90_OVER_CI95 * (end - estimate.mean) for end in (low, high)
-            )
+            short = estimate.mean + CI90_OVER_CI95 * (low - estimate.mean)
+            long = estimate.mean + CI90_OVER_CI95 * (high - estimate.mean)
             number = ParameterScore(
                 effect=one.effect,
                 parameter=name,
                 error=abs(estimate.mean - value) / size,
-                deviation=(high - low) / 3.92 / size,
+                deviation=(high - low) / CI95_OVER_SIGMA / size,
                 said=abs(estimate.mean - nothing) / size,
                 in_95=low <= value <= high,
                 in_90=short <= value <= long,

@@ -117,7 +117,10 @@ class ClassicalController:
         self._exclusive = constant(machine.is_exclusive)
         # the joint whose distance to the target decides about reach: the first one behind the
         # exclusive joints (the paper's q3)
-        exclusive = [i for i, e in enumerate(machine.is_exclusive) if e]
+        exclusive = []
+        for i, e in enumerate(machine.is_exclusive):
+            if e:
+                exclusive.append(i)
         self._reach_joint = min(exclusive[-1] + 1, machine.num_joints - 1) if exclusive else 0
         age = torch.arange(machine.num_history - 1, -1, -1, dtype=torch.float32, device=device)
         self._period_s = machine.period_s

@@ -226,7 +226,11 @@ def _fit_law(distance_m: list[float], size_m: list[float]) -> _DistanceLaw:
 def _read_rows(path: Path) -> list[dict[str, Any]]:
     try:
         table = json.loads(path.read_text())
-        return [row for row in table if {"perception", "condition", "distance_m"} <= row.keys()]
+        rows = []
+        for row in table:
+            if {"perception", "condition", "distance_m"} <= row.keys():
+                rows.append(row)
+        return rows
     except (OSError, ValueError, AttributeError, TypeError) as error:
         raise ConfigError(
             f"noise.table={path}: expected table.json of benchmarks/perception ({error})"

@@ -92,7 +92,10 @@ class ToolPoseOptions:
             task: The spec.
             **fixed: Options that the spec does not leave open.
         """
-        names = [field.name for field in fields(cls) if field.name not in fixed]
+        names = []
+        for field in fields(cls):
+            if field.name not in fixed:
+                names.append(field.name)
         return cls(**fixed, **{name: getattr(task, name) for name in names})
 
 

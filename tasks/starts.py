@@ -197,7 +197,9 @@ def join_starts(
     Raises:
         ConfigError: If too few were accepted.
     """
-    joined = {key: torch.cat([batch[key] for batch in drawn]) for key in drawn[0]}
+    joined = {}
+    for key in drawn[0]:
+        joined[key] = torch.cat([batch[key] for batch in drawn])
     found = len(joined["q"])
     if found < count:
         raise ConfigError(

@@ -203,12 +203,14 @@ def _resolve_range(
         ends = tuple(np.array([side]) for side in _as_range(value))
     else:
         tables = value if isinstance(value, Mapping) else {"other": value}
-        ends = tuple(
-            expand_per_joint(
-                {name: _as_range(v)[side] for name, v in tables.items()}, machine, where
+        bounds = []
+        for side in (0, 1):
+            bounds.append(
+                expand_per_joint(
+                    {name: _as_range(v)[side] for name, v in tables.items()}, machine, where
+                )
             )
-            for side in (0, 1)
-        )
+        ends = tuple(bounds)
         if number.none is not None:
             ends = tuple(np.where(chosen, side, number.none) for side in ends)
     low, high = ends

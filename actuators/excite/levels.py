@@ -70,16 +70,18 @@ class Levels:
         total = max(1, int(duration_s / machine.period_s))
         count = min(max(1, round(duration_s / self.pose_s)), total)
         starts = draw_start_poses(machine, self.stop_margin, generator)
-        return [
-            Segment(
-                name=f"levels_{i:02d}",
-                start=next(starts),
-                u=self._program(machine, total // count, generator),
-                stops="inward",
-                stop_margin=self.stop_margin,
+        segments = []
+        for i in range(count):
+            segments.append(
+                Segment(
+                    name=f"levels_{i:02d}",
+                    start=next(starts),
+                    u=self._program(machine, total // count, generator),
+                    stops="inward",
+                    stop_margin=self.stop_margin,
+                )
             )
-            for i in range(count)
-        ]
+        return segments
 
     def _program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands, `(T, J)`."""

@@ -71,11 +71,10 @@ def describe_run(
         entry |= {"start_s": _round_ms(t_s[begin]), "end_s": _round_ms(ends_s[end - 1])}
         if stage[begin] != BEFORE:
             entry["offset_s"] = _round_ms(track.played[begin, run] * period_s)
-            away = [
-                (begin + i, begin + k)
-                for i, k in split_stretches(stage[begin:end] == AWAY)
-                if stage[begin + i] == AWAY
-            ]
+            away = []
+            for i, k in split_stretches(stage[begin:end] == AWAY):
+                if stage[begin + i] == AWAY:
+                    away.append((begin + i, begin + k))
             entry["away_s"] = [[_round_ms(t_s[i]), _round_ms(ends_s[k - 1])] for i, k in away]
             if segment.repeat_of:
                 entry["repeat_of"] = segment.repeat_of

@@ -218,9 +218,9 @@ class PlanPlayer:
         moving = MOVES[phase]
         arrived = moving & (~far.any(1) | late)
         for n in np.flatnonzero(arrived & far.any(1)):
-            joints = [
-                f"{self._machine.joint_names[j]} ({q[n, j]:.3f})" for j in np.flatnonzero(far[n])
-            ]
+            joints = []
+            for j in np.flatnonzero(far[n]):
+                joints.append(f"{self._machine.joint_names[j]} ({q[n, j]:.3f})")
             name = self._plan.runs[n][self.segment[n]].name
             log.warning(
                 "run %d: way to the start of %s given up, out of place: %s; going on from there",
@@ -378,10 +378,9 @@ def drive(
         phase, segment, played = runner.phase.copy(), runner.segment.copy(), runner.played
         sent = np.array(link.send(Command(u.reshape(form))).u, dtype=np.float64).reshape(shape)
         runner.took(sent)
-        columns = {
-            name: np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64)
-            for name, value in extra().items()
-        }
+        columns = {}
+        for name, value in extra().items():
+            columns[name] = np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64)
         yield Sample(
             t_s=state.t_s,
             q=q.copy(),

@@ -11,6 +11,7 @@ import numpy as np
 from brokk_rl.machine import Machine
 
 GRAVITY_M_S2 = 9.81
+"""Gravity, m/s²: standard gravity (9.80665), rounded."""
 NUM_CANDIDATES = 128
 """Random poses among which the next one is chosen."""
 

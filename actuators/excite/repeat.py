@@ -45,12 +45,14 @@ class Repeat:
         before: Sequence[Segment],
     ) -> list[Segment]:
         """Return the segments `before`, renamed; their length stays."""
-        return [
-            replace(
-                segment,
-                name=f"{segment.name}_repeat_{i}",
-                repeat_of=segment.repeat_of or segment.name,
-            )
-            for i in range(1, self.times + 1)
-            for segment in before
-        ]
+        repeated = []
+        for i in range(1, self.times + 1):
+            for segment in before:
+                repeated.append(
+                    replace(
+                        segment,
+                        name=f"{segment.name}_repeat_{i}",
+                        repeat_of=segment.repeat_of or segment.name,
+                    )
+                )
+        return repeated

@@ -17,6 +17,7 @@ from brokk_rl.split import group_by_run
 KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
 """Commands at which the static curve bends, on either side."""
 RESOLUTION_S = 0.01
+"""Step of the delays that are tried, s. Chosen by hand; not searched."""
 LONGEST_S = 1.0
 """Longest delay searched for; more than the history of any model here, so that a history too short
 shows."""
@@ -26,6 +27,7 @@ commands, would be preferred because averaging looks like the valve's lag."""
 AT_STOP = 0.005
 """A joint this close to its stop, as a part of its travel, tells nothing about the delay."""
 RESAMPLED = 200
+"""Bootstrap resamples over runs. Chosen by hand; not searched."""
 MIN_MOVING = 100
 """Samples with a command, in all recordings together, below which no delay is estimated."""
 
@@ -66,10 +68,10 @@ def estimate_dead_times(
     if not usable:
         raise RecordingError(f"too little data: no recording is longer than {2.0 * LONGEST_S:g} s")
     grid_s = np.arange(0.0, LONGEST_S + 1e-9, RESOLUTION_S)
-    return {
-        name: _estimate_dead_time(usable, joint, grid_s, machine, generator)
-        for joint, name in enumerate(machine.joint_names)
-    }
+    estimates = {}
+    for joint, name in enumerate(machine.joint_names):
+        estimates[name] = _estimate_dead_time(usable, joint, grid_s, machine, generator)
+    return estimates
 
 
 def _estimate_dead_time(
@@ -79,9 +81,10 @@ def _estimate_dead_time(
     machine: Machine,
     generator: np.random.Generator,
 ) -> DeadTimeEstimate | None:
-    moving = [
-        recording for recording in recordings if (np.abs(recording.u[:, joint]) > KNOTS[1]).any()
-    ]
+    moving = []
+    for recording in recordings:
+        if (np.abs(recording.u[:, joint]) > KNOTS[1]).any():
+            moving.append(recording)
     if (
         sum(int((np.abs(recording.u[:, joint]) > KNOTS[1]).sum()) for recording in moving)
         < MIN_MOVING

@@ -168,10 +168,10 @@ class CandidateRuns:
             :, -1
         ]
         square = np.square(last, dtype=np.float64).sum(0) * steps * self._ahead[-1]
-        return [
-            float(np.sqrt(s / n)) if n else None
-            for s, n in zip(square, self.active.sum(0), strict=True)
-        ]
+        rmse = []
+        for s, n in zip(square, self.active.sum(0), strict=True):
+            rmse.append(float(np.sqrt(s / n)) if n else None)
+        return rmse
 
     def jacobian(self, x: np.ndarray, size: float = STEP) -> tuple[np.ndarray, np.ndarray]:
         """Return errors `(W, K, J)` at `x` `(P, J)` and derivatives `(W, K, J, D)`.
@@ -225,10 +225,9 @@ class SoftL1Loss:
     @classmethod
     def around(cls, squares: np.ndarray, active: np.ndarray, robust: float) -> "SoftL1Loss":
         """Return the loss with scale `robust` times the median error of `squares` `(W, J)`."""
-        typical = [
-            np.median(column[rows]) if rows.any() else 0.0
-            for column, rows in zip(squares.T, active.T, strict=True)
-        ]
+        typical = []
+        for column, rows in zip(squares.T, active.T, strict=True):
+            typical.append(np.median(column[rows]) if rows.any() else 0.0)
         return cls(np.maximum(robust**2 * np.array(typical), 1e-14))
 
     def weights(self, squares: np.ndarray) -> np.ndarray:

@@ -54,8 +54,9 @@ def tabulate_parameters(
         runs.values(np.clip(x + sure.half, 0.0, 1.0)),
     )
     width = runs.values(np.ones_like(x)) - runs.values(np.zeros_like(x))
-    return {
-        name: {
+    parameters = {}
+    for p, (name, row) in enumerate(found.items()):
+        parameters[name] = {
             joint: {
                 "value": value,
                 "standard_error": float(sure.deviation[p, j] * width[p, j]),
@@ -66,20 +67,24 @@ def tabulate_parameters(
             }
             for j, (joint, value) in enumerate(row.items())
         }
-        for p, (name, row) in enumerate(found.items())
-    }
+    return parameters
 
 
 def find_correlated_pairs(
     machine: Machine, runs: CandidateRuns, sure: ParameterUncertainty
 ) -> list[dict[str, Any]]:
     """Return the pairs of parameters whose correlation exceeds `TANGLED`."""
-    labels = [f"{name} {joint}" for name in runs.names for joint in machine.joint_names]
+    labels = []
+    for name in runs.names:
+        for joint in machine.joint_names:
+            labels.append(f"{name} {joint}")
     pairs = np.argwhere(np.triu(np.abs(sure.correlation), 1) > TANGLED)
-    return [
-        {"pair": [labels[a], labels[b]], "correlation": round(float(sure.correlation[a, b]), 3)}
-        for a, b in pairs
-    ]
+    correlated = []
+    for a, b in pairs:
+        correlated.append(
+            {"pair": [labels[a], labels[b]], "correlation": round(float(sure.correlation[a, b]), 3)}
+        )
+    return correlated
 
 
 def format_option(fitted: Any, facts: dict[str, Any]) -> str:
@@ -98,10 +103,11 @@ def format_option(fitted: Any, facts: dict[str, Any]) -> str:
         "# 95 % intervals:",
     ]
     for name, row in facts["parameters"].items():
-        cells = [
-            f"{joint} {cell['ci95'][0]:.4g} to {cell['ci95'][1]:.4g}{'' if cell['told'] else ' (not told)'}"
-            for joint, cell in row.items()
-        ]
+        cells = []
+        for joint, cell in row.items():
+            cells.append(
+                f"{joint} {cell['ci95'][0]:.4g} to {cell['ci95'][1]:.4g}{'' if cell['told'] else ' (not told)'}"
+            )
         lines.append(f"#   {name}: {', '.join(cells)}")
     return (
         "\n".join(lines)
@@ -239,15 +245,8 @@ class GreyBoxFit:
         sure = estimate_uncertainty(runs, x, self.robust)
         found = self._rounded(machine, runs, x)
         fitted: Any = dataclasses.replace(self.actuator, **found)  # pyright: ignore[reportArgumentType, reportCallIssue]
-        facts = {
-            "schema": 1,
-            "machine": machine.name,
-            "recordings": len(train),
-            "runs": len({recording.run for recording in train}),
-            "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
-            "windows": len(runs.active),
-            "horizon_s": self.horizon_s,
-            "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
+        facts = self._describe(machine, train, runs, held, x)
+        facts |= {
             "seconds": round(search.before_s + time.monotonic() - began, 1),
             "created": record.format_now(),
             "parameters": tabulate_parameters(found, runs, x, sure),
@@ -256,6 +255,7 @@ class GreyBoxFit:
         try:
             write_json(folder / f"{self.name}.json", facts)
             write_text(folder / f"{self.name}.yaml", format_option(fitted, facts))
+            # the state of the search is of no use once the result is on disk
             place.unlink(missing_ok=True)
         except OSError as failure:
             raise StorageError(
@@ -263,6 +263,26 @@ class GreyBoxFit:
             ) from failure
         log_undetermined(facts)
         return fitted
+
+    def _describe(
+        self,
+        machine: Machine,
+        train: Sequence[Recording],
+        runs: CandidateRuns,
+        held: CandidateRuns,
+        x: np.ndarray,
+    ) -> dict[str, Any]:
+        """Return the facts on the data of a fit, and its error on the validation runs `held`."""
+        return {
+            "schema": 1,
+            "machine": machine.name,
+            "recordings": len(train),
+            "runs": len({recording.run for recording in train}),
+            "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
+            "windows": len(runs.active),
+            "horizon_s": self.horizon_s,
+            "validation_rmse": dict(zip(machine.joint_names, held.end_rmse(x), strict=True)),
+        }
 
     def _nominal(self, machine: Machine, device: torch.device) -> np.ndarray:
         """Return the actuator's own parameters in units of their ranges, `(P, J)`.
@@ -302,13 +322,13 @@ class GreyBoxFit:
     def _rounded(
         self, machine: Machine, runs: CandidateRuns, x: np.ndarray
     ) -> dict[str, dict[str, float]]:
-        return {
-            name: {
+        rounded = {}
+        for name, row in zip(runs.names, runs.values(x), strict=True):
+            rounded[name] = {
                 joint: float(f"{value:.5g}")
                 for joint, value in zip(machine.joint_names, row, strict=True)
             }
-            for name, row in zip(runs.names, runs.values(x), strict=True)
-        }
+        return rounded
 
 
 @dataclass

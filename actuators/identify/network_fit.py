@@ -67,9 +67,9 @@ class FreeRunOptimizer:
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the tensors that an update changes, by name, to be copied from and into."""
-        found = {
-            f"networks.{name}": value.detach() for name, value in self.networks.named_parameters()
-        }
+        found = {}
+        for name, value in self.networks.named_parameters():
+            found[f"networks.{name}"] = value.detach()
         found |= {f"averaged.{name}": value for name, value in self.averaged.named_parameters()}
         for number, parameter in enumerate(self._parameters):
             found |= {

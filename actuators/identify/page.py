@@ -92,12 +92,15 @@ def _add_errors(page: Report, result: Mapping[str, Any], folder: Path, machine: 
             ]
             rows.append([joint if number == 0 else "", name, *cells])
     for number, (name, figures) in enumerate(result["overall"].items()):
-        cells = [
-            _format_percent(
-                figures[h], [row[h]["percent"] for row in result["overall"].values() if row[h]], ""
+        cells = []
+        for h in horizons:
+            cells.append(
+                _format_percent(
+                    figures[h],
+                    [row[h]["percent"] for row in result["overall"].values() if row[h]],
+                    "",
+                )
             )
-            for h in horizons
-        ]
         rows.append(["all joints" if number == 0 else "", name, None, *cells])
     windows, judged = result["data"]["windows"], result["data"]["test"]
     caption = (
@@ -135,21 +138,22 @@ def _add_comparisons(page: Report, result: Mapping[str, Any]) -> None:
         "▸ better beyond doubt: the interval excludes 0."
     )
     for rival in sorted(rivals, key=lambda name: name == HOLD):
-        rows = [
-            [
-                "all joints" if joint == "overall" else joint,
-                *(
-                    row
-                    and Cell(
-                        f"{row['reduction_percent']:.0f}",
-                        _format_range(row["reduction_ci95"], ".0f"),
-                        _is_surely_better(row),
-                    )
-                    for row in figures.values()
-                ),
-            ]
-            for joint, figures in rivals[rival].items()
-        ]
+        rows = []
+        for joint, figures in rivals[rival].items():
+            rows.append(
+                [
+                    "all joints" if joint == "overall" else joint,
+                    *(
+                        row
+                        and Cell(
+                            f"{row['reduction_percent']:.0f}",
+                            _format_range(row["reduction_ci95"], ".0f"),
+                            _is_surely_better(row),
+                        )
+                        for row in figures.values()
+                    ),
+                ]
+            )
         columns = ["joint", *(f"{horizon} s" for horizon in rivals[rival]["overall"])]
         with page.add_details(f"against {rival}", is_open=rival == LINEAR):
             page.add_table(columns, rows)

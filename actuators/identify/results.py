@@ -78,12 +78,13 @@ def _judge_comparison(result: Mapping[str, Any], horizon: str) -> VerdictSentenc
         )
     against = result["against"][rival]
     total, rows = against["overall"][horizon], [against[joint][horizon] for joint in joints]
-    better = [
-        joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][1] < 0
-    ]
-    worse = [
-        joint for joint, row in zip(joints, rows, strict=True) if row["ci95"] and row["ci95"][0] > 0
-    ]
+    better, worse = [], []
+    for joint, row in zip(joints, rows, strict=True):
+        # an interval that excludes 0 leaves no doubt
+        if row["ci95"] and row["ci95"][1] < 0:
+            better.append(joint)
+        elif row["ci95"] and row["ci95"][0] > 0:
+            worse.append(joint)
     change = total["reduction_percent"]
     text = f"{mine}, against {overall[rival]:.2f} % of {rival}: {abs(change):.0f} % {'less' if change >= 0 else 'more'}"
     if total["reduction_ci95"]:
@@ -136,7 +137,10 @@ def _judge_worst_joint(
 
 
 def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[VerdictSentence]:
-    known = {joint: delay for joint, delay in result["delay_s"].items() if delay is not None}
+    known = {}
+    for joint, delay in result["delay_s"].items():
+        if delay is not None:
+            known[joint] = delay
     if not known:
         return []
     history_s = machine.num_history * machine.period_s
@@ -148,7 +152,14 @@ def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[Verdic
     )
     stated = f"machine '{machine.name}' says {machine.dead_time_s:g} s"
     found: list[VerdictSentence] = []
-    lost = [joint for joint, delay in known.items() if not delay["found"]]
+    lost, long, off = [], [], []
+    for joint, delay in known.items():
+        if not delay["found"]:
+            lost.append(joint)
+        elif delay["ci95"][1] > history_s:
+            long.append(joint)
+        if abs(delay["value"] - machine.dead_time_s) > DELAY_TOLERANCE_S:
+            off.append(joint)
     if lost:
         found.append(
             VerdictSentence(
@@ -156,9 +167,6 @@ def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[Verdic
                 f"The dead time of {', '.join(lost)} is not found: the motion does not follow the command.",
             )
         )
-    long = [
-        joint for joint, delay in known.items() if delay["found"] and delay["ci95"][1] > history_s
-    ]
     if long:
         count = int(np.ceil(max(known[joint]["ci95"][1] for joint in long) / machine.period_s)) + 2
         text = f"The dead time of {', '.join(long)} may exceed the history of {history_s:.2f} s: models miss the command that acts."
@@ -168,11 +176,6 @@ def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[Verdic
                 f"{text} Set num_history of machine '{machine.name}' to {count} or more and fit again.",
             )
         )
-    off = [
-        joint
-        for joint, delay in known.items()
-        if abs(delay["value"] - machine.dead_time_s) > DELAY_TOLERANCE_S
-    ]
     if off:
         text = f"Dead time {span}, but {stated}: correct dead_time_s ({', '.join(off)})."
         found.append(VerdictSentence("warn", text))
@@ -208,7 +211,10 @@ def _judge_excitation(result: Mapping[str, Any]) -> list[VerdictSentence]:
 
 def _judge_test_data(result: Mapping[str, Any]) -> list[VerdictSentence]:
     found, data = [], result["data"]
-    idle = [joint for joint, facts in data["excitation"].items() if facts["judged_s"] <= 0]
+    idle = []
+    for joint, facts in data["excitation"].items():
+        if facts["judged_s"] <= 0:
+            idle.append(joint)
     if idle:
         found.append(
             VerdictSentence(
@@ -285,42 +291,21 @@ def build_results(
         RecordingError: no recording is long enough to search for a dead time in.
     """
     machine, model = identified.machine, identified.model
-    judging = [
-        (cut, done)
-        for cut, done in zip(identified.cuts, identified.done, strict=True)
-        if cut is not None
-    ]
-    cut = open_loop.join_windows([cut for cut, _ in judging])
-    predicted = {
-        name: np.concatenate([done[name].predicted for _, done in judging])
-        for name in judging[0][1]
-    }
-    scores = FreeRunScores(predicted, cut, machine, resampling)
+    scores = _join_stages(identified, resampling)
     kept = identified.done[-1][model]
     last = identified.stages[-1]
     fitted_to = list_recordings(last.train) + list_recordings(last.validation)
     delays = dead_time.estimate_dead_times(fitted_to, machine, delaying)
-    acting_s = np.array(
-        [
-            delay.value_s if delay and delay.is_found else machine.dead_time_s
-            for delay in delays.values()
-        ]
-    )
+    acting = []
+    for delay in delays.values():
+        acting.append(delay.value_s if delay and delay.is_found else machine.dead_time_s)
+    acting_s = np.array(acting)
     result: dict[str, Any] = {
         "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
         "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
     }  # fmt: skip
     result |= _tabulate_errors(scores, identified)
-    result["delay_s"] = {
-        joint: delay
-        and {
-            "value": delay.value_s,
-            "ci95": list(delay.ci95_s),
-            "explained": delay.explained,
-            "found": delay.is_found,
-        }
-        for joint, delay in delays.items()
-    }
+    result["delay_s"] = {joint: _tabulate_delay(delay) for joint, delay in delays.items()}
     result["regimes"] = score_regimes(scores, acting_s)
     result["data"] = _describe_data(identified, fitted_to, scores)
     findings = write_verdict(result, machine)
@@ -328,10 +313,34 @@ def build_results(
     drawings = {
         "prediction": pictures.draw_prediction(scores, model),
         "error_over_horizon": pictures.draw_error_over_horizon(scores, model),
-        "regimes": pictures.draw_regimes(result["regimes"], machine, model, list(predicted)),
+        "regimes": pictures.draw_regimes(result["regimes"], machine, model, list(scores.predicted)),
         "dead_time": pictures.draw_dead_times(delays, machine),
     }
     return result, findings, drawings
+
+
+def _join_stages(identified: IdentificationRun, resampling: np.random.Generator) -> FreeRunScores:
+    """Return the scores over the windows of all stages that judge something."""
+    cuts, judging = [], []
+    for cut, done in zip(identified.cuts, identified.done, strict=True):
+        if cut is not None:
+            cuts.append(cut)
+            judging.append(done)
+    predicted = {}
+    for name in judging[0]:
+        predicted[name] = np.concatenate([done[name].predicted for done in judging])
+    return FreeRunScores(predicted, open_loop.join_windows(cuts), identified.machine, resampling)
+
+
+def _tabulate_delay(delay: dead_time.DeadTimeEstimate | None) -> dict[str, Any] | None:
+    if delay is None:
+        return None
+    return {
+        "value": delay.value_s,
+        "ci95": list(delay.ci95_s),
+        "explained": delay.explained,
+        "found": delay.is_found,
+    }
 
 
 def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> dict[str, Any]:
@@ -373,7 +382,9 @@ def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> di
             )
             for joint, row in zip(table, rows, strict=True):
                 table[joint][key] = row
-    judged = [recording for stage in identified.stages for recording in list_recordings(stage.test)]
+    judged = []
+    for stage in identified.stages:
+        judged.extend(list_recordings(stage.test))
     longest_s, before_s = (
         open_loop.find_longest_horizon_s(judged, machine),
         open_loop.count_samples_before(machine) * machine.period_s,
@@ -388,12 +399,16 @@ def _describe_data(
 ) -> dict[str, Any]:
     """Return facts on the data: amount, runs of each part, excitation of each joint."""
     machine, last = identified.machine, identified.stages[-1]
-    judged = [recording for stage in identified.stages for recording in list_recordings(stage.test)]
+    judged = []
+    for stage in identified.stages:
+        judged.extend(list_recordings(stage.test))
     u, q = (
         np.concatenate([getattr(recording, name) for recording in fitted_to]) for name in ("u", "q")
     )
     moved_s, judged_s = measure_commanded_s(fitted_to), measure_commanded_s(judged)
-    tested = {name for stage in identified.stages for name in stage.test}
+    tested = set()
+    for stage in identified.stages:
+        tested.update(stage.test)
     return {
         "train": _count_recordings(list_recordings(last.train), len(last.train)),
         "validation": _count_recordings(list_recordings(last.validation), len(last.validation)),

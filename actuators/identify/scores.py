@@ -19,6 +19,7 @@ from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.split import COMMANDED
 
 RESAMPLED = 1000
+"""Bootstrap resamples over runs; the usual number for 95 % intervals."""
 TAILS = (50.0 * (1.0 - CONFIDENCE), 50.0 * (1.0 + CONFIDENCE))
 """Percentiles that bound the interval."""
 
@@ -103,17 +104,19 @@ class FreeRunScores:
         step = self.step(horizon_s)
         error = self.error[name][np.isfinite(self.cut.measured[:, step, 0])]
         path, (rmse, resampled) = error[:, : step + 1], self.rmse(name)
-        return [
-            {
-                "rmse": float(rmse[step, j]),
-                "ci95": bound_interval(resampled[:, step, j]),
-                "percent": float(100.0 * rmse[step, j] / self.travel[j]),
-                "path_rmse": float(np.sqrt(np.mean(path[..., j] ** 2))),
-                "path_mean": float(np.abs(path[..., j]).mean()),
-                "end_mean": float(np.abs(error[:, step, j]).mean()),
-            }
-            for j in range(len(self.travel))
-        ]
+        rows = []
+        for j in range(len(self.travel)):
+            rows.append(
+                {
+                    "rmse": float(rmse[step, j]),
+                    "ci95": bound_interval(resampled[:, step, j]),
+                    "percent": float(100.0 * rmse[step, j] / self.travel[j]),
+                    "path_rmse": float(np.sqrt(np.mean(path[..., j] ** 2))),
+                    "path_mean": float(np.abs(path[..., j]).mean()),
+                    "end_mean": float(np.abs(error[:, step, j]).mean()),
+                }
+            )
+        return rows
 
     def against(self, name: str, rival: str, horizon_s: float) -> list[dict[str, Any]]:
         """Return the difference of a model's and a rival's error: per joint, then the mean.
@@ -126,10 +129,9 @@ class FreeRunScores:
         (mine, mine_again), (other, other_again) = (
             [part[..., step, :] for part in self.rmse(key)] for key in (name, rival)
         )
-        rows = [
-            [values[..., j] for values in (mine, other, mine_again, other_again)]
-            for j in range(len(self.travel))
-        ]
+        rows = []
+        for j in range(len(self.travel)):
+            rows.append([values[..., j] for values in (mine, other, mine_again, other_again)])
         rows.append(
             [
                 (100.0 * values / self.travel).mean(-1)
@@ -160,7 +162,10 @@ def average_joints(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict
         if len(set(units)) == 1
         else ("percent",)
     )
-    return {key: float(np.mean([row[key] for row in rows])) for key in keys}
+    means = {}
+    for key in keys:
+        means[key] = float(np.mean([row[key] for row in rows]))
+    return means
 
 
 def _compare_errors(
@@ -178,6 +183,7 @@ def _compare_errors(
 
 
 SECOND_S = 1.0
+"""Length of the pieces into which free runs are cut, s. Chosen by hand; not searched."""
 NEAR_STOP = 0.05
 """Part of the travel that counts as near a stop."""
 SMALL, LARGE = 0.3, 0.7

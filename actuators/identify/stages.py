@@ -80,7 +80,10 @@ class FittedModel:
 
 def list_recordings(part: Mapping[str, Sequence[Recording]]) -> list[Recording]:
     """Return the recordings of all runs."""
-    return [recording for recordings in part.values() for recording in recordings]
+    found = []
+    for recordings in part.values():
+        found.extend(recordings)
+    return found
 
 
 def fit_or_restore(

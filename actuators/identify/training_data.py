@@ -154,10 +154,9 @@ has died away."""
 
 def measure_commanded_each_way_s(recordings: Sequence[Recording]) -> np.ndarray:
     """Return for how long each joint is commanded forth and back, s, shape `(2, J)`."""
-    both = [
-        np.stack([(r.u > COMMANDED).sum(0), (r.u < -COMMANDED).sum(0)]) / r.rate_hz
-        for r in recordings
-    ]
+    both = []
+    for r in recordings:
+        both.append(np.stack([(r.u > COMMANDED).sum(0), (r.u < -COMMANDED).sum(0)]) / r.rate_hz)
     return np.sum(both, 0)
 
 

@@ -18,6 +18,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 SCHEMA = 1
+"""Version of the format; another one is refused."""
 SHIPPED = Path(__file__).parents[1] / "weights"
 """Folder of the checkpoints that come with the package."""
 
@@ -197,9 +198,9 @@ def _list_differences(then: Any, now: Any, name: str = "") -> list[str]:
     """Return where two stamps differ, e.g. `fit.width (was 32, is 64)`."""
     if isinstance(then, dict) and isinstance(now, dict):
         keys = sorted({*then, *now})
-        return [
-            found
-            for key in keys
-            for found in _list_differences(then.get(key), now.get(key), f"{name}.{key}".strip("."))
-        ]
+        differences = []
+        for key in keys:
+            inner = f"{name}.{key}".strip(".")
+            differences.extend(_list_differences(then.get(key), now.get(key), inner))
+        return differences
     return [] if then == now else [f"{name} (was {then}, is {now})"]

@@ -133,10 +133,9 @@ class HydraulicModel:
     def __init__(
         self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        nominal = {
-            name: expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
-            for name in PER_JOINT
-        }
+        nominal = {}
+        for name in PER_JOINT:
+            nominal[name] = expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
         _check(nominal)
         longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
         check_dead_time(float(longest_s), machine, "actuator.transport_s")

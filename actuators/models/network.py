@@ -139,13 +139,12 @@ class JointNetworks(nn.Module):
         super().__init__()
         self.num_history, self.coupled = num_history, coupled
         sizes = (2 * num_history, width, width, 1)
-        weight = [
-            _initialise_weights(num_joints, m, n, generator=generator) for m, n in pairwise(sizes)
-        ]
-        bias = [
-            _initialise_weights(num_joints, 1, n, fan_in=m, generator=generator)
-            for m, n in pairwise(sizes)
-        ]
+        weight = []
+        for m, n in pairwise(sizes):
+            weight.append(_initialise_weights(num_joints, m, n, generator=generator))
+        bias = []
+        for m, n in pairwise(sizes):
+            bias.append(_initialise_weights(num_joints, 1, n, fan_in=m, generator=generator))
         self.weight = nn.ParameterList([nn.Parameter(value) for value in weight])
         self.bias = nn.ParameterList([nn.Parameter(value) for value in bias])
         self.flow = SharedFlow(num_joints, num_history, generator) if coupled else None

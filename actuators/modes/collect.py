@@ -142,12 +142,11 @@ class Collect:
             predict_tool_speed(machine, track.q[:, 0]),
             self.session.folder / "plan.png",
         )
-        unplayed = {
-            entry["name"]
-            for run in summary["runs"]
-            for entry in run
-            if entry["cut_s"] > CUT * entry["program_s"]
-        }
+        unplayed = set()
+        for run in summary["runs"]:
+            for entry in run:
+                if entry["cut_s"] > CUT * entry["program_s"]:
+                    unplayed.add(entry["name"])
         if unplayed:
             log.warning(
                 "plan: no time for %s in some of the runs; raise collect.run_minutes",

@@ -126,11 +126,10 @@ class Identify:
         self.session.seed_all()
         stages = self._stages()
         judged = [recording for stage in stages for recording in list_recordings(stage.test)]
-        horizons_s = [
-            h
-            for h in HORIZONS_S
-            if h <= open_loop.find_longest_horizon_s(judged, self.machine) + 1e-9
-        ]
+        horizons_s = []
+        for h in HORIZONS_S:
+            if h <= open_loop.find_longest_horizon_s(judged, self.machine) + 1e-9:
+                horizons_s.append(h)
         cuts = [self._cut(stage, horizons_s) for stage in stages]
         models = {self.fit.name: self.fit, **self.baselines}
         done: list[dict[str, FittedModel]] = []
@@ -227,9 +226,9 @@ class Identify:
         )
 
     def _check_unseen(self, runs: Runs, test: Runs) -> None:
-        files = [
-            {r.path.resolve() for r in list_recordings(part) if r.path} for part in (runs, test)
-        ]
+        files = []
+        for part in (runs, test):
+            files.append({r.path.resolve() for r in list_recordings(part) if r.path})
         if shared := {*map(str, files[0] & files[1]), *(runs.keys() & test.keys())}:
             raise RecordingError(
                 f"identify.test: {min(shared)} is also among identify.recordings; judge by runs that were not fitted to"
@@ -289,9 +288,10 @@ def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder:
         for row, name in enumerate(models):
             cells = []
             for horizon in horizons:
-                given = {
-                    other: rows[horizon][key] for other, rows in models.items() if rows[horizon]
-                }
+                given = {}
+                for other, rows in models.items():
+                    if rows[horizon]:
+                        given[other] = rows[horizon][key]
                 text = f"{given[name]:.{digits}f}" if given else "–"
                 cells.append(
                     f"[bold]{text}[/]" if given and given[name] == min(given.values()) else text

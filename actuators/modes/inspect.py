@@ -145,12 +145,18 @@ class Inspect:
             )
         except RecordingError:
             return dict.fromkeys(self.machine.joint_names)
-        return {
-            name: None
-            if delay is None
-            else {"value": delay.value_s, "ci95": list(delay.ci95_s), "explained": delay.explained}
-            for name, delay in found.items()
-        }
+        delays = {}
+        for name, delay in found.items():
+            delays[name] = (
+                None
+                if delay is None
+                else {
+                    "value": delay.value_s,
+                    "ci95": list(delay.ci95_s),
+                    "explained": delay.explained,
+                }
+            )
+        return delays
 
     def _overall(self, inspected: Sequence[InspectedFile]) -> dict[str, dict[str, float | None]]:
         """Return figures of each joint over all recordings: extremes and weighted means."""
@@ -295,18 +301,19 @@ class Inspect:
             if one.breaches:
                 page.add_list([str(breach) for breach in one.breaches])
             if one.inspection and one.inspection.findings:
-                rows = [
-                    [
-                        f.kind,
-                        f.joint or "all",
-                        str(f.row),
-                        str(f.num_rows),
-                        f"{f.t_s:.2f}",
-                        f"{f.duration_s:.2f}",
-                        f.text,
-                    ]
-                    for f in one.inspection.findings
-                ]
+                rows = []
+                for f in one.inspection.findings:
+                    rows.append(
+                        [
+                            f.kind,
+                            f.joint or "all",
+                            str(f.row),
+                            str(f.num_rows),
+                            f"{f.t_s:.2f}",
+                            f"{f.duration_s:.2f}",
+                            f.text,
+                        ]
+                    )
                 with page.add_details(f"{len(rows)} findings"):
                     page.add_table(
                         ["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows
@@ -316,12 +323,15 @@ class Inspect:
 
 def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:
     """Return the original rates of logs that were resampled when converted."""
-    rates = {
-        one.recording.run: one.recording.metadata.get("resampled_from")
-        for one in inspected
-        if one.recording
-    }
-    return [f"run {run}: resampled from {rate}" for run, rate in rates.items() if rate]
+    rates = {}
+    for one in inspected:
+        if one.recording:
+            rates[one.recording.run] = one.recording.metadata.get("resampled_from")
+    resampled = []
+    for run, rate in rates.items():
+        if rate:
+            resampled.append(f"run {run}: resampled from {rate}")
+    return resampled
 
 
 def _check_clocks(inspected: Sequence[InspectedFile]) -> list[str]:

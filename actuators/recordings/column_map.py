@@ -149,12 +149,12 @@ class ColumnMap:
         pieces = np.split(
             np.arange(len(t_s)), np.flatnonzero(np.diff(t_s) > self.longest_gap_s) + 1
         )
-        kept = [
-            rows
-            for rows in pieces
-            if len(rows) > 1
-            and t_s[rows[-1]] - t_s[rows[0]] >= max(self.shortest_s, machine.period_s)
-        ]
+        kept = []
+        for rows in pieces:
+            if len(rows) > 1 and t_s[rows[-1]] - t_s[rows[0]] >= max(
+                self.shortest_s, machine.period_s
+            ):
+                kept.append(rows)
         if not kept:
             raise RecordingError(
                 f"{path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
@@ -167,10 +167,12 @@ class ColumnMap:
                 len(pieces) - len(kept),
                 self.shortest_s,
             )
-        return [
-            _resample(t_s[p], u[p], q[p], {k: v[p] for k, v in extra.items()}, path, machine)
-            for p in kept
-        ]
+        found = []
+        for p in kept:
+            found.append(
+                _resample(t_s[p], u[p], q[p], {k: v[p] for k, v in extra.items()}, path, machine)
+            )
+        return found
 
     def _commands(self, table: "_Table", column: CommandColumn) -> np.ndarray:
         u = column.command(table.numbers(Column(column=column.column, scale=1.0, offset=0.0)))

@@ -131,11 +131,10 @@ def _add_legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:
     """Explain the colours that occur."""
     from matplotlib.patches import Patch
 
-    patches = [
-        Patch(color=colour, alpha=0.6, label=kind)
-        for kind, colour in COLOURS.items()
-        if kind in kinds
-    ]
+    patches = []
+    for kind, colour in COLOURS.items():
+        if kind in kinds:
+            patches.append(Patch(color=colour, alpha=0.6, label=kind))
     if has_breaches:
         patches.append(Patch(color=BREACH, label="breaks the format"))
     if patches:

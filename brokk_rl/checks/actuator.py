@@ -21,6 +21,7 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
 NUM_STEPS = 20
+"""Control periods of a check. Chosen by hand; not searched."""
 
 
 def check_actuator(

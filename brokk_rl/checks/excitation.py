@@ -9,6 +9,7 @@ from brokk_rl.contracts.actuator import Excitation, Segment
 from brokk_rl.machine import Machine
 
 DURATION_S = 300.0
+"""Length of the plan of a check, s. Chosen by hand; not searched."""
 
 
 def check_excitation(excitation: Excitation, machine: Machine) -> None:

@@ -12,6 +12,7 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
 NUM_ENVS = 4
+"""Environments of a check. Chosen by hand; not searched."""
 
 
 def build_rest_history(

@@ -19,6 +19,7 @@ from brokk_rl.contracts.actuator import Follower, FollowerModel
 from brokk_rl.machine import Machine, mask_exclusive_joints
 
 NUM_STEPS = 60
+"""Control periods of a check. Chosen by hand; not searched."""
 
 
 def check_follower(

@@ -12,6 +12,7 @@ from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 
 HEIGHT_PX, WIDTH_PX = 120, 160
+"""Size of the picture of a check, px. Chosen by hand: small is fast."""
 UNIT_TOLERANCE = 1e-5
 """Largest departure of an axis' length from 1: that of float32."""
 NEGATIVE_VARIANCE = -1e-12

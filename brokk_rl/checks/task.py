@@ -159,7 +159,10 @@ def _check_optional(
             tuple(action.shape) == (NUM_ENVS, num_actions),
             f"classical_action: got shape {tuple(action.shape)}",
         )
-    half = [name for name in ("describe", "deployable") if hasattr(process, name)]
+    half = []
+    for name in ("describe", "deployable"):
+        if hasattr(process, name):
+            half.append(name)
     require(
         len(half) != 1,
         f"{half}: a task that can be deployed has both methods, describe and deployable",

@@ -109,10 +109,9 @@ class Benchmark:
             follower=self.follower,
         )
         with TrainingGroup(device) as group:
-            rows = [
-                _add_comparisons(row, alone.get(row["num_envs"]))
-                for row in self._rows(plant, device, group)
-            ]
+            rows = []
+            for row in self._rows(plant, device, group):
+                rows.append(_add_comparisons(row, alone.get(row["num_envs"])))
         if group.rank.first:
             name = (
                 torch.cuda.get_device_name(device)
@@ -222,8 +221,13 @@ def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Return the row of all processes: rates add up; `per_rank` holds the rates of each."""
     if len(rows) == 1:
         return rows[0]
-    rates = [name for name in rows[0] if name.endswith("_per_s")]
-    per_rank = [{name: row[name] for name in rates} for row in rows]
+    rates = []
+    for name in rows[0]:
+        if name.endswith("_per_s"):
+            rates.append(name)
+    per_rank = []
+    for row in rows:
+        per_rank.append({name: row[name] for name in rates})
     return (
         rows[0]
         | {name: sum(row[name] for row in rows) for name in rates}
@@ -286,17 +290,19 @@ def _print(rows: list[dict[str, Any]]) -> None:
     for row in rows:
         texts = []
         for name in names:
-            shares = [
-                row[kind][name]
-                for kind in ("of_batch", "weak_scaling")
-                if name in row.get(kind, {})
-            ]
+            shares = []
+            for kind in ("of_batch", "weak_scaling"):
+                if name in row.get(kind, {}):
+                    shares.append(row[kind][name])
             texts.append(" ".join([f"{row[name]:,.0f}", *(f"({share:.2f})" for share in shares)]))
         table.add_row(f"{row['num_envs']:,}", *texts, "yes" if row["graph"] else "no")
     notes = {
         "of_batch": "of mujoco.batch alone",
         "weak_scaling": "of one process times their number",
     }
-    told = [text for kind, text in notes.items() if kind in rows[0]]
+    told = []
+    for kind, text in notes.items():
+        if kind in rows[0]:
+            told.append(text)
     table.caption = f"In brackets: rate {'; '.join(told)}." if told else None
     Console().print(table)

@@ -60,7 +60,9 @@ class Compare:
         patterns = (self.compare.runs,) if isinstance(self.compare.runs, str) else self.compare.runs
         runs = [load_run(folder) for folder in find_runs(patterns)]
         columns = find_differences(runs)
-        results = [result for run in runs for result in run.results(columns)]
+        results = []
+        for run in runs:
+            results.extend(run.results(columns))
         groups = group_results(results)
         folder = self.session.folder
         write_json(

@@ -298,9 +298,10 @@ def check_import_names() -> Iterator[DoctorFinding]:
             owned += 1
     for distribution in metadata.distributions():
         name = distribution.metadata["Name"]
-        tops = {
-            path.parts[0].removesuffix(".py") for path in distribution.files or () if path.parts
-        }
+        tops = set()
+        for path in distribution.files or ():
+            if path.parts:
+                tops.add(path.parts[0].removesuffix(".py"))
         if name != DISTRIBUTION and (clash := sorted(tops.intersection(IMPORT_NAMES))):
             yield DoctorFinding(
                 "warn",
@@ -313,7 +314,10 @@ def check_import_names() -> Iterator[DoctorFinding]:
 def check_extensions() -> Iterator[DoctorFinding]:
     """Report installed packages that add options by entry point."""
     try:
-        others = [package for package in registry.find_packages() if package != registry.CORE]
+        others = []
+        for package in registry.find_packages():
+            if package != registry.CORE:
+                others.append(package)
         registry.list_options()
     except BrokkError as error:
         yield DoctorFinding("fail", str(error))

@@ -107,10 +107,9 @@ class TrainingGroup:
         """
         parts = self.gather(dict(figures))
         episodes = sum(part["episodes"] for part in parts)
-        pooled = {
-            name: sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
-            for name in figures
-        }
+        pooled = {}
+        for name in figures:
+            pooled[name] = sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
         return pooled | {
             "episodes": episodes,
             "fault_rate": sum(part["fault_rate"] for part in parts) / len(parts),
@@ -125,7 +124,10 @@ class TrainingGroup:
         if not self.together:
             return
         found = self.gather(hash_tensors(state))
-        other = [index for index, value in enumerate(found) if value != found[0]]
+        other = []
+        for index, value in enumerate(found):
+            if value != found[0]:
+                other.append(index)
         if other:
             raise DistributedError(
                 f"the policy of rank {', '.join(map(str, other))} is no longer that of rank 0: "

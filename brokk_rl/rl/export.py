@@ -85,11 +85,10 @@ def export_onnx(
     _write_onnx(module, observations[:1].cpu(), part)
     with torch.no_grad():
         expected = module(observations.cpu()).numpy()
-    metadata = {
-        f"brokk.{key}": _format_metadata(value)
-        for key, value in contract.items()
-        if key != "network"
-    }
+    metadata = {}
+    for key, value in contract.items():
+        if key != "network":
+            metadata[f"brokk.{key}"] = _format_metadata(value)
     model = onnx.load(part)
     onnx.helper.set_model_props(model, metadata)
     onnx.save(model, part)

@@ -193,7 +193,9 @@ def draw_curves(progress: Path, picture: Path) -> None:
     A curve whose column is missing is left out: a task may record fewer figures.
     """
     with progress.open(newline="") as file:
-        rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        rows = []
+        for row in csv.DictReader(file):
+            rows.append({name: float(value) for name, value in row.items()})
     if not rows:
         return
     figure = Figure(figsize=(13, 6.5), layout="constrained")

@@ -165,9 +165,9 @@ def write_bundle(
     A task that cannot be deployed has `null` for `observation` in the contract.
     """
     config = training.runner_config()
-    weights = {
-        name: value.detach().cpu().contiguous() for name, value in actor.state_dict().items()
-    }
+    weights = {}
+    for name, value in actor.state_dict().items():
+        weights[name] = value.detach().cpu().contiguous()
     machine = loop.machine
     contract = {
         "schema": SCHEMA,
@@ -220,7 +220,10 @@ def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[st
             "export it again from a checkpoint (mode=export)"
         ) from error
     machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
-    bad = [name for name, value in weights.items() if not torch.isfinite(value).all()]
+    bad = []
+    for name, value in weights.items():
+        if not torch.isfinite(value).all():
+            bad.append(name)
     if bad:
         raise CheckpointError(
             f"the policy in {folder} holds NaN or infinite weights in {', '.join(bad[:3])}"

@@ -264,10 +264,9 @@ class DevicePPO(PPO):
         if (
             self.is_multi_gpu
         ):  # the sum stays outside: it is the one part whose length others decide
-            graphs = [
-                capture_graph(part, device, gradients=True)
-                for part in (self._differentiate, self._descend)
-            ]
+            graphs = []
+            for part in (self._differentiate, self._descend):
+                graphs.append(capture_graph(part, device, gradients=True))
             captured = (graphs[0].replay, self._sum_up, graphs[1].replay)
         else:
             captured = (
@@ -307,9 +306,9 @@ class DevicePPO(PPO):
         Schulman et al. 2017, equations 7 and 9, with the weights of rsl-rl.
         """
         storage, rows = self.storage, self._rows
-        observations = {
-            name: value.flatten(0, 1)[rows] for name, value in storage.observations.items()
-        }
+        observations = {}
+        for name, value in storage.observations.items():
+            observations[name] = value.flatten(0, 1)[rows]
         old_values, returns, advantages, old_log_prob, actions = (
             value.flatten(0, 1)[rows]
             for value in (
@@ -320,9 +319,10 @@ class DevicePPO(PPO):
                 storage.actions,
             )
         )
-        old_parameters = tuple(
-            value.flatten(0, 1)[rows] for value in storage.distribution_params or ()
-        )
+        parameters = []
+        for value in storage.distribution_params or ():
+            parameters.append(value.flatten(0, 1)[rows])
+        old_parameters = tuple(parameters)
         if self.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         kind = torch.device(self.device).type

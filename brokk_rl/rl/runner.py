@@ -211,11 +211,11 @@ class TrainingRunner(OnPolicyRunner):
     def _policy_state(self) -> dict[str, torch.Tensor]:
         """Return parameters and normalisers of actor and critic by name."""
         models = {"actor": self.alg.actor, "critic": self.alg.critic}
-        return {
-            f"{part}.{name}": value
-            for part, model in models.items()
-            for name, value in model.state_dict().items()
-        }
+        state = {}
+        for part, model in models.items():
+            for name, value in model.state_dict().items():
+                state[f"{part}.{name}"] = value
+        return state
 
     def _configure_multi_gpu(self) -> None:
         """Tell rsl-rl of the processes of `group`.
@@ -353,9 +353,11 @@ def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
             f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an "
             "older one"
         ) from error
-    bad = [
-        name for state in states for name, value in state.items() if not torch.isfinite(value).all()
-    ]
+    bad: list[str] = []
+    for state in states:
+        for name, value in state.items():
+            if not torch.isfinite(value).all():
+                bad.append(name)
     if bad:
         raise CheckpointError(
             f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older "
@@ -381,5 +383,9 @@ def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str)
 
 def _drop_nulls(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: _drop_nulls(item) for key, item in value.items() if item is not None}
+        kept = {}
+        for key, item in value.items():
+            if item is not None:
+                kept[key] = _drop_nulls(item)
+        return kept
     return value

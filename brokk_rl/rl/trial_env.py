@@ -62,10 +62,9 @@ class SimulatedTrials:
             model = effect.wrap(model, machine, num, device)
         levers = OperatorLevers(operators, trials.guided)
         task = self.task.build(machine, num, device)
-        starts = {
-            key: value[:1].expand(num, *value.shape[1:]).clone()
-            for key, value in task.starts(1, 0).items()
-        }
+        starts = {}
+        for key, value in task.starts(1, 0).items():
+            starts[key] = value[:1].expand(num, *value.shape[1:]).clone()
         loop = ControlLoop(
             machine, world, model, levers, task, starts | _make_starts(machine, trials)
         )

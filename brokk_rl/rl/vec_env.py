@@ -230,7 +230,10 @@ class ControlLoop(VecEnv):
         Reads back from the device once.
         """
         values = dict(zip(self._total_names, self._totals.tolist(), strict=True))
-        endings = {name: value for name, value in values.items() if name.startswith("end/")}
+        endings = {}
+        for name, value in values.items():
+            if name.startswith("end/"):
+                endings[name] = value
         episodes = sum(endings.values())
         fault_rate = values[f"end/{FAULT}"] / max(1, self._steps * self.num_envs)
         self._totals.zero_()

@@ -34,10 +34,9 @@ class NativeWorld:
             torch.from_numpy(self._batch.state),
             torch.from_numpy(self._batch.warning),
         )
-        bound = {
-            name: torch.from_numpy(self._batch.bind(name))
-            for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat")
-        }
+        bound = {}
+        for name in ("qpos", "qvel", "act", "ctrl", "mocap_pos", "mocap_quat"):
+            bound[name] = torch.from_numpy(self._batch.bind(name))
         self._qpos, self._qvel, self._act, self._ctrl, self._mocap_pos, self._mocap_quat = (
             bound.values()
         )

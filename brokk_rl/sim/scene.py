@@ -136,7 +136,10 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         name="block", mocap=True, pos=make_nominal_scenes(1)[0, :3].numpy()
     )
     block = build_collision_geoms(1.0, HOLE_RADIUS_M)
-    corners = [(scale, radius) for scale in SCALE_BOUNDS for radius in HOLE_RADIUS_BOUNDS_M]
+    corners = []
+    for scale in SCALE_BOUNDS:
+        for radius in HOLE_RADIUS_BOUNDS_M:
+            corners.append((scale, radius))
     largest = np.max([build_collision_geoms(*corner).size for corner in corners], axis=0)
     for name, size, pos, yaw in zip(block.names, largest, block.pos, block.yaw_rad, strict=True):
         is_shown = name.startswith("slab") or name == "plug"

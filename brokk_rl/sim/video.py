@@ -50,12 +50,15 @@ FAR_M = 10.0
 """Horizontal distance beyond which a block is not part of the task (goal_pose puts it 20 m
 away)."""
 NUM_STILLS = 3
+"""Pictures of a video. Chosen by hand; not searched."""
 RENDER_TIMEOUT_S = 600
 """Bound on the rendering process; 200 frames take about 40 s on a CPU."""
 FONT_SIZE = 18
+"""Size of the text, px. Chosen by hand; not searched."""
 VIDEO_QUALITY = 7
 """Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
 SCHEMATIC_DPI = 100
+"""Dots an inch. Chosen by hand; not searched."""
 SHOWN_GROUPS = (0, 1, 2)
 """Geom groups that pictures show; group 3 holds geoms that only collide."""
 

@@ -225,9 +225,7 @@ class Exam:
         log.info("answers in %s; exam.do=score opens the labels", self.session.folder)
 
     def _cases(self) -> list[Path]:
-        found = sorted(
-            path for path in (self._folder / dataset.CASES_FOLDER).glob("*") if path.is_dir()
-        )
+        found = sorted(filter(Path.is_dir, (self._folder / dataset.CASES_FOLDER).glob("*")))
         if not found:
             raise RecordingError(
                 f"exam.folder={self._folder}: expected cases in {dataset.CASES_FOLDER}/, as exam.do=make writes them"
@@ -240,11 +238,9 @@ class Exam:
 
     def _oracle(self) -> None:
         """Open the labels; write `oracle.json`: shares of the gap that true effects close."""
-        labels = [
-            label
-            for label in dataset.open_labels(self._folder)["cases"]
-            if label["kind"] in ("one", "several")
-        ]
+        cases = dataset.open_labels(self._folder)["cases"]
+        # only these have effects that a simulator could repair
+        labels = [label for label in cases if label["kind"] in ("one", "several")]
         place, found = self.session.folder / ORACLE_FILE, {}
         if place.is_file():
             found = json.loads(place.read_text())  # of a run that was interrupted
@@ -273,12 +269,11 @@ class Exam:
     def _baselines(self) -> None:
         """Have every baseline answer every case, then score them beside `exam.answers`."""
         cases, settings = self._cases(), self.exam
-        usable = {
-            name: one
-            for name, one in settings.baselines.items()
-            if getattr(one, "exam", "") is not None
-        }
-        for name in settings.baselines.keys() - usable.keys():
+        usable = {}
+        for name, one in settings.baselines.items():
+            if getattr(one, "exam", "") is not None:
+                usable[name] = one
+                continue
             log.warning(
                 "%s is left out: it learns from another exam, exam.baselines.%s.exam=<development exam>",
                 name,
@@ -315,17 +310,13 @@ class Exam:
                 cases, settings.prices, settings.certainty, lambda: progress.advance(task)
             )
             parts = split_by_family(cases)
-            apart = [
-                fit.fitted(part, settings.prices, settings.certainty, lambda: None)
-                for part in parts
-            ]
-        before, after = (
-            compute_metrics(fit.marks(cases, *each))
-            for each in ((settings.prices, settings.certainty), found)
-        )
-        crosswise = compute_metrics(
-            [mark for half in (0, 1) for mark in fit.marks(parts[1 - half], *apart[half])]
-        )
+            apart = []
+            for part in parts:
+                apart.append(fit.fitted(part, settings.prices, settings.certainty, lambda: None))
+        before = compute_metrics(fit.marks(cases, settings.prices, settings.certainty))
+        after = compute_metrics(fit.marks(cases, *found))
+        # the numbers of each half are judged by the causes of the other: no cause is in both
+        crosswise = compute_metrics(fit.marks(parts[1], *apart[0]) + fit.marks(parts[0], *apart[1]))
         for name, one in zip(("prices", "certainty"), found, strict=True):
             numbers = {
                 "_target_": f"{type(one).__module__}.{type(one).__name__}",
@@ -345,7 +336,11 @@ class Exam:
         )
 
     def _of_machine(self) -> list[str]:
-        return [name for name, trouble in self.exam.mix.troubles.items() if trouble.joints == "all"]
+        shared = []
+        for name, trouble in self.exam.mix.troubles.items():
+            if trouble.joints == "all":
+                shared.append(name)
+        return shared
 
     def _score(self) -> None:
         self._scored(self.exam.answers)
@@ -354,9 +349,9 @@ class Exam:
         """Open the labels; write `marks.json`, report and ledger; print the table."""
         labels = dataset.open_labels(self._folder)
         facts = json.loads((self._folder / "exam.json").read_text())
-        tables = {
-            name: self._table(Path(folder), labels["cases"]) for name, folder in answers.items()
-        }
+        tables = {}
+        for name, folder in answers.items():
+            tables[name] = self._table(Path(folder), labels["cases"])
         write_json(self.session.folder / "marks.json", {"exam": facts, "candidates": tables})
         report.write_report(self.session.folder, facts, tables)
         if self.exam.ledger is not None:
@@ -408,5 +403,5 @@ class Exam:
 def _show(tables: dict[str, dict[str, Any]]) -> None:
     shown = Table("", *tables)
     for label, *cells in report.build_rows(tables):
-        shown.add_row(str(label), *(report.format_cell(cell) for cell in cells))
+        shown.add_row(str(label), *map(report.format_cell, cells))
     Console().print(shown)

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from brokk_rl.machine import Machine
+from brokk_rl.machine import Body, Machine
 from exam.plants.plant_parameters import RAD_PER_CYCLE, PlantParameters
 
 GRAVITY_M_S2 = 9.81
+"""Gravity, m/s²: standard gravity (9.80665), rounded."""
 RIGID_S = 0.05
 """Period of oscillation up to which a boom counts as rigid, s: a control period of 20 Hz."""
 HARDENS_AT = 0.05
@@ -64,16 +65,12 @@ class Arm:
         self._mass_kg = [body.mass_kg.value for body in machine.bodies]
         self._com_m = [np.array(body.com_m) for body in machine.bodies]
         self._yield = np.array([body.yield_force.value for body in machine.bodies])
-        drawn = [np.array([d.value for d in body.origin_m]) for body in machine.bodies] + [
-            machine.tip_m
-        ]
-        extra_m = numbers["extra_m"]
+        drawn = [_read_origin(body) for body in machine.bodies] + [machine.tip_m]
         # link j reaches from joint j to the next one, or to the tip
-        self._reach_m = [drawn[0][None]] + [
-            drawn[j + 1]
-            * (1.0 + extra_m[:, j, None] / max(float(np.linalg.norm(drawn[j + 1])), 1e-9))
-            for j in range(len(drawn) - 1)
-        ]
+        self._reach_m = [drawn[0][None]]
+        for j, link_m in enumerate(drawn[1:]):
+            length_m = max(float(np.linalg.norm(link_m)), 1e-9)
+            self._reach_m.append(link_m * (1.0 + numbers["extra_m"][:, j, None] / length_m))
         self._base = _rotate(np.array([0.0, 1.0, 0.0]), numbers["pitch_rad"][:, 0]) @ _rotate(
             np.array([1.0, 0.0, 0.0]), numbers["roll_rad"][:, 0]
         )
@@ -93,7 +90,8 @@ class Arm:
     def tool(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the measured tip, `(N, 3)` m, and its angle below the horizontal, `(N,)`."""
         at_m, _, tip_m = self._chain(q)
-        tip_m, last_m = ((self._base @ point[..., None])[..., 0] for point in (tip_m, at_m[-1]))
+        tip_m = (self._base @ tip_m[..., None])[..., 0]
+        last_m = (self._base @ at_m[-1][..., None])[..., 0]
         along = tip_m - last_m
         heading = np.stack([np.cos(q[:, 0]), np.sin(q[:, 0])], 1)
         return tip_m, np.arctan2(-along[:, 2], (along[:, :2] * heading).sum(1))
@@ -115,6 +113,11 @@ class Arm:
             self._centres.append(at_m + turned @ self._com_m[j])
         tip_m = at_m + (turned @ np.broadcast_to(self._reach_m[-1], (len(q), 3))[..., None])[..., 0]
         return origins, axes, tip_m
+
+
+def _read_origin(body: Body) -> np.ndarray:
+    """Return the origin of a body in its parent as drawn, `(3,)` m."""
+    return np.array([dimension.value for dimension in body.origin_m])
 
 
 def _rotate(axis: np.ndarray, angle: np.ndarray) -> np.ndarray:

@@ -48,16 +48,14 @@ class OutOfLibraryFaults:
             machine.upper - machine.lower,
         )
         self._luck = luck
-        self._of = {
-            kind: severity * np.array([[other == kind] for other in kinds])
-            for kind in KINDS
-            if any(k == kind for k in kinds)
-        }
-        self._bout_s, self._blocked_s, self._tired = (
-            np.zeros(len(kinds)),
-            np.zeros(len(kinds)),
-            np.zeros((len(kinds), 1)),
-        )
+        # a kind that no run has is left out: its step costs nothing
+        self._of: dict[str, np.ndarray] = {}
+        for kind in KINDS:
+            if kind in kinds:
+                has = np.array([other == kind for other in kinds])
+                self._of[kind] = severity * has[:, None]
+        self._bout_s, self._blocked_s = np.zeros(len(kinds)), np.zeros(len(kinds))
+        self._tired = np.zeros((len(kinds), 1))
         self._before = np.zeros_like(severity)
         self.bend = 0.12 * self._of.get("bouc_wen", np.zeros_like(severity))
 

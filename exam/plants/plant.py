@@ -61,15 +61,11 @@ class ExamPlant:
         tracked: Sequence[bool],
         steps: int,
     ) -> None:
-        self._machine, self._n = (
-            machine,
-            {name: np.stack([one[name] for one in parameters]) for name in parameters[0]},
-        )
+        self._machine, self._n = machine, _stack_runs(parameters)
         n, count, joints = self._n, len(parameters), machine.num_joints
-        self._chance = [
-            _RunNoise(seed, one, steps, machine)
-            for seed, one in zip(seeds, parameters, strict=True)
-        ]
+        self._chance: list[_RunNoise] = []
+        for seed, one in zip(seeds, parameters, strict=True):
+            self._chance.append(_RunNoise(seed, one, steps, machine))
         self._wander = np.stack([chance.wander for chance in self._chance], 1)
         self._noise = np.stack([chance.noise for chance in self._chance], 1)
         self._luck = np.stack([chance.luck for chance in self._chance], 1)
@@ -83,11 +79,8 @@ class ExamPlant:
         self._boom = Boom(n, self._q, np.full((count, 1), make != "chambers"))
         self._true, self._earlier = self._q.copy(), self._q.copy()
         self._flow, self._droop = np.zeros((count, joints)), np.zeros((count, 1))
-        self._k, self._elapsed_s, self._tracked = (
-            0,
-            np.asarray(elapsed_s, dtype=float),
-            np.array(tracked),
-        )
+        self._k, self._tracked = 0, np.array(tracked)
+        self._elapsed_s = np.asarray(elapsed_s, dtype=float)
         self._starving = make == "compensated"
         self._power.begin(self._arm.load(self._true))
 
@@ -181,6 +174,14 @@ class ExamPlant:
         pass
 
 
+def _stack_runs(parameters: Sequence[PlantParameters]) -> PlantParameters:
+    """Return each parameter of all runs, `(N, J)`."""
+    stacked = {}
+    for name in parameters[0]:
+        stacked[name] = np.stack([one[name] for one in parameters])
+    return stacked
+
+
 class _RunNoise:
     """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours."""
 
@@ -192,10 +193,11 @@ class _RunNoise:
             generator.standard_normal(shape),
             generator.standard_normal(machine.num_joints),
         )
-        wander = [
-            lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white[:, j], zi=[a * first[j]])[0]
-            for j, a in enumerate(keep.tolist())
-        ]
+        # first-order noise of unit variance from its first value on
+        wander = []
+        for j, a in enumerate(keep.tolist()):
+            gain = [np.sqrt(1.0 - a * a)]
+            wander.append(lfilter(gain, [1.0, -a], white[:, j], zi=[a * first[j]])[0])
         self.wander = (np.stack(wander, 1) * one["wander"]).astype(np.float32)
         self.noise = generator.standard_normal(shape, dtype=np.float32)
         self.luck = generator.random((steps + 1, 3), dtype=np.float32)
@@ -233,7 +235,7 @@ class HydraulicPlants:
         Raises:
             ConfigError: an effect, an outside_fault or a roughness is unknown.
         """
-        found = []
+        makes, parameters, outside_faults = set(), [], []
         for run in runs:
             if run.roughness not in self.roughness:
                 raise ConfigError(
@@ -246,13 +248,15 @@ class HydraulicPlants:
             numbers = apply_faults(numbers, run.faults)
             if run.outside_fault is not None:
                 numbers["outside_severity"] = run.outside_fault.severity
-            found.append((make, numbers))
-        (make,) = {make for make, _ in found}
+            makes.add(make)
+            parameters.append(numbers)
+            outside_faults.append(run.outside_fault.kind if run.outside_fault else None)
+        (make,) = makes
         return ExamPlant(
             machine,
             make,
-            [numbers for _, numbers in found],
-            [run.outside_fault.kind if run.outside_fault else None for run in runs],
+            parameters,
+            outside_faults,
             [run.chance for run in runs],
             np.array([run.elapsed_s for run in runs]),
             [run.tracked for run in runs],

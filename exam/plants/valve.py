@@ -10,6 +10,7 @@ import numpy as np
 from exam.plants.plant_parameters import PlantParameters
 
 TAU = 2.0 * np.pi
+"""Radians a cycle."""
 LAND_LEAK = 0.08
 """Opening at which the leak over the metering land takes half of the pressure from a joint at rest;
 chosen by hand."""

@@ -18,6 +18,7 @@ from tasks.reward import RewardTerm
 from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
 
 DOWN_RAD = math.pi / 2
+"""Pitch of a tool that points straight down, rad (the paper's 1.57)."""
 
 
 @spec

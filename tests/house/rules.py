@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
@@ -282,3 +283,35 @@ def _without_type_checking(node: ast.AST) -> Iterator[ast.AST]:
             continue
         yield child
         yield from _without_type_checking(child)
+
+
+NUMBER = re.compile(r"(?:^|[\s:,\[{])-?\d[\d_]*\.?\d*(?:e[-+]?\d+)?(?=[\s,\]}]|$)")
+"""A number in YAML: not a part of a word, an address or a command."""
+WORDS = re.compile(r"\"[^\"]*\"|'[^']*'|\$\{[^}]*\}|_target_: [\w.]+")
+"""Parts of a line of YAML that hold no numbers."""
+
+
+def uncommented_numbers(files: Mapping[str, str]) -> list[str]:
+    """Return the lines of YAML with a number that nobody explains.
+
+    A number is explained by a comment on its line or above it, by the same of a block that it
+    stands in, or by a field `source`.
+    """
+    found = []
+    for name, text in files.items():
+        blocks: list[tuple[int, bool]] = []  # indentation of the open blocks, and their comments
+        above = False
+        for count, line in enumerate(text.splitlines(), 1):
+            code, mark, _ = WORDS.sub("", line).partition("#")
+            if not code.strip():
+                above = bool(mark) and bool(blocks)  # a comment at the top describes the file
+                continue
+            indent = len(code) - len(code.lstrip())
+            while blocks and blocks[-1][0] >= indent:
+                blocks.pop()
+            explained = bool(mark) or above or "source:" in code or any(c for _, c in blocks)
+            if not explained and NUMBER.search(code):
+                found.append(f"{name}:{count}: a number without unit and source")
+            blocks.append((indent, explained))
+            above = False
+    return found

@@ -61,6 +61,15 @@ def test_no_module_is_long_without_a_reason() -> None:
     assert rules.lengths(SOURCES, 500, LONG) == []
 
 
+def test_numbers_of_the_configuration_are_explained() -> None:
+    texts = {}
+    for folder in ("conf", "exam/conf"):
+        for path in sorted((ROOT / folder).rglob("*.yaml")):
+            if "hydra" not in path.parts:  # settings of Hydra's own plugins
+                texts[str(path.relative_to(ROOT))] = path.read_text()
+    assert rules.uncommented_numbers(texts) == []
+
+
 @pytest.mark.parametrize(
     ("rule", "module", "text"),
     [
@@ -87,6 +96,8 @@ def test_no_module_is_long_without_a_reason() -> None:
         (rules.units, "brokk_rl.a", "def f(n_envs): pass"),
         (rules.verb_names, "brokk_rl.a", "def distance(a): pass"),
         (rules.first_lines, "brokk_rl.a", '"""What it is."""'),
+        (rules.uncommented_numbers, "a.yaml", "# A file.\ngain: 1.0"),
+        (rules.uncommented_numbers, "a.yaml", "a:  # m\n  b: 1\nc: [0, 1]"),
     ],
 )
 def test_a_planted_violation_is_found(
@@ -112,6 +123,8 @@ def test_a_planted_violation_is_found(
             '"""A."""\ndef _b(): pass\nclass C:\n    """C."""\n    def check(self): pass',
         ),
         (rules.units, "brokk_rl.a", "def f(num_envs, tilt_rad): pass"),
+        (rules.uncommented_numbers, "a.yaml", "a: 127.0.0.1\nb: 1  # m\nc:  # s\n  d: 2"),
+        (rules.uncommented_numbers, "a.yaml", "a: null\n# m; by hand\nb: [0.0, 1.0]"),
     ],
 )
 def test_what_is_allowed_is_not_found(

@@ -1,0 +1,375 @@
+"""Recordings as increments, and the valve model of `ValveFit` on them, for a fit in seconds.
+
+Positions hardly feed back into the speed, so the speed is fitted as a function of commands. The
+model is driven by recorded commands and, for the pose, recorded positions. Increments of `WIDTH`
+samples are compared. For given dead time, play and lags the curves are a linear least-squares
+problem; pose and pump follow in a few sweeps.
+
+Axes: `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments, `P` widths of the
+play.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+from scipy.signal import lfilter
+
+from actuators.models.valve import PoseFeatures
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+WIDTH = 5
+"""Samples in an increment: long enough for a coarse sensor, short enough to see when a joint
+starts."""
+PLAYS = np.array([0.0, 0.01, 0.02, 0.035, 0.05, 0.08, 0.12])
+"""Widths for which the play is computed; between them its output is interpolated."""
+STIFFNESS = 4.0
+"""Prior: slope of a flow curve changes by so much per root of stroke."""
+POSE = 0.03
+"""Prior: relative change of speed per feature of the pose."""
+TOGETHER = 15.0
+"""Increments whose errors hang together: a speed that wanders for some seconds is no evidence for a
+bend of the curve or a pose."""
+FIRST_DEMAND = 0.55
+"""Demand of each joint, of the pump's flow, from which the sweeps start. Chosen by hand; not
+searched."""
+SIGMA_OVER_MEDIAN = 1.4826
+"""Standard deviation over the median absolute deviation of a normal distribution: 1 / 0.6745."""
+OUTLIER = 4.0
+"""Typical errors beyond which an increment counts with its size instead of its square. Chosen by
+hand; not searched."""
+
+
+@dataclass
+class StaticFit:
+    """Curves `(J, 2 (K - 1))`, pose `(J, 2, M)` and demands `(J,)`."""
+
+    curve: np.ndarray
+    pose: np.ndarray
+    demand: np.ndarray
+
+
+class SpeedData:
+    """Recordings as increments, and the model on them."""
+
+    def __init__(
+        self, recordings: Sequence[Recording], machine: Machine, knots: np.ndarray
+    ) -> None:
+        self.recordings, self.machine, self._knots = list(recordings), machine, knots
+        self._period_s = machine.period_s
+        # what came before the recording is not known
+        self._skip = max(1, round((machine.num_history + 1.0 / machine.period_s) / WIDTH))
+        used = [r for r in recordings if r.num_samples > WIDTH * (self._skip + 4)]
+        if not used:
+            raise RecordingError(
+                f"too little data: none of the {len(self.recordings)} recordings lasts long enough to fit to"
+            )
+        self._u = [r.u.astype(np.float64) for r in used]
+        self._played = [_apply_plays(u) for u in self._u]
+        pose = PoseFeatures(machine, torch.device("cpu"))
+        self._pose = [pose.features(torch.as_tensor(r.q)).numpy().astype(np.float64) for r in used]
+        self.num_pose = pose.size
+        q = [r.q.astype(np.float64) for r in used]
+        way = [self._increments(np.diff(part, axis=0, append=part[-1:])) for part in q]
+        self.way = np.concatenate(way).T  # (J, I)
+        self._free = np.concatenate([self._at_stop(part) for part in q]).T
+        self.scale = np.maximum(np.mean(self.way**2, 1), 1e-12)
+        if (still := np.flatnonzero(self.scale < 1e-10)).size:
+            names = ", ".join(machine.joint_names[j] for j in still)
+            raise RecordingError(
+                f"too little data: {names} never moves in the {len(used)} recordings to fit to"
+            )
+        self._noise = 1e-3 * self.scale  # a first guess of the squared error, for the priors
+        self._bend = _build_bend_penalty(knots)
+
+    def features(
+        self, j: int, dynamics: np.ndarray, known: Sequence[np.ndarray] | None = None
+    ) -> np.ndarray:
+        """Return increments per unit of the curve at each knot, `(I, 2 (K - 1))`.
+
+        `known`: factors on the speed, or none.
+        """
+        parts = []
+        for n in range(len(self._u)):
+            basis = self._basis(self._spool(n, j, dynamics), j)
+            basis = basis if known is None else basis * known[n][:, None]
+            parts.append(self._increments(lag_signal(basis, dynamics[3], self._period_s)))
+        return np.concatenate(parts)
+
+    def factors(self, found: StaticFit, dynamics: np.ndarray) -> list[list[np.ndarray]]:
+        """Return the speed factor from pose and pump, by joint and recording, each `(T,)`."""
+        joints, half = range(self.machine.num_joints), len(self._knots) - 1
+        full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
+        unit = self.machine.max_speed * self._period_s
+        spool = self._stack_spools(dynamics)
+        plain = []
+        for s in spool:
+            plain.append(
+                np.stack([self._basis(s[:, j], j) @ found.curve[j] for j in joints], 1) / unit
+            )
+        share = []
+        for p, s in zip(plain, spool, strict=True):
+            share.append(
+                _compute_pump_share(
+                    found.demand, np.abs(p) / np.where(s > 0, full[:, 0], full[:, 1])
+                )
+            )
+        factors = []
+        for j in joints:
+            factors.append(
+                [
+                    self._factor(n, j, spool[n][:, j] > 0, found.pose) * share[n]
+                    for n in range(len(self._u))
+                ]
+            )
+        return factors
+
+    def curve(
+        self,
+        features: np.ndarray,
+        way: np.ndarray,
+        noise: float | None = None,
+        free: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Return the curve that explains `way` `(I,)`: ridge regression to straight lines."""
+        noise = 1e-3 * float(np.mean(way**2)) if noise is None else noise
+        weighted = features if free is None else features * free[:, None]
+        normal = weighted.T @ features + noise / STIFFNESS**2 * self._bend
+        normal += 1e-9 * np.trace(normal) * np.eye(len(normal))
+        return np.linalg.solve(normal, weighted.T @ way)
+
+    def statics(
+        self, dynamics: np.ndarray, sweeps: int, demand: np.ndarray | None = None
+    ) -> StaticFit:
+        """Return curves, pose and demands for given dynamics `(J, 4)`.
+
+        `demand`: where to begin, if known.
+        """
+        joints, count, half = self.machine.num_joints, len(self._u), len(self._knots) - 1
+        spool = self._stack_spools(dynamics)
+        bases = []
+        for n in range(count):
+            bases.append([self._basis(spool[n][:, j], j) for j in range(joints)])
+        found = StaticFit(
+            np.zeros((joints, 2 * half)),
+            np.zeros((joints, 2, self.num_pose)),
+            np.full(joints, FIRST_DEMAND) if demand is None else demand,
+        )
+        opening = [np.abs(s) for s in spool]
+        noise, free = self._noise.copy(), self._free.copy()
+        # curve, pose and pump are each linear or small given the other two: they take turns
+        for _ in range(sweeps):
+            share = [_compute_pump_share(found.demand, o) for o in opening]
+            flow: list[list[np.ndarray]] = []
+            for j in range(joints):
+                basis = [by_joint[j] for by_joint in bases]
+                out = [s[:, j] > 0 for s in spool]
+                flow.append(
+                    self._fit_joint(j, basis, out, share, dynamics[j, 3], found, noise, free)
+                )
+            full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
+            unit = self.machine.max_speed * self._period_s
+            plain, opening, posed = [], [], []
+            for n, s in enumerate(spool):
+                plain.append(np.stack([by_joint[n] for by_joint in flow], 1))
+                opening.append(np.abs(plain[n]) / unit / np.where(s > 0, full[:, 0], full[:, 1]))
+                factor = [self._factor(n, j, s[:, j] > 0, found.pose) for j in range(joints)]
+                posed.append(plain[n] * np.stack(factor, 1))
+            found.demand = self._demand(found.demand, posed, opening, dynamics, noise, free)
+        return found
+
+    def _fit_joint(
+        self,
+        j: int,
+        basis: Sequence[np.ndarray],
+        out: Sequence[np.ndarray],
+        share: Sequence[np.ndarray],
+        speed_s: float,
+        found: StaticFit,
+        noise: np.ndarray,
+        free: np.ndarray,
+    ) -> list[np.ndarray]:
+        """Refit curve and pose of joint `j` in `found`, and its row of `noise` and `free`.
+
+        Args:
+            j: The joint.
+            basis: Of each recording, `(T, 2 (K - 1))`.
+            out: Whether the joint extends, `(T,)`.
+            share: Part of its flow that the pump gives, `(T,)`.
+            speed_s: Lag of the speed, s.
+            found: Fit of all joints.
+            noise: Squared error of each joint, `(J,)`.
+            free: Weight of each increment, `(J, I)`.
+
+        Returns:
+            Its steps without pose and pump, of each recording, `(T,)`.
+        """
+        count = len(basis)
+        scaled = []
+        for n in range(count):
+            factor = self._factor(n, j, out[n], found.pose)
+            scaled.append(basis[n] * (factor * share[n])[:, None])
+        features = self._collect(scaled, speed_s)
+        found.curve[j] = self.curve(features, self.way[j], noise[j], free[j])
+        plain, moved, sides = [], [], []
+        for n in range(count):
+            plain.append(basis[n] @ found.curve[j])
+            moved.append((plain[n] * share[n])[:, None])
+            part = moved[n] * self._pose[n][:, j]
+            sides.append(np.hstack([part * out[n][:, None], part * ~out[n][:, None]]))
+        slopes = self._collect(sides, speed_s)
+        level = self._collect(moved, speed_s)[:, 0]
+        weighted = slopes * free[j][:, None]
+        normal = weighted.T @ slopes + noise[j] / POSE**2 * np.eye(slopes.shape[1])
+        pose = np.linalg.solve(normal, weighted.T @ (self.way[j] - level))
+        found.pose[j] = pose.reshape(2, -1)
+        left = self.way[j] - level - slopes @ found.pose[j].ravel()
+        # increments of a joint at rest fit anyway and would hide the typical error
+        moves = np.abs(self.way[j]) > 0.1 * np.sqrt(self.scale[j])
+        typical = SIGMA_OVER_MEDIAN * np.median(np.abs(left[moves]))
+        # Huber's weights: beyond `OUTLIER` typical errors an increment counts with its size
+        free[j] = self._free[j] * np.minimum(
+            1.0, OUTLIER * typical / np.maximum(np.abs(left), 1e-9)
+        )
+        noise[j] = TOGETHER * max(typical**2, 1e-6 * self.scale[j])
+        return plain
+
+    def _collect(self, parts: Sequence[np.ndarray], speed_s: float) -> np.ndarray:
+        """Return the increments of steps `(T, …)` of all recordings after the lag of the speed."""
+        increments = []
+        for part in parts:
+            increments.append(self._increments(lag_signal(part, speed_s, self._period_s)))
+        return np.concatenate(increments)
+
+    def _demand(
+        self,
+        start: np.ndarray,
+        posed: list[np.ndarray],
+        opening: list[np.ndarray],
+        dynamics: np.ndarray,
+        noise: np.ndarray,
+        free: np.ndarray,
+    ) -> np.ndarray:
+        """Return the demands on the pump that explain best how joints slow each other."""
+        joints = self.machine.num_joints
+        weight = np.sqrt(free / noise[:, None])
+        if all((o > 0.05).sum(1).max() < 2 for o in opening):
+            return np.zeros(joints)  # never two at once
+
+        def compute_residual(demand: np.ndarray) -> np.ndarray:
+            parts = []
+            for factor, opened in zip(posed, opening, strict=True):
+                moved = factor * _compute_pump_share(demand, opened)[:, None]
+                for j in range(joints):
+                    moved[:, j] = lag_signal(moved[:, j], dynamics[j, 3], self._period_s)
+                parts.append(self._increments(moved))
+            return ((self.way - np.concatenate(parts).T) * weight).ravel()
+
+        starts = [
+            start,
+            *(np.full(joints, level) for level in (0.3, 0.55, 0.8) if (start == start[0]).all()),
+        ]
+        best = min(starts, key=lambda demand: float(np.square(compute_residual(demand)).sum()))
+        return least_squares(
+            compute_residual,
+            np.clip(best, 0.0, 1.99),
+            bounds=(0.0, 2.0),
+            diff_step=1e-3,
+            max_nfev=12,
+        ).x
+
+    def _factor(self, n: int, j: int, out: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        features = self._pose[n][:, j]
+        return np.maximum(1.0 + np.where(out, features @ pose[j, 0], features @ pose[j, 1]), 0.0)
+
+    def _spool(self, n: int, j: int, dynamics: np.ndarray) -> np.ndarray:
+        dead_time_s, play, spool_s, _ = dynamics
+        low = int(np.clip(np.searchsorted(PLAYS, play, side="right") - 1, 0, len(PLAYS) - 2))
+        part = (play - PLAYS[low]) / (PLAYS[low + 1] - PLAYS[low])
+        played = (1.0 - part) * self._played[n][low, :, j] + part * self._played[n][low + 1, :, j]
+        return lag_signal(
+            delay_signal(played, dead_time_s / self._period_s), spool_s, self._period_s
+        )
+
+    def _stack_spools(self, dynamics: np.ndarray) -> list[np.ndarray]:
+        """Return the spool strokes of each recording, `(T, J)`, for dynamics `(J, 4)`."""
+        joints = range(self.machine.num_joints)
+        spools = []
+        for n in range(len(self._u)):
+            spools.append(np.stack([self._spool(n, j, dynamics[j]) for j in joints], 1))
+        return spools
+
+    def _basis(self, spool: np.ndarray, j: int) -> np.ndarray:
+        """Return signed hat functions of the spool times full step, `(T, 2 (K - 1))`."""
+        knots, half, size = self._knots, len(self._knots) - 1, np.minimum(np.abs(spool), 1.0)
+        cell = np.clip(np.searchsorted(knots, size, side="right") - 1, 0, half - 1)
+        part = (size - knots[cell]) / (knots[cell + 1] - knots[cell])
+        out, rows = np.zeros((len(spool), 2 * half)), np.arange(len(spool))
+        first = np.where(spool > 0, 0, half)
+        out[rows, first + cell] = part
+        inner = cell > 0
+        out[rows[inner], (first + cell - 1)[inner]] = 1.0 - part[inner]
+        return out * (np.sign(spool) * self.machine.max_speed[j] * self._period_s)[:, None]
+
+    def _increments(self, steps: np.ndarray) -> np.ndarray:
+        """Sum steps `(T, …)` over `WIDTH` samples each, without the beginning, `(I, …)`."""
+        count = len(steps) // WIDTH
+        return steps[: count * WIDTH].reshape(count, WIDTH, *steps.shape[1:]).sum(1)[self._skip :]
+
+    def _at_stop(self, q: np.ndarray) -> np.ndarray:
+        """Return 1 for found away from both stops, else 0, `(I, J)`."""
+        margin = 0.005 * (self.machine.upper - self.machine.lower)
+        inside = (q > self.machine.lower + margin) & (q < self.machine.upper - margin)
+        return (self._increments(inside.astype(np.float64)) > WIDTH - 0.5).astype(np.float64)
+
+
+def delay_signal(u: np.ndarray, periods: float) -> np.ndarray:
+    """Return `u` `(T,)` later by a fractional number of samples, its mean over each period."""
+    whole = int(np.floor(periods + 5e-7))
+    part = periods - whole
+    known = np.pad(u, (whole + 1, 0), mode="edge")
+    return (1.0 - part) * known[1 : len(u) + 1] + part * known[: len(u)]
+
+
+def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.ndarray:
+    """Return a first-order lag of `u` `(T, …)`, as it stands at the end of each period."""
+    if time_constant_s < 1e-4:
+        return u
+    kept = np.exp(-period_s / time_constant_s)
+    return lfilter([1.0 - kept], [1.0, -kept], u, axis=0, zi=kept * u[:1])[0]
+
+
+def _apply_plays(u: np.ndarray) -> np.ndarray:
+    """Return the play operator of each of `PLAYS` on `u` `(T, J)`, `(P, T, J)`."""
+    out, now, half = (
+        np.empty((len(PLAYS), *u.shape)),
+        np.repeat(u[:1], len(PLAYS), 0),
+        PLAYS[:, None] / 2,
+    )
+    for t in range(len(u)):
+        now = np.minimum(np.maximum(now, u[t] - half), u[t] + half)
+        out[:, t] = now
+    return out
+
+
+def _compute_pump_share(demand: np.ndarray, opening: np.ndarray) -> np.ndarray:
+    return 1.0 / np.maximum(1.0, opening @ demand)
+
+
+def _build_bend_penalty(knots: np.ndarray) -> np.ndarray:
+    """Return the quadratic form of slope changes, each over the root of its stroke."""
+    half, rows = len(knots) - 1, []
+    for first in (0, half):
+        for k in range(1, half):
+            before, after = knots[k] - knots[k - 1], knots[k + 1] - knots[k]
+            row = np.zeros(2 * half)
+            row[first + k] += 1.0 / after
+            row[first + k - 1] -= 1.0 / before + 1.0 / after
+            if k > 1:
+                row[first + k - 2] += 1.0 / before
+            rows.append(row / np.sqrt((before + after) / 2))
+    return np.stack(rows).T @ np.stack(rows) if rows else np.zeros((2 * half, 2 * half))
