@@ -39,7 +39,7 @@ from diagnosis.residuals import (
     fit_noise,
     weigh_residuals,
 )
-from diagnosis.responses import MIN_RESPONSE, SHAPE_FACTORS, Response, fit_faults
+from diagnosis.responses import MIN_RESPONSE, Response, fit_faults, list_shape_trials
 from diagnosis.search import SubsetTable
 
 log = logging.getLogger(__name__)
@@ -419,10 +419,8 @@ def _is_one_sided(kind: EffectType) -> bool:
 
 def _list_trials(kind: EffectType) -> dict[str, list[ParameterRay]]:
     """Return the ways in which an effect can grow, by a name for each of its shapes."""
-    trials: list[dict[str, float]] = [{}]
-    trials += [{number: part} for number in kind.shaping for part in SHAPE_FACTORS]
     found = {}
-    for place, trial in enumerate(trials):
+    for place, trial in enumerate(list_shape_trials(kind)):
         shape = {name: np.full(kind.num_joints, part) for name, part in trial.items()}
         rays = build_rays(kind, REFERENCE_SIZES)
         found[f"{kind.name} {place}"] = [replace(ray, shape=shape) for ray in rays]

@@ -208,7 +208,9 @@ class DetectedEffect:
             if "machine" in estimates:
                 row = np.array([estimates["machine"].mean])
             else:
-                row = np.full(len(self.joints), float(self.kind.numbers[name].none))
+                number = self.kind.numbers[name]
+                off = number.typical if number.none is None else number.none
+                row = np.full(len(self.joints), float(off))
                 row[self.joints] = [one.mean for one in estimates.values()]
             found[name] = np.repeat(row[None], count, 0)
         return found

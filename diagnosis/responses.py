@@ -227,7 +227,7 @@ def cross_validate_change(
 # Chosen by hand. SHAPE_FACTORS was (0.4, 2.0) before; no comparison is recorded.
 SHAPE_FACTORS = (0.35, 0.5, 0.7, 1.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
-FINE_GRID = tuple(np.geomspace(SIZE_GRID[0], SIZE_GRID[-1], 20).round(3).tolist())
+FINE_GRID = tuple(np.geomspace(SIZE_GRID[0], 7.0, 24).round(3).tolist())
 """Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of
 step, and only a dull one fits."""
 REFERENCE_GRID = SIZE_GRID[:4]
@@ -239,8 +239,24 @@ MIN_RESPONSE = 1e-3
 
 def choose_rays(kind: EffectType, grid: Sequence[float] = SIZE_GRID) -> list[ParameterRay]:
     """Return the ways in which an effect can grow, at sizes as close as it has to be simulated; none beyond those of `grid`."""
-    fine = [size for size in FINE_GRID if size <= grid[-1]]
+    # effects that ring slowly have no upper end in the field; on the reference only small ones count
+    fine = [size for size in FINE_GRID if grid is SIZE_GRID or size <= grid[-1]]
     return build_rays(kind, fine if kind.shaping and not list_shared_effects([kind]) else grid)
+
+
+def list_shape_trials(kind: EffectType) -> list[dict[str, float]]:
+    """Return values of the numbers that only shape an effect, over the typical ones.
+
+    The first is empty: all are typical. Each other changes one number, to one of its `trials`, else
+    to a multiple of the typical value.
+    """
+    found: list[dict[str, float]] = [{}]
+    for name in kind.shaping:
+        number = kind.numbers[name]
+        values = getattr(number, "trials", ())
+        parts = [one / number.typical for one in values if one != number.typical]
+        found += [{name: part} for part in (parts if values else SHAPE_FACTORS)]
+    return found
 
 
 def add_responses(
@@ -255,27 +271,28 @@ def add_responses(
     the rays remember them.
     """
     kind = ways[0].kind
-    trials: list[dict[str, float]] = [{}]
-    if not ways[0].shape:
-        trials += [{number: part} for number in kind.shaping for part in SHAPE_FACTORS]
+    trials = [{}] if ways[0].shape else list_shape_trials(kind)
     responses = []
     for trial in trials:
         shape = _repeat_per_joint(trial, len(shapes))
         shaped = [replace(ray, shape=shape) for ray in ways] if trial else ways
         responses.append([residuals.response(ray) for ray in shaped])
-    best = np.zeros(len(shapes), dtype=int)
-    for j, mine in enumerate(shapes):
-        if max(np.abs(response[j]).max() for response in responses[0]) < MIN_RESPONSE:
-            continue
-        z, made, losses = residuals.z[j], [], []
-        for response in responses:
+    made: list[list[list[Response]]] = []  # by trial and joint, one a ray
+    losses = np.zeros((len(trials), len(shapes)))
+    for t, response in enumerate(responses):
+        made.append([])
+        for j in range(len(shapes)):
             pairs = zip(ways, response, strict=True)
-            made.append([Response(ray.sizes, change[j]) for ray, change in pairs])
-        if len(made) > 1:
-            for one in made:
-                losses.append(compute_loss(z - sum_responses(one, fit_sizes(z, one))))
-            best[j] = int(np.argmin(losses))
-        mine[name] = made[best[j]]
+            made[t].append([Response(ray.sizes, change[j]) for ray, change in pairs])
+            if len(trials) > 1:
+                z, own = residuals.z[j], made[t][j]
+                losses[t, j] = compute_loss(z - sum_responses(own, fit_sizes(z, own)))
+    if list_shared_effects([kind]):  # one cause: its form is the same on all joints
+        losses[:] = losses.sum(1, keepdims=True)
+    best = losses.argmin(0)
+    for j, mine in enumerate(shapes):
+        if max(np.abs(response[j]).max() for response in responses[0]) >= MIN_RESPONSE:
+            mine[name] = made[best[j]][j]
     if len(trials) == 1:
         return list(ways)
     shape = {

@@ -9,7 +9,7 @@ Axes: `W` windows, `K` steps, `I` increments, `J` joints, `D` changes of a comma
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -36,7 +36,7 @@ MAX_DELAY_ERROR = 0.4
 """Largest standard error, in periods, of a delay that counts."""
 MIN_DELAYS = 20
 """Fewer delays tell nothing about how they scatter."""
-JITTER_SIZES = np.geomspace(0.2, 8.0, 12)
+JITTER_SIZES = np.geomspace(0.2, 30.0, 16)
 DRAWS_PER_WINDOW = 3
 """Times that the chances of each window are drawn."""
 MAX_DRAWN = 300
@@ -252,9 +252,13 @@ def detect_timing_effect(
         np.concatenate([one.value / one.error for one in known])
     ):
         return None
-    gains, earned = {}, {}
+    gains, earned, shapes = {}, {}, {}
     for kind in kinds:
-        drawn = [_subsample_delays(one) for one in _draw_delays(changes, kind)]
+        drawn, shapes[kind.name] = [], {}
+        for shape in _list_shapes(kind):
+            tried = [_subsample_delays(one) for one in _draw_delays(changes, kind, shape)]
+            if not drawn or _compute_best(usual, seen, tried) > _compute_best(usual, seen, drawn):
+                drawn, shapes[kind.name] = tried, shape
         gains[kind.name] = np.array([usual.gain(seen, one) for one in drawn])
         best = drawn[int(np.argmax(gains[kind.name]))]
         by_joint: dict[int, float] = {}
@@ -285,6 +289,9 @@ def detect_timing_effect(
         values = best.numbers[name].none + best.size(name) * ends
         mean, low, high = (float(value) for value in best.clipped(name, values))
         parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
+    for name, value in shapes[best.name].items():
+        tried = Estimate(value, (value, value))
+        parameters[name] = dict.fromkeys(machine.joint_names, tried)
     rest = {name: float(gain.max()) for name, gain in gains.items() if name != best.name}
     every = np.ones(machine.num_joints, dtype=bool)
     return DetectedEffect(
@@ -343,7 +350,23 @@ def add_mean_delay(
     )
 
 
-def _draw_delays(changes: CommandChanges, kind: EffectType) -> list[np.ndarray]:
+def _list_shapes(kind: EffectType) -> list[dict[str, float]]:
+    """Return the values that are tried of the numbers that only shape an effect."""
+    found: list[dict[str, float]] = [{}]
+    for name in kind.shaping:
+        number = kind.numbers[name]
+        found = [one | {name: value} for one in found for value in number.trials]
+    return found
+
+
+def _compute_best(usual: DelayErrorModel, seen: FrameDelays, drawn: Sequence[np.ndarray]) -> float:
+    """Return the largest gain of the delays drawn at any size."""
+    return max(usual.gain(seen, one) for one in drawn)
+
+
+def _draw_delays(
+    changes: CommandChanges, kind: EffectType, shape: Mapping[str, float]
+) -> list[np.ndarray]:
     """Return hidden delays that an effect of each size makes, without errors of measurement, each `(D,)`."""
     residuals, joints = changes.residuals, changes.residuals.increments.shape[2]
     sizes = np.repeat(JITTER_SIZES, DRAWS_PER_WINDOW)[:, None]
@@ -352,6 +375,8 @@ def _draw_delays(changes: CommandChanges, kind: EffectType) -> list[np.ndarray]:
         values[name] = np.repeat(
             kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1
         )
+    for name, value in shape.items():
+        values[name] = np.full((len(sizes), joints), value)
     paths = residuals.simulator.simulate([(kind, values)], len(sizes))
     moved = to_increments(paths, residuals.start) - residuals.increments
     found = [changes.delays(one).value for one in moved]

@@ -21,17 +21,25 @@ class LoadDependence(EffectSpec):
         joints: Joints it acts on, or `all`.
         sensitivity: Share of the weight, over the machine's `yield_force`, that is missing from the
             pressure over the valve.
+        lowering: Share of that by which lowering is faster: 1 for a plain valve, 0 where a pump that
+            senses the load is short of pressure only when it lifts.
     """
 
     joints: Joints
     sensitivity: Value
+    lowering: Value = 1.0  # a plain valve, as files from before this number mean
     side = "speed"
     weighed = True
-    numbers: ClassVar = {"sensitivity": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 1.5))}
+    numbers: ClassVar = {
+        "sensitivity": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 1.5)),
+        "lowering": EffectNumber("1", none=None, typical=1.0, bounds=(0.0, 1.0), trials=(0.0, 1.0)),
+    }
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """`moved (sqrt(1 + sensitivity sign(moved) weight / yield_force) - 1)`: orifice."""
-        head = 1.0 + now.value["sensitivity"] * now.moved.sign() * _weight(now)
+        """`moved (sqrt(1 + sensitivity load / yield_force) - 1)`: orifice; load + where lowered."""
+        load = now.moved.sign() * _weight(now)
+        load = load * torch.where(load > 0.0, now.value["lowering"], 1.0)
+        head = 1.0 + now.value["sensitivity"] * load
         return now.moved * (head.clamp(LEAST_HEAD, MOST_HEAD).sqrt() - 1.0), {}
 
 

@@ -36,6 +36,8 @@ class EffectNumber:
         typical: Size on a machine that has the effect.
         bounds: Smallest and largest value that make sense.
         per_joint: Whether each joint has its own; otherwise one number an environment, `(N, 1)`.
+        trials: Values of a number that only shapes the effect which a diagnosis tries; empty for
+            multiples of the typical one.
     """
 
     unit: str
@@ -43,6 +45,7 @@ class EffectNumber:
     typical: float
     bounds: tuple[float, float]
     per_joint: bool = True
+    trials: tuple[float, ...] = ()
 
 
 class ParameterRanges:

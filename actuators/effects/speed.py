@@ -126,7 +126,10 @@ class Compliance(EffectSpec):
     side = "speed"
     numbers: ClassVar = {
         "ringing_s": EffectNumber("s", none=0.0, typical=0.3, bounds=(0.0, 2.0)),
-        "damping": EffectNumber("1", none=None, typical=0.12, bounds=(0.02, 0.95)),
+        # Trials reach from a ringing boom to a joint that only gives way: oil with air, long hoses.
+        "damping": EffectNumber(
+            "1", none=None, typical=0.12, bounds=(0.02, 0.95), trials=(0.05, 0.12, 0.3, 0.6, 0.9)
+        ),
     }
 
     def begin(self, now: StepInputs) -> Memory:
@@ -169,19 +172,30 @@ class ThermalDrift(EffectSpec):
         change: Relative change of the speed after a long time.
         time_s: Time constant of warming up.
         elapsed_s: Time that the machine has run at the reset.
+        cold_change: Relative change of the speed at switch-on, which fades while the machine warms
+            up.
     """
 
     joints: Joints
     change: Value
     time_s: Value
     elapsed_s: Value
+    cold_change: Value = 0.0  # its neutral value: files from before this number lack it
     side = "speed"
     running = "elapsed_s"
     shared = True
     numbers: ClassVar = {
         "change": EffectNumber("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
-        "time_s": EffectNumber("s", none=None, typical=1200.0, bounds=(1.0, 36_000.0)),
+        # Trials reach from a small tank in the cold to a whole shift.
+        "time_s": EffectNumber(
+            "s",
+            none=None,
+            typical=1200.0,
+            bounds=(1.0, 36_000.0),
+            trials=(60.0, 150.0, 400.0, 1200.0, 3600.0),
+        ),
         "elapsed_s": EffectNumber("s", none=None, typical=0.0, bounds=(0.0, 360_000.0)),
+        "cold_change": EffectNumber("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
     }
 
     def begin(self, now: StepInputs) -> Memory:
@@ -189,11 +203,16 @@ class ThermalDrift(EffectSpec):
         return {"running_s": torch.zeros_like(now.moved)}
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """`change (1 - exp(-t / time)) moved`, `t` at the middle of the period."""
+        """Return the change of the way that a joint goes.
+
+        `(change (1 - exp(-t / time)) + cold_change exp(-t / time)) moved`, `t` at the middle of the
+        period.
+        """
         running_s, period_s = now.memory["running_s"], now.plant.period_s
         t_s = now.value["elapsed_s"] + running_s + 0.5 * period_s
         warm = 1.0 - torch.exp(-t_s / now.value["time_s"])
-        return now.value["change"] * warm * now.moved, {"running_s": running_s + period_s}
+        change = now.value["change"] * warm + now.value["cold_change"] * (1.0 - warm)
+        return change * now.moved, {"running_s": running_s + period_s}
 
 
 def measure_last_step(now: StepInputs) -> torch.Tensor:

@@ -116,29 +116,41 @@ class FrameLoss(EffectSpec):
     Attributes:
         joints: Joints it acts on, or `all`.
         probability: Share of frames that are lost.
+        persistence: How losses hang together: 0 where each frame is lost by itself; a loss lasts
+            `1 / ((1 - persistence) (1 - probability))` frames on average.
     """
 
     joints: Joints
     probability: Value
+    persistence: Value = 0.0  # each frame by itself, as files from before this number mean
     side = "command"
     stage = "timing"
     stochastic = True
     smooth = False
     shared = True
     numbers: ClassVar = {
-        "probability": EffectNumber("1", none=0.0, typical=0.02, bounds=(0.0, 0.95))
+        "probability": EffectNumber("1", none=0.0, typical=0.02, bounds=(0.0, 0.95)),
+        "persistence": EffectNumber(
+            "1", none=None, typical=0.0, bounds=(0.0, 0.98), trials=(0.0, 0.7, 0.9)
+        ),
     }
 
     def begin(self, now: StepInputs) -> Memory:
         """All frames have arrived."""
-        return {"sent": now.history.u[:, :-1]}
+        return {"sent": now.history.u[:, :-1], "was_lost": torch.zeros_like(now.moved)}
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
-        """The newest command, or where it is lost the one before as the valve saw it."""
-        lost = now.chance < now.value["probability"]
-        return append_command(
+        """The newest command, or where it is lost the one before as the valve saw it.
+
+        A frame is lost with `(1 - persistence) probability`, after a lost one with `persistence`
+        more: of all frames the share `probability`.
+        """
+        kept = now.value["persistence"]
+        lost = now.chance < (1.0 - kept) * now.value["probability"] + kept * now.memory["was_lost"]
+        sent, memory = append_command(
             now, torch.where(lost, now.memory["sent"][:, -1], now.history.u[:, -1])
         )
+        return sent, memory | {"was_lost": lost.to(now.moved.dtype)}
 
 
 def append_command(now: StepInputs, newest: torch.Tensor) -> tuple[torch.Tensor, Memory]:
