@@ -80,6 +80,7 @@ class CanLink:
         self._can, self._machine = can, machine
         self._memory: LoopMemory | None = None
         self._child: ChildProcess | None = None
+        # The last command in force, from which the guard lets the next one grow.
         self._reached = np.zeros(machine.num_joints)
         self._was_active = False
 
@@ -98,8 +99,10 @@ class CanLink:
         """
         u = np.asarray(command.u, dtype=float)
         self._opened()
+        # NaN passes comparisons with limits unnoticed, so it is stopped here.
         if not np.isfinite(u).all():
             raise LinkError(f"link: a command that is no number cannot be sent: {u}")
+        # Zero needs no operator: it must always pass.
         if not u.any():
             self._ask(u)
             self._reached = u
@@ -107,6 +110,7 @@ class CanLink:
         self._wait_for_operator()
         asked_s = self._ask(u)
         until_s = asked_s + ANSWER_S
+        # The guard's answer must be younger than the question.
         while (state := self._read_state()).t_s <= asked_s:
             if time.monotonic() > until_s:
                 raise LinkError("link: the bus process does not answer")
@@ -116,6 +120,7 @@ class CanLink:
         if state.guard is not GuardState.ACTIVE:
             self._reached = np.zeros_like(u)
             return Command(np.zeros_like(u))
+        # The guard limits commands and withholds some joints; the recording needs the real mean.
         most = self._can.limits.max_command
         passed = np.where(state.sent != 0, u.clip(-most, most), 0.0)
         return Command(self._average_growth(passed))
@@ -145,9 +150,11 @@ class CanLink:
                         f"link: no joint positions on {can.source} within {can.patience_s:g} s; is the machine on?"
                     )
                 time.sleep(WAIT_S)
+        # Also for an interruption: a started bus process must not be left behind.
         except BaseException:
             self.__exit__()
             raise
+        # Only now: the bus process was started with its own priority.
         if can.realtime:
             ask_for_priority(COMMANDER_PRIORITY)
         self._arm()
@@ -160,6 +167,7 @@ class CanLink:
             self._child.end(PATIENCE_S)  # sends zero before it goes
         if self._memory is not None:
             self._memory.close()
+        # Closing twice is harmless.
         self._child = self._memory = None
 
     def _ask(self, u: np.ndarray) -> float:
@@ -179,6 +187,7 @@ class CanLink:
                 raise LinkError(
                     f"link: the machine was not released for motion: {state.trip.value}"
                 )
+            # Zero commands show the guard that somebody is there, and move nothing.
             self._ask(np.zeros(self._machine.num_joints))
             time.sleep(WAIT_S)
         self._was_active = True
@@ -193,11 +202,13 @@ class CanLink:
         They grow no faster than the guard allows; towards zero they fall at once.
         """
         rate, period_s = self._can.limits.max_rate_1_s, self._machine.period_s
+        # Growth begins at the smaller of old and new command of the same sign.
         kept = np.minimum(np.abs(self._reached), np.abs(wanted))
         start = np.where(wanted * self._reached > 0, kept, 0.0)
         grow_s = np.minimum((np.abs(wanted) - start) / rate, period_s)
         end = start + rate * grow_s
         self._reached = np.sign(wanted) * end
+        # The mean of a ramp and a constant after it.
         return np.sign(wanted) * (end - rate * grow_s**2 / (2.0 * period_s))
 
     def _read_state(self) -> OperatorState:

@@ -189,23 +189,38 @@ def plan_search_levels(
             break
         # Cells that have found their resolution are not searched again in another.
         rest &= ~here
-        # The upper percentile and not the maximum: one wrong depth must not enlarge the region.
-        reach = float(np.percentile(size_px[here], SIZE_PERCENTILES[1])) * (1.0 + slack) / STEP
-        hidden = (_dilate(here, UNSEEN * reach) > 0) & unknown
-        # Separate regions get separate ranges of size: two blocks at two distances do not share
-        # one.
-        count, pieces = cv2.connectedComponents(_dilate(here | hidden, reach))
-        for piece in range(1, count):
-            part = pieces == piece
-            some_px = size_px[part & here]
-            if len(some_px) >= LEAST:
-                low, high = np.percentile(some_px, SIZE_PERCENTILES)
-                prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
-                region = part.astype(np.uint8)
-                level = SearchLevel(
-                    2**number, region, prior, everywhere_px, slack, frame.depth_m, nearest_m
-                )
-                found.append(level)
+        for piece, prior in _split_region(here, size_px, unknown, slack):
+            level = SearchLevel(
+                2**number, piece, prior, everywhere_px, slack, frame.depth_m, nearest_m
+            )
+            found.append(level)
+    return found
+
+
+def _split_region(
+    here: np.ndarray, size_px: np.ndarray, unknown: np.ndarray, slack: float
+) -> list[tuple[np.ndarray, SizePrior]]:
+    """Return the connected regions around cells, uint8, each with its range of sizes.
+
+    Args:
+        here: Cells of one resolution, bool.
+        size_px: Size of a hole at each cell.
+        unknown: Cells without depth, bool.
+        slack: Allowed relative error of the size.
+    """
+    # The upper percentile and not the maximum: one wrong depth must not enlarge the region.
+    reach = float(np.percentile(size_px[here], SIZE_PERCENTILES[1])) * (1.0 + slack) / STEP
+    hidden = (_dilate(here, UNSEEN * reach) > 0) & unknown
+    # Separate regions get separate ranges of size: two blocks at two distances do not share one.
+    count, pieces = cv2.connectedComponents(_dilate(here | hidden, reach))
+    found = []
+    for piece in range(1, count):
+        part = pieces == piece
+        some_px = size_px[part & here]
+        if len(some_px) >= LEAST:
+            low, high = np.percentile(some_px, SIZE_PERCENTILES)
+            prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
+            found.append((part.astype(np.uint8), prior))
     return found
 
 

@@ -75,13 +75,16 @@ class CanBus:
             LinkError: there is no such bus.
         """
         options = {"bitrate": self.bitrate, "port": self.port}
+        # Adapters refuse options that they do not know, even when these are `None`.
         options = {key: value for key, value in options.items() if value is not None}
+        # Classic frames only: the gateway does not understand CAN FD.
         if self.interface == "udp_multicast":
             options["fd"] = False
         if self.interface == "virtual":
             options["rx_queue_size"] = QUEUE_FRAMES
         try:
             bus = can.Bus(interface=self.interface, channel=self.channel, **options)  # type: ignore[arg-type]
+            # The kernel filters before the program wakes up.
             if frame_ids is not None:
                 bus.set_filters([_build_filter(one) for one in frame_ids])
         except (can.CanError, OSError, ValueError, ImportError) as error:
@@ -110,9 +113,11 @@ class OpenCanBus:
             LinkError: the bus is down.
         """
         try:
+            # A negative time would block for ever.
             message = self._bus.recv(max(0.0, timeout_s))
         except (can.CanError, OSError, ValueError) as error:
             raise LinkError(f"bus: cannot receive ({error})") from error
+        # Bus-off needs a restart of the controller; other error frames are transient.
         if message is not None and message.is_error_frame and message.arbitration_id & BUS_OFF:
             raise LinkError("bus: the controller has gone off the bus (bus-off)")
         if message is None or message.is_error_frame or message.is_remote_frame:
@@ -132,6 +137,7 @@ class OpenCanBus:
             check=False,
         )
         try:
+            # Without waiting: a command that cannot go out now is outdated later.
             self._bus.send(message, timeout=0.0)
         except (can.CanError, OSError) as error:
             raise LinkError(f"bus: cannot send ({error})") from error
@@ -140,6 +146,7 @@ class OpenCanBus:
         """Close the bus; a second call does nothing."""
         try:
             self._bus.shutdown()
+        # Closing happens after an error too, and must not hide it.
         except (can.CanError, OSError) as error:
             log.debug("bus: %s while closing", error)
 
@@ -203,10 +210,12 @@ class OpenBusReplay:
         end_s = time.monotonic() + max(0.0, timeout_s)
         if self._next is None:
             self._next = self._read_next()
+        # The first frame is due at once; the others keep their distance from it.
         if self._offset_s is None:
             self._offset_s = time.monotonic() - self._next.timestamp / self._speed
         due_s = self._next.timestamp / self._speed + self._offset_s
         time.sleep(max(0.0, min(due_s, end_s) - time.monotonic()))
+        # The frame stays, for the next call.
         if due_s > end_s:
             return None
         message, self._next = self._next, None

@@ -161,7 +161,7 @@ class DemoFeed:
         if request.kind == "target":
             self._chosen = request.value
         elif request.kind == "point":
-            return self._choose_at(*(float(part) for part in request.value.split(",")))
+            return self._choose_at(*map(float, request.value.split(",")))
         elif request.kind == "record":
             self._recording, self._recorded_s = request.value == "on", self._clock()
         else:

@@ -280,7 +280,7 @@ class LoopFeed:
         frame = self.read_frame(-1.0)
         if frame is None:
             return None
-        x, y = (float(part) for part in value.split(","))
+        x, y = map(float, value.split(","))
         found = locate_borehole(frame, x, y, self._config.page.borehole_radius_m)
         if found is None:
             return None
@@ -298,5 +298,5 @@ class LoopFeed:
 
 
 def _to_vector(values: Any) -> Vector:
-    x, y, z = (float(value) for value in values)
+    x, y, z = map(float, values)
     return x, y, z

@@ -52,6 +52,7 @@ class PolicyHistory:
         shape = (machine.num_history, machine.num_joints)
         self.q, self.u, self.proposed = np.zeros(shape), np.zeros(shape), np.zeros(shape)
         self.filled = 0
+        # -1: no flow was heard yet, so there is no difference to form.
         self._flow_sum, self._flow_number, self._silent = np.zeros(machine.num_joints), -1, 0
 
     @property
@@ -67,6 +68,7 @@ class PolicyHistory:
         """Take a sample of a fresh state; `missed` periods went by without one."""
         number, before = state.flow_number, self._flow_number
         u = np.array(state.flow)
+        # The mean over the period is exact, since sums and counts go on between samples.
         if 0 <= before < number:
             u = (state.flow_sum - self._flow_sum) / (number - before)
         self._silent = self._silent + 1 if number == before else 0
@@ -75,6 +77,7 @@ class PolicyHistory:
         self._flow_sum, self._flow_number = np.array(state.flow_sum), number
         if missed > 1:
             self.filled = 0
+        # One missed period is bridged by the middle; more would be invented.
         if missed == 1 and self.filled:
             self._push((self.q[-1] + state.q) / 2, u)
         self._push(np.array(state.q), u)
@@ -84,6 +87,7 @@ class PolicyHistory:
         self.proposed = np.concatenate([self.proposed[1:], u[None]])
 
     def _push(self, q: np.ndarray, u: np.ndarray) -> None:
+        # Proposals from before a gap belong to another motion.
         if not self.filled:
             self.proposed = np.zeros_like(self.proposed)
         self.q = np.concatenate([self.q[1:], q[None]])
@@ -119,6 +123,7 @@ def run(stop: Stop, config: PolicyProcessConfig, memory: LoopMemory) -> None:
         CheckpointError: the bundle cannot be used.
     """
     adviser = PolicyAdviser(config, PolicyBundle(config.folder, config.machine), memory)
+    # The period comes from the machine: the policy was trained at this rate.
     timer = CycleTimer(config.machine.period_s)
     while not stop():
         timer.wait()
@@ -166,6 +171,7 @@ class PolicyAdviser:
                 status = AdviceStatus.REJECTED
             else:
                 u = answer
+        # Zero is remembered too: the history must show that nothing was proposed.
         self._history.propose(u)
         self._publish(status, u, target_m, infer_s, now_s)
         return status
@@ -174,6 +180,7 @@ class PolicyAdviser:
         if state is None:
             return AdviceStatus.NO_STATE
         stale_s = self._config.stale_s
+        # Old positions and a silent bus process are equally bad.
         if now_s - state.q_t_s > stale_s or now_s - state.t_s > stale_s:
             self._history.empty()
             return AdviceStatus.STALE
@@ -190,6 +197,7 @@ class PolicyAdviser:
         proposed = history.proposed[None] if encoder.has_proposals else None
         q, u = history.q[None], history.u[None]
         observation = encoder.encode(target_m[None], q, u, pitch, proposed)
+        # A target of NaN would otherwise reach the network.
         if not np.isfinite(observation).all():
             return None
         u = self._bundle.command(observation)[0].astype(float)
@@ -209,6 +217,7 @@ class PolicyAdviser:
         now_s: float,
     ) -> None:
         self._number += 1
+        # The display moves by one period even without advice, back towards neutral.
         shown = self._display.show(u, self._machine.period_s)
         advice = PolicyAdvice(
             t_s=now_s,
@@ -221,6 +230,7 @@ class PolicyAdviser:
             infer_s=infer_s,
         )
         self._memory.advice.write(advice)
+        # The request slot exists only where commands may be sent.
         if self._memory.request is not None and status is AdviceStatus.VALID:
             self._memory.request.write(RequestedCommand(now_s, u))
         text = {

@@ -47,6 +47,7 @@ class CaptureLogReader:
                 is long enough.
         """
         (contents, q, flow), found = self._series(path, machine), []
+        # All joints share the pieces: a gap in one of them ends the piece for all.
         for begin_s, end_s in _split_at_gaps([*q.values(), *flow.values()], self.longest_gap_s):
             if end_s - begin_s >= max(self.shortest_s, 2 * machine.period_s):
                 found.append(self._piece(contents, q, flow, begin_s, end_s, path, machine))
@@ -65,6 +66,7 @@ class CaptureLogReader:
         """
         contents, q, flow = self._series(path, machine)
         for first_s, last_s in _split_at_gaps([*q.values(), *flow.values()], self.longest_gap_s):
+            # The ends may be off by less than a gap, since messages do not fall on them.
             if first_s <= begin_s + self.longest_gap_s and last_s >= end_s - self.longest_gap_s:
                 return self._piece(
                     contents, q, flow, max(first_s, begin_s), min(last_s, end_s), path, machine
@@ -96,10 +98,12 @@ class CaptureLogReader:
         path: Path,
         machine: Machine,
     ) -> Recording:
+        # The small addition keeps a period that rounding would drop.
         grid_s = (
             begin_s + np.arange(int((end_s - begin_s) / machine.period_s + 1e-6)) * machine.period_s
         )
         first_s = next(iter(contents.messages.values()))[0][0]
+        # The monotonic clock is tied to the wall clock at the first message.
         created = datetime.fromtimestamp((contents.wall_ns / 1e9) + (begin_s - first_s), UTC)
         columns_u, columns_q = [], []
         for name in machine.joint_names:
@@ -129,9 +133,11 @@ def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
         if signal in messages.names:
             t_s, values, valid = messages.series("t_s"), messages.series(signal), f"Valid_{joint}"
             if positions and valid in messages.names:
+                # Values that the sensor itself calls invalid are left out.
                 kept = messages.series(valid) == 1.0
                 t_s, values = t_s[kept], values[kept]
             if len(t_s) > 1:
+                # Times must increase: a repeated message has the time of the first.
                 forward = np.concatenate([[True], np.diff(t_s) > 0])
                 return t_s[forward], values[forward]
     raise RecordingError(
@@ -141,6 +147,7 @@ def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
 
 def _split_at_gaps(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
     """Return the spans, begin and end, in which none of the series has a gap."""
+    # Only the span that all series cover.
     begin_s, end_s = max(t_s[0] for t_s, _ in series), min(t_s[-1] for t_s, _ in series)
     gaps: list[tuple[float, float]] = []
     for t_s, _ in series:
@@ -178,8 +185,10 @@ def _build_extra_columns(
         t_s = advised.series("t_s")
         shown = np.full((len(t_s), machine.num_joints), np.nan)
         for row, (_, values) in enumerate(advised):
+            # Advice that was not valid was not shown.
             if values["reason"] == "valid":
                 shown[row] = values["u"]
+        # The advice in force at each row is the last one before it.
         rows = np.searchsorted(t_s, grid_s, side="right") - 1
         for j, name in enumerate(machine.joint_names):
             extra[f"advice_{name}"] = np.where(rows >= 0, shown[rows.clip(0), j], np.nan).astype(

@@ -121,6 +121,12 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
             found.means[each.name][which] = _average_participants(found, each.name, which)
     _note_few(found)
     _add_loads(found, data)
+    _estimate_effects(found)
+    return found
+
+
+def _estimate_effects(found: Analysis) -> None:
+    """Add the effect of guidance on each measure and scale, and p adjusted within its family."""
     for name, by_condition in (
         *found.means.items(),
         *((f"tlx_{scale}", value) for scale, value in found.loads.items()),
@@ -135,17 +141,12 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
             secondary.append(each.name)
     # Holm within each family: the scales are no more tests of the recordings.
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
-        p = [get_deciding_p(found.effects[name]) for name in family]
-        found.holm |= dict(
-            zip(
-                family,
-                permutation_tests.adjust_by_holm(
-                    np.array([math.nan if value is None else value for value in p])
-                ).tolist(),
-                strict=True,
-            )
-        )
-    return found
+        p = []
+        for name in family:
+            deciding = get_deciding_p(found.effects[name])
+            p.append(math.nan if deciding is None else deciding)
+        adjusted = permutation_tests.adjust_by_holm(np.array(p))
+        found.holm |= dict(zip(family, adjusted.tolist(), strict=True))
 
 
 def get_deciding_p(found: GuidanceEffect) -> float | None:

@@ -83,6 +83,7 @@ class Conductor:
         ):  # what an interruption left half saved
             with suppress(ValueError):  # a file that cannot be read is said in the report
                 keep(folder, path, machine, stage)
+        # Read after the repair above, so that the repaired trials count.
         self._data: StudyData = folders.read_study(folder)
         self._who: str | None = None
         self._step: Step | None = None
@@ -112,10 +113,12 @@ class Conductor:
             ConfigError: the plan knows no such participant, or they were erased.
         """
         plan = self._data.plan
+        # An erased participant keeps a place in the plan, but nobody may fill it again.
         if who is not None and (who not in plan["participants"] or who in plan.get("erased", {})):
             raise ConfigError(
                 f"study.participant={who}: no participant of the plan; {list_choices(who, plan['participants'])}"
             )
+        # Leaving is an abort: the trial under way is kept and done again.
         if self._attempt is not None:
             self._attempt.abort("the sitting was left")
             self._attempt.close()
@@ -127,6 +130,7 @@ class Conductor:
         try:
             if self._attempt is not None:
                 self._attempt.tick()
+        # Errors show on the page; the server of the page must not die of them.
         except BrokkError as error:
             self._fall_back(error)
 
@@ -134,6 +138,7 @@ class Conductor:
         """Take a message of a page; return the reason of a refusal, else an empty string."""
         do, step = said.get("do"), self._step
         try:
+            # During a trial the only way out is to stop it.
             if do == "choose" and isinstance(said.get("who"), str) and not self.running:
                 self.choose(said["who"])
             elif do == "leave" and not self.running:
@@ -141,6 +146,7 @@ class Conductor:
             elif self._who is None or step is None:
                 return "nobody"
             elif do == "stop_sitting":
+                # A reason is a short text; the page's own limit may be circumvented.
                 self._stop(str(said.get("reason", ""))[:200])
             elif do == "go_on" and step.kind == "stopped":
                 self._note({"stopped": False, "went_on": _format_now()})
@@ -176,6 +182,7 @@ class Conductor:
             "problem": self.problem,
             "simulated": self._facts["simulated"],
         }
+        # Nobody is chosen: the list of participants is shown.
         if self._who is None or self._step is None:
             return found | {"participants": progress(self._data)}
         step = self._step
@@ -200,6 +207,7 @@ class Conductor:
     def _fall_back(self, error: BrokkError) -> None:
         """Go back to the list of participants, and show the error there; the files on the disk are continued later."""
         log.error("%s", error)
+        # No recording may go on behind the list of participants.
         self._stage.record(None)
         self._who, self._step, self._attempt, self._form, self.problem = (
             None,
@@ -222,6 +230,7 @@ class Conductor:
 
     def _go_on(self) -> None:
         """Read the folder again, and begin the next step."""
+        # The folder and not memory decides the next step: a crash anywhere then costs nothing.
         self._data, self._step, self._form = folders.read_study(self._folder), None, None
         self.problem = ""
         if self._who is None:
@@ -241,6 +250,8 @@ class Conductor:
                 facts, self._clock,
             )  # fmt: skip
         elif step.kind == "questionnaire":
+            # Seeded by participant and period, so that a resumed questionnaire asks the same
+            # pairs.
             seed = self._seed(f"pairs {self._who} {step.period}")
             self._form = Form(
                 self._folder, self._who, step.period, seed, {"simulated": self._facts["simulated"]}
@@ -256,6 +267,7 @@ class Conductor:
         consent = {
             "agreed": agreed,
             "version": self._words.version,
+            # A language tag is short; longer text is no tag.
             "language": str(said.get("language", ""))[:5],
             "at": _format_now(),
         }
@@ -275,6 +287,7 @@ class Conductor:
 
     def _note(self, facts: dict[str, Any]) -> None:
         assert self._who is not None
+        # The record is written whole, so that earlier facts stay.
         known = {}
         for key, value in self._data.participants.get(self._who, {}).items():
             if key != "participant":

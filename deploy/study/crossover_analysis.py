@@ -84,17 +84,23 @@ def estimate_effect(
         unguided: Likewise.
         guided_first: Who was guided in the first period, `(P,)` bool.
     """
+    # A person with one condition only tells nothing about the difference.
     both = ~(np.isnan(guided) | np.isnan(unguided))
     guided, unguided, first = guided[both], unguided[both], np.asarray(guided_first, bool)[both]
     num, num_first = len(guided), int(first.sum())
     facts: dict = {}
     if num:
         facts |= {"guided": float(guided.mean()), "unguided": float(unguided.mean())}
+    # Two persons are the least for a standard deviation.
     if num >= 2:
         facts |= _test_pairs(guided - unguided)
+    # Each sequence needs two persons: the variance is pooled within sequences.
     if min(num_first, num - num_first) >= 2:
         facts |= _adjust_for_period(
-            np.where(first, guided - unguided, unguided - guided), guided + unguided, first
+            # First minus second period, whatever the condition was.
+            np.where(first, guided - unguided, unguided - guided),
+            guided + unguided,
+            first,
         )
     return GuidanceEffect(num_persons=num, num_guided_first=num_first, **facts)
 
@@ -110,6 +116,7 @@ def _test_pairs(difference: np.ndarray) -> dict:
         "hodges_lehmann": estimate_hodges_lehmann(difference)[0],
         "hodges_lehmann_ci95": estimate_hodges_lehmann(difference)[1],
     }
+    # Equal differences have no scale: dz would be a division by rounding errors.
     if std > ROUNDING * float(np.abs(difference).max()):
         facts |= {
             "paired_dz": mean / std,
@@ -119,10 +126,13 @@ def _test_pairs(difference: np.ndarray) -> dict:
 
 
 def _adjust_for_period(period_difference: np.ndarray, total: np.ndarray, first: np.ndarray) -> dict:
+    # Half the difference of the sequences is guidance, half their sum the period (see the
+    # module).
     before, after = period_difference[first].mean(), period_difference[~first].mean()
     guidance, period = float(before - after) / 2, -float(before + after) / 2
     shape, free = math.sqrt(1 / first.sum() + 1 / (~first).sum()), len(first) - 2
     std = _pool_variance(period_difference, first)
+    # Half, as guidance is half of the difference between the means.
     error = std * shape / 2
     half = float(stats.t.ppf(0.5 + CONFIDENCE / 2, free)) * error
     facts: dict = {
@@ -137,6 +147,7 @@ def _adjust_for_period(period_difference: np.ndarray, total: np.ndarray, first: 
             "dz_ci95": compute_dz_interval(guidance / std, 2 / shape, free),
             "period_p": float(2 * stats.t.sf(abs(period / error), free)),
         }
+    # Sums of both periods differ between sequences only by a carry-over.
     if (spread := _pool_variance(total, first)) > 0:
         apart = float(total[first].mean() - total[~first].mean())
         facts["carry_over_p"] = float(2 * stats.t.sf(abs(apart) / (spread * shape), free))
@@ -148,6 +159,7 @@ def _pool_variance(values: np.ndarray, first: np.ndarray) -> float:
     squares = 0.0
     for part in (values[first], values[~first]):
         squares += float(((part - part.mean()) ** 2).sum())
+    # Two means are estimated, one for each sequence.
     std = math.sqrt(squares / (len(values) - 2))
     return std if std > ROUNDING * float(np.abs(values).max()) else 0.0
 
@@ -190,6 +202,7 @@ def estimate_hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | N
     means = np.sort((difference[rows] + difference[columns]) / 2)
     ways = np.ones(1)  # in how many assignments ranks 1 … n add up to each sum
     for rank in range(1, num + 1):
+        # The convolution adds each rank with both signs.
         ways = np.concatenate((ways, np.zeros(rank))) + np.concatenate((np.zeros(rank), ways))
     below = np.cumsum(ways) / 2.0**num
     cut = int(

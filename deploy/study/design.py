@@ -164,9 +164,13 @@ def make_latin_squares(size: int) -> tuple[np.ndarray, np.ndarray]:
     """
     # Shifts of one row make a Latin square.
     row, place = np.mgrid[:size, :size]
-    factor = next(
-        (m for m in range(2, size) if math.gcd(m, size) == math.gcd(m - 1, size) == 1), size - 1
-    )
+    # Shifts by `factor` are orthogonal to shifts by 1 if both it and the difference divide nothing
+    # of the size.
+    factor = size - 1
+    for candidate in range(2, size):
+        if math.gcd(candidate, size) == math.gcd(candidate - 1, size) == 1:
+            factor = candidate
+            break
     return (row + place) % size, (row + factor * place) % size
 
 
@@ -174,9 +178,8 @@ def plan_trials(design: Design, generator: np.random.Generator) -> list[Trial]:
     """Return every trial in the order in which it is to be done, practice first."""
     holes, starts = list(design.holes), list(design.starts)
     hole_square, start_square = make_latin_squares(len(holes))
-    shuffle = [
-        generator.permutation(len(holes)) for _ in range(2)
-    ]  # which name stands for which letter of the squares
+    # Which name stands for which letter of the squares; holes are drawn first.
+    shuffle = generator.permutation(len(holes)), generator.permutation(len(holes))
     found = []
     for index, (participant, conditions) in enumerate(draw_sequences(design, generator).items()):
         for number in range(design.practice_trials):

@@ -86,6 +86,7 @@ def measure(
     last = find_insertion(tip, hole, success)
     within = t_s <= limit_s
     inserted = last is not None and bool(within[last])
+    # The sample of the insertion counts; after it the arm is moved away.
     num = last + 1 if inserted and last is not None else int(within.sum())
     period_s = 1.0 / recording.rate_hz
     q, u, tip, t_s = (
@@ -95,12 +96,14 @@ def measure(
         t_s[:num],
     )
     path_m = measure_path_length(tip, period_s)
+    # The goal lies below the rim by the required depth.
     goal = np.array(hole.center_in_base_m) - [0.0, 0.0, success.depth_m]
     onsets = detect_lever_movements(u)
     found = {
         "time_s": float(t_s[-1]) if inserted else limit_s,
         "success": float(inserted),
         "path_m": path_m,
+        # The straight way over the path; rounding may take it above 1.
         "efficiency": min(1.0, float(np.linalg.norm(goal - tip[0])) / path_m)
         if inserted and path_m
         else math.nan,
@@ -119,12 +122,14 @@ def measure(
         "contacts": math.nan,
         "peak_force_n": math.nan,
     }
+    # Without advice in the recording there is nothing to follow.
     names = [f"advice_{joint}" for joint in recording.joints]
     if all(name in recording.extra for name in names):
         advice = np.stack([recording.extra[name][:num] for name in names], 1).astype(float)
         found |= measure_tracking(u, advice, period_s)
     if "force_n" in recording.extra:
         touching = recording.extra["force_n"][:num] > CONTACT_N
+        # Each rise of the contact is one contact, also one at the start.
         found["contacts"] = float(np.count_nonzero(np.diff(touching.astype(int), prepend=0) > 0))
         found["peak_force_n"] = float(np.max(recording.extra["force_n"][:num], initial=0.0))
     return found
@@ -141,6 +146,7 @@ def find_insertion(tip_in_base_m: np.ndarray, hole: Hole, success: Success) -> i
 
 def measure_path_length(tip_in_base_m: np.ndarray, period_s: float) -> float:
     """Return the length of a path, `(T, 3)`, between means over pieces of `PIECE_S`, m; first and last sample are its ends."""
+    # Means over pieces, so that noise of the encoders adds no length.
     size = max(1, round(PIECE_S / period_s))
     inner = len(tip_in_base_m) // size * size
     corners = tip_in_base_m[:inner].reshape(-1, size, 3).mean(1)
@@ -152,6 +158,7 @@ def detect_motion(q: np.ndarray, machine: Machine, period_s: float) -> np.ndarra
     """Return which joints move, `(T, J)` bool, by the slope over a quarter of a second."""
     if len(q) < 2:
         return np.zeros(q.shape, bool)
+    # Five samples around each: differences of single samples are mostly noise.
     speed = np.gradient(average_windows(q, 5), period_s, axis=0)
     return np.abs(speed) > MOVING * machine.max_speed
 
@@ -162,6 +169,7 @@ def detect_lever_movements(u: np.ndarray) -> np.ndarray:
     # the state after the newest sample that says anything: on, off, or at the start off
     told = np.where(on, 1, np.where(off, 0, -1))
     rows = np.where(told >= 0, np.arange(len(u))[:, None], -1)
+    # The newest sample that says on or off; in between the state is kept (hysteresis).
     newest = np.maximum.accumulate(rows, axis=0)
     held = np.where(newest >= 0, np.take_along_axis(told, np.maximum(newest, 0), 0), 0)
     return np.argwhere(np.diff(held.astype(int), axis=0, prepend=0) > 0)
@@ -178,8 +186,10 @@ def measure_tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict
     away = np.where(shown[:, None], u - np.nan_to_num(advice), 0.0)
     error = math.sqrt(float((away**2).sum() / (shown.sum() * u.shape[1])))
     asked = np.nan_to_num(advice)
+    # No lag longer than the trial.
     most = min(round(MOST_LAG_S / period_s), len(u) - 1)
     agreement = [float((u[lag:] * asked[: len(u) - lag]).sum()) for lag in range(most + 1)]
+    # Correlation without normalisation: only the place of its maximum counts.
     return {
         "advice_error": error,
         "advice_lag_s": int(np.argmax(agreement)) * period_s if max(agreement) > 0 else math.nan,
@@ -188,12 +198,15 @@ def measure_tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict
 
 def average_windows(values: np.ndarray, size: int) -> np.ndarray:
     """Return centred moving means over `size` samples, `(T, …)`, over fewer at the ends."""
+    # Differences of cumulative sums: the time does not depend on the window.
     total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, 0)))
     index = np.arange(len(values))
     low, high = np.maximum(index - size // 2, 0), np.minimum(index + size // 2 + 1, len(values))
     return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (values.ndim - 1))
 
 
+# Defaults of SPARC (Balasubramanian et al., J. NeuroEng. Rehabil. 12 (2015) 112): cut-off, share
+# of the peak below which the spectrum is left out, and powers of two of zero padding.
 CUT_OFF_HZ = 10.0
 THRESHOLD = 0.05
 PADDING = 4
@@ -211,15 +224,18 @@ def compute_sparc(speed: np.ndarray, rate_hz: float) -> float:
     """
     if len(speed) < 2 or not np.any(speed):
         return math.nan
+    # Zero padding refines the spectrum.
     size = 2 ** (math.ceil(math.log2(len(speed))) + PADDING)
     frequency = np.arange(size) * rate_hz / size
     spectrum = np.abs(np.fft.fft(speed, size))
     spectrum = spectrum / spectrum.max()
+    # Above the cut-off there is no voluntary motion.
     within = frequency <= CUT_OFF_HZ
     frequency, spectrum = frequency[within], spectrum[within]
     above = np.flatnonzero(spectrum >= THRESHOLD)
     frequency, spectrum = frequency[above[0] : above[-1] + 1], spectrum[above[0] : above[-1] + 1]
     if len(frequency) < 2:
         return math.nan
+    # Both axes of the outline are scaled to 1, so that duration and size drop out.
     across = np.diff(frequency) / (frequency[-1] - frequency[0])
     return -float(np.hypot(across, np.diff(spectrum)).sum())

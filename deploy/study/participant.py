@@ -41,6 +41,8 @@ log = logging.getLogger(__name__)
 
 STARTING_S = 60.0
 """Longest wait for the page, s."""
+SCREEN_FIELDS = ("kind", "who", "period", "phase", "number", "done")
+"""Fields of the view that tell one screen from another."""
 AGAIN_S = 2.0
 """Time after which a button that had no effect is pressed again."""
 
@@ -187,9 +189,7 @@ class _Taking:
             # A person waits until the arm is at its start and the advice is valid.
             if shown.get("phase") == "ready" and not self._ready(shown):
                 continue
-            screen = [
-                shown.get(key) for key in ("kind", "who", "period", "phase", "number", "done")
-            ]
+            screen = list(map(shown.get, SCREEN_FIELDS))
             if (
                 screen != pressed or time.monotonic() - pressed_s > AGAIN_S
             ):  # each screen is answered once, or once more if need be

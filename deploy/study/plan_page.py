@@ -39,25 +39,8 @@ def build_plan_page(
     """
     num, num_trials, inside = design.num_participants, len(design.holes), design.success
     # Everything is computed for this plan, so that the page can be judged before the study.
-    can = sample_size.evaluate_size(num, design.alpha)
     paired_least, sequence_least = sample_size.find_smallest_sizes(design.alpha)
-    wanted = sample_size.find_sufficient_size(design.alpha)
-    if design.order == "fixed":
-        summary, tone = (
-            "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.",
-            "bad",
-        )
-    elif can.smallest_p > design.alpha:
-        summary, tone = (
-            f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is {can.smallest_p:.3f}. It takes "
-            f"{sequence_least} to be able to, and {wanted} to find a large effect (dz 0.8) in four of five studies.",
-            "bad",
-        )
-    else:
-        summary = f"{num} participants find an effect of dz 0.8 in {100 * can.power[1]:.0f} of 100 studies."
-        # Four of five is the usual power; less is a warning.
-        tone = "good" if can.power[1] >= 0.8 else "warn"
-        summary += "" if tone == "good" else f" {wanted} would find it in four of five."
+    summary, tone = _judge_design(design, sequence_least)
     found = Report(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
     found.add_text(notice, "warn")
     found.add_facts(
@@ -80,8 +63,9 @@ def build_plan_page(
         ["hole", "x, m", "y, m", "rim z, m", "radius, m"],
         [[n, *h.center_in_base_m, h.radius_m] for n, h in design.holes.items()],
     )
+    num_joints = len(next(iter(design.starts.values())))
     found.add_table(
-        ["start", *(f"joint {i + 1}" for i in range(len(next(iter(design.starts.values())))))],
+        ["start", *(f"joint {i + 1}" for i in range(num_joints))],
         [[n, *q] for n, q in design.starts.items()],
     )
     found.add_heading("Order of trials")
@@ -90,6 +74,30 @@ def build_plan_page(
     )
     _add_schedule(found, planned)
     return found
+
+
+def _judge_design(design: Design, sequence_least: int) -> tuple[str, str]:
+    """Return a sentence on the power of the design, and whether it is good, bad or a warning."""
+    num = design.num_participants
+    can = sample_size.evaluate_size(num, design.alpha)
+    wanted = sample_size.find_sufficient_size(design.alpha)
+    if design.order == "fixed":
+        summary, tone = (
+            "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.",
+            "bad",
+        )
+    elif can.smallest_p > design.alpha:
+        summary, tone = (
+            f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is {can.smallest_p:.3f}. It takes "
+            f"{sequence_least} to be able to, and {wanted} to find a large effect (dz 0.8) in four of five studies.",
+            "bad",
+        )
+    else:
+        summary = f"{num} participants find an effect of dz 0.8 in {100 * can.power[1]:.0f} of 100 studies."
+        # Four of five is the usual power; less is a warning.
+        tone = "good" if can.power[1] >= 0.8 else "warn"
+        summary += "" if tone == "good" else f" {wanted} would find it in four of five."
+    return summary, tone
 
 
 def _add_sample_sizes(
@@ -159,19 +167,17 @@ def _add_schedule(found: Report, planned: list[Trial]) -> None:
             if trial.participant == participant:
                 mine.append(trial)
         found.add_heading(participant, 3)
-        columns = [
-            "",
-            *(str(number) for number in range(1, max(trial.number for trial in mine) + 1)),
-        ]
+        largest = max(trial.number for trial in mine)
+        columns = ["", *map(str, range(1, largest + 1))]
         rows = []
         for period in sorted({trial.period for trial in mine}):
             here = [trial for trial in mine if trial.period == period]
             title = "practice" if not period else f"period {period}: {here[0].condition}"
-            cells: list[str | Cell] = [f"{trial.hole} from {trial.start}" for trial in here]
-            if not period:
-                cells = [
-                    Cell(f"{trial.hole} from {trial.start}", trial.condition) for trial in here
-                ]
+            cells: list[str | Cell] = []
+            for trial in here:
+                text = f"{trial.hole} from {trial.start}"
+                # In practice the condition changes from trial to trial.
+                cells.append(text if period else Cell(text, trial.condition))
             # Empty cells leave room for notes by hand.
             rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
             rows.append(["notes", *[""] * (len(columns) - 1)])

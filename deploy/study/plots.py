@@ -33,7 +33,10 @@ def draw_paths(found: Analysis) -> Figure:
     holes = sorted({_name_hole(trial) for trial in drawn})
     figure = Figure(figsize=(3.6 * max(1, len(holes)), 6.8), layout="constrained")
     for column, name in enumerate(holes):
-        here = [trial for trial in drawn if _name_hole(trial) == name]
+        here = []
+        for trial in drawn:
+            if _name_hole(trial) == name:
+                here.append(trial)
         for row, (title, horizontal, vertical) in enumerate(
             (("from above", 0, 1), ("from the side", None, 2))
         ):

@@ -134,6 +134,13 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
             "level": found.alpha,
         }
     )
+    _add_effects(page, folder, found)
+    _add_paths_and_workload(page, folder, found)
+    _add_comparisons(page, found)
+    return page
+
+
+def _add_effects(page: Report, folder: Path, found: Analysis) -> None:
     page.add_heading("What guidance does")
     page.add_text(
         "Guided minus unguided, with the period in the model: what practice does between the first and the second period is not "
@@ -149,6 +156,9 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
         folder / "effects.png", "Effect of guidance on every measure, with 95 % intervals"
     )
     page.add_picture(folder / "pairs.png", "Every participant, and means with 95 % intervals")
+
+
+def _add_paths_and_workload(page: Report, folder: Path, found: Analysis) -> None:
     page.add_heading("Tool paths")
     page.add_picture(
         folder / "paths.png",
@@ -160,6 +170,10 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
         "0 to 100, more is more load; below each figure its 95 % interval",
     )
     page.add_picture(folder / "tlx.png", "Means of the six scales with 95 % intervals")
+
+
+def _add_comparisons(page: Report, found: Analysis) -> None:
+    """Add the usual tests, the following of the advice, and the remarks."""
     page.add_heading("Without the period in the model")
     page.add_text(
         "The usual paired tests, for comparison; practice is part of the differences here, though not of their mean where as many "
@@ -179,7 +193,6 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
         page.add_table(["where", "what"], [[remark.where, remark.text] for remark in found.remarks])
     else:
         page.add_text("Nothing is missing, doubled or half filled.")
-    return page
 
 
 def _build_table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[str | Cell]]]:

@@ -80,11 +80,10 @@ def find_sufficient_size(
 
 def find_smallest_sizes(alpha: float) -> tuple[int, int]:
     """Return the smallest sizes at which the paired test and the sequence test can reach `alpha`."""
-    paired = next(
-        num for num in range(1, 100) if permutation_tests.get_smallest_paired_p(num) <= alpha
-    )
-    return paired, next(
-        num
-        for num in range(2, 100)
-        if permutation_tests.get_smallest_sequence_p((num + 1) // 2, num) <= alpha
-    )
+    paired = 1
+    while permutation_tests.get_smallest_paired_p(paired) > alpha:
+        paired += 1
+    sequence = 2
+    while permutation_tests.get_smallest_sequence_p((sequence + 1) // 2, sequence) > alpha:
+        sequence += 1
+    return paired, sequence

@@ -67,15 +67,7 @@ def simulate(
     names = list(dict.fromkeys(trial.participant for trial in todo))
     persons = np.array([names.index(trial.participant) for trial in todo])
     is_guided = np.array([trial.condition == "guided" for trial in todo])
-    batch = TrialBatch(
-        q=np.array([design.starts[trial.start] for trial in todo]),
-        rim_in_base_m=np.array([design.holes[trial.hole].center_in_base_m for trial in todo]),
-        radius_m=np.array([design.holes[trial.hole].radius_m for trial in todo]),
-        guided=is_guided,
-        limit_s=design.limit_s,
-        depth_m=design.success.depth_m,
-        clearance_m=design.success.clearance_m,
-    )
+    batch = _build_batch(design, todo, is_guided)
     # The seed is that of the study: the same persons take part in both conditions.
     operators = Divided(
         machine, persons, is_guided, guided, unguided, session.stream("study operators")
@@ -88,19 +80,14 @@ def simulate(
         found = measure(
             recording, machine, design.holes[trial.hole], design.success, design.limit_s
         )
-        kind = name_spec(guided if trial.condition == "guided" else unguided)
         facts: dict[str, Any] = {
             **asdict(trial),
             "hole": {"name": trial.hole, **asdict(design.holes[trial.hole])},
-        }
-        facts |= {
             "limit_s": design.limit_s,
             "outcome": "inserted" if found["success"] else "time limit",
-        }
-        facts |= {
             "recording": f"{folders.RECORDINGS}/{path.name}",
             "simulated": True,
-            "operator": kind,
+            "operator": name_spec(guided if trial.condition == "guided" else unguided),
         }
         folders.write_trial(folder, trial.name, facts)
         # Time and effort together: a made-up workload only has to vary with both. Chosen by hand;
@@ -114,6 +101,19 @@ def simulate(
     for (participant, period), load in loads.items():
         answers = answer_questionnaire(float(np.mean(load)), own[participant], generator)
         folders.write_questionnaire(folder, participant, period, {**answers, "simulated": True})
+
+
+def _build_batch(design: Design, todo: list[Trial], is_guided: np.ndarray) -> TrialBatch:
+    """Return starts, holes and limits of trials."""
+    return TrialBatch(
+        q=np.array([design.starts[trial.start] for trial in todo]),
+        rim_in_base_m=np.array([design.holes[trial.hole].center_in_base_m for trial in todo]),
+        radius_m=np.array([design.holes[trial.hole].radius_m for trial in todo]),
+        guided=is_guided,
+        limit_s=design.limit_s,
+        depth_m=design.success.depth_m,
+        clearance_m=design.success.clearance_m,
+    )
 
 
 def answer_questionnaire(

@@ -84,9 +84,10 @@ def progress(data: StudyData) -> list[dict[str, Any]]:
     found = []
     for who in data.plan["participants"]:
         done = sum(name == who and period > 0 for name, period, _ in data.trials)
-        of = sum(
-            trial["participant"] == who and trial["period"] > 0 for trial in data.plan["trials"]
-        )
+        of = 0
+        for trial in data.plan["trials"]:
+            if trial["participant"] == who and trial["period"] > 0:
+                of += 1
         step = find_next_step(data, who).kind
         state = (
             "erased"

@@ -208,8 +208,9 @@ def erase(folder: Path, participant: str) -> tuple[list[Path], list[Path]]:
     _write(folder / PLAN, plan)
     reports = []
     for name in _read(folder / REPORTS) if (folder / REPORTS).exists() else []:
-        reports.append(Path(name))
-    return gone, [report for report in reports if report.exists()]
+        if Path(name).exists():
+            reports.append(Path(name))
+    return gone, reports
 
 
 def _is_of_participant(path: Path, participant: str) -> bool:

@@ -188,10 +188,11 @@ class Attempt:
         """Return the trial as plain data for the pages."""
         now_s, sight = self._clock(), self._stage.sight()
         away = None if sight.q is None else sight.q - self._start
-        joints = [] if away is None else [
-            {"joint": name, "away": round(float(value), 3), "there": bool(abs(value) <= self._times.start_tolerance)}
-            for name, value in zip(self._machine.joint_names, away, strict=True)
-        ]  # fmt: skip
+        joints = []
+        if away is not None:
+            for name, value in zip(self._machine.joint_names, away, strict=True):
+                is_there = bool(abs(value) <= self._times.start_tolerance)
+                joints.append({"joint": name, "away": round(float(value), 3), "there": is_there})
         left_s = {"countdown": self._times.countdown_s, "running": self._limit_s}.get(
             self._phase, 0.0
         ) - (now_s - self._since_s)

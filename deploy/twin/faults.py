@@ -84,10 +84,10 @@ class ActiveFaults:
         try:
             asked = json.loads(text)
             if "place" in asked:
-                self._place = (
-                    [float(q) for q in asked["place"]["q"]],
-                    [float(x) for x in asked["place"]["hole_in_base_m"]],
-                )
+                # Converted here, so that a bad request is refused and not the next cycle.
+                place = asked["place"]
+                q, hole_m = list(map(float, place["q"])), list(map(float, place["hole_in_base_m"]))
+                self._place = q, hole_m
                 return
             fault, message, seconds = (
                 asked["fault"],
@@ -113,6 +113,7 @@ class ActiveFaults:
 
     def on(self, fault: str, message: str, now_s: float) -> bool:
         """Return whether a fault is on for a message."""
+        # The empty name stands for all messages.
         return any(self.until_s.get((fault, name), -1.0) > now_s for name in (message, ""))
 
     def since_s(self, fault: str, now_s: float) -> float:
@@ -126,6 +127,7 @@ class ActiveFaults:
         def on(fault: str) -> bool:
             return self.on(fault, name, now_s)
 
+        # Faults are applied to the coded bytes, where real ones occur.
         data = bytearray(frame.data)
         if (
             on("silent")
@@ -137,6 +139,7 @@ class ActiveFaults:
             data[self._chance.randrange(len(data))] ^= 1 << self._chance.randrange(8)
         if on("masquerade"):
             data[layout.crc_byte] ^= WRONG_CRC
+        # The data identifier enters the CRC, so another message's CRC is wrong here.
         if on("short"):
             del data[-1]
         frame = CanFrame(
@@ -146,6 +149,7 @@ class ActiveFaults:
             self._late.append((now_s + DELAY_S, frame))
             return []
         if on("reorder"):
+            # The first frame waits for the next one, which then goes first.
             held = self._held.pop(name, None)
             if held is None:
                 self._held[name] = frame
@@ -155,11 +159,13 @@ class ActiveFaults:
 
     def due(self, now_s: float) -> list[CanFrame]:
         """Return the frames that were held up until now."""
-        ripe = []
+        ripe, waiting = [], []
         for at_s, frame in self._late:
             if at_s <= now_s:
                 ripe.append(frame)
-        self._late = [(at_s, frame) for at_s, frame in self._late if at_s > now_s]
+            else:
+                waiting.append((at_s, frame))
+        self._late = waiting
         return ripe
 
 
@@ -174,6 +180,7 @@ class FaultPort:
         self._socket: socket.socket | None = None
         if port is not None:
             self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            # This computer only: faults must not be reachable from the network.
             self._socket.bind(("127.0.0.1", port))
             self._socket.setblocking(False)
 
@@ -184,6 +191,7 @@ class FaultPort:
         try:
             text, sender = self._socket.recvfrom(REQUEST_BYTES)
         except BlockingIOError:
+            # No request is the usual case in a cycle.
             return None
         try:
             faults.request(text, time.monotonic())

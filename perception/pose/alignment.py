@@ -186,6 +186,125 @@ def align_plane(
     stride = max(1, round(height * width / MOST))
     lines = np.arange(0, height, stride)
     u, v = both.places(np.arange(width), lines)
+    on = _find_face_pixels(both, face, frame, allowed, ellipse, inner, stride, u, v)
+    if np.count_nonzero(on) < LEAST:
+        return face
+    warp = _register_pictures(both, face, on, stride, u, v)
+    # Pictures of different scenes correlate little, whatever the plane.
+    if warp.likeness < ALIKE:
+        return None
+    # A step beyond the uncertainty of depth follows another surface, or a repeated pattern.
+    largest_px = LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px
+    if not np.isfinite(warp.m).all() or warp.moved_px > largest_px:
+        return face
+    cov = warp.estimate_covariance(cell_px)
+    if cov is None:
+        return face
+    return merge_planes(face, replace(face, m=warp.m, cov=cov), bias_per_m)
+
+
+@dataclass(frozen=True)
+class _PlaneWarp:
+    """The plane by which both pictures agree best, with the state of its last step.
+
+    Attributes:
+        m: Plane, `(3,)` 1/m.
+        likeness: Correlation of left and warped right picture.
+        moved_px: Largest shift on the face from the start, px.
+        u: Columns of the pixels compared, `(P,)`.
+        v: Their rows.
+        push: Derivatives of the warped picture, `(4, P)`; the last one is that of the gain.
+        heavy: Weighted instruments in their place, `(4, P)`.
+        off: Residuals, `(P,)`.
+        scale: Their robust standard deviation.
+    """
+
+    m: np.ndarray
+    likeness: float
+    moved_px: float
+    u: np.ndarray
+    v: np.ndarray
+    push: np.ndarray
+    heavy: np.ndarray
+    off: np.ndarray
+    scale: float
+
+    def estimate_covariance(self, cell_px: int) -> np.ndarray | None:
+        """Return the covariance of the plane, `(3, 3)`; errors may be correlated within cells."""
+        # Pixels of one cell share their error; a cell's number joins its row and column, which
+        # stay below 10,000.
+        row, column = self.v // cell_px, self.u // cell_px
+        cell = row.astype(np.int64) * 10_000 + column.astype(np.int64)
+        slopes = (self.push[:3] * compute_psi_slope(self.off / (TUKEY * self.scale))).T
+        return estimate_sandwich_covariance(slopes, self.heavy[:3].T, self.off, number_cells(cell))
+
+
+def _register_pictures(
+    both: StereoPatch, face: FacePlane, on: np.ndarray, stride: int, u: np.ndarray, v: np.ndarray
+) -> _PlaneWarp:
+    """Fit the plane by which the pictures agree best at the pixels `on`; see `align_plane`."""
+    at = np.flatnonzero(on)
+    weight = on.astype(np.float32)
+    window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
+    # Not zero: windows without a pixel of the face divide by it.
+    counted = np.maximum(cv2.boxFilter(weight, -1, window), 1e-3)
+    weight, counted = weight[..., None], counted[..., None]
+
+    def departing(values: np.ndarray) -> np.ndarray:
+        """Return two pictures `(h, w, 2)` on the face, less the mean of a window, `(2, P)`."""
+        departs = values - cv2.boxFilter(values * weight, -1, window) / counted
+        return departs.reshape(-1, 2)[at].T.astype(float)
+
+    # Grey value and its gradient share one filter pass.
+    left = cv2.merge([both.left, cv2.Sobel(both.left, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
+    right = cv2.merge([both.right, cv2.Sobel(both.right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
+    mine, instrument = departing(left[::stride])
+    height, width = both.left.shape
+    row = np.repeat(np.arange(0, height, stride).astype(np.float32)[:, None], width, 1)
+    line, column = np.divmod(at, width)
+    u_on, v_on = u[0, column], v[line, 0]
+    ray = np.linalg.inv(both.camera_matrix) @ np.stack([u_on, v_on, np.ones(len(at))])
+    m, seen = face.m, mine
+    # Gauss-Newton steps with the warped picture: the plane changes, so the picture is warped
+    # anew.
+    for _ in range(ROUNDS):
+        seen, rise = departing(both.seen(u, v, row, m, right))
+        push = np.vstack([ray * (-both.pull_px / both.shrink * rise), -mine])
+        heavy = np.vstack([ray * (-both.pull_px / both.shrink * instrument), -mine])
+        # Exposure may differ between the cameras by a factor.
+        gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
+        off = seen - gain * mine
+        # The median is robust to occluders that depth did not show; 1e-6 guards a noiseless
+        # picture.
+        scale = 1.4826 * compute_upper_median(np.abs(off)) + 1e-6
+        # Tukey's weights (95 % efficiency for normal errors) leave gross errors out altogether.
+        heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
+        # The last unknown is the gain, which only has to be estimated along.
+        step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
+        m = m - step
+        # The largest shift on the face decides: a tilt moves its border most.
+        if both.pull_px * np.abs(step @ ray).max() < SETTLED_PX:
+            break
+    likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
+    moved_px = float(both.pull_px * np.abs((m - face.m) @ ray).max())
+    return _PlaneWarp(m, likeness, moved_px, u_on, v_on, push, heavy, off, scale)
+
+
+def _find_face_pixels(
+    both: StereoPatch,
+    face: FacePlane,
+    frame: Frame,
+    allowed: np.ndarray,
+    ellipse: np.ndarray,
+    inner: float,
+    stride: int,
+    u: np.ndarray,
+    v: np.ndarray,
+) -> np.ndarray:
+    """Find the pixels at `u`, `v` that show the face in both pictures, `(h, w)` bool.
+
+    See `align_plane` for the arguments; of `stride` rows one is looked at.
+    """
     pixel = np.ix_(
         np.rint(v[:, 0]).astype(int).clip(0, allowed.shape[0] - 1),
         np.rint(u[0]).astype(int).clip(0, allowed.shape[1] - 1),
@@ -214,66 +333,7 @@ def align_plane(
         cv2.erode(whole, np.ones((2 * round(BORDER_PX / stride) + 1, 2 * BORDER_PX + 1), np.uint8))
         > 0
     )
-    at = np.flatnonzero(on)
-    if len(at) < LEAST:
-        return face
-    weight = on.astype(np.float32)
-    window = (WINDOW_PX, max(3, WINDOW_PX // stride | 1))
-    # Not zero: windows without a pixel of the face divide by it.
-    counted = np.maximum(cv2.boxFilter(weight, -1, window), 1e-3)
-    weight, counted = weight[..., None], counted[..., None]
-
-    def departing(values: np.ndarray) -> np.ndarray:
-        """Return two pictures `(h, w, 2)` on the face, less the mean of a window, `(2, P)`."""
-        departs = values - cv2.boxFilter(values * weight, -1, window) / counted
-        return departs.reshape(-1, 2)[at].T.astype(float)
-
-    # Grey value and its gradient share one filter pass.
-    left = cv2.merge([both.left, cv2.Sobel(both.left, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
-    right = cv2.merge([both.right, cv2.Sobel(both.right, cv2.CV_32F, 1, 0, ksize=3, scale=0.125)])
-    mine, instrument = departing(left[::stride])
-    row = np.repeat(lines.astype(np.float32)[:, None], width, 1)
-    line, column = np.divmod(at, width)
-    u_on, v_on = u[0, column], v[line, 0]
-    ray = np.linalg.inv(both.camera_matrix) @ np.stack([u_on, v_on, np.ones(len(at))])
-    m, seen = face.m, mine
-    # Gauss-Newton steps with the warped picture: the plane changes, so the picture is warped
-    # anew.
-    for _ in range(ROUNDS):
-        seen, rise = departing(both.seen(u, v, row, m, right))
-        push = np.vstack([ray * (-both.pull_px / both.shrink * rise), -mine])
-        heavy = np.vstack([ray * (-both.pull_px / both.shrink * instrument), -mine])
-        # Exposure may differ between the cameras by a factor.
-        gain = float(np.sqrt((seen @ seen) / max(float(mine @ mine), 1e-9)))
-        off = seen - gain * mine
-        # The median is robust to occluders that depth did not show; 1e-6 guards a noiseless
-        # picture.
-        scale = 1.4826 * compute_upper_median(np.abs(off)) + 1e-6
-        # Tukey's weights (95 % efficiency for normal errors) leave gross errors out altogether.
-        heavy *= np.maximum(1 - (off / (TUKEY * scale)) ** 2, 0.0) ** 2
-        # The last unknown is the gain, which only has to be estimated along.
-        step = np.linalg.lstsq(heavy @ push.T, heavy @ off, rcond=1e-12)[0][:3]
-        m = m - step
-        # The largest shift on the face decides: a tilt moves its border most.
-        if both.pull_px * np.abs(step @ ray).max() < SETTLED_PX:
-            break
-    likeness = float(seen @ mine) / max(float(np.sqrt((seen @ seen) * (mine @ mine))), 1e-9)
-    # Pictures of different scenes correlate little, whatever the plane.
-    if likeness < ALIKE:
-        return None
-    # A step beyond the uncertainty of depth follows another surface, or a repeated pattern.
-    moved_px = both.pull_px * np.abs((m - face.m) @ ray).max()
-    if (
-        not np.isfinite(m).all()
-        or moved_px > LARGEST_PX * both.shrink + 3.0 * face.sigma * both.pull_px
-    ):
-        return face
-    # Pixels of one cell share their error; a cell's number joins its row and column, which stay
-    # below 10,000.
-    cell = (v_on // cell_px).astype(np.int64) * 10_000 + (u_on // cell_px).astype(np.int64)
-    slopes = (push[:3] * compute_psi_slope(off / (TUKEY * scale))).T
-    cov = estimate_sandwich_covariance(slopes, heavy[:3].T, off, number_cells(cell))
-    return face if cov is None else merge_planes(face, replace(face, m=m, cov=cov), bias_per_m)
+    return on
 
 
 def merge_planes(first: FacePlane, second: FacePlane, bias_per_m: float) -> FacePlane:

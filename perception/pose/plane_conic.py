@@ -150,41 +150,14 @@ class PlaneConicEstimator:
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
-        s = self.settings
-        row = as_row(ellipse)
-        # Depth for the plane comes from a ring around the ellipse: inside the hole it shows no
-        # face.
+        s, row = self.settings, as_row(ellipse)
         gray, allowed = self._prepare(frame, masks)
-        reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
-        points = plane.collect_support(
-            frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
-        )
-        # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
-        face = plane.fit_plane(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
-        # No depth on the face at all: the ellipse alone gives a pose if the camera's place is
-        # known.
+        face = self._fit_face(frame, allowed, row, ellipse)
         if face is None:
-            if (
-                self._without_depth is not None
-                and frame.base_from_camera is not None
-                and points.known < s.blind
-            ):
-                return self._without_depth.estimate(frame, masks, ellipse)
-            return Rejection(
-                "pose",
-                "pixels of the face with depth",
-                float(len(points.inverse)),
-                float(plane.LEAST),
-                ellipse,
-            )
-        # Noise above that of any matcher: the surroundings are no single plane.
-        if face.sigma > s.noise_limit_per_m:
-            return Rejection(
-                "pose", "depth noise on the face, 1/m", face.sigma, s.noise_limit_per_m, ellipse
-            )
-        # Errors of neighbouring pixels are alike, so the count of pixels overstates the
-        # precision.
-        face = replace(face, cov=face.cov * s.matcher_alike)
+            assert self._without_depth is not None
+            return self._without_depth.estimate(frame, masks, ellipse)
+        if isinstance(face, Rejection):
+            return face
         shape = self._check_shape(face, row, frame, ellipse)
         if isinstance(shape, Rejection):
             return shape
@@ -192,25 +165,61 @@ class PlaneConicEstimator:
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
             agreed = alignment.align_plane(
-                both,
-                face,
-                frame,
-                allowed,
-                row,
-                s.inner,
-                s.cell_px,
-                s.matcher_bias_per_m,
-                # `None` says that the pictures disagree: then parallax means nothing either.
+                both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m
             )
+            # `None` says that the pictures disagree: then parallax means nothing either.
             both, face = (None, face) if agreed is None else (both, agreed)
-            shape = self._check_shape(face, row, frame, ellipse)
             # A refined plane may turn a plausible ellipse into an implausible one.
+            shape = self._check_shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        # The rim is fitted on the final plane: its circle has only three unknowns there.
+        circle = self._fit_circle(gray, frame, face, ellipse, has_good_shape=shape)
+        if isinstance(circle, Rejection):
+            return circle
+        return self._describe_hole(gray, frame, masks, face, circle, both, ellipse)
+
+    def _fit_face(
+        self, frame: Frame, allowed: np.ndarray, row: np.ndarray, ellipse: Ellipse
+    ) -> FacePlane | Rejection | None:
+        """Return the plane of the face from depth; `None` where `without_depth` serves in its place."""
+        s = self.settings
+        # Depth for the plane comes from a ring around the ellipse: inside the hole it shows no
+        # face.
+        reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
+        points = plane.collect_support(
+            frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
+        )
+        # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
+        face = plane.fit_plane(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
+        if face is None:
+            # Without depth the ellipse alone gives a pose if the camera's place is known.
+            is_blind = frame.base_from_camera is not None and points.known < s.blind
+            if self._without_depth is not None and is_blind:
+                return None
+            reason, num_points = "pixels of the face with depth", float(len(points.inverse))
+            return Rejection("pose", reason, num_points, float(plane.LEAST), ellipse)
+        # Noise above that of any matcher: the surroundings are no single plane.
+        if face.sigma > s.noise_limit_per_m:
+            reason = "depth noise on the face, 1/m"
+            return Rejection("pose", reason, face.sigma, s.noise_limit_per_m, ellipse)
+        # Errors of neighbouring pixels are alike, so the count of pixels overstates the
+        # precision.
+        return replace(face, cov=face.cov * s.matcher_alike)
+
+    def _fit_circle(
+        self,
+        gray: np.ndarray,
+        frame: Frame,
+        face: FacePlane,
+        ellipse: Ellipse,
+        has_good_shape: bool,
+    ) -> RimCircle | Rejection:
+        """Return the circle of the rim on the final plane, or the gate that it misses."""
+        s = self.settings
+        # On the plane a circle has only three unknowns.
         circle = rim.fit_rim_circle(
             gray,
-            row,
+            as_row(ellipse),
             frame.camera_matrix,
             face.m,
             s.radius_m,
@@ -220,27 +229,37 @@ class PlaneConicEstimator:
         )
         # An ellipse of wrong shape may still belong to a rim, but then most of the circle must be
         # seen.
-        least = s.coverage if shape else max(s.coverage, FORGIVEN)
+        least = s.coverage if has_good_shape else max(s.coverage, FORGIVEN)
         if circle is None or circle.coverage < least:
-            return Rejection(
-                "pose",
-                "part of a circle on the face with a rim",
-                circle.coverage if circle else 0.0,
-                least,
-                ellipse,
-            )
+            reason, seen = "part of a circle on the face with a rim", 0.0
+            if circle is not None:
+                seen = circle.coverage
+            return Rejection("pose", reason, seen, least, ellipse)
         if abs(circle.radius_m - s.radius_m) > s.radius_tolerance * s.radius_m:
             limit = s.radius_m * (1.0 + np.sign(circle.radius_m - s.radius_m) * s.radius_tolerance)
             return Rejection("pose", "radius, m", circle.radius_m, float(limit), ellipse)
-        row = circle.ellipse
+        return circle
+
+    def _describe_hole(
+        self,
+        gray: np.ndarray,
+        frame: Frame,
+        masks: Masks,
+        face: FacePlane,
+        circle: RimCircle,
+        both: alignment.StereoPatch | None,
+        ellipse: Ellipse,
+    ) -> HolePose | Rejection:
+        """Return the hole of a rim, or the gate of the appearance that it misses."""
+        s, row = self.settings, circle.ellipse
         # Appearance is measured in the fitted circle: the first ellipse may follow the shade
         # within.
         inside = appearance.measure_interior(gray, frame.depth_m, row, frame.camera_matrix, face)
-        parallax, covered = (
-            alignment.measure_parallax(both, face, frame.depth_m, row, *s.looks.parts)
-            if both
-            else (float("nan"), 0.0)
-        )
+        parallax, covered = float("nan"), 0.0
+        if both is not None:
+            parallax, covered = alignment.measure_parallax(
+                both, face, frame.depth_m, row, *s.looks.parts
+            )
         # Behind an occluder, or in dust, hole and disc look the same.
         undecided = inside.darkness > s.looks.veiled or (
             covered > UNDECIDED and inside.unknown > UNDECIDED
@@ -248,6 +267,8 @@ class PlaneConicEstimator:
         refused = self._check_appearance(inside, parallax, masks, row, ellipse, undecided)
         if refused:
             return refused
+        # A network that marks mouths has decided already; without it the doubt stays.
+        doubt = UNDECIDED_SCORE if undecided and masks.hole_mask is None else 1.0
         return HolePose(
             center_m=circle.center_m,
             axis=face.normal,
@@ -255,8 +276,7 @@ class PlaneConicEstimator:
             cov_m2=compute_center_covariance(face, circle, s.bias_per_m),
             axis_cov_rad2=face.normal_cov_rad2(),
             frame="camera",
-            score=float(ellipse.score)
-            * (UNDECIDED_SCORE if undecided and masks.hole_mask is None else 1.0),
+            score=float(ellipse.score) * doubt,
             t_s=frame.t_s,
         )
 
