@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from actuators.modes.convert import LogReader
+from actuators.recordings.log_reader import LogReader
 from brokk_rl import record
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
