@@ -104,7 +104,8 @@ def test_shares_are_read_and_errors_apart_are_joined_over_travel(machine: Machin
     }
     found = scorecard.read_errors(given, machine)
     assert found["reduced"]["mean"] == pytest.approx(0.75)
-    assert found["apart"] == pytest.approx(0.5)
+    assert found["apart"]["reduced"] == pytest.approx(0.5)
+    assert found["apart"]["before"] == pytest.approx(0.1)
     assert found["rivals"] == {"hold": 0.3}
     assert found["closed"] is None
 
@@ -219,9 +220,12 @@ def test_a_scorecard_skips_missing_folders_and_keeps_finished_cases(
     assert set(found["skipped"]) == {"mini_excavator", "so101"}
     assert "| emps | unknown |" in (data.parent / "card" / "scorecard.md").read_text()
     assert "Known:" in (data.parent / "card" / "scorecard.html").read_text()
-    again = brokk(*words, "resume=card")
+    # the answer stands; knowledge that has changed meanwhile counts
+    again = brokk(*words, "resume=card", "real_machine.emps.known.plausible=[lag]")
     assert again.code == 0, again.err
     assert len(stages.commands) == 1
+    later = json.loads((data.parent / "card" / "scorecard.json").read_text())
+    assert later["cases"] == found["cases"]
 
 
 def test_a_refusal_is_an_abstention_and_a_failure_is_none(
