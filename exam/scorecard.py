@@ -247,7 +247,8 @@ def _format_rivals(errors: Mapping[str, Any]) -> Cell:
         return Cell(MISSING)
     factor, unit = UNITS[errors["unit"]]
     shown = [f"{name} {factor * value:.3g}" for name, value in errors["rivals"].items()]
-    return Cell(", ".join(shown), unit)
+    is_beaten = errors["after"] > errors["rivals"].get("hold", np.inf)
+    return Cell(", ".join(shown), f"{unit}; standing still is better" if is_beaten else unit)
 
 
 def format_markdown(cases: Mapping[str, Mapping[str, Any]]) -> str:

@@ -180,7 +180,9 @@ def _diagnose(work: CaseRun) -> dict[str, Any]:
 def _print_table(results: dict[str, dict[str, Any]], folder: Path) -> None:
     """Print the columns of scores; the files have all columns and the notes."""
     shown = [k for k, name in enumerate(scorecard.COLUMNS) if name in PRINTED]
-    table = Table(*(scorecard.COLUMNS[k] for k in shown), box=None)
+    table = Table(box=None)
+    for k in shown:
+        table.add_column(scorecard.COLUMNS[k], overflow="fold")
     for row in scorecard.build_rows(results):
         cells = []
         for k in shown:
