@@ -15,12 +15,14 @@ from brokk_rl.errors import StorageError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
 from diagnosis import calibration, decision, detection, next_experiment
-from diagnosis.answer import Answer, Estimate, NextExperiment, Outcome, Ranked, Selected, Where
+from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, Where
+from diagnosis.attribution import MIN_RESTORED, EffectAttribution, EffectPart
 from diagnosis.baseline import Baseline
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
+from diagnosis.closure import Estimate, serialize_estimate
 from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
-from diagnosis.effect_library import EffectType
+from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
 from diagnosis.refine import FittedSet
@@ -85,11 +87,9 @@ class DiagnosisPipeline:
             self.base, self.case.machine, paths, fitted and fitted.own, self.generator
         )
         foretold = reach.foretold()
-        selected = [
-            decision.describe_detected_effect(result, one, self.calibration, self.case.machine)
-            for one in found
-        ]
-        selected += self._selected(result, reach) if fitted else []
+        parts = EffectAttribution(result, reach).measure_parts() if fitted or found else {}
+        selected = self._describe_detected(result, found, parts)
+        selected += self._selected(result, parts) if fitted else []
         selected.sort(key=lambda one: -one.probability)
         told = "unknown" if unknown else "effects" if selected else "none"
         after = field.runs(paths) if selected else None
@@ -108,20 +108,38 @@ class DiagnosisPipeline:
                 )
             ),
             where=seen.where(),
-            gap=reach.gap(),
+            gap=reach.gap(named=bool(selected)),
             next_experiment=self._next(result, selected),
             reason=self._reason(told, result, selected, remainder),
             more=seen.more()
             | self._more(result, weighed, foretold)
-            | {"unknown_remainder": remainder}
+            | {"unknown_remainder": remainder, "reference_error": reach.measure_reference()}
             | self._unseen(result, fitted),
         )
         return Outcome(answer, before, after, floor)
 
-    def _selected(self, result: DetectionResult, reach: GapClosure) -> list[Selected]:
+    def _describe_detected(
+        self,
+        result: DetectionResult,
+        found: Sequence[DetectedEffect],
+        parts: Mapping[str, EffectPart],
+    ) -> list[Selected]:
+        """Return the answers about effects that sensors, frames or tool points show.
+
+        Their share of their own statistic is no share of the gap.
+        """
+        selected = []
+        for one in found:
+            answer = decision.describe_detected_effect(
+                result, one, self.calibration, self.case.machine
+            )
+            own = {"own_statistic_explained": one.closed}
+            selected.append(_add_part(answer, parts.get(one.kind.name), own))
+        return selected
+
+    def _selected(self, result: DetectionResult, parts: Mapping[str, EffectPart]) -> list[Selected]:
         kinds = {kind.name: kind for kind in self.kinds}
         chosen = decision.rank_chosen_effects(result, kinds)
-        shares = reach.by_effect(result, [kind.name for kind in chosen])
         assert result.fitted is not None, "what is selected has been simulated"
         found = []
         for kind in chosen:
@@ -135,23 +153,21 @@ class DiagnosisPipeline:
                 (how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)),
                 None,
             )
-            found.append(
-                Selected(
-                    effect=kind.name,
-                    joints=tuple(
-                        name
-                        for name, has in zip(self.case.machine.joint_names, joints, strict=True)
-                        if has
-                    ),
-                    probability=calibration.compute_probability(self.calibration.right, signs),
-                    parameters=decision.estimate_numbers(
-                        result, kind, self.case.machine, self.calibration.form[kind.stage]
-                    ),
-                    gap_closed=shares[kind.name],
-                    same_as=like,
-                    decided_by=decided,
-                )
+            names = [
+                name for name, has in zip(self.case.machine.joint_names, joints, strict=True) if has
+            ]
+            answer = Selected(
+                effect=kind.name,
+                joints=tuple(names),
+                probability=calibration.compute_probability(self.calibration.right, signs),
+                parameters=decision.estimate_numbers(
+                    result, kind, self.case.machine, self.calibration.form[kind.stage]
+                ),
+                gap_closed=None,
+                same_as=like,
+                decided_by=decided,
             )
+            found.append(_add_part(answer, parts.get(kind.name)))
         return sorted(found, key=lambda one: -one.probability)
 
     def _remainder(self, result: DetectionResult, reach: GapClosure) -> dict[str, Any] | None:
@@ -253,7 +269,7 @@ class DiagnosisPipeline:
             },
             "remainder": _describe_remainder(result, names),
             "weighed": weighed,
-            "predicted_closed": foretold and {"mean": foretold.mean, "ci95": list(foretold.ci95)},
+            "predicted_closed": foretold and serialize_estimate(foretold),
         }
 
     def _reason(
@@ -291,12 +307,29 @@ class DiagnosisPipeline:
         known = GapClosure(
             self.base, self.case.machine, field.residuals.base, None, self.generator
         ).gap()
-        known = replace(known, closed=None)
+        known = replace(known, closed=None, closed_reason=f"cannot tell, because {why}")
         answer = Answer(
             verdict="unknown", selected=(), ranking=(Ranked("unknown", (), 1.0),), where=Where({}, (), None), gap=known,
             next_experiment=None, reason=f"cannot tell, because {why}",
         )  # fmt: skip
         return Outcome(answer, runs, None, floor)
+
+
+def _add_part(
+    answer: Selected, part: EffectPart | None, own: Mapping[str, Any] | None = None
+) -> Selected:
+    """Return the answer with the part of its effect; without one free runs do not show it."""
+    if part is None:
+        return replace(answer, gap_closed=None, edit=own)
+    edit = {
+        "reduced": serialize_estimate(part.reduced),
+        "rise_without": serialize_estimate(part.rise),
+        "restored": part.restored,
+        "least": MIN_RESTORED,
+    }
+    return replace(
+        answer, gap_closed=part.closed, identified=part.identified, edit={**edit, **(own or {})}
+    )
 
 
 MAX_RIVALS = 40

@@ -49,10 +49,12 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
         f" An unknown remainder is left on {join_words(left_over['joints'])}." if left_over else ""
     )
     tone: Tone = "good" if closed is not None and closed.ci95[0] > GOOD_CLOSED else "warn"
-    if closed is None:
-        return f"The simulator lacks {names}.{told}{rest}", tone
     it = "it" if len(answer.selected) == 1 else "them"
-    share = f"{100 * closed.mean:.0f} % of the gap (95 %: {_format_percent_range(closed)})"
+    if closed is None or gap is None:
+        fewer = f" Adding {it} removes {_format_share(gap.reduction)} of the error." if gap else ""
+        why = f" No share of the gap is told: {gap.closed_reason}." if gap else ""
+        return f"The simulator lacks {names}.{fewer}{why}{told}{rest}", tone
+    share = f"{_format_share(closed, ' of the gap')}"
     return f"The simulator lacks {names}; adding {it} closes {share}.{told}{rest}", tone
 
 
@@ -141,7 +143,8 @@ def format_estimate(
     if value is None:
         return "–", ""
     low, high = (factor * bound for bound in value.ci95)
-    return f"{factor * value.mean:{style}}", f"{low:{style}} to {high:{style}}"
+    interval = f"{low:{style}} to {high:{style}}" if value.has_interval else "no interval"
+    return f"{factor * value.mean:{style}}", interval + (", at its bound" if value.at_bound else "")
 
 
 def _describe_place(answer: Answer) -> str:
@@ -172,8 +175,11 @@ def describe_regime(regime: str) -> str:
     return phrases.get(regime, regime)
 
 
-def _format_percent_range(value: Estimate) -> str:
-    return f"{100 * value.ci95[0]:.0f} to {100 * value.ci95[1]:.0f} %"
+def _format_share(value: Estimate, of: str = "") -> str:
+    """Return a share in percent, with its interval where there is one."""
+    low, high = (f"{100 * bound:.0f}" for bound in value.ci95)
+    interval = f" (95 %: {low} to {high} %)" if value.has_interval else ""
+    return f"{100 * value.mean:.0f} %{of}{interval}"
 
 
 REPORT_FILE = "report.html"

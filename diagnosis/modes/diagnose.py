@@ -149,11 +149,12 @@ def _print_answer(found: Answer, folder: Path) -> None:
     console = Console()
     table = Table("effect", "joints", "probability", "numbers", "closes", "same as", box=None)
     for one in found.selected:
-        told = [
-            f"{name} {joint} {value.mean:.4g} ({value.ci95[0]:.4g} to {value.ci95[1]:.4g})"
-            for name, values in one.parameters.items()
-            for joint, value in values.items()
-        ]
+        told = []
+        for name, values in one.parameters.items():
+            for joint, value in values.items():
+                told.append(
+                    f"{name} {joint} {' ('.join(report.format_estimate(value, 1.0, '.4g'))})"
+                )
         closes = f"{100 * one.gap_closed.mean:.0f} %" if one.gap_closed else ""
         table.add_row(
             one.effect,
