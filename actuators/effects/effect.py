@@ -126,6 +126,7 @@ class EffectSpec:
         weighed: Whether it asks for the weight on the joints.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
+        alike: Whether a shared effect has about the same size on all joints.
         running: Name of the number that is the time since the machine was started. That number is
             known and not fitted.
     """
@@ -140,6 +141,7 @@ class EffectSpec:
     delays: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
+    alike: ClassVar[bool] = True
     running: ClassVar[str | None] = None
 
     @classmethod

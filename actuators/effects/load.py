@@ -78,7 +78,9 @@ class FlowSharing(EffectSpec):
     joints: Joints
     demand: Value
     side = "joints"
-    numbers: ClassVar = {"demand": EffectNumber("1", none=0.0, typical=0.7, bounds=(0.0, 2.0))}
+    shared = True
+    alike = False  # a boom asks the pump for more than a slewing gear
+    numbers: ClassVar = {"demand": EffectNumber("1", none=0.0, typical=0.7, bounds=(0.0, 4.0))}
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`moved (1 / max(1, sum of demands) - 1)`: all are slowed in proportion."""
