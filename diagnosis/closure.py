@@ -132,3 +132,45 @@ def read_estimate(value: Mapping[str, Any] | None) -> Estimate | None:
         return None
     low, high = value["ci95"] or (value["mean"], value["mean"])
     return Estimate(value["mean"], (low, high), bool(value.get("at_bound")))
+
+
+@dataclass(frozen=True)
+class Gate:
+    """A condition of a verdict.
+
+    Attributes:
+        name: Its name.
+        passed: Whether it holds.
+        value: The number that is judged; `None` where there is none.
+        limit: Its limit.
+        text: The finding in words, and the remedy where it failed.
+    """
+
+    name: str
+    passed: bool
+    value: float | None
+    limit: float | None
+    text: str
+
+
+@dataclass(frozen=True)
+class RivalError:
+    """Error of a rival on the windows of the gap, all joints together and by joint; `None`: not to be had."""
+
+    rmse: float | None
+    joints: Mapping[str, float]
+    reason: str = ""
+
+    def to_json(self, key: str) -> dict[str, Any]:
+        """Return plain JSON data; `key`: name of the error of all joints."""
+        found: dict[str, Any] = {key: self.rmse, "joints": dict(self.joints)}
+        return found | ({"reason": self.reason} if self.reason else {})
+
+
+def read_rivals(given: Mapping[str, Any]) -> dict[str, RivalError]:
+    """Return the rivals of a `diagnosis.json`."""
+    found = {}
+    for name, one in given.items():
+        rmse = next((value for key, value in one.items() if key.startswith("rmse_")), None)
+        found[name] = RivalError(rmse, one.get("joints", {}), one.get("reason", ""))
+    return found
