@@ -21,13 +21,16 @@ from exam.real_cases import KnownCauses
 JSON_FILE = "scorecard.json"
 TABLE_FILE = "scorecard.md"
 REPORT_FILE = "scorecard.html"
+PUBLIC_FIELDS = ("verdict", "reason", "selected", "gap", "rivals", "unseen")
+"""Fields of `diagnosis.json` that a score needs."""
 REFUSED = "refused"
 """Verdict of a diagnosis that refuses the recordings; an abstention."""
 HORIZON_S = 5.0
 """Length of the free runs that `gap` of `diagnosis.json` is about, s."""
 COLUMNS = (
     "machine", "verdict", "first pick", "known, named", "phantoms", "abstention", "closed",
-    "error less by", "apart: less by", "error: before, after, floor", "rivals' error", "seconds",
+    "error less by", "apart: less by", "error: before, after, floor", "rivals' error",
+    "apart: before, after, hold", "seconds (CPU)",
 )  # fmt: skip
 UNITS = {"rad": (1e3, "mrad"), "m": (1e3, "mm"), "travel": (1e2, "% of travel")}
 """Factor and unit of printed errors, by the unit of `gap`."""
@@ -87,11 +90,12 @@ def read_errors(answer: Mapping[str, Any], machine: Machine) -> dict[str, Any]:
 
     Returns:
         `unit`; `before`, `after`, `floor`; `closed` and `reduced` as `{mean, ci95}` or `None`;
-        `apart`: error less by, on recordings apart, all joints together, and `apart_joints`;
-        `rivals`: errors by name, empty where the answer has none.
+        `reduced_joints`; `apart`, on recordings apart: errors `before` and `after` over travel and
+        `reduced`, `None` where the answer has none; `rivals`: errors by name.
     """
     empty = dict.fromkeys(("unit", "before", "after", "floor", "closed", "reduced"))
-    found: dict[str, Any] = {**empty, **_read_apart(answer, machine), "rivals": {}}
+    found: dict[str, Any] = {**empty, "apart": _read_apart(answer, machine), "rivals": {}}
+    found["reduced_joints"] = {}
     gap = answer.get("gap")
     if not gap:
         return found
@@ -101,22 +105,35 @@ def read_errors(answer: Mapping[str, Any], machine: Machine) -> dict[str, Any]:
     found["unit"], found["closed"] = key.removeprefix("rmse_"), gap["closed"]
     reduced = 1.0 - found["after"] / found["before"] if found["before"] else 0.0
     found["reduced"] = gap.get("reduced") or {"mean": reduced, "ci95": None}
+    for name, joint in gap.get("joints", {}).items():
+        found["reduced_joints"][name] = joint["share"]
     for name, error in (answer.get("rivals") or {}).items():
         found["rivals"][name] = error[key]
     return found
 
 
-def _read_apart(answer: Mapping[str, Any], machine: Machine) -> dict[str, Any]:
+def _read_apart(answer: Mapping[str, Any], machine: Machine) -> dict[str, Any] | None:
     unseen = answer.get("unseen")
     if not unseen:
-        return {"apart": None, "apart_joints": {}}
+        return None
     squares = {"before": 0.0, "after": 0.0}
     for name, size in zip(machine.joint_names, machine.upper - machine.lower, strict=True):
         for key in squares:
             squares[key] += float(unseen["joints"][name][key] / size) ** 2
+    found = {key: (value / len(machine.joint_names)) ** 0.5 for key, value in squares.items()}
+    reduced = 1.0 - found["after"] / found["before"] if found["before"] else 0.0
     joints = {name: one["share"] for name, one in unseen["joints"].items()}
-    ratio = (squares["after"] / squares["before"]) ** 0.5 if squares["before"] else 1.0
-    return {"apart": 1.0 - ratio, "apart_joints": joints}
+    return {**found, "reduced": reduced, "joints": joints}
+
+
+def add_hold_errors(
+    errors: dict[str, Any], field: Sequence[Recording], apart: Sequence[Recording], machine: Machine
+) -> None:
+    """Add the error of standing still, as rival `hold` unless the answer has it, and to `apart`."""
+    if errors["unit"] is not None and "hold" not in errors["rivals"]:
+        errors["rivals"]["hold"] = compute_hold_error(field, machine, errors["unit"])
+    if errors["apart"] is not None:
+        errors["apart"]["hold"] = compute_hold_error(apart, machine, "travel")
 
 
 def compute_hold_error(recordings: Sequence[Recording], machine: Machine, unit: str) -> float:
@@ -142,7 +159,7 @@ def build_rows(cases: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]
     for name, case in cases.items():
         if case["outcome"] != "answered":
             blanks: list[str | Cell] = [MISSING] * (len(COLUMNS) - 2)
-            rows.append([name, Cell(case["outcome"], case["reason"]), *blanks])
+            rows.append([name, case["outcome"], *blanks])
             continue
         scores, errors = case["scores"], case["errors"]
         rows.append(
@@ -154,11 +171,12 @@ def build_rows(cases: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]
                 Cell(str(len(scores["phantoms"])), ", ".join(scores["phantoms"])),
                 _format_abstention(scores),
                 _format_share(errors["closed"]),
-                _format_share(errors["reduced"]),
+                _format_reduced(errors),
                 _format_apart(errors),
                 _format_errors([errors[key] for key in ("before", "after", "floor")], errors),
                 _format_rivals(errors),
-                f"{case['seconds']:.0f}",
+                _format_errors_apart(errors),
+                f"{case['seconds']:.0f} ({case['cpu_seconds']:.0f})",
             ]
         )
     return rows
@@ -192,11 +210,28 @@ def _format_share(share: Mapping[str, Any] | None) -> Cell:
     return Cell(f"{share['mean']:.2f}", note)
 
 
-def _format_apart(errors: Mapping[str, Any]) -> Cell:
-    if errors["apart"] is None:
+def _format_reduced(errors: Mapping[str, Any]) -> Cell:
+    if errors["reduced"] is None:
         return Cell(MISSING)
-    joints = ", ".join(f"{name} {share:.2f}" for name, share in errors["apart_joints"].items())
-    return Cell(f"{errors['apart']:.2f}", joints)
+    return Cell(f"{errors['reduced']['mean']:.2f}", _format_joints(errors["reduced_joints"]))
+
+
+def _format_apart(errors: Mapping[str, Any]) -> Cell:
+    apart = errors["apart"]
+    if apart is None:
+        return Cell(MISSING)
+    return Cell(f"{apart['reduced']:.2f}", _format_joints(apart["joints"]))
+
+
+def _format_joints(shares: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
+
+
+def _format_errors_apart(errors: Mapping[str, Any]) -> Cell:
+    apart = errors["apart"]
+    if apart is None:
+        return Cell(MISSING)
+    return _format_errors([apart[key] for key in ("before", "after", "hold")], {"unit": "travel"})
 
 
 def _format_errors(values: Sequence[float | None], errors: Mapping[str, Any]) -> Cell:
@@ -212,7 +247,8 @@ def _format_rivals(errors: Mapping[str, Any]) -> Cell:
         return Cell(MISSING)
     factor, unit = UNITS[errors["unit"]]
     shown = [f"{name} {factor * value:.3g}" for name, value in errors["rivals"].items()]
-    return Cell(", ".join(shown), unit)
+    is_beaten = errors["after"] > errors["rivals"].get("hold", np.inf)
+    return Cell(", ".join(shown), f"{unit}; standing still is better" if is_beaten else unit)
 
 
 def format_markdown(cases: Mapping[str, Mapping[str, Any]]) -> str:
@@ -245,6 +281,9 @@ def write_scorecard(
     """
     write_json(folder / JSON_FILE, {"schema": 1, "cases": dict(cases), "skipped": dict(skipped)})
     left_out = [f"{name} is skipped: {why}" for name, why in skipped.items()]
+    for name, case in cases.items():
+        if case["outcome"] != "answered":
+            left_out.append(f"{name} {case['outcome']}: {case['reason']}")
     write_text(folder / TABLE_FILE, format_markdown(cases) + "".join(f"\n{t}\n" for t in left_out))
     page = Report("Scorecard of the diagnosis on real machines", _summarize_cases(cases))
     for text in left_out:

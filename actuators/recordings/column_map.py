@@ -78,15 +78,42 @@ class CommandColumn:
 
 
 @spec
+class TargetColumn:
+    """A column of target positions whose speed is the command, for a servo that follows targets.
+
+    Attributes:
+        column: Its name in the header.
+        scale: Unit of the recording for one of the log; negative turns the sign.
+        full_speed: Speed of the target at full command, rad/s or m/s; that of the machine's
+            `max_speed`, for a model that integrates commands to give the target.
+    """
+
+    column: str
+    scale: float
+    full_speed: float
+
+    def check(self) -> None:
+        if self.full_speed <= 0 or self.scale == 0:
+            raise ConfigError(
+                f"column '{self.column}': expected full_speed > 0 and a scale other than 0"
+            )
+
+    def command(self, values: np.ndarray, t_s: np.ndarray) -> np.ndarray:
+        """Return the command in force from each sample to the next, 0 at the last; same shape."""
+        speed = np.diff(self.scale * values) / np.diff(t_s)
+        return np.append(speed, 0.0) / self.full_speed
+
+
+@spec
 class JointColumns:
     """The columns of one joint.
 
     Attributes:
-        command: Its command.
+        command: Its command: a column of commands, or the speed of a column of targets.
         position: Its position, to rad or m.
     """
 
-    command: CommandColumn
+    command: CommandColumn | TargetColumn
     position: Column
 
 
@@ -147,7 +174,8 @@ class ColumnMap:
                 f"{where}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
             )
         u = np.stack(
-            [self._commands(table, self.joints[name].command) for name in machine.joint_names], 1
+            [self._commands(table, self.joints[name].command, t_s) for name in machine.joint_names],
+            1,
         )
         q = np.stack([table.numbers(self.joints[name].position) for name in machine.joint_names], 1)
         extra = {name: table.numbers(column, empty=True) for name, column in self.optional.items()}
@@ -179,12 +207,20 @@ class ColumnMap:
             )
         return found
 
-    def _commands(self, table: "_Table | _NumberTable", column: CommandColumn) -> np.ndarray:
-        u = column.command(table.numbers(Column(column=column.column, scale=1.0, offset=0.0)))
+    def _commands(
+        self, table: "_Table | _NumberTable", column: CommandColumn | TargetColumn, t_s: np.ndarray
+    ) -> np.ndarray:
+        values = table.numbers(Column(column=column.column, scale=1.0, offset=0.0))
+        if isinstance(column, TargetColumn):
+            u = column.command(values, t_s)
+            # a gap between pieces is no motion of the target
+            u[:-1][np.diff(t_s) > self.longest_gap_s] = 0.0
+        else:
+            u = column.command(values)
         if (row := _find_first(np.abs(u) > 1.0 + self.overrun)) is not None:
             raise RecordingError(
                 f"{table.where(row, column.column)}: command {u[row]:g} is beyond full by more than {self.overrun:g}; "
-                "mend full_plus, full_minus or neutral of the column map, or the log"
+                "mend full_plus, full_minus, neutral or full_speed of the column map, or the log"
             )
         return u.clip(-1.0, 1.0)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import resource
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from rich.table import Table
 
 from brokk_rl import record
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
+from brokk_rl.record import Recording
 from brokk_rl.report import Cell
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
@@ -22,12 +24,12 @@ from exam.real_cases import DIAGNOSIS_FOLDER, CaseRun, RealCase, RefusalError
 
 log = logging.getLogger(__name__)
 
-RESULT_FILE = "result.json"
-"""Result of a finished case, in its folder."""
+RUN_FILE = "run.json"
+"""Answer, logs and seconds of a finished case, in its folder."""
 PRINTED = {
     "machine": False, "verdict": True, "first pick": True, "known, named": False,
     "phantoms": False, "abstention": True, "closed": False, "apart: less by": False,
-    "seconds": False,
+    "seconds (CPU)": False,
 }  # fmt: skip
 """Columns of the printed table, and whether with their notes."""
 
@@ -96,10 +98,9 @@ class Scorecard:
         results: dict[str, dict[str, Any]] = {}
         begun, num_run = time.monotonic(), 0
         for number, (name, case) in enumerate(todo.items(), 1):
-            kept = _read_result(folder / name)
-            if kept is not None:
+            if _is_answered(folder / name):
                 log.info("%d of %d, %s: done already", number, len(todo), name)
-                results[name] = kept
+                results[name] = _build_result(case, folder / name)
                 continue
             elapsed_s, left = time.monotonic() - begun, len(todo) - number + 1
             about = f", about {elapsed_s / num_run * left / 60:.0f} min left" if num_run else ""
@@ -111,54 +112,77 @@ class Scorecard:
         _print_table(results, self.session.folder)
 
     def _run_case(self, name: str, case: RealCase, data: Path, folder: Path) -> dict[str, Any]:
-        """Return the result of one case; that of an answered case is kept in its folder."""
+        """Run one case; return its result. An answer is kept in the folder of the case."""
         work = CaseRun(case, data, folder, self.scorecard.limit_s)
-        told = {"title": case.title, "known": case.known.source}
         try:
             counts = work.convert_logs()
             log.info("%s: logs %s", name, counts)
             log.info("%s: simulator", name)
             work.fit_simulator()
             log.info("%s: diagnosis", name)
-            begun = time.monotonic()
+            begun, begun_cpu_s = time.monotonic(), _read_cpu_s()
             answer = _diagnose(work)
-            seconds = time.monotonic() - begun
+            seconds, cpu_s = time.monotonic() - begun, _read_cpu_s() - begun_cpu_s
         except BrokkError as error:
             log.warning("%s failed: %s", name, error)
+            told = {"title": case.title, "known": case.known.source}
             return {"outcome": "failed", "reason": str(error), **told}
-        errors = scorecard.read_errors(answer, case.machine)
-        if errors["unit"] is not None and "hold" not in errors["rivals"]:
-            recordings = record.read_recordings(str(folder / "field" / "*.parquet"), case.machine)
-            errors["rivals"]["hold"] = scorecard.compute_hold_error(
-                recordings, case.machine, errors["unit"]
-            )
-        found = {
-            "outcome": "answered", "reason": "", **told, "logs": counts,
-            "scores": scorecard.score_answer(answer, case.known), "errors": errors,
-            "seconds": round(seconds, 1),
-        }  # fmt: skip
-        write_json(folder / RESULT_FILE, found)
-        return found
+        run = {"logs": counts, "seconds": round(seconds, 1), "cpu_seconds": round(cpu_s, 1)}
+        write_json(folder / RUN_FILE, run | {"answer": answer})
+        return _build_result(case, folder)
+
+
+def _is_answered(folder: Path) -> bool:
+    return (folder / RUN_FILE).is_file()
+
+
+def _build_result(case: RealCase, folder: Path) -> dict[str, Any]:
+    """Return the result of an answered case, scored by the knowledge that is configured now."""
+    run = json.loads((folder / RUN_FILE).read_text())
+    answer = run.pop("answer")
+    errors = scorecard.read_errors(answer, case.machine)
+    scorecard.add_hold_errors(
+        errors, _read_part(folder, "field", case), _read_part(folder, "apart", case), case.machine
+    )
+    return {
+        "outcome": "answered",
+        "reason": "",
+        "title": case.title,
+        "known": case.known.source,
+        **run,
+        "scores": scorecard.score_answer(answer, case.known),
+        "errors": errors,
+    }
+
+
+def _read_part(folder: Path, part: str, case: RealCase) -> list[Recording]:
+    if not (folder / part).is_dir():
+        return []
+    return record.read_recordings(str(folder / part / "*.parquet"), case.machine)
+
+
+def _read_cpu_s() -> float:
+    """Return the CPU time of all ended stages, s."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def _diagnose(work: CaseRun) -> dict[str, Any]:
-    """Return the answer to a case; a refusal is one too."""
+    """Return the public fields of the answer to a case; a refusal is an answer too."""
     try:
         work.diagnose_field()
     except RefusalError as error:
         return {"verdict": scorecard.REFUSED, "selected": [], "reason": str(error)}
-    return json.loads((work.folder / DIAGNOSIS_FOLDER / ANSWER_FILE).read_text())
-
-
-def _read_result(folder: Path) -> dict[str, Any] | None:
-    path = folder / RESULT_FILE
-    return json.loads(path.read_text()) if path.is_file() else None
+    found = json.loads((work.folder / DIAGNOSIS_FOLDER / ANSWER_FILE).read_text())
+    return {name: found[name] for name in scorecard.PUBLIC_FIELDS if name in found}
 
 
 def _print_table(results: dict[str, dict[str, Any]], folder: Path) -> None:
     """Print the columns of scores; the files have all columns and the notes."""
     shown = [k for k, name in enumerate(scorecard.COLUMNS) if name in PRINTED]
-    table = Table(*(scorecard.COLUMNS[k] for k in shown), box=None)
+    table = Table(box=None)
+    for k in shown:
+        table.add_column(scorecard.COLUMNS[k], overflow="fold")
     for row in scorecard.build_rows(results):
         cells = []
         for k in shown:

@@ -104,7 +104,8 @@ def test_shares_are_read_and_errors_apart_are_joined_over_travel(machine: Machin
     }
     found = scorecard.read_errors(given, machine)
     assert found["reduced"]["mean"] == pytest.approx(0.75)
-    assert found["apart"] == pytest.approx(0.5)
+    assert found["apart"]["reduced"] == pytest.approx(0.5)
+    assert found["apart"]["before"] == pytest.approx(0.1)
     assert found["rivals"] == {"hold": 0.3}
     assert found["closed"] is None
 
@@ -157,6 +158,20 @@ def test_parquet_logs_become_recordings_and_a_missing_column_is_named(tmp_path: 
     pq.write_table(pa.table(columns), tmp_path / "b.parquet")
     with pytest.raises(RecordingError, match="column 'q_elbow_rad' is missing"):
         reader.read(tmp_path / "b.parquet", machine)
+
+
+def test_the_speed_of_a_target_is_the_command(tmp_path: Path) -> None:
+    machine, reader = option("machine", "so101"), option("import", "so101_speed")
+    t_s = np.arange(0.0, 8.0, 0.02)
+    columns = {"t_state_s": t_s}
+    for joint, speed in zip(machine.joint_names, machine.max_speed, strict=True):
+        # half of full speed up to 4 s, then at rest
+        columns[f"target_{joint}_rad"] = 0.5 * speed * np.minimum(t_s, 4.0)
+        columns[f"q_{joint}_rad"] = columns[f"target_{joint}_rad"]
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    (found,) = reader.read(tmp_path / "a.parquet", machine)
+    np.testing.assert_allclose(found.u[found.t_s < 3.99], 0.5, atol=1e-5)
+    np.testing.assert_allclose(found.u[found.t_s > 4.01], 0.0, atol=1e-5)
 
 
 class Stages:
@@ -216,12 +231,15 @@ def test_a_scorecard_skips_missing_folders_and_keeps_finished_cases(
     found = json.loads((data.parent / "card" / "scorecard.json").read_text())
     assert found["cases"]["emps"]["scores"]["abstention_right"] is True
     assert found["cases"]["emps"]["errors"]["rivals"]["hold"] > 0
-    assert set(found["skipped"]) == {"mini_excavator", "so101"}
+    assert set(found["skipped"]) == {"mini_excavator", "so101", "so101_speed"}
     assert "| emps | unknown |" in (data.parent / "card" / "scorecard.md").read_text()
     assert "Known:" in (data.parent / "card" / "scorecard.html").read_text()
-    again = brokk(*words, "resume=card")
+    # the answer stands; knowledge that has changed meanwhile counts
+    again = brokk(*words, "resume=card", "real_machine.emps.known.plausible=[lag]")
     assert again.code == 0, again.err
     assert len(stages.commands) == 1
+    later = json.loads((data.parent / "card" / "scorecard.json").read_text())
+    assert later["cases"] == found["cases"]
 
 
 def test_a_refusal_is_an_abstention_and_a_failure_is_none(
