@@ -59,6 +59,11 @@ MIN_REDUCED = 0.02
 effects act on: simulators of valves differ by as much from day to day."""
 
 
+MIN_FREEZE_S = 2.0
+"""Mean duration of equal samples from which a sensor has frozen. A coarse sensor stays at each of its
+steps for shorter (effect `quantisation`): at 10 % of full speed it passes 20 mrad within a second."""
+
+
 @dataclass(frozen=True)
 class RemarkedShare:
     """The joint on which a finding lasts longest, as a share of the field's time."""
@@ -76,7 +81,10 @@ def judge_recordings(
     """Return the gates of the recordings: findings that make any cause untellable."""
     gates = []
     for name, limit in MAX_REMARK_SHARES.items():
-        worst = _find_worst_joint(name, remarks, field)
+        counted = [one for one in remarks if one.name == name]
+        if name == "frozen sensor":
+            counted = [one for one in counted if _measure_stretch_s(one, field) >= MIN_FREEZE_S]
+        worst = _find_worst_joint(counted, field)
         text = (
             f"'{name}' on {worst.joint} in {100 * worst.share:.0f} % of the time; {TEXTS[name][2]}"
         )
@@ -88,17 +96,22 @@ def judge_recordings(
     return [*gates, _judge_limits(reference or field, machine)]
 
 
+def _measure_stretch_s(remark: RecordingRemark, field: Sequence[Recording]) -> float:
+    """Return the mean duration of the stretches of a remark, s."""
+    durations = {name_recording(recording): recording.duration_s for recording in field}
+    return remark.share * durations.get(remark.recording, 0.0) / max(1, remark.count)
+
+
 def _find_worst_joint(
-    name: str, remarks: Sequence[RecordingRemark], field: Sequence[Recording]
+    remarks: Sequence[RecordingRemark], field: Sequence[Recording]
 ) -> RemarkedShare:
     total_s = sum(recording.duration_s for recording in field)
     duration_s = {name_recording(recording): recording.duration_s for recording in field}
     by_joint: dict[str, float] = {}
     for remark in remarks:
-        if remark.name == name:
-            joint = remark.joint or "all joints"
-            seconds = remark.share * duration_s.get(remark.recording, 0.0)
-            by_joint[joint] = by_joint.get(joint, 0.0) + seconds / max(total_s, 1e-9)
+        joint = remark.joint or "all joints"
+        seconds = remark.share * duration_s.get(remark.recording, 0.0)
+        by_joint[joint] = by_joint.get(joint, 0.0) + seconds / max(total_s, 1e-9)
     if not by_joint:
         return RemarkedShare(0.0, "")
     joint = max(by_joint, key=by_joint.__getitem__)
@@ -225,7 +238,7 @@ def list_failures(gates: Sequence[Gate]) -> str:
     return "; ".join(gate.text for gate in gates if not gate.passed)
 
 
-def demote(ranking: Sequence[Ranked]) -> tuple[Ranked, ...]:
+def demote_ranking(ranking: Sequence[Ranked]) -> tuple[Ranked, ...]:
     """Return the ranking with `unknown` at its top: it takes the probability of the verdict that failed."""
     unknown = max([one.probability for one in ranking], default=1.0)
     rows = [Ranked("unknown", (), unknown)]

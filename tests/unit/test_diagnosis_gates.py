@@ -65,6 +65,14 @@ def test_findings_beyond_their_share_forbid_any_telling(
     assert not by_name(gates.judge_recordings(more, [*field, calm], [], machine))[gate.name].passed
 
 
+def test_a_coarse_sensor_is_not_frozen(machine: Machine) -> None:
+    field = [recording(machine)]  # 240 s: 80 % in 95 stretches are 2.02 s each
+    for count, passes in ((95, False), (97, True)):
+        frozen = replace(remark("frozen sensor", "q3", 0.8), count=count)
+        found = by_name(gates.judge_recordings([frozen], field, [], machine))
+        assert found["frozen_sensor"].passed is passes
+
+
 def test_limits_that_the_recordings_leave_are_told(machine: Machine) -> None:
     plain = recording(machine)
     travel = machine.upper - machine.lower
@@ -225,7 +233,7 @@ def test_a_repaired_simulator_worse_than_standing_still_is_not_named(machine: Ma
 
 def test_a_verdict_that_fails_gives_its_probability_to_unknown() -> None:
     rows = (Ranked("none", (), 0.9), Ranked("lag", ("q1",), 0.3), Ranked("unknown", (), 0.05))
-    found = gates.demote(rows)
+    found = gates.demote_ranking(rows)
     assert [(one.effect, pytest.approx(one.probability)) for one in found] == [
         ("unknown", 0.9), ("none", 0.1), ("lag", 0.1)
     ]  # fmt: skip
@@ -237,7 +245,7 @@ def findings(machine: Machine, before: float, after: float | None, detected: int
     draw = 1.0 + 0.05 * np.random.default_rng(3).standard_normal((40, 1, 1))
     fitted = None if after is None else SimpleNamespace(after=seen.after * draw, own=seen.after)
     result = verdict.DetectionResult(
-        residuals=SimpleNamespace(base=seen.base.field.residuals.base, mean=None), tables=[], rays={},
+        residuals=SimpleNamespace(base=seen.base.field.residuals.base, mean=None), tables=[], rays={},  # pyright: ignore[reportArgumentType]
         price=lambda j, subset: 0.0, chosen=EffectSet((frozenset({"lag"}),) * 5, 1.0), fitted=fitted,  # pyright: ignore[reportArgumentType]
         detected=[SimpleNamespace()] * detected, clue_gains=np.zeros(1), reference_clue_gains=np.zeros(1),  # pyright: ignore[reportArgumentType]
         scatter=np.zeros(1), strays=np.zeros(1), tool_left=0.0,
