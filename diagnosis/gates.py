@@ -59,9 +59,9 @@ MIN_REDUCED = 0.02
 effects act on: simulators of valves differ by as much from day to day."""
 
 
-MIN_FREEZE_S = 2.0
-"""Mean duration of equal samples from which a sensor has frozen. A coarse sensor stays at each of its
-steps for shorter (effect `quantisation`): at 10 % of full speed it passes 20 mrad within a second."""
+MAX_LEVELS = 200
+"""Distinct positions in the field up to which a sensor is coarse: it stays at its steps, and equal
+samples are no freeze (effect `quantisation`). A 12-bit encoder visits a thousand or more."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,8 @@ def judge_recordings(
     for name, limit in MAX_REMARK_SHARES.items():
         counted = [one for one in remarks if one.name == name]
         if name == "frozen sensor":
-            counted = [one for one in counted if _measure_stretch_s(one, field) >= MIN_FREEZE_S]
+            coarse = find_coarse_sensors(field, machine)
+            counted = [one for one in counted if one.joint not in coarse]
         worst = _find_worst_joint(counted, field)
         text = (
             f"'{name}' on {worst.joint} in {100 * worst.share:.0f} % of the time; {TEXTS[name][2]}"
@@ -96,10 +97,14 @@ def judge_recordings(
     return [*gates, _judge_limits(reference or field, machine)]
 
 
-def _measure_stretch_s(remark: RecordingRemark, field: Sequence[Recording]) -> float:
-    """Return the mean duration of the stretches of a remark, s."""
-    durations = {name_recording(recording): recording.duration_s for recording in field}
-    return remark.share * durations.get(remark.recording, 0.0) / max(1, remark.count)
+def find_coarse_sensors(recordings: Sequence[Recording], machine: Machine) -> set[str]:
+    """Return the joints whose sensors show few distinct positions."""
+    q = np.concatenate([recording.q for recording in recordings])
+    found = set()
+    for name, column in zip(machine.joint_names, q.T, strict=True):
+        if len(np.unique(column)) <= MAX_LEVELS:
+            found.add(name)
+    return found
 
 
 def _find_worst_joint(
@@ -238,7 +243,7 @@ def list_failures(gates: Sequence[Gate]) -> str:
     return "; ".join(gate.text for gate in gates if not gate.passed)
 
 
-def demote_ranking(ranking: Sequence[Ranked]) -> tuple[Ranked, ...]:
+def rank_unknown_first(ranking: Sequence[Ranked]) -> tuple[Ranked, ...]:
     """Return the ranking with `unknown` at its top: it takes the probability of the verdict that failed."""
     unknown = max([one.probability for one in ranking], default=1.0)
     rows = [Ranked("unknown", (), unknown)]

@@ -109,7 +109,7 @@ class DiagnosisPipeline:
             result, selected, self.penalties, self.calibration, machine, chance
         )
         if seen.verdict == "unknown" and seen.failed:
-            ranking = gates.demote_ranking(ranking)
+            ranking = gates.rank_unknown_first(ranking)
         answer = Answer(
             verdict=seen.verdict,
             selected=tuple(selected),

@@ -66,10 +66,14 @@ def test_findings_beyond_their_share_forbid_any_telling(
 
 
 def test_a_coarse_sensor_is_not_frozen(machine: Machine) -> None:
-    field = [recording(machine)]  # 240 s: 80 % in 95 stretches are 2.02 s each
-    for count, passes in ((95, False), (97, True)):
-        frozen = replace(remark("frozen sensor", "q3", 0.8), count=count)
-        found = by_name(gates.judge_recordings([frozen], field, [], machine))
+    fine = recording(machine)
+    for levels, passes in ((200, True), (201, False)):
+        q = fine.q.copy()
+        q[:, 2] = np.arange(len(q)) % levels / levels
+        field = [replace(fine, q=q)]
+        assert ("q3" in gates.find_coarse_sensors(field, machine)) is passes
+        frozen = [remark("frozen sensor", "q3", 0.8)]
+        found = by_name(gates.judge_recordings(frozen, field, [], machine))
         assert found["frozen_sensor"].passed is passes
 
 
@@ -233,7 +237,7 @@ def test_a_repaired_simulator_worse_than_standing_still_is_not_named(machine: Ma
 
 def test_a_verdict_that_fails_gives_its_probability_to_unknown() -> None:
     rows = (Ranked("none", (), 0.9), Ranked("lag", ("q1",), 0.3), Ranked("unknown", (), 0.05))
-    found = gates.demote_ranking(rows)
+    found = gates.rank_unknown_first(rows)
     assert [(one.effect, pytest.approx(one.probability)) for one in found] == [
         ("unknown", 0.9), ("none", 0.1), ("lag", 0.1)
     ]  # fmt: skip
