@@ -107,6 +107,7 @@ def read_gap(given: Mapping[str, Any]) -> Gap:
     """Return the gap of a `diagnosis.json`; earlier ones have no `reduced`."""
     key = next(iter(given["before"]))
     before, after, floor = (given[name][key] for name in ("before", "after", "floor"))
+    reduced = read_estimate(given.get("reduced"))
     return Gap(
         before,
         after,
@@ -115,7 +116,7 @@ def read_gap(given: Mapping[str, Any]) -> Gap:
         key.removeprefix("rmse_"),
         given.get("floor_of", "reference"),
         {name: JointClosed(**one) for name, one in given.get("joints", {}).items()},
-        read_estimate(given.get("reduced")),
+        reduced if reduced and reduced.has_interval else None,
         given.get("closed_reason") or "",
     )
 
