@@ -21,7 +21,7 @@ import yaml
 from actuators.identify.boosting_fit import import_ensemble, tabulate_trees
 from actuators.identify.valve_fit import ValveFit
 from actuators.models import checkpoint
-from actuators.models.hybrid import HybridActuator, ResidualInputs, compute_residual
+from actuators.models.hybrid import MOVING, HybridActuator, ResidualInputs, compute_residual
 from actuators.models.trees import TENSORS
 from actuators.models.valve import ValveActuator
 from brokk_rl import open_loop
@@ -45,8 +45,10 @@ VALIDATION_S = 5.0
 VALIDATION_STRIDE_S = 2.0
 """Distance between them, s. Chosen by hand; not searched."""
 SPREAD_LIMIT = 3.0
-"""Spread at which half the residual is left, over its root mean square in training. Chosen by hand;
-not searched."""
+"""Spread at which half the residual is left, over its root mean square in training while a joint
+moves. Chosen by hand; not searched."""
+PIECE = 600
+"""Samples of a recording that run in one piece: shorter ones spend their time in lead-ins."""
 CPU = torch.device("cpu")
 
 
@@ -204,7 +206,10 @@ class HybridFit:
         tensors["low"], tensors["high"] = inputs.amin(1), inputs.amax(1)
         tensors["limit"], tensors["share"] = torch.ones(joints), torch.ones(joints)
         _, spread = compute_residual(inputs, torch.as_tensor(rows.step), tensors)
-        tensors["limit"] = SPREAD_LIMIT * spread.square().mean(0).sqrt().clamp(min=1e-6)
+        # joints at rest agree anyway and would hide the typical spread
+        moves = (torch.as_tensor(rows.step).abs() > MOVING).float()
+        typical = ((spread.square() * moves).sum(0) / moves.sum(0).clamp(min=1.0)).sqrt()
+        tensors["limit"] = SPREAD_LIMIT * typical.clamp(min=1e-6)
         return tensors
 
 
@@ -264,16 +269,26 @@ def stack_residuals(
 def _run_curve(
     curve: ValveActuator, machine: Machine, recordings: Sequence[Recording]
 ) -> list[np.ndarray]:
-    """Return the steps of the curve at recorded commands and positions, each `(T, J)`."""
-    longest, count = max(recording.num_samples for recording in recordings), len(recordings)
+    """Return the steps of the curve at recorded commands and positions, each `(T, J)`.
+
+    Recordings run in pieces side by side; a piece begins early by what precedes a free run.
+    """
+    lead, size = open_loop.count_samples_before(machine), machine.num_history
+    pieces, leads = [], []
+    for recording in recordings:
+        for start in range(0, recording.num_samples, PIECE):
+            rows = slice(max(0, start - lead), start + PIECE)
+            pieces.append([torch.as_tensor(part[rows]) for part in (recording.u, recording.q)])
+            leads.append(start - rows.start)
+    count, longest = len(pieces), lead + PIECE
     u, q = (torch.zeros(count, longest, machine.num_joints) for _ in range(2))
-    for n, recording in enumerate(recordings):
-        u[n, : recording.num_samples] = torch.as_tensor(recording.u)
-        q[n] = torch.as_tensor(recording.q[-1])
-        q[n, : recording.num_samples] = torch.as_tensor(recording.q)
+    for n, (commands, positions) in enumerate(pieces):
+        u[n, : len(commands)] = commands
+        q[n] = positions[-1]
+        q[n, : len(positions)] = positions
     model = curve.build(machine, count, CPU)
     model.reset(torch.ones(count, dtype=torch.bool))
-    size, steps = machine.num_history, []
+    steps = []
     history = History(q=q[:, :1].repeat(1, size, 1), u=u[:, :1].repeat(1, size, 1))
     with torch.inference_mode():
         for k in range(longest):
@@ -283,7 +298,14 @@ def _run_curve(
             model.step(history)
             steps.append(model.state["step"].clone())
     moved = torch.stack(steps, 1).double().numpy()
-    return [moved[n, : recording.num_samples] for n, recording in enumerate(recordings)]
+    found, n = [], 0
+    for recording in recordings:
+        parts = []
+        for _ in range(0, recording.num_samples, PIECE):
+            parts.append(moved[n, leads[n] : len(pieces[n][0])])
+            n += 1
+        found.append(np.concatenate(parts))
+    return found
 
 
 def select_unlike(recordings: Sequence[Recording], machine: Machine) -> list[Recording]:
