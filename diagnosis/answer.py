@@ -22,66 +22,17 @@ from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
+from diagnosis.closure import (
+    Estimate,
+    Gap,
+    Gate,
+    RivalError,
+    read_estimate,
+    read_gap,
+    read_rivals,
+    serialize_estimate,
+)
 from diagnosis.free_runs import WindowedRuns
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """A number with its 95 % interval."""
-
-    mean: float
-    ci95: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class JointClosed:
-    """Error of one joint over free runs of 5 s, in rad or m, and the closed share of its gap.
-
-    Attributes:
-        before: Of the simulator as it was.
-        after: With the selected effects.
-        floor: `None` without any.
-        share: `1 - after / before`.
-        closed: `(before - after) / (before - floor)`; `None` without a floor below `before`.
-    """
-
-    before: float
-    after: float
-    floor: float | None
-    share: float
-    closed: float | None
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Error of all joints over free runs of 5 s on parts of the field that no effect was fitted to.
-
-    Attributes:
-        before: Of the simulator as it was.
-        after: With the selected effects.
-        floor: The error without any effect: that of the simulator on left-out reference
-            recordings; without a reference that of a flexible model on field recordings that it was
-            not fitted to; `None` where neither is known.
-        closed: `(before - after) / (before - floor)`; `None` where there is no gap to close.
-        unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
-            over their travel.
-        floor_of: `reference`, `flexible model`, or empty.
-        joints: The same joint by joint.
-    """
-
-    before: float
-    after: float
-    floor: float | None
-    closed: Estimate | None
-    unit: str = "rad"
-    floor_of: str = "reference"
-    joints: Mapping[str, JointClosed] = field(default_factory=dict)
-
-    @property
-    def key(self) -> str:
-        """Name of the errors in `diagnosis.json`."""
-        return f"rmse_{self.unit}"
-
 
 SCHEMA = 1
 ANSWER_FILE = "diagnosis.json"
@@ -101,9 +52,12 @@ class Selected:
         parameters: By name and joint (`machine` for a number that joints do not have), in the unit
             that the name says.
         gap_closed: Share of the gap that it closes: its Shapley value in the set of all that are
-            selected.
+            selected; they add up to `closed`. `None` for an effect that free runs do not show.
         same_as: Effects that these recordings cannot tell from it.
         decided_by: The measurement that would tell it from those of `same_as`.
+        identified: Its removal from the repaired simulator restores the error; `None` where free
+            runs do not show it.
+        edit: The numbers of that test, plain JSON.
     """
 
     effect: str
@@ -113,6 +67,8 @@ class Selected:
     gap_closed: Estimate | None
     same_as: tuple[str, ...] = ()
     decided_by: str | None = None
+    identified: bool | None = None
+    edit: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -180,6 +136,8 @@ class Answer:
         where: Where the gap lies.
         gap: Its size, and the remainder.
         next_experiment: `None` where nothing is left to tell apart.
+        rivals: Errors of simple rivals on the windows of the gap, by name.
+        gates: Conditions of the verdict.
         reason: One sentence in words.
         more: Further plain JSON: `sanity`, `horizons`, `evidence`, `remainder`, …
     """
@@ -190,6 +148,8 @@ class Answer:
     where: Where
     gap: Gap | None
     next_experiment: NextExperiment | None
+    rivals: Mapping[str, RivalError] = field(default_factory=dict)
+    gates: tuple[Gate, ...] = ()
     reason: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
 
@@ -207,15 +167,7 @@ class Answer:
             "regimes": [dataclasses.asdict(regime) for regime in self.where.regimes],
             "stage": self.where.stage,
         }
-        gap = self.gap and {
-            **{
-                name: {self.gap.key: getattr(self.gap, name)}
-                for name in ("before", "after", "floor")
-            },
-            "closed": None if self.gap.closed is None else _serialize_estimate(self.gap.closed),
-            "floor_of": self.gap.floor_of,
-            "joints": {name: dataclasses.asdict(one) for name, one in self.gap.joints.items()},
-        }
+        gap, key = self.gap and self.gap.to_json(), self.gap.key if self.gap else "rmse_rad"
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
@@ -224,6 +176,8 @@ class Answer:
             "ranking": [_serialize_tuples(dataclasses.asdict(one)) for one in self.ranking],
             "where": where,
             "gap": gap,
+            "rivals": {name: one.to_json(key) for name, one in self.rivals.items()},
+            "gates": [dataclasses.asdict(one) for one in self.gates],
             "next_experiment": None
             if self.next_experiment is None
             else _serialize_tuples(dataclasses.asdict(self.next_experiment)),
@@ -277,7 +231,7 @@ def _parse_answer(found: dict[str, Any]) -> Answer:
         found["where"]["stage"],
         units,
     )
-    gap = _read_gap(found["gap"]) if found["gap"] else None
+    gap = read_gap(found["gap"]) if found["gap"] else None
     following = found.get("next_experiment")
     known = {"schema", *(one.name for one in dataclasses.fields(Answer))}
     return Answer(
@@ -289,6 +243,8 @@ def _parse_answer(found: dict[str, Any]) -> Answer:
         ),
         where=where,
         gap=gap,
+        rivals=read_rivals(found.get("rivals", {})),
+        gates=tuple(Gate(**one) for one in found.get("gates", ())),
         next_experiment=following
         and NextExperiment(
             following["excitation"], tuple(following["separates"]), following.get("why", "")
@@ -298,34 +254,20 @@ def _parse_answer(found: dict[str, Any]) -> Answer:
     )
 
 
-def _read_gap(given: dict[str, Any]) -> Gap:
-    key = next(iter(given["before"]))
-    before, after, floor = (given[name][key] for name in ("before", "after", "floor"))
-    joints = {name: JointClosed(**one) for name, one in given.get("joints", {}).items()}
-    floor_of = given.get("floor_of", "reference")
-    return Gap(
-        before,
-        after,
-        floor,
-        _read_estimate(given["closed"]),
-        key.removeprefix("rmse_"),
-        floor_of,
-        joints,
-    )
-
-
 def _serialize_selected(one: Selected) -> dict[str, Any]:
     return {
         "effect": one.effect,
         "joints": list(one.joints),
         "probability": one.probability,
         "parameters": {
-            name: {joint: _serialize_estimate(value) for joint, value in values.items()}
+            name: {joint: serialize_estimate(value) for joint, value in values.items()}
             for name, values in one.parameters.items()
         },
-        "gap_closed": None if one.gap_closed is None else _serialize_estimate(one.gap_closed),
+        "gap_closed": None if one.gap_closed is None else serialize_estimate(one.gap_closed),
         "same_as": list(one.same_as),
         "decided_by": one.decided_by,
+        "identified": one.identified,
+        "edit": one.edit,
     }
 
 
@@ -334,25 +276,23 @@ def _read_selected(one: dict[str, Any]) -> Selected:
         effect=one["effect"],
         joints=tuple(one["joints"]),
         probability=one["probability"],
-        parameters={
-            name: {
-                joint: Estimate(value["mean"], tuple(value["ci95"]))
-                for joint, value in values.items()
-            }
-            for name, values in one["parameters"].items()
-        },
-        gap_closed=_read_estimate(one["gap_closed"]),
+        parameters=_read_parameters(one["parameters"]),
+        gap_closed=read_estimate(one["gap_closed"]),
         same_as=tuple(one["same_as"]),
         decided_by=one.get("decided_by"),
+        identified=one.get("identified"),
+        edit=one.get("edit"),
     )
 
 
-def _serialize_estimate(value: Estimate) -> dict[str, Any]:
-    return {"mean": value.mean, "ci95": list(value.ci95)}
-
-
-def _read_estimate(value: dict[str, Any] | None) -> Estimate | None:
-    return None if value is None else Estimate(value["mean"], tuple(value["ci95"]))
+def _read_parameters(given: Mapping[str, Any]) -> dict[str, dict[str, Estimate]]:
+    found: dict[str, dict[str, Estimate]] = {}
+    for name, values in given.items():
+        found[name] = {}
+        for joint, value in values.items():
+            if (estimate := read_estimate(value)) is not None:
+                found[name][joint] = estimate
+    return found
 
 
 def _serialize_tuples(fields: dict[str, Any]) -> dict[str, Any]:

@@ -1,7 +1,8 @@
 """The gap: errors of free runs before and after the repair, the floor, and the share that is closed.
 
 All errors are those of free runs on parts of the recordings that the sizes were not fitted to; only
-the predicted share comes from the parts that they were fitted to.
+the predicted share comes from the parts that they were fitted to. The floor is that of the
+unchanged machine under the field's own motion: see `motion_floor`.
 Axes: `W` windows, `K` steps, `J` joints, `B` draws of the bootstrap.
 """
 
@@ -19,17 +20,30 @@ import numpy as np
 from brokk_rl import open_loop
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis.answer import Estimate, Gap, JointClosed
+from diagnosis import motion_floor
 from diagnosis.baseline import Baseline
+from diagnosis.bootstrap import draw_weights, summarise_draws
 from diagnosis.case import HORIZON_S, estimate_running_s
+from diagnosis.closure import Estimate, Gap, JointClosed
 from diagnosis.detection import DetectionResult
-from diagnosis.refine import simulate_refit, simulate_sizes
+from diagnosis.motion_floor import LeftOutErrors, collect_left_out
+from diagnosis.refine import simulate_sizes
+from diagnosis.residuals import to_increments
 
-NUM_DRAWS = 1000
-BLOCK_WINDOWS = 4
-"""Windows in a row that are drawn together: poses and oil change slowly."""
-MIN_GAP_RATIO = 1.1
-"""Error over floor below which there is no gap whose share could be told."""
+MIN_GAP_RATIO = 1.02
+"""Error over floor from which there is a gap whose share is told. Its interval shows how surely:
+the limit only keeps the denominator off 0. Chosen by hand; not searched."""
+MIN_EXCESS_RATIO = 1.25
+"""So many times the floor is more than what the simulator errs by anyway, where it exceeds the
+floor for sure."""
+MIN_CHANGE = 0.01
+"""Change of free runs, over their error, from which an effect acts on a joint. Runs in batches of
+another size differ by rounding of single precision, about a thousandth of that."""
+NO_FLOOR = "there is no reference, and too little field for a flexible model: no floor is known"
+NO_MOTION = (
+    "the named effects act on sensors or on the tool: free runs of the joints do not show them"
+)
+"""Reasons why no share of the gap can be told."""
 
 
 def choose_unit(machine: Machine) -> str:
@@ -38,63 +52,15 @@ def choose_unit(machine: Machine) -> str:
     return units.pop() if len(units) == 1 else "travel"
 
 
-def compute_squares(paths: np.ndarray, measured: np.ndarray, machine: Machine) -> np.ndarray:
-    """Return the mean square error of each window, all joints together, `(W,)`, in the square of `choose_unit`."""
+def compute_joint_squares(paths: np.ndarray, measured: np.ndarray) -> np.ndarray:
+    """Return the mean square error of each window and joint, `(W, J)`, in rad² or m²."""
+    return np.square(paths - measured).mean(1)
+
+
+def combine_joints(squares: np.ndarray, machine: Machine) -> np.ndarray:
+    """Return the root mean square over joints, `(…,)`, of mean squares `(…, J)`, in the unit of `choose_unit`."""
     size = machine.upper - machine.lower if choose_unit(machine) == "travel" else 1.0
-    return np.square((paths - measured) / size).mean((1, 2))
-
-
-def draw_windows(
-    field: int, floor: int, generator: np.random.Generator
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return windows of field and floor in bootstraps over blocks, as many as each has."""
-    return [
-        (_draw_blocks(field, generator), _draw_blocks(floor, generator)) for _ in range(NUM_DRAWS)
-    ]
-
-
-def compute_shares(
-    before: np.ndarray,
-    after: np.ndarray,
-    floor: np.ndarray,
-    drawn: Sequence[tuple[np.ndarray, np.ndarray]],
-) -> np.ndarray:
-    """Return the share of the gap that is closed, then the same of each draw, `(1 + B,)`."""
-    found = [_compute_share(compute_rmse(before), compute_rmse(after), compute_rmse(floor))]
-    # Before and after share the windows of a draw: hard windows are hard for both.
-    for f, g in drawn:
-        errors = (compute_rmse(before[f]), compute_rmse(after[f]), compute_rmse(floor[g]))
-        found.append(_compute_share(*errors))
-    return np.array(found)
-
-
-def summarise_draws(values: np.ndarray) -> Estimate:
-    """Return the first of values `(1 + B,)` with the 95 % interval of the others."""
-    low, high = np.nanquantile(values[1:], [0.025, 0.975])
-    return Estimate(float(values[0]), (float(min(low, values[0])), float(max(high, values[0]))))
-
-
-def compute_rmse(square: np.ndarray) -> float:
-    """Return the root of the mean over windows."""
-    return float(np.sqrt(square.mean()))
-
-
-def estimate_closed(
-    before: np.ndarray, after: np.ndarray, floor: np.ndarray, generator: np.random.Generator
-) -> Estimate | None:
-    """Return the share of the gap that is closed, with the interval of a bootstrap over blocks of windows.
-
-    Args:
-        before: Mean square errors of field windows, `(W,)`.
-        after: The same after repair.
-        floor: Of reference windows.
-        generator: Draws the blocks.
-    """
-    if compute_rmse(before) < MIN_GAP_RATIO * compute_rmse(floor):
-        return None
-    return summarise_draws(
-        compute_shares(before, after, floor, draw_windows(len(before), len(floor), generator))
-    )
+    return np.sqrt((squares / np.square(size)).mean(-1))
 
 
 def compute_shapley(
@@ -114,30 +80,12 @@ def compute_shapley(
     return found
 
 
-def _compute_share(before: float, after: float, floor: float) -> float:
-    # No repair is better than the floor: where it is, the floor comes from harder recordings.
-    floor = min(floor, after)
-    return float((before - after) / max(before - floor, 0.02 * before + 1e-12))
-
-
-def _draw_blocks(count: int, generator: np.random.Generator) -> np.ndarray:
-    starts = generator.integers(
-        0, max(1, count - BLOCK_WINDOWS + 1), size=-(-count // BLOCK_WINDOWS)
-    )
-    return np.concatenate([np.arange(start, min(start + BLOCK_WINDOWS, count)) for start in starts])
-
-
-MIN_EXCESS_RATIO = 1.25
-"""So many times the floor is more than what the simulator errs by anyway, where it exceeds the
-floor for sure."""
-
-
 @dataclass(frozen=True, eq=False)
 class GapClosure:
     """Errors before, after and at the floor.
 
     Attributes:
-        base: The simulator and its floor.
+        base: The simulator and its errors on the reference.
         machine: The machine.
         after: Free runs with the effects, `(W, K, J)`; those without where none was found.
         own: The same with sizes fitted to the window's own half; `None` where none were fitted.
@@ -151,115 +99,138 @@ class GapClosure:
     generator: np.random.Generator
 
     @cached_property
+    def weights(self) -> np.ndarray:
+        """Draws of windows, the same for all shares, `(1 + B, W)`: hard windows are hard before and after."""
+        return draw_weights(len(self._measured), self.generator)
+
+    @cached_property
     def before(self) -> np.ndarray:
-        """Mean square errors of the simulator as it was, `(W,)`."""
-        residuals = self.base.field.residuals
-        return compute_squares(residuals.base, self._measured, self.machine)
+        """Error of the simulator as it was, in each draw, `(1 + B,)`."""
+        return self.errors(self.base.field.residuals.base)
+
+    @cached_property
+    def left_out(self) -> LeftOutErrors | None:
+        """Errors on the reference, outside of the fit; `None` without any."""
+        parts = [one.residuals for one in self.base.left_out]
+        return collect_left_out(parts) if parts else None
+
+    @cached_property
+    def joint_floor(self) -> np.ndarray | None:
+        """Mean squares at the floor in each draw, `(1 + B, J)`; `None` where it is unknown."""
+        known, residuals = self.left_out, self.base.field.residuals
+        if known is None or residuals.noise is None:
+            return None
+        if self.base.is_flexible:
+            # These windows are of the field itself: their motion is the field's own.
+            return draw_weights(len(known.actual), self.generator) @ known.actual
+        increments = to_increments(self.after, residuals.start)
+        return motion_floor.draw_floor(
+            known, residuals.noise, increments, self.weights, self.generator
+        )
 
     @cached_property
     def floor(self) -> np.ndarray | None:
-        """Mean square errors at the floor, by window; `None` where it is unknown."""
-        if not self.base.left_out:
-            return None
-        squares = []
-        for one in self.base.left_out:
-            measured = one.residuals.simulator.cut.measured
-            squares.append(compute_squares(one.residuals.base, measured, self.machine))
-        return np.concatenate(squares)
-
-    @cached_property
-    def draws(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Windows of each bootstrap, the same for all shares."""
-        return draw_windows(len(self.before), len(self._floor), self.generator)
+        """Error at the floor in each draw, `(1 + B,)`; `None` where it is unknown."""
+        return None if self.joint_floor is None else combine_joints(self.joint_floor, self.machine)
 
     @property
     def _measured(self) -> np.ndarray:
         return self.base.field.residuals.simulator.cut.measured
 
-    @property
-    def _floor(self) -> np.ndarray:
-        """The floor, or 0 where it is unknown."""
-        return np.zeros(1) if self.floor is None else self.floor
+    def joint_squares(self, paths: np.ndarray) -> np.ndarray:
+        """Return mean squares of free runs in each draw, `(1 + B, J)`."""
+        return self.weights @ compute_joint_squares(paths, self._measured)
 
-    def shares(self, paths: np.ndarray) -> np.ndarray:
-        """Return the share of the gap that free runs close, then the same of each draw, `(1 + B,)`."""
-        return compute_shares(
-            self.before,
-            compute_squares(paths, self._measured, self.machine),
-            self._floor,
-            self.draws,
-        )
+    def errors(self, paths: np.ndarray) -> np.ndarray:
+        """Return the error of free runs in each draw, all joints together, `(1 + B,)`."""
+        return combine_joints(self.joint_squares(paths), self.machine)
 
     @cached_property
     def has_gap(self) -> bool:
         """True if there is a floor, and errors that exceed it."""
-        return self.floor is not None and compute_rmse(self.before) >= MIN_GAP_RATIO * compute_rmse(
-            self.floor
+        return self.floor is not None and bool(self.before[0] > MIN_GAP_RATIO * self.floor[0])
+
+    @cached_property
+    def is_repaired(self) -> bool:
+        """True if the effects change the free runs of any joint."""
+        return bool(self.moved.any())
+
+    @cached_property
+    def moved(self) -> np.ndarray:
+        """Which joints' free runs the effects change by more than rounding, `(J,)` bool."""
+        change = np.square(self.after - self.base.field.residuals.base).mean((0, 1))
+        error = np.square(self.base.field.residuals.base - self._measured).mean((0, 1))
+        return np.sqrt(change) > MIN_CHANGE * np.sqrt(error)
+
+    def share_closed(self, fewer: np.ndarray) -> np.ndarray:
+        """Return differences of errors `(1 + B,)` over the gap of the same draw."""
+        assert self.floor is not None, "asked where there is a gap"
+        # In a draw the gap may vanish.
+        least = (1.0 - 1.0 / MIN_GAP_RATIO) * self.before
+        return fewer / np.maximum(self.before - self.floor, least)
+
+    def gap(self, named: bool = False) -> Gap:
+        """Return the errors, all joints together and joint by joint; `named`: effects are named."""
+        after = self.errors(self.after)
+        closed, reason = None, self._find_obstacle(named)
+        if not reason:
+            closed = summarise_draws(self.share_closed(self.before - after))
+        whose = "flexible model" if self.base.is_flexible else "reference"
+        return Gap(
+            before=float(self.before[0]),
+            after=float(after[0]),
+            floor=None if self.floor is None else float(self.floor[0]),
+            closed=closed,
+            unit=choose_unit(self.machine),
+            floor_of="" if self.floor is None else whose,
+            joints=self._joints(),
+            reduced=summarise_draws((self.before - after) / np.maximum(self.before, 1e-12)),
+            closed_reason=reason,
         )
 
-    def gap(self) -> Gap:
-        """Return the errors, all joints together and joint by joint."""
-        left = compute_squares(self.after, self._measured, self.machine)
-        closed = summarise_draws(self.shares(self.after)) if self.has_gap else None
-        floor = None if self.floor is None else compute_rmse(self.floor)
-        of = "" if floor is None else "flexible model" if self.base.is_flexible else "reference"
-        return Gap(
-            compute_rmse(self.before),
-            compute_rmse(left),
-            floor,
-            closed,
-            choose_unit(self.machine),
-            of,
-            self._joints(),
-        )
+    def _find_obstacle(self, named: bool) -> str:
+        """Return why no share of the gap can be told; empty where it can."""
+        if self.floor is None:
+            return NO_FLOOR
+        if named and not self.is_repaired:
+            return NO_MOTION
+        if not self.has_gap:
+            return (
+                f"the error ({self.before[0]:.3g}) is not above what the unchanged machine "
+                f"would show under this motion ({self.floor[0]:.3g})"
+            )
+        return ""
 
     def foretold(self) -> Estimate | None:
         """Return the share that should be closed, as the parts that were fitted to say; `None` without a gap or a fit."""
-        return (
-            summarise_draws(self.shares(self.own))
-            if self.has_gap and self.own is not None
-            else None
-        )
-
-    def by_effect(self, result: DetectionResult, names: Sequence[str]) -> dict[str, Estimate]:
-        """Return the share that each chosen effect closes, its Shapley value; without a floor, that of the whole error."""
-        values = compute_shapley(names, lambda some: self.shares(self._with(result, some)))
-        return {name: summarise_draws(value) for name, value in values.items()}
+        if not self.has_gap or self.own is None:
+            return None
+        return summarise_draws(self.share_closed(self.before - self.errors(self.own)))
 
     def beyond(self) -> list[str]:
         """Return the joints whose error after repair exceeds the floor for sure."""
-        if self.floor is None:
+        if self.joint_floor is None:
             return []
-        left = np.square(self.after - self._measured).mean(1)  # (W, J)
-        squares, drawn = [], []
-        for one in self.base.left_out:
-            error = one.residuals.base - one.residuals.simulator.cut.measured
-            squares.append(np.square(error).mean(1))
-        floor = np.concatenate(squares)
-        for f, g in self.draws:
-            drawn.append(np.sqrt(left[f].mean(0) / np.maximum(floor[g].mean(0), 1e-18)))
-        ratio = np.sqrt(left.mean(0) / np.maximum(floor.mean(0), 1e-18))
-        beyond = (ratio > MIN_EXCESS_RATIO) & (np.quantile(drawn, 0.025, axis=0) > 1.0)
+        ratio = np.sqrt(self.joint_squares(self.after) / np.maximum(self.joint_floor, 1e-18))
+        low = np.quantile(ratio[1:], 0.025, axis=0)
+        beyond = (ratio[0] > MIN_EXCESS_RATIO) & (low > 1.0)
         return [self.machine.joint_names[j] for j in np.flatnonzero(beyond)]
 
-    def _with(self, result: DetectionResult, names: frozenset[str]) -> np.ndarray:
-        """Return free runs with some of the chosen effects, their sizes fitted anew."""
-        if not names:
-            return self.base.field.residuals.base
-        if names == result.chosen.names:
-            return self.after
-        subsets = [subset & names for subset in result.chosen.subsets]
-        start = [table.score(s).sizes for table, s in zip(result.tables, subsets, strict=True)]
-        return simulate_refit(result.residuals, subsets, result.rays, start)
+    def measure_reference(self) -> dict[str, Any] | None:
+        """Return the error over the reference's own excitation, plain JSON data; `None` without a reference."""
+        if self.left_out is None:
+            return None
+        squares = self.left_out.actual.mean(0)
+        joints = dict(zip(self.machine.joint_names, np.sqrt(squares).tolist(), strict=True))
+        name = f"rmse_{choose_unit(self.machine)}"
+        return {name: float(combine_joints(squares, self.machine)), "joints": joints}
 
     def _joints(self) -> dict[str, JointClosed]:
-        residuals = self.base.field.residuals
-        before = _compute_joint_rmse([residuals.base], [self._measured])
-        after = _compute_joint_rmse([self.after], [self._measured])
-        floor = None
-        if parts := [one.residuals for one in self.base.left_out]:
-            measured = [one.simulator.cut.measured for one in parts]
-            floor = _compute_joint_rmse([one.base for one in parts], measured)
+        before, after = (
+            np.sqrt(self.joint_squares(paths)[0])
+            for paths in (self.base.field.residuals.base, self.after)
+        )
+        floor = None if self.joint_floor is None else np.sqrt(self.joint_floor[0])
         return _describe_joints(self.machine, before, after, floor)
 
 

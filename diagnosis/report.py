@@ -8,7 +8,7 @@ from typing import Any
 
 from brokk_rl.machine import Machine
 from brokk_rl.report import Cell, Report, Tone
-from diagnosis import plots
+from diagnosis import plots, report_checks
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 from diagnosis.error_growth import READINGS
 from diagnosis.probes import CLEAR_Z
@@ -28,7 +28,7 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
     told += _describe_tool(answer)
     if answer.verdict == "none":
         return (
-            f"No gap: the simulator is as right about these recordings as about its own.{told}",
+            f"No gap: the simulator errs as the unchanged machine would under this motion.{told}",
             "good",
         )
     if answer.verdict == "unknown":
@@ -49,10 +49,12 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
         f" An unknown remainder is left on {join_words(left_over['joints'])}." if left_over else ""
     )
     tone: Tone = "good" if closed is not None and closed.ci95[0] > GOOD_CLOSED else "warn"
-    if closed is None:
-        return f"The simulator lacks {names}.{told}{rest}", tone
     it = "it" if len(answer.selected) == 1 else "them"
-    share = f"{100 * closed.mean:.0f} % of the gap (95 %: {_format_percent_range(closed)})"
+    if closed is None or gap is None:
+        fewer = f" Adding {it} removes {_format_share(gap.reduction)} of the error." if gap else ""
+        why = f" No share of the gap is told: {gap.closed_reason}." if gap else ""
+        return f"The simulator lacks {names}.{fewer}{why}{told}{rest}", tone
+    share = f"{_format_share(closed, ' of the gap')}"
     return f"The simulator lacks {names}; adding {it} closes {share}.{told}{rest}", tone
 
 
@@ -141,7 +143,8 @@ def format_estimate(
     if value is None:
         return "–", ""
     low, high = (factor * bound for bound in value.ci95)
-    return f"{factor * value.mean:{style}}", f"{low:{style}} to {high:{style}}"
+    interval = f"{low:{style}} to {high:{style}}" if value.has_interval else "no interval"
+    return f"{factor * value.mean:{style}}", interval + (", at its bound" if value.at_bound else "")
 
 
 def _describe_place(answer: Answer) -> str:
@@ -172,8 +175,11 @@ def describe_regime(regime: str) -> str:
     return phrases.get(regime, regime)
 
 
-def _format_percent_range(value: Estimate) -> str:
-    return f"{100 * value.ci95[0]:.0f} to {100 * value.ci95[1]:.0f} %"
+def _format_share(value: Estimate, of: str = "") -> str:
+    """Return a share in percent, with its interval where there is one."""
+    low, high = (f"{100 * bound:.0f}" for bound in value.ci95)
+    interval = f" (95 %: {low} to {high} %)" if value.has_interval else ""
+    return f"{100 * value.mean:.0f} %{of}{interval}"
 
 
 REPORT_FILE = "report.html"
@@ -197,11 +203,13 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
             "Error of free runs of 5 s on recordings that no effect was fitted to: before, after, "
             "and the floor.",
         )
+    report_checks.add_rivals(page, answer)
     for remark in more.get("sanity", []):
         if remark["severity"] == "bad":
             page.add_text(_describe_remark(remark), "bad")
     units = {joint.name: joint.unit for joint in machine.joints}
     _add_effects(page, answer)
+    report_checks.add_gates(page, answer)
     _add_errors_by_joint(page, answer, units)
     _add_residual_model(page, more)
     _add_where(page, outcome, machine, units)
@@ -234,10 +242,12 @@ def _add_effects(page: Report, answer: Answer) -> None:
         page.add_table(
             ["effect", "joints", "probability", "closes, %", "parameter", "value"],
             rows,
-            "With 95 % intervals. 'Closes' is the effect's share of the closed gap (Shapley value).",
+            "With 95 % intervals. 'Closes' is the effect's part of the gap (Shapley value).",
         )
     for one in answer.selected:
         page.add_text(describe_class(one), "warn")
+        page.add_text(report_checks.describe_bounds(one), "warn")
+        page.add_text(report_checks.describe_edit(one), "warn")
     page.add_text(describe_remainder(answer))
     if answer.reason and answer.verdict == "none":
         page.add_text(f"{answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}.")

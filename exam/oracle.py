@@ -17,8 +17,9 @@ import torch
 
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.machine import Machine
-from diagnosis import baseline, case, effect_library, gap
+from diagnosis import baseline, case, effect_library
 from diagnosis.baseline import Baseline
+from diagnosis.gap import GapClosure
 from diagnosis.refine import fit_set
 from diagnosis.residuals import ParameterRay, build_rays
 from diagnosis.responses import Response, fit_sizes
@@ -97,10 +98,6 @@ def load_case_evidence(
     return CaseEvidence(base, grown, errors)
 
 
-MIN_GAP_RATIO = 1.1
-"""Error over floor below which a share of the gap is noise; chosen by hand."""
-
-
 def close_gap(
     folder: Path, effects: Mapping[str, Sequence[str]], fit: ActuatorFit, machine: Machine
 ) -> float | None:
@@ -127,22 +124,12 @@ def close_gap(
             if joint in joints and name in errors.shapes:
                 visible.add(name)
         subsets.append(frozenset(visible))
-    measured = residuals.simulator.cut.measured
-    before = gap.compute_squares(residuals.base, measured, machine)
-    floors = []
-    for one in found.base.left_out:
-        left_out = one.residuals
-        floors.append(gap.compute_squares(left_out.base, left_out.simulator.cut.measured, machine))
-    floor = np.concatenate(floors)
-    if not any(subsets) or gap.compute_rmse(before) < MIN_GAP_RATIO * gap.compute_rmse(floor):
+    if not any(subsets):
         return None
     start = list(map(_fit_start, found.errors, subsets))
-    after = gap.compute_squares(
-        fit_set(residuals, subsets, found.rays, start).after, measured, machine
-    )
-    return float(
-        gap.compute_shares(before, after, floor, [])[0]
-    )  # as an answer says it: no repair is better than the floor
+    after = fit_set(residuals, subsets, found.rays, start).after
+    closed = GapClosure(found.base, machine, after, None, np.random.default_rng(0)).gap().closed
+    return None if closed is None else closed.mean
 
 
 def close_labelled_gap(

@@ -2,30 +2,17 @@
 
 import logging
 from pathlib import Path
-from typing import Protocol
 
+from actuators.recordings.log_reader import LogReader
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
 FOLDER = "recordings"
-
-
-class LogReader(Protocol):
-    """A spec in `conf/import`: reads one kind of log."""
-
-    def read(self, path: Path, machine: Machine) -> list[Recording]:
-        """Return the gapless pieces of the log at `path`, in order; they share metadata `run`.
-
-        Raises:
-            RecordingError: the log cannot be used; names file, row and column.
-        """
-        ...
 
 
 @spec

@@ -1,4 +1,6 @@
-"""CSV logs of other machines: the meaning of their columns, and conversion to recordings.
+"""Logs of other machines: the meaning of their columns, and conversion to recordings.
+
+A log is a CSV file, a parquet file (`.parquet`) or a MATLAB file up to version 7 (`.mat`).
 
 A log is cut at its gaps and each piece is brought to the machine's rate: positions linearly between
 samples, commands as the value in force (zero-order hold). Pieces of one log share the metadata
@@ -16,6 +18,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from scipy import io as matlab
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
@@ -73,24 +78,51 @@ class CommandColumn:
 
 
 @spec
+class TargetColumn:
+    """A column of target positions whose speed is the command, for a servo that follows targets.
+
+    Attributes:
+        column: Its name in the header.
+        scale: Unit of the recording for one of the log; negative turns the sign.
+        full_speed: Speed of the target at full command, rad/s or m/s; that of the machine's
+            `max_speed`, for a model that integrates commands to give the target.
+    """
+
+    column: str
+    scale: float
+    full_speed: float
+
+    def check(self) -> None:
+        if self.full_speed <= 0 or self.scale == 0:
+            raise ConfigError(
+                f"column '{self.column}': expected full_speed > 0 and a scale other than 0"
+            )
+
+    def command(self, values: np.ndarray, t_s: np.ndarray) -> np.ndarray:
+        """Return the command in force from each sample to the next, 0 at the last; same shape."""
+        speed = np.diff(self.scale * values) / np.diff(t_s)
+        return np.append(speed, 0.0) / self.full_speed
+
+
+@spec
 class JointColumns:
     """The columns of one joint.
 
     Attributes:
-        command: Its command.
+        command: Its command: a column of commands, or the speed of a column of targets.
         position: Its position, to rad or m.
     """
 
-    command: CommandColumn
+    command: CommandColumn | TargetColumn
     position: Column
 
 
 @spec
 class ColumnMap:
-    """Reads CSV logs of another machine by a map of their columns.
+    """Reads logs of another machine by a map of their columns.
 
     Attributes:
-        delimiter: Between the cells of a line.
+        delimiter: Between the cells of a line of a CSV file.
         decimal: Decimal sign of its numbers.
         time: Time, to s; its zero does not matter.
         joints: Columns of each joint of the machine, by joint name.
@@ -134,7 +166,7 @@ class ColumnMap:
                 f"import: the map names the joints {', '.join(self.joints)}, machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
-        table = _Table(path, self.delimiter, self.decimal)
+        table = _open_table(path, self.delimiter, self.decimal)
         t_s = table.numbers(self.time)
         if (row := _find_first(np.diff(t_s) <= 0)) is not None:
             where = table.where(row + 1, self.time.column)
@@ -142,7 +174,8 @@ class ColumnMap:
                 f"{where}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
             )
         u = np.stack(
-            [self._commands(table, self.joints[name].command) for name in machine.joint_names], 1
+            [self._commands(table, self.joints[name].command, t_s) for name in machine.joint_names],
+            1,
         )
         q = np.stack([table.numbers(self.joints[name].position) for name in machine.joint_names], 1)
         extra = {name: table.numbers(column, empty=True) for name, column in self.optional.items()}
@@ -174,12 +207,20 @@ class ColumnMap:
             )
         return found
 
-    def _commands(self, table: "_Table", column: CommandColumn) -> np.ndarray:
-        u = column.command(table.numbers(Column(column=column.column, scale=1.0, offset=0.0)))
+    def _commands(
+        self, table: "_Table | _NumberTable", column: CommandColumn | TargetColumn, t_s: np.ndarray
+    ) -> np.ndarray:
+        values = table.numbers(Column(column=column.column, scale=1.0, offset=0.0))
+        if isinstance(column, TargetColumn):
+            u = column.command(values, t_s)
+            # a gap between pieces is no motion of the target
+            u[:-1][np.diff(t_s) > self.longest_gap_s] = 0.0
+        else:
+            u = column.command(values)
         if (row := _find_first(np.abs(u) > 1.0 + self.overrun)) is not None:
             raise RecordingError(
                 f"{table.where(row, column.column)}: command {u[row]:g} is beyond full by more than {self.overrun:g}; "
-                "mend full_plus, full_minus or neutral of the column map, or the log"
+                "mend full_plus, full_minus, neutral or full_speed of the column map, or the log"
             )
         return u.clip(-1.0, 1.0)
 
@@ -234,6 +275,71 @@ class _Table:
             if not (empty or np.isfinite(values[row])):
                 raise RecordingError(f"{self.where(row, column.column)}: {text} is not a number")
         return column.scale * values + column.offset
+
+
+class _NumberTable:
+    """A log whose columns are numbers already: parquet or MATLAB."""
+
+    def __init__(self, path: Path, columns: dict[str, np.ndarray]) -> None:
+        self._path, self._columns = path, columns
+
+    def where(self, row: int, column: str) -> str:
+        """Return file, row and column for a message."""
+        return f"{self._path}: row {row}, column '{column}'"
+
+    def numbers(self, column: Column, empty: bool = False) -> np.ndarray:
+        """Return a column, shape `(T,)`; NaN is refused unless `empty` allows it."""
+        if column.column not in self._columns:
+            raise RecordingError(
+                f"{self._path}: column '{column.column}' is missing or holds no numbers; "
+                f"{list_choices(column.column, self._columns)}"
+            )
+        values = self._columns[column.column]
+        if not empty and (row := _find_first(~np.isfinite(values))) is not None:
+            raise RecordingError(f"{self.where(row, column.column)}: {values[row]} is not a number")
+        return column.scale * values + column.offset
+
+
+def _open_table(path: Path, delimiter: str, decimal: str) -> _Table | _NumberTable:
+    """Open a log by the ending of its name."""
+    kind = path.suffix.lower()
+    if kind == ".parquet":
+        return _NumberTable(path, _read_parquet(path))
+    if kind == ".mat":
+        return _NumberTable(path, _read_matlab(path))
+    return _Table(path, delimiter, decimal)
+
+
+def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+    """Return the columns of numbers by name."""
+    try:
+        table = pq.read_table(path)
+    except (OSError, pa.ArrowException) as error:
+        raise RecordingError(f"{path}: cannot be read as parquet ({error})") from error
+    found = {}
+    for name in table.column_names:
+        kind = table[name].type
+        if pa.types.is_floating(kind) or pa.types.is_integer(kind):
+            found[name] = table[name].to_numpy().astype(float)
+    return found
+
+
+def _read_matlab(path: Path) -> dict[str, np.ndarray]:
+    """Return the real vectors of the most frequent length by name."""
+    try:
+        given = matlab.loadmat(path)
+    except (OSError, ValueError, NotImplementedError) as error:
+        raise RecordingError(
+            f"{path}: cannot be read as a MATLAB file up to version 7 ({error})"
+        ) from error
+    vectors = {}
+    for name, values in given.items():
+        is_real = isinstance(values, np.ndarray) and values.dtype.kind in "fiu"
+        if is_real and values.size > 1 and values.size == max(values.shape):
+            vectors[name] = values.ravel().astype(float)
+    sizes = [len(values) for values in vectors.values()]
+    length = max(sizes, key=sizes.count, default=0)
+    return {name: values for name, values in vectors.items() if len(values) == length}
 
 
 def _find_first(condition: np.ndarray) -> int | None:

@@ -231,14 +231,6 @@ def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(
         )
 
 
-def test_the_closed_share_of_a_worked_example() -> None:
-    generator = np.random.default_rng(8)
-    before, after, floor = (np.full(40, value**2) for value in (0.03, 0.012, 0.01))
-    found = gap.estimate_closed(before, after, floor, generator)
-    assert found and found.mean == pytest.approx(0.9) and found.ci95 == pytest.approx((0.9, 0.9))
-    assert gap.estimate_closed(floor, floor, floor, generator) is None
-
-
 def test_shares_of_effects_that_pay_only_together_are_equal_and_add_up() -> None:
     value = {frozenset(): 0.0, frozenset("a"): 0.0, frozenset("b"): 0.35, frozenset("ab"): 0.53}
     found = gap.compute_shapley(["a", "b"], lambda names: value[names])

@@ -1,11 +1,9 @@
-"""How far effects close a gap: worked numbers, foretold apart from achieved, large effects fitted together."""
+"""Units of errors, parts of effects, and large effects fitted together."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +16,8 @@ from actuators.models.lag import FirstOrderLag
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import baseline, effect_library, gap, refine
+from diagnosis import baseline, bootstrap, effect_library, gap, refine
 from diagnosis.case import GapCase
-from diagnosis.gap import GapClosure
 from diagnosis.residuals import ErrorCovariance, build_rays
 
 CPU = torch.device("cpu")
@@ -34,36 +31,6 @@ LINEAR = FirstOrderLag(
 )
 
 
-def held(base: np.ndarray, measured: np.ndarray) -> Any:
-    return SimpleNamespace(
-        base=base, simulator=SimpleNamespace(cut=SimpleNamespace(measured=measured))
-    )
-
-
-def reach(machine: Machine, before: float, after: float, own: float, floor: float) -> GapClosure:
-    """Errors of one size everywhere: 40 windows, 10 steps."""
-    measured = np.zeros((40, 10, machine.num_joints))
-    null = SimpleNamespace(residuals=held(measured + floor, measured))
-    base: Any = SimpleNamespace(
-        field=SimpleNamespace(residuals=held(measured + before, measured)),
-        left_out=[null],
-        is_flexible=False,
-    )
-    return GapClosure(base, machine, measured + after, measured + own, np.random.default_rng(0))
-
-
-def test_what_is_closed_and_what_was_foretold_are_told_apart(machine: Machine) -> None:
-    seen = reach(machine, before=0.030, after=0.012, own=0.009, floor=0.002)
-    found, foretold = seen.gap(), seen.foretold()
-    assert found.closed and foretold
-    assert found.closed.mean == pytest.approx(18 / 28) and foretold.mean == pytest.approx(21 / 28)
-    assert found.joints["q3"].closed == pytest.approx(18 / 28) and found.joints[
-        "q3"
-    ].share == pytest.approx(0.6)
-    assert seen.beyond() == list(machine.joint_names)  # 12 is far beyond 2
-    assert reach(machine, 0.030, 0.0022, 0.0022, 0.002).beyond() == []
-
-
 def test_errors_in_metres_and_radians_are_taken_over_the_travel(machine: Machine) -> None:
     slide = replace(machine.joints[0], kind="slide", lower=replace(machine.joints[0].lower, value=0.0),
                     upper=replace(machine.joints[0].upper, value=0.1), home=0.05)  # fmt: skip
@@ -73,16 +40,15 @@ def test_errors_in_metres_and_radians_are_taken_over_the_travel(machine: Machine
     paths = np.zeros((1, 2, 2))
     paths[..., 0], paths[..., 1] = 0.01, 0.2  # a tenth of the travel each
     assert gap.choose_unit(mixed) == "travel" and gap.choose_unit(machine) == "rad"
-    assert gap.compute_rmse(
-        gap.compute_squares(paths, np.zeros((1, 2, 2)), mixed)
-    ) == pytest.approx(0.1)
+    squares = gap.compute_joint_squares(paths, np.zeros((1, 2, 2)))
+    assert gap.combine_joints(squares, mixed)[0] == pytest.approx(0.1)
 
 
 def test_the_part_of_an_effect_has_an_interval() -> None:
     value = {frozenset(): np.zeros(3), frozenset("a"): np.array([0.5, 0.4, 0.6]), frozenset("b"): np.array([0.2, 0.1, 0.3]),
              frozenset("ab"): np.array([0.9, 0.8, 1.0])}  # fmt: skip
     found = {
-        name: gap.summarise_draws(values)
+        name: bootstrap.summarise_draws(values)
         for name, values in gap.compute_shapley(["a", "b"], lambda some: value[some]).items()
     }
     assert found["a"].mean == pytest.approx(0.6) and found["b"].mean == pytest.approx(
