@@ -22,7 +22,16 @@ from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from diagnosis.closure import Estimate, Gap, read_estimate, read_gap, serialize_estimate
+from diagnosis.closure import (
+    Estimate,
+    Gap,
+    Gate,
+    RivalError,
+    read_estimate,
+    read_gap,
+    read_rivals,
+    serialize_estimate,
+)
 from diagnosis.free_runs import WindowedRuns
 
 SCHEMA = 1
@@ -127,6 +136,8 @@ class Answer:
         where: Where the gap lies.
         gap: Its size, and the remainder.
         next_experiment: `None` where nothing is left to tell apart.
+        rivals: Errors of simple rivals on the windows of the gap, by name.
+        gates: Conditions of the verdict.
         reason: One sentence in words.
         more: Further plain JSON: `sanity`, `horizons`, `evidence`, `remainder`, …
     """
@@ -137,6 +148,8 @@ class Answer:
     where: Where
     gap: Gap | None
     next_experiment: NextExperiment | None
+    rivals: Mapping[str, RivalError] = field(default_factory=dict)
+    gates: tuple[Gate, ...] = ()
     reason: str = ""
     more: Mapping[str, Any] = field(default_factory=dict)
 
@@ -154,7 +167,7 @@ class Answer:
             "regimes": [dataclasses.asdict(regime) for regime in self.where.regimes],
             "stage": self.where.stage,
         }
-        gap = self.gap and self.gap.to_json()
+        gap, key = self.gap and self.gap.to_json(), self.gap.key if self.gap else "rmse_rad"
         return {
             "schema": SCHEMA,
             "verdict": self.verdict,
@@ -163,6 +176,8 @@ class Answer:
             "ranking": [_serialize_tuples(dataclasses.asdict(one)) for one in self.ranking],
             "where": where,
             "gap": gap,
+            "rivals": {name: one.to_json(key) for name, one in self.rivals.items()},
+            "gates": [dataclasses.asdict(one) for one in self.gates],
             "next_experiment": None
             if self.next_experiment is None
             else _serialize_tuples(dataclasses.asdict(self.next_experiment)),
@@ -228,6 +243,8 @@ def _parse_answer(found: dict[str, Any]) -> Answer:
         ),
         where=where,
         gap=gap,
+        rivals=read_rivals(found.get("rivals", {})),
+        gates=tuple(Gate(**one) for one in found.get("gates", ())),
         next_experiment=following
         and NextExperiment(
             following["excitation"], tuple(following["separates"]), following.get("why", "")

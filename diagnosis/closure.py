@@ -107,6 +107,7 @@ def read_gap(given: Mapping[str, Any]) -> Gap:
     """Return the gap of a `diagnosis.json`; earlier ones have no `reduced`."""
     key = next(iter(given["before"]))
     before, after, floor = (given[name][key] for name in ("before", "after", "floor"))
+    reduced = read_estimate(given.get("reduced"))
     return Gap(
         before,
         after,
@@ -115,7 +116,7 @@ def read_gap(given: Mapping[str, Any]) -> Gap:
         key.removeprefix("rmse_"),
         given.get("floor_of", "reference"),
         {name: JointClosed(**one) for name, one in given.get("joints", {}).items()},
-        read_estimate(given.get("reduced")),
+        reduced if reduced and reduced.has_interval else None,
         given.get("closed_reason") or "",
     )
 
@@ -132,3 +133,45 @@ def read_estimate(value: Mapping[str, Any] | None) -> Estimate | None:
         return None
     low, high = value["ci95"] or (value["mean"], value["mean"])
     return Estimate(value["mean"], (low, high), bool(value.get("at_bound")))
+
+
+@dataclass(frozen=True)
+class Gate:
+    """A condition of a verdict.
+
+    Attributes:
+        name: Its name.
+        passed: Whether it holds.
+        value: The number that is judged; `None` where there is none.
+        limit: Its limit.
+        text: The finding in words, and the remedy where it failed.
+    """
+
+    name: str
+    passed: bool
+    value: float | None
+    limit: float | None
+    text: str
+
+
+@dataclass(frozen=True)
+class RivalError:
+    """Error of a rival on the windows of the gap, all joints together and by joint; `None`: not to be had."""
+
+    rmse: float | None
+    joints: Mapping[str, float]
+    reason: str = ""
+
+    def to_json(self, key: str) -> dict[str, Any]:
+        """Return plain JSON data; `key`: name of the error of all joints."""
+        found: dict[str, Any] = {key: self.rmse, "joints": dict(self.joints)}
+        return found | ({"reason": self.reason} if self.reason else {})
+
+
+def read_rivals(given: Mapping[str, Any]) -> dict[str, RivalError]:
+    """Return the rivals of a `diagnosis.json`."""
+    found = {}
+    for name, one in given.items():
+        rmse = next((value for key, value in one.items() if key.startswith("rmse_")), None)
+        found[name] = RivalError(rmse, one.get("joints", {}), one.get("reason", ""))
+    return found

@@ -14,20 +14,21 @@ from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import StorageError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
-from diagnosis import calibration, decision, detection, next_experiment
+from diagnosis import calibration, decision, detection, gates, next_experiment, sanity, verdict
 from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, Where
 from diagnosis.attribution import MIN_RESTORED, EffectAttribution, EffectPart
 from diagnosis.baseline import Baseline
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
-from diagnosis.closure import Estimate, serialize_estimate
+from diagnosis.closure import Estimate, Gate, serialize_estimate
 from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
 from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
 from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
-from diagnosis.stages import examine_gap
+from diagnosis.stages import Survey, examine_gap
+from diagnosis.verdict import Judgement
 
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
@@ -70,53 +71,69 @@ class DiagnosisPipeline:
         """Return the outcome; `tell` receives the name and the progress of each step."""
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
+        tell("recordings", 0.3)
+        remarks = sanity.examine_recordings(self.case.field, self.case.machine, self.thresholds)
+        told = verdict.judge_case(self.case, self.base, remarks, self._known())
+        if failed := gates.list_failures(told):
+            return self._cannot_tell(failed, told)
         search = detection.EffectSearch(self.case, self.base, self.kinds, self.penalties, tell)
-        return self._outcome(search.run())
+        return self._outcome(search.run(), told)
 
-    def _outcome(self, result: DetectionResult) -> Outcome:
+    def _known(self) -> GapClosure:
+        """Return the errors of the simulator as it was."""
+        machine, paths = self.case.machine, self.base.field.residuals.base
+        return GapClosure(self.base, machine, paths, None, self.generator)
+
+    def _outcome(self, result: DetectionResult, told: Sequence[Gate]) -> Outcome:
         weighed = decision.record_weights(result, self.penalties)
         result = decision.drop_unlikely_effects(result, self.penalties, self.calibration)
-        field, residuals = self.base.field, result.residuals
-        before, floor = field.runs(field.residuals.base), self._floor()
+        field, machine = self.base.field, self.case.machine
+        rivals = verdict.collect_rivals(self.base)
         unknown = decision.is_unknown(result, self.penalties, self.calibration)
-        fitted = None if unknown else result.fitted
-        found = [] if unknown else result.detected
-        mean = 0.0 if residuals.mean is None else residuals.mean
-        paths = fitted.after if fitted else residuals.base + mean if found else field.residuals.base
-        reach = GapClosure(
-            self.base, self.case.machine, paths, fitted and fitted.own, self.generator
+        seen = verdict.judge_findings(
+            result, self.case, self.base, rivals, self.thresholds, self.generator, unknown
         )
+        result, reach = seen.result, seen.reach
         foretold = reach.foretold()
-        parts = EffectAttribution(result, reach).measure_parts() if fitted or found else {}
-        selected = self._describe_detected(result, found, parts)
-        selected += self._selected(result, parts) if fitted else []
+        named = seen.verdict == "effects"
+        parts = EffectAttribution(result, reach).measure_parts() if named else {}
+        selected = self._describe_detected(result, seen.found, parts)
+        selected += self._selected(result, parts) if seen.fitted else []
         selected.sort(key=lambda one: -one.probability)
-        told = "unknown" if unknown else "effects" if selected else "none"
-        after = field.runs(paths) if selected else None
-        machine = self.case.machine
-        seen = examine_gap(
-            before, floor, after, machine, self.thresholds, self._dead_time_s(), self.generator
-        )
-        remainder = self._remainder(result, reach) if selected else None
+        before, floor = field.runs(field.residuals.base), self._floor()
+        after = field.runs(reach.after) if named else None
+        survey = self._examine(before, floor, after)
+        remainder = self._remainder(result, reach) if named else None
         chance = decision.compute_unknown_probability(result, self.penalties, self.calibration)
+        ranking: Sequence[Ranked] = decision.rank_hypotheses(
+            result, selected, self.penalties, self.calibration, machine, chance
+        )
+        if seen.verdict == "unknown" and seen.failed:
+            ranking = gates.rank_unknown_first(ranking)
         answer = Answer(
-            verdict=told,
+            verdict=seen.verdict,
             selected=tuple(selected),
-            ranking=tuple(
-                decision.rank_hypotheses(
-                    result, selected, self.penalties, self.calibration, machine, chance
-                )
-            ),
-            where=seen.where(),
-            gap=reach.gap(named=bool(selected)),
+            ranking=tuple(ranking),
+            where=survey.where(),
+            gap=reach.gap(named=named),
+            rivals=verdict.describe_rivals(rivals, machine),
+            gates=(*told, *seen.gates),
             next_experiment=self._next(result, selected),
-            reason=self._reason(told, result, selected, remainder),
-            more=seen.more()
+            reason=self._reason(seen, selected, remainder),
+            more=survey.more()
             | self._more(result, weighed, foretold)
             | {"unknown_remainder": remainder, "reference_error": reach.measure_reference()}
-            | self._unseen(result, fitted),
+            | self._unseen(result, seen.fitted),
         )
         return Outcome(answer, before, after, floor)
+
+    def _examine(
+        self, before: WindowedRuns, floor: WindowedRuns | None, after: WindowedRuns | None
+    ) -> Survey:
+        machine, dead_time_s = self.case.machine, self._dead_time_s()
+        return examine_gap(
+            before, floor, after, machine, self.thresholds, dead_time_s, self.generator
+        )
 
     def _describe_detected(
         self,
@@ -160,8 +177,13 @@ class DiagnosisPipeline:
                 effect=kind.name,
                 joints=tuple(names),
                 probability=calibration.compute_probability(self.calibration.right, signs),
-                parameters=decision.estimate_numbers(
-                    result, kind, self.case.machine, self.calibration.form[kind.stage]
+                parameters=verdict.mark_bounds(
+                    decision.estimate_numbers(
+                        result, kind, self.case.machine, self.calibration.form[kind.stage]
+                    ),
+                    result.fitted,
+                    kind,
+                    self.case.machine,
                 ),
                 gap_closed=None,
                 same_as=like,
@@ -273,12 +295,11 @@ class DiagnosisPipeline:
         }
 
     def _reason(
-        self,
-        told: str,
-        result: DetectionResult,
-        selected: Sequence[Selected],
-        remainder: Mapping[str, Any] | None,
+        self, seen: Judgement, selected: Sequence[Selected], remainder: Mapping[str, Any] | None
     ) -> str:
+        told, result = seen.verdict, seen.result
+        if told == "unknown" and seen.failed:
+            return f"no effect of the library explains these recordings: {seen.failed}"
         if told == "effects":
             text = "; ".join(
                 f"{one.effect} on {', '.join(one.joints) or 'the machine'}" for one in selected
@@ -300,18 +321,26 @@ class DiagnosisPipeline:
             return f"the gap of {where} can be predicted ({'; '.join(clues)}), but by no effect of the library"
         return "no effect earns more on the field recordings than it would by chance"
 
-    def _cannot_tell(self, why: str) -> Outcome:
-        """Return the answer of recordings that cannot tell anything."""
-        field = self.base.field
+    def _cannot_tell(self, why: str, told: Sequence[Gate] = ()) -> Outcome:
+        """Return the answer of recordings that cannot tell anything; with `told` it says where the gap lies."""
+        field, machine = self.base.field, self.case.machine
         runs, floor = field.runs(field.residuals.base), self._floor()
-        known = GapClosure(
-            self.base, self.case.machine, field.residuals.base, None, self.generator
-        ).gap()
-        known = replace(known, closed=None, closed_reason=f"cannot tell, because {why}")
+        reason = f"cannot tell, because {why}"
+        known = replace(self._known().gap(), closed=None, closed_reason=reason)
+        survey = self._examine(runs, floor, None) if told else None
+        rivals = verdict.collect_rivals(self.base)
         answer = Answer(
-            verdict="unknown", selected=(), ranking=(Ranked("unknown", (), 1.0),), where=Where({}, (), None), gap=known,
-            next_experiment=None, reason=f"cannot tell, because {why}",
-        )  # fmt: skip
+            verdict="unknown",
+            selected=(),
+            ranking=(Ranked("unknown", (), 1.0),),
+            where=survey.where() if survey else Where({}, (), None),
+            gap=known,
+            rivals=verdict.describe_rivals(rivals, machine),
+            gates=tuple(told) or (Gate("enough_data", False, None, None, why),),
+            next_experiment=None,
+            reason=reason,
+            more=survey.more() if survey else {},
+        )
         return Outcome(answer, runs, None, floor)
 
 

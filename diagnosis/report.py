@@ -8,7 +8,7 @@ from typing import Any
 
 from brokk_rl.machine import Machine
 from brokk_rl.report import Cell, Report, Tone
-from diagnosis import plots
+from diagnosis import plots, report_checks
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 from diagnosis.error_growth import READINGS
 from diagnosis.probes import CLEAR_Z
@@ -28,7 +28,7 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
     told += _describe_tool(answer)
     if answer.verdict == "none":
         return (
-            f"No gap: the simulator is as right about these recordings as about its own.{told}",
+            f"No gap: the simulator errs as the unchanged machine would under this motion.{told}",
             "good",
         )
     if answer.verdict == "unknown":
@@ -203,11 +203,13 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
             "Error of free runs of 5 s on recordings that no effect was fitted to: before, after, "
             "and the floor.",
         )
+    report_checks.add_rivals(page, answer)
     for remark in more.get("sanity", []):
         if remark["severity"] == "bad":
             page.add_text(_describe_remark(remark), "bad")
     units = {joint.name: joint.unit for joint in machine.joints}
     _add_effects(page, answer)
+    report_checks.add_gates(page, answer)
     _add_errors_by_joint(page, answer, units)
     _add_residual_model(page, more)
     _add_where(page, outcome, machine, units)
@@ -240,10 +242,12 @@ def _add_effects(page: Report, answer: Answer) -> None:
         page.add_table(
             ["effect", "joints", "probability", "closes, %", "parameter", "value"],
             rows,
-            "With 95 % intervals. 'Closes' is the effect's share of the closed gap (Shapley value).",
+            "With 95 % intervals. 'Closes' is the effect's part of the gap (Shapley value).",
         )
     for one in answer.selected:
         page.add_text(describe_class(one), "warn")
+        page.add_text(report_checks.describe_bounds(one), "warn")
+        page.add_text(report_checks.describe_edit(one), "warn")
     page.add_text(describe_remainder(answer))
     if answer.reason and answer.verdict == "none":
         page.add_text(f"{answer.reason[0].upper()}{answer.reason[1:].rstrip('.')}.")

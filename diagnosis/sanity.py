@@ -26,6 +26,9 @@ MIN_AGREEMENT = 0.9
 obeyed time; chosen by hand."""
 SPEED_ROWS = 3
 """Rows before and after a row that give its speed; chosen by hand: 0.3 s at 20 Hz."""
+FAST_SHARE = 0.2
+"""Speed, of full speed, from which motion without command is no sinking load but an input that is
+not logged. The effect `creep` sinks at a few percent; chosen by hand."""
 NUM_POSITIONS = 15
 """Positions of a joint that are tried as a threshold; chosen by hand."""
 
@@ -184,6 +187,7 @@ class RecordingRemark:
         amount: How much, with its unit.
         meaning: Possible causes.
         advice: The remedy.
+        share: Its time over that of the recording.
     """
 
     name: str
@@ -196,6 +200,7 @@ class RecordingRemark:
     amount: str
     meaning: str
     advice: str
+    share: float = 0.0
 
     def plain(self) -> dict[str, Any]:
         """Return it as plain JSON data."""
@@ -217,6 +222,11 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
         "warn",
         "the load sinks (a leak), or the joint was moved by something that is not logged",
         "log every input; a slow sinking towards the load is the effect 'creep'",
+    ),
+    "unlogged input": (
+        "bad",
+        "the joint moves at a working speed without command: something moves it that is not logged",
+        "log every input that moves the machine: levers, a second operator, automatic functions",
     ),
     "frozen sensor": (
         "warn",
@@ -295,7 +305,7 @@ def examine_recordings(
     for recording, findings in inspected:
         rest = [f for f in findings if not (f.kind == "no motion" and f.joint in locked)]
         remarks += [
-            *_group_findings(recording, rest),
+            *_group_findings(recording, rest, machine),
             *_check_clock(recording),
             *_check_saturation(recording, machine, thresholds),
         ]
@@ -324,6 +334,7 @@ def _make_remark(
     span_s: tuple[float | np.ndarray, float | np.ndarray],
     count: int,
     amount: str,
+    share: float = 0.0,
 ) -> RecordingRemark:
     severity, meaning, advice = TEXTS[name]
     where = recording if isinstance(recording, str) else name_recording(recording)
@@ -338,24 +349,39 @@ def _make_remark(
         amount,
         meaning,
         advice,
+        share,
     )
 
 
+def _name_finding(finding: RecordingFinding, recording: Recording, machine: Machine) -> str:
+    """Return the name of the remark about a finding; fast motion without command has one of its own."""
+    if finding.kind != "no command":
+        return FINDING_NAMES[finding.kind]
+    j = machine.joint_names.index(finding.joint or "")
+    q = recording.q[finding.row : finding.row + finding.num_rows, j]
+    ahead = 2 * SPEED_ROWS
+    if len(q) <= ahead:
+        return FINDING_NAMES[finding.kind]
+    speed = np.abs(q[ahead:] - q[:-ahead]) * recording.rate_hz / ahead
+    is_fast = np.quantile(speed, 0.9) > FAST_SHARE * machine.max_speed[j]
+    return "unlogged input" if is_fast else FINDING_NAMES[finding.kind]
+
+
 def _group_findings(
-    recording: Recording, findings: Sequence[RecordingFinding]
+    recording: Recording, findings: Sequence[RecordingFinding], machine: Machine
 ) -> Iterator[RecordingRemark]:
     """Yield one remark for all stretches of one kind and joint."""
 
     def key(finding: RecordingFinding) -> tuple[str, str]:
-        return finding.kind, finding.joint or ""
+        return _name_finding(finding, recording, machine), finding.joint or ""
 
-    for (kind, joint), group in groupby(sorted(findings, key=key), key):
+    for (name, joint), group in groupby(sorted(findings, key=key), key):
         some = sorted(group, key=lambda finding: finding.row)
         seconds = sum(finding.num_rows for finding in some) / recording.rate_hz
         part = seconds / max(recording.duration_s, 1.0 / recording.rate_hz)
         text = f"{some[0].text}; {seconds:.1f} s in all, {100 * part:.1f} % of the recording"
         span_s = some[0].t_s, some[-1].t_s + some[-1].duration_s
-        yield _make_remark(FINDING_NAMES[kind], joint or None, recording, span_s, len(some), text)
+        yield _make_remark(name, joint or None, recording, span_s, len(some), text, part)
 
 
 def _report_interlock(
@@ -365,8 +391,15 @@ def _report_interlock(
         rows = lock.rows[number]
         if len(rows):
             span_s = recording.t_s[rows[0]], recording.t_s[rows[-1]]
+            share = len(rows) / recording.num_samples
             yield _make_remark(
-                "interlock", lock.joint, recording, span_s, lock.num_stretches[number], lock.text
+                "interlock",
+                lock.joint,
+                recording,
+                span_s,
+                lock.num_stretches[number],
+                lock.text,
+                share,
             )
 
 

@@ -52,7 +52,7 @@ class BoostingFit:
         Raises:
             ConfigError: it is not.
         """
-        _import_ensemble()
+        import_ensemble(self.name)
 
     def fit(
         self,
@@ -69,7 +69,7 @@ class BoostingFit:
             ConfigError: scikit-learn is not installed.
             RecordingError: too little data.
         """
-        ensemble = _import_ensemble()
+        ensemble = import_ensemble(self.name)
         inputs, targets = _stack_rows(machine, [*train, *validation], self.max_rows)
         forests = []
         for j in range(machine.num_joints):
@@ -111,17 +111,21 @@ def tabulate_trees(model: Any, depth: int) -> dict[str, np.ndarray]:
             else:
                 feature[e, place], threshold[e, place] = node["feature_idx"], node["num_threshold"]
                 waiting += [(node["left"], 2 * place + 1), (node["right"], 2 * place + 2)]
-    offset = np.float32(np.ravel(model._baseline_prediction)[0])
+    offset = np.array(np.ravel(model._baseline_prediction)[0], dtype=np.float32)
     return {"feature": feature, "threshold": threshold, "leaf": leaf, "offset": offset}
 
 
-def _import_ensemble() -> Any:
+def import_ensemble(name: str) -> Any:
+    """Return the ensembles of scikit-learn for the fit `name`.
+
+    Raises:
+        ConfigError: scikit-learn is not installed.
+    """
     try:
         return import_module("sklearn.ensemble")
     except ImportError as error:
         raise ConfigError(
-            "fit=boosting needs scikit-learn: pip install 'brokk-rl[boosting]', or leave it out "
-            "('~baselines.boosting')"
+            f"fit={name} needs scikit-learn: pip install 'brokk-rl[boosting]'"
         ) from error
 
 
@@ -143,6 +147,6 @@ def _stack_rows(
         seen = [x.unfold(0, size, 1)[:-1].transpose(1, 2)[::every] for x in (u, q)]
         place = (recording.q[size - 1 : -1] - machine.lower) / (machine.upper - machine.lower)
         place = torch.as_tensor(place[::every]).float()
-        inputs.append(build_tree_features(*seen, place).numpy())
+        inputs.append(build_tree_features(seen[0], seen[1], place).numpy())
         targets.append((q[size:] - q[size - 1 : -1])[::every].T.numpy())
     return np.concatenate(inputs, 1), np.concatenate(targets, 1)

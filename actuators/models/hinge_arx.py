@@ -130,13 +130,16 @@ class HingeArxFit:
         """
         knees = torch.tensor(self.knees)
         grams, products, scales = _accumulate_moments(machine, train, knees)
-        try:
-            cut = open_loop.cut_windows(validation, machine, VALIDATION_S, VALIDATION_STRIDE_S)
-        except RecordingError:  # recordings too short to choose by
-            cut = None
         path = folder / f"{self.name}.safetensors"
-        best, chosen = np.inf, self.ridges[len(self.ridges) // 2]
-        for ridge in self.ridges if cut else ():
+        best, chosen, ridges = np.inf, self.ridges[len(self.ridges) // 2], self.ridges
+        longest_s = open_loop.find_longest_horizon_s(validation, machine)
+        if longest_s < VALIDATION_S:  # too short to choose by
+            _write_weights(
+                path, machine, _solve_ridge(grams, products, scales, chosen), knees, chosen
+            )
+            return HingeArx(checkpoint=str(path))
+        cut = open_loop.cut_windows(validation, machine, VALIDATION_S, VALIDATION_STRIDE_S)
+        for ridge in ridges:
             _write_weights(
                 path, machine, _solve_ridge(grams, products, scales, ridge), knees, ridge
             )
@@ -160,7 +163,7 @@ def _accumulate_moments(
             continue
         u, q = (torch.as_tensor(x, dtype=torch.float64) for x in (recording.u, recording.q))
         seen = [x.unfold(0, size, 1)[:-1].transpose(1, 2) for x in (u, q)]
-        inputs = build_hinge_features(*seen, knees.double()).permute(2, 0, 1).numpy()
+        inputs = build_hinge_features(seen[0], seen[1], knees.double()).permute(2, 0, 1).numpy()
         target = (q[size:] - q[size - 1 : -1]).T.numpy()
         gram += inputs.transpose(0, 2, 1) @ inputs
         product += (inputs.transpose(0, 2, 1) @ target[..., None])[..., 0]

@@ -120,6 +120,7 @@ def evaluate_trees(
     """
     joints, trees, leaves = leaf.shape
     count = features.shape[1]
+    feature = feature.long()
     node = torch.zeros((joints, trees, count), dtype=torch.int64, device=features.device)
     values = features.transpose(1, 2)  # (J, F, N)
     for _ in range((leaves - 1).bit_length()):

@@ -18,7 +18,7 @@ from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import answer, baseline, case, effect_library, pipeline, report
+from diagnosis import answer, baseline, case, effect_library, pipeline, report, report_checks
 from diagnosis.answer import Answer
 from diagnosis.baseline import Baseline
 from diagnosis.calibration import ProbabilityModel
@@ -167,6 +167,12 @@ def _print_answer(found: Answer, folder: Path) -> None:
     console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
     if found.selected:
         console.print(table)
+    for line in report_checks.list_failed_gates(found.gates):
+        console.print(line, highlight=False)
+    for one in found.selected:
+        for line in (report_checks.describe_bounds(one), report_checks.describe_edit(one)):
+            if line:
+                console.print(line, highlight=False)
     console.print(
         f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}",
         highlight=False,

@@ -7,45 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from composed import option
+from gaps import DELAY, recording
 
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
 from diagnosis.sanity import TEXTS, RecordingRemark, examine_recordings
-
-PERIOD_S = 0.05
-DELAY = 11
-NOISE = 0.0003
 
 
 @pytest.fixture(scope="module")
 def thresholds() -> InspectionThresholds:
     return option("thresholds", "default")
-
-
-def recording(
-    machine: Machine, ignored: np.ndarray | None = None, seconds: float = 240.0
-) -> Recording:
-    """Returns a recording in which all joints but q2 go to and fro; `ignored`, `(T,)`: where q3 does not obey."""
-    steps = round(seconds / PERIOD_S)
-    u = np.zeros((steps, 5))
-    for j, (length, level) in enumerate(((90, 0.5), (70, 0.4), (80, 0.5), (60, 0.4), (100, 0.3))):
-        u[:, j] = level * np.array([0.0, 1.0, 0.0, -1.0])[(np.arange(steps) // length) % 4]
-    u[:, 1] = 0.0
-    obeyed = u.copy()
-    if ignored is not None:
-        obeyed[ignored, 2] = 0.0
-    moved = np.zeros((steps, 5))
-    moved[DELAY:] = obeyed[:-DELAY] * machine.max_speed * PERIOD_S
-    q = (
-        machine.home
-        + np.cumsum(moved, 0)
-        + NOISE * np.random.default_rng(0).standard_normal((steps, 5))
-    )
-    return Recording(
-        machine="brokk170", joints=machine.joint_names, units=("rad",) * 5, rate_hz=20.0, t_s=np.arange(steps) * PERIOD_S,
-        u=u.astype(np.float32), q=q.astype(np.float32), metadata={"run": "planted"},
-    )  # fmt: skip
 
 
 def named(remarks: list[RecordingRemark]) -> dict[str, RecordingRemark]:

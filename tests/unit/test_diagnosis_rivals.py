@@ -1,0 +1,98 @@
+"""Rivals: worked errors, machines that they can learn, and no window predicted by its own fit."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from brokk_rl.open_loop import FreeRunWindows
+from diagnosis import rivals
+from diagnosis.rivals import assign_folds, measure_rivals
+
+BEFORE, STEPS = 33, 100
+
+
+def driven(windows: int, dead_band: float, seed: int = 0, noise: float = 1e-4) -> FreeRunWindows:
+    """Returns windows of one joint that follows its command, beyond a dead band, nine samples later."""
+    draw, length = np.random.default_rng(seed), BEFORE + STEPS
+    u = np.repeat(draw.uniform(-1.0, 1.0, (windows, length // 19 + 1)), 19, 1)[:, : length - 1]
+    beyond = np.sign(u) * np.maximum(np.abs(u) - dead_band, 0.0)
+    step = 0.02 * np.pad(beyond, ((0, 0), (9, 0)))[:, : length - 1]
+    q = np.cumsum(np.pad(step, ((0, 0), (1, 0))), 1)
+    q = q + noise * draw.standard_normal(q.shape)
+    run = np.zeros(windows)
+    return FreeRunWindows(u[..., None], q[..., None], run, 13, BEFORE)
+
+
+def rmse(squares: np.ndarray | None) -> float:
+    assert squares is not None
+    return float(np.sqrt(squares.mean()))
+
+
+def test_standing_still_errs_by_the_distance_from_the_start() -> None:
+    q = np.zeros((2, BEFORE + STEPS, 1))
+    q[:, BEFORE:, 0] = np.array([[0.3], [0.1]])  # one step aside, for good
+    cut = FreeRunWindows(np.zeros((2, BEFORE + STEPS - 1, 1)), q, np.zeros(2), 13, BEFORE)
+    found = measure_rivals(cut)["hold"].squares
+    assert found is not None
+    np.testing.assert_allclose(found, [[0.09], [0.01]])
+
+
+def test_a_dead_band_is_learned_with_hinges() -> None:
+    cut = driven(40, 0.3)
+    found = measure_rivals(cut)
+    assert rmse(found["arx"].squares) < 0.05 * rmse(found["hold"].squares)
+
+
+def test_without_hinges_a_dead_band_is_not_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+    cut = driven(40, 0.3)
+    with_hinges = rmse(measure_rivals(cut)["arx"].squares)
+    monkeypatch.setattr(rivals, "HINGES", ())
+    assert rmse(measure_rivals(cut)["arx"].squares) > 3.0 * with_hinges
+
+
+def test_no_window_is_predicted_by_a_fit_to_it() -> None:
+    cut = driven(32, 0.2)
+    changed = driven(32, 0.2)
+    changed.q[5, BEFORE:] += np.linspace(0.0, 0.5, STEPS)[:, None]
+    first, second = (rivals.run_arx(one) for one in (cut, changed))
+    same = first.fold == first.fold[5]
+    # its own positions after the start do not matter to its fold; those of other folds change
+    np.testing.assert_allclose(first.paths[same], second.paths[same], atol=2e-3)
+    assert np.abs(first.paths[~same] - second.paths[~same]).max() > 1e-3
+
+
+@pytest.mark.parametrize(("num_windows", "folds"), [(2, 2), (3, 3), (16, 4), (50, 4)])
+def test_folds_take_turns_in_blocks(num_windows: int, folds: int) -> None:
+    found = assign_folds(num_windows)
+    assert len(np.unique(found)) == folds and len(found) == num_windows
+    if num_windows == 50:
+        assert found[:8].tolist() == [0, 0, 0, 0, 1, 1, 1, 1]
+
+
+def test_one_window_leaves_none_to_fit() -> None:
+    found = measure_rivals(driven(1, 0.0))
+    assert found["hold"].squares is not None
+    assert found["arx"].squares is None and found["arx"].reason == rivals.TOO_FEW
+    assert found["flexible"].squares is None
+
+
+def test_a_flexible_rival_needs_scikit_learn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
+    found = measure_rivals(driven(8, 0.0))["flexible"]
+    assert found.squares is None and found.reason == rivals.NO_BOOSTING
+
+
+def test_boosting_learns_what_the_arx_cannot() -> None:
+    pytest.importorskip("sklearn")
+    cut = driven(80, 0.0, noise=1e-5)
+    # speed depends on the position: no term of the ARX
+    moved = np.diff(cut.q, axis=1)
+    q = [cut.q[:, :1]]
+    for k in range(moved.shape[1]):
+        q.append(q[-1] + moved[:, k : k + 1] * np.where(q[-1] > 0.0, 1.6, 0.6))
+    bent = FreeRunWindows(cut.u, np.concatenate(q, 1), cut.run, 13, BEFORE)
+    found = measure_rivals(bent)
+    assert rmse(found["flexible"].squares) < 0.95 * rmse(found["arx"].squares)
