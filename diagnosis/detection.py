@@ -213,12 +213,6 @@ class EffectSearch:
         )  # fmt: skip
 
     @property
-    def alike(self) -> frozenset[str]:
-        """Shared effects with about the same size on all joints."""
-        alike = [kind for kind in self.kinds if getattr(kind.target, "alike", True)]
-        return effect_library.list_shared_effects(alike)
-
-    @property
     def shared(self) -> frozenset[str]:
         """Effects with one cause for all joints."""
         return effect_library.list_shared_effects(self.kinds)
@@ -290,7 +284,8 @@ class EffectSearch:
         chosen = choose_by_penalties(tables, price, self.penalties, self.shared)
         tied = effects
         # Joints first size a shared effect separately; it is bound where responses still add up.
-        if z is None and (common := chosen.names & self.alike):
+        alike = effect_library.list_alike_effects(self.kinds)
+        if z is None and (common := chosen.names & alike):
             tied = CandidateEffects(
                 residuals, *bind_shared_sizes(common, tables, effects.rays, effects.shapes)
             )

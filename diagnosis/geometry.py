@@ -131,9 +131,9 @@ below the accuracy of any drawing or zero."""
 
 MIN_RATIO = 1.0
 """Least displacement by an error of geometry, over that of tool points on the reference (both root
-mean square per coordinate): an error below the instruments' own is no cause of a gap. On 37 answers
-with tool points on practice plants of other making, errors that were there reached 1.6 or more, and
-errors that were not there 0.8 at most."""
+mean square per coordinate): an error below the instruments' own is no cause of a gap. On 120
+answers from practice plants of other making, this drops every link length that is named without
+being off, and no error that is there."""
 
 
 @dataclass(frozen=True)

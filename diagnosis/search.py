@@ -299,14 +299,11 @@ def list_promising_subsets(
 ) -> list[Subset]:
     """Return the subsets of a joint that are worth pricing: effects that pay by themselves, and the larger ones that earn most.
 
-    An effect that is `shared` by all joints may earn little on each, or nothing where a joint hardly
-    shows it: that is no evidence against it.
+    An effect that is `shared` by all joints may earn little on each.
     """
 
     def pays(subset: Subset) -> bool:
         own = subset - shared
-        if not own and len(subset) == 1:
-            return True
         return table.scores[subset].total > least * len(own) and _has_each_gain(
             subset, own, table, share
         )
