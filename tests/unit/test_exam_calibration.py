@@ -130,8 +130,8 @@ def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothin
 ) -> None:
     outside = {
         **dict.fromkeys(weights.outside, 0.0),
-        "constant": float(np.log(0.4 / 0.6)),
-    }  # odds of 2 to 3, whatever is seen
+        "constant": float(np.log(0.45 / 0.55)),
+    }  # odds of 9 to 11, whatever is seen
     weights = dataclasses.replace(
         weights, outside=outside, none={"constant": 2.0, "nearest": 0.0, "outside": 0.0}
     )
@@ -140,8 +140,8 @@ def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothin
         "a fifth of causes lies outside, so few are missed only so"
     )
     assert not decision.is_unknown(silent, prices, weights)
-    rows = decision.rank_hypotheses(named, [], prices, weights, machine, 0.4)
-    assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.4)
+    rows = decision.rank_hypotheses(named, [], prices, weights, machine, 0.45)
+    assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.45)
     assert {row.effect for row in rows} >= {"lag", "unknown", "none"}
 
 
