@@ -23,7 +23,7 @@ from diagnosis.motion_floor import LeftOutErrors
 from diagnosis.rivals import Rival
 from diagnosis.sanity import TEXTS, RecordingRemark, name_recording
 
-# Chosen by hand on practice cases of `outside_plant`, seeds 11, 12 and 31; not searched.
+# Limits here were chosen by hand on practice cases from a plant of other making; not searched.
 MAX_REMARK_SHARES = {
     "unlogged input": 0.1,
     "interlock": 0.02,
@@ -44,19 +44,21 @@ predicts no motion at all is no model of the machine. Healthy ones have 0.09 to 
 MAX_FLOOR_RATIO = 1.75
 """Error over the floor up to which an unchanged machine is credible: unchanged practice machines
 have 0.7 to 1.5 after ageing between the days."""
-MAX_JOINT_RATIO = 2.5
-"""The same for the worst joint: 2.1 at most on unchanged machines."""
+MAX_JOINT_RATIO = 3.5
+"""The same for the worst joint. Of 15 unchanged practice machines the worst reaches 3.3, as a joint
+that hardly moves in the reference has a floor that is hardly known."""
 SURE_RATIO = 1.15
 """The lower end of the interval of either ratio that must be exceeded too: a ratio by chance is no
 gap. Unchanged machines reach 1.13."""
 MAX_SENSOR_RATIO = 3.0
 """Error over the sensor's noise below which nothing but noise is left; three standard deviations."""
-MAX_RIVAL_RATIO = 1.25
-"""Error over that of a rival fitted to the field, above which something is left to find: on unchanged
-machines the ratio is 1.12 at most."""
-MIN_REDUCED = 0.02
-"""Least reduction of the error on windows apart, lower end of its interval, of the joints that the
-effects act on: simulators of valves differ by as much from day to day."""
+MAX_RIVAL_RATIO = 1.5
+"""Error over that of a rival fitted to the field, above which something is left to find: on 15
+unchanged practice machines the ratio is 1.46 at most, and 1.12 on all but one."""
+MIN_REDUCED = 0.05
+"""Least reduction of the error on windows apart, of the joints that the effects act on. The lower end
+of its interval must lie above minus the reduction. A lower end above 0.02 instead withdrew five right
+names of twenty and no more than two wrong ones, on 60 practice cases."""
 
 
 MAX_LEVELS = 200
@@ -233,7 +235,8 @@ def judge_effects(
     names = [name for name, has in zip(reach.machine.joint_names, moved, strict=True) if has]
     share = f"{100 * reduced.mean:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
     text = f"{', '.join(effects)} remove {share} of the error of {', '.join(names) or 'no joint'} on windows apart"
-    gates = [Gate("reduces", reduced.has_interval and low > MIN_REDUCED, low, MIN_REDUCED, text)]
+    passed = reduced.has_interval and reduced.mean >= MIN_REDUCED and low > -reduced.mean
+    gates = [Gate("reduces", passed, reduced.mean, MIN_REDUCED, text)]
     after_all = float(reach.errors(reach.after)[0])
     return [*gates, *filter(None, [_judge_rival("hold", after_all, rivals, 1.0, reach)])]
 

@@ -152,7 +152,7 @@ def test_none_is_said_near_the_floor_only(
     found = judged(machine, thresholds, 0.019, 0.010)
     assert not found["near_floor"].passed and found["near_floor_by_joint"].passed
     assert found["near_floor"].value == pytest.approx(1.9, rel=0.03)
-    found = judged(machine, thresholds, 0.027, 0.010)
+    found = judged(machine, thresholds, 0.037, 0.010)
     assert not found["near_floor_by_joint"].passed
 
 
@@ -171,19 +171,19 @@ def test_one_joint_far_above_its_floor_is_enough(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
     seen = reach(machine, 0.010, 0.010, 0.010, 0.010, scatter=0.05)
-    for factor, passes in ((2.4, True), (2.7, False)):
+    for factor, passes in ((3.3, True), (3.7, False)):
         base = seen.base.field.residuals.base.copy()
         base[..., 2] *= factor
         again = with_base(seen, base)
         found = by_name(gates.judge_none(again, rivals(), [recording(machine)], thresholds))
-        assert found["near_floor"].passed and found["near_floor_by_joint"].passed is passes
+        assert found["near_floor_by_joint"].passed is passes
         assert "q3" in found["near_floor_by_joint"].text
 
 
 def test_none_is_never_said_where_a_rival_does_better(
     machine: Machine, thresholds: InspectionThresholds
 ) -> None:
-    for name, below, above in (("hold", 0.99, 1.02), ("arx", 1.22, 1.28), ("flexible", 1.22, 1.28)):
+    for name, below, above in (("hold", 0.99, 1.02), ("arx", 1.47, 1.53), ("flexible", 1.47, 1.53)):
         before = reach(machine, 0.012, 0.012, 0.012, 0.010, scatter=0.05).before[0]
         for ratio, passes in ((below, True), (above, False)):
             found = judged(machine, thresholds, 0.012, 0.010, **{name: float(before) / ratio})
@@ -223,8 +223,10 @@ def test_effects_must_close_a_share_on_windows_apart(machine: Machine) -> None:
 
     assert less(0.10, 0.02)["reduces"].passed
     assert "q3" in less(0.10, 0.02)["reduces"].text and "q1" not in less(0.10, 0.02)["reduces"].text
-    assert not less(0.015, 0.005)["reduces"].passed
-    assert not less(0.10, 0.6)["reduces"].passed  # by chance
+    assert less(0.055, 0.005)["reduces"].passed
+    assert not less(0.045, 0.005)["reduces"].passed
+    chance = less(-0.01, 0.6)["reduces"]
+    assert chance.value > chance.limit and not chance.passed
     assert not less(-0.10, 0.02)["reduces"].passed
 
 
