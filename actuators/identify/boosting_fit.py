@@ -69,26 +69,40 @@ class BoostingFit:
             ConfigError: scikit-learn is not installed.
             RecordingError: too little data.
         """
-        ensemble = import_ensemble(self.name)
+        self.require()
         inputs, targets = _stack_rows(machine, [*train, *validation], self.max_rows)
-        forests = []
-        for j in range(machine.num_joints):
-            model = ensemble.HistGradientBoostingRegressor(
-                max_iter=self.trees,
-                max_depth=self.depth,
-                max_leaf_nodes=None,
-                learning_rate=self.learning_rate,
-                min_samples_leaf=self.min_samples,
-                early_stopping=False,
-                random_state=seed % 2**31,
-            )
-            forests.append(tabulate_trees(model.fit(inputs[j], targets[j]), self.depth))
+        forests = [self.grow_trees(x, y, seed) for x, y in zip(inputs, targets, strict=True)]
         tensors = {}
         for name in forests[0]:
             tensors[name] = torch.as_tensor(np.stack([forest[name] for forest in forests]))
         path = folder / f"{self.name}.safetensors"
         checkpoint.write_checkpoint(path, "boosting", machine, tensors, {"depth": self.depth})
         return BoostedTrees(checkpoint=str(path))
+
+    def grow_trees(
+        self, inputs: np.ndarray, targets: np.ndarray, seed: int, weight: np.ndarray | None = None
+    ) -> dict[str, np.ndarray]:
+        """Return trees fitted to rows of one joint as complete trees; see `evaluate_trees`.
+
+        Args:
+            inputs: Features, `(B, F)`.
+            targets: What they should answer, `(B,)`.
+            seed: Of scikit-learn's random numbers.
+            weight: Weight of each row, `(B,)`; `None`: all count alike.
+
+        Raises:
+            ConfigError: scikit-learn is not installed.
+        """
+        model = import_ensemble(self.name).HistGradientBoostingRegressor(
+            max_iter=self.trees,
+            max_depth=self.depth,
+            max_leaf_nodes=None,
+            learning_rate=self.learning_rate,
+            min_samples_leaf=self.min_samples,
+            early_stopping=False,
+            random_state=seed % 2**31,
+        )
+        return tabulate_trees(model.fit(inputs, targets, weight), self.depth)
 
 
 def tabulate_trees(model: Any, depth: int) -> dict[str, np.ndarray]:

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 import yaml
 
-from actuators.identify.boosting_fit import import_ensemble, tabulate_trees
+from actuators.identify.boosting_fit import BoostingFit
 from actuators.identify.valve_fit import ValveFit
 from actuators.models import checkpoint
 from actuators.models.hybrid import MOVING, HybridActuator, ResidualInputs, compute_residual
@@ -60,31 +60,17 @@ class HybridFit:
         name: Name in tables, of the checkpoint and of the file for `actuator=@…`.
         valve: Fit of the curve.
         members: Members of the ensemble, each fitted to runs drawn with replacement.
-        trees: Trees a joint and member.
-        depth: Of each tree.
-        learning_rate: Share of each tree's answer that is added.
-        min_samples: Least rows in a leaf.
-        max_rows: Rows fitted to at most, evenly spread.
+        boosting: Trees of each member.
     """
 
     name: str
     valve: ValveFit
+    boosting: BoostingFit
     members: int
-    trees: int
-    depth: int
-    learning_rate: float
-    min_samples: int
-    max_rows: int
 
     def check(self) -> None:
         if self.members < 2:
             raise ConfigError(f"fit.members: a spread needs 2 or more, got {self.members}")
-        if min(self.trees, self.depth, self.min_samples, self.max_rows) < 1:
-            raise ConfigError("fit: trees, depth, min_samples and max_rows must be 1 or more")
-        if self.depth > 8:
-            raise ConfigError(f"fit.depth: expected 8 or less, got {self.depth}")
-        if not 0 < self.learning_rate <= 1:
-            raise ConfigError(f"fit.learning_rate: expected (0, 1], got {self.learning_rate}")
 
     def require(self) -> None:
         """Check that scikit-learn is there.
@@ -92,7 +78,7 @@ class HybridFit:
         Raises:
             ConfigError: it is not.
         """
-        import_ensemble(self.name)
+        self.boosting.require()
 
     def fit(
         self,
@@ -110,6 +96,7 @@ class HybridFit:
             RecordingError: too little data.
             StorageError: a file could not be written.
         """
+        self.require()
         del device  # trees are fitted on the CPU
         every = [*train, *validation]
         path = folder / f"{self.name}.safetensors"
@@ -178,8 +165,7 @@ class HybridFit:
         self, curve: ValveActuator, machine: Machine, recordings: Sequence[Recording], seed: int
     ) -> dict[str, torch.Tensor]:
         """Return the tensors of a residual with all of it in force."""
-        ensemble = import_ensemble(self.name)
-        rows = stack_residuals(curve, machine, recordings, self.max_rows)
+        rows = stack_residuals(curve, machine, recordings, self.boosting.max_rows)
         generator = np.random.default_rng(seed)
         forests: dict[str, list[np.ndarray]] = {name: [] for name in TENSORS}
         num_runs = int(rows.run.max()) + 1
@@ -188,16 +174,8 @@ class HybridFit:
             weight = count[rows.run]
             drawn, by_joint = weight > 0, []
             for j in range(machine.num_joints):
-                model = ensemble.HistGradientBoostingRegressor(
-                    max_iter=self.trees,
-                    max_depth=self.depth,
-                    max_leaf_nodes=None,
-                    learning_rate=self.learning_rate,
-                    min_samples_leaf=self.min_samples,
-                    early_stopping=False,
-                    random_state=seed % 2**31,
-                ).fit(rows.inputs[j][drawn], rows.target[drawn, j], weight[drawn])
-                by_joint.append(tabulate_trees(model, self.depth))
+                inputs, target = rows.inputs[j][drawn], rows.target[drawn, j]
+                by_joint.append(self.boosting.grow_trees(inputs, target, seed, weight[drawn]))
             for name in TENSORS:
                 forests[name].append(np.stack([forest[name] for forest in by_joint]))
         tensors = {name: torch.as_tensor(np.stack(each)) for name, each in forests.items()}
@@ -314,10 +292,10 @@ def select_unlike(recordings: Sequence[Recording], machine: Machine) -> list[Rec
     A run is described by size and direction of its commands, how many joints move together, and
     where they move; the distance is from the median of all runs, in their spread.
     """
-    runs = group_by_run(recordings)
+    parts = list(group_by_run(recordings).values())
     described = []
-    for parts in runs.values():
-        u, q = (np.concatenate([getattr(part, name) for part in parts]) for name in ("u", "q"))
+    for run in parts:
+        u, q = (np.concatenate([getattr(part, name) for part in run]) for name in ("u", "q"))
         place = (q - machine.lower) / (machine.upper - machine.lower)
         together = np.mean((np.abs(u) > COMMANDED).sum(1) > 1)
         row = [np.abs(u).mean(0), u.mean(0), place.mean(0), place.std(0), [together]]
@@ -327,7 +305,7 @@ def select_unlike(recordings: Sequence[Recording], machine: Machine) -> list[Rec
     order = np.argsort(-np.square(apart).sum(1), kind="stable")
     total, found = sum(recording.num_samples for recording in recordings), []
     for number in order[:-1]:  # one run is left to fit to
-        found += list(runs.values())[number] if isinstance(runs, dict) else []
+        found += parts[number]
         if sum(recording.num_samples for recording in found) >= UNLIKE * total:
             break
     return found

@@ -4,15 +4,16 @@ Axes: `N` environments, `J` joints, `H` history (oldest first), `K` hinges a sig
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from actuators.models import checkpoint
+from actuators.models.linear import ArxModel
 from brokk_rl import open_loop
 from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.spec import spec
@@ -33,7 +34,7 @@ class HingeArx:
 
     checkpoint: str
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HingeArxModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ArxModel:
         """Return the model.
 
         Raises:
@@ -50,32 +51,8 @@ class HingeArx:
             raise CheckpointError(
                 f"{path}: expected a tensor 'weight' of shape {(machine.num_joints, columns)}"
             )
-        return HingeArxModel(weight.to(device), knees.to(device), machine, device)
-
-
-class HingeArxModel:
-    """`q' = q + weight . [hinges of u, increments]`, each joint from its own history."""
-
-    def __init__(
-        self, weight: torch.Tensor, knees: torch.Tensor, machine: Machine, device: torch.device
-    ) -> None:
-        self._weight, self._knees = weight, knees
-        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
-        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """Nothing."""
-        return {}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Do nothing."""
-
-    def step(self, history: History) -> torch.Tensor:
-        """Return the joint positions one control period later, shape `(N, J)`."""
-        inputs = build_hinge_features(history.u, history.q, self._knees)
-        moved = torch.einsum("nij,ji->nj", inputs, self._weight)
-        return (history.q[:, -1] + moved).clamp(self._lower, self._upper)
+        build_features = partial(build_hinge_features, knees=knees.to(device))
+        return ArxModel(weight.to(device), build_features, machine, device)
 
 
 def build_hinge_features(u: torch.Tensor, q: torch.Tensor, knees: torch.Tensor) -> torch.Tensor:
@@ -129,26 +106,24 @@ class HingeArxFit:
             RecordingError: too little data.
         """
         knees = torch.tensor(self.knees)
-        grams, products, scales = _accumulate_moments(machine, train, knees)
+        moments = _accumulate_moments(machine, train, knees)
         path = folder / f"{self.name}.safetensors"
-        best, chosen, ridges = np.inf, self.ridges[len(self.ridges) // 2], self.ridges
-        longest_s = open_loop.find_longest_horizon_s(validation, machine)
-        if longest_s < VALIDATION_S:  # too short to choose by
-            _write_weights(
-                path, machine, _solve_ridge(grams, products, scales, chosen), knees, chosen
-            )
+
+        def write(ridge: float) -> HingeArx:
+            weight = torch.as_tensor(_solve_ridge(*moments, ridge), dtype=torch.float32)
+            tensors = {"weight": weight, "knees": knees}
+            checkpoint.write_checkpoint(path, "hinge_arx", machine, tensors, {"ridge": ridge})
             return HingeArx(checkpoint=str(path))
+
+        if open_loop.find_longest_horizon_s(validation, machine) < VALIDATION_S:
+            return write(self.ridges[len(self.ridges) // 2])  # too short to choose by
         cut = open_loop.cut_windows(validation, machine, VALIDATION_S, VALIDATION_STRIDE_S)
-        for ridge in ridges:
-            _write_weights(
-                path, machine, _solve_ridge(grams, products, scales, ridge), knees, ridge
-            )
-            error = open_loop.roll_out(HingeArx(checkpoint=str(path)), machine, cut, device)
-            travel = machine.upper - machine.lower
-            loss = float(np.mean(np.square((error - cut.measured)[:, -1] / travel)))
-            best, chosen = (loss, ridge) if loss < best else (best, chosen)
-        _write_weights(path, machine, _solve_ridge(grams, products, scales, chosen), knees, chosen)
-        return HingeArx(checkpoint=str(path))
+        travel, losses = machine.upper - machine.lower, []
+        for ridge in self.ridges:
+            error = open_loop.roll_out(write(ridge), machine, cut, device) - cut.measured
+            losses.append(float(np.mean(np.square(error[:, -1] / travel))))
+        # a fit that ran away has no finite loss
+        return write(self.ridges[int(np.argmin(np.nan_to_num(losses, nan=np.inf)))])
 
 
 def _accumulate_moments(
@@ -182,10 +157,3 @@ def _solve_ridge(
     """Return the weights of each joint, `(J, F)`."""
     penalised = gram + ridge * np.eye(gram.shape[1])
     return np.linalg.solve(penalised, product[..., None])[..., 0] / scale
-
-
-def _write_weights(
-    path: Path, machine: Machine, weight: np.ndarray, knees: torch.Tensor, ridge: float
-) -> None:
-    tensors = {"weight": torch.as_tensor(weight, dtype=torch.float32), "knees": knees}
-    checkpoint.write_checkpoint(path, "hinge_arx", machine, tensors, {"ridge": ridge})

@@ -1,6 +1,6 @@
 """Baselines that a learned actuator must beat: a machine that stands still, and a linear model."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -84,14 +84,32 @@ class Arx:
         expected = (machine.num_joints, 3 * machine.num_history - 1)
         if "weight" not in tensors or tuple(tensors["weight"].shape) != expected:
             raise CheckpointError(f"{path}: expected a tensor 'weight' of shape {expected}")
-        return ArxModel(tensors["weight"].to(device), machine, device)
+        return ArxModel(tensors["weight"].to(device), build_arx_features, machine, device)
+
+
+def build_arx_features(u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+    """Return `[u, |u| u, increments]` of histories `u` and `q` `(N, H, J)`, `(N, 3 H - 1, J)`."""
+    return torch.cat([u, u.abs() * u, q[:, 1:] - q[:, :-1]], 1)
 
 
 class ArxModel:
-    """`q' = q + weight . [u, |u| u, increments]`, each joint from its own history."""
+    """`q' = q + weight . features`, each joint from its own history.
 
-    def __init__(self, weight: torch.Tensor, machine: Machine, device: torch.device) -> None:
-        self._weight = weight
+    Args:
+        weight: `(J, F)`.
+        build_features: Features of histories `u` and `q` `(N, H, J)`, `(N, F, J)`.
+        machine: The machine.
+        device: Where the tensors live.
+    """
+
+    def __init__(
+        self,
+        weight: torch.Tensor,
+        build_features: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
+        machine: Machine,
+        device: torch.device,
+    ) -> None:
+        self._weight, self._build_features = weight, build_features
         self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
         self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
 
@@ -105,10 +123,9 @@ class ArxModel:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        u, q = history.u, history.q
-        inputs = torch.cat([u, u.abs() * u, q[:, 1:] - q[:, :-1]], 1)
+        inputs = self._build_features(history.u, history.q)
         moved = torch.einsum("nij,ji->nj", inputs, self._weight)
-        return (q[:, -1] + moved).clamp(self._lower, self._upper)
+        return (history.q[:, -1] + moved).clamp(self._lower, self._upper)
 
 
 @spec
@@ -136,7 +153,7 @@ class ArxFit:
         seed: int,
         device: torch.device,
     ) -> Arx:
-        """Fit to `train` and writes `<name>.safetensors` into `folder`.
+        """Fit to `train` and write `<name>.safetensors` into `folder`.
 
         Raises:
             RecordingError: too little data.

@@ -73,7 +73,8 @@ def tiny() -> HybridFit:
         curve_retract=(0.0, 0.1, 1.0),
     )
     valve = dataclasses.replace(fit.valve, actuator=curve, sweeps=2, iterations=1)
-    return dataclasses.replace(fit, valve=valve, members=2, trees=20, depth=3)
+    boosting = dataclasses.replace(fit.boosting, trees=20, depth=3)
+    return dataclasses.replace(fit, valve=valve, members=2, boosting=boosting)
 
 
 def test_the_residual_is_the_mean_of_the_members_where_they_agree() -> None:
