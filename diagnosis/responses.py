@@ -228,8 +228,8 @@ def cross_validate_change(
 SHAPE_FACTORS = (0.35, 0.5, 0.7, 1.4, 2.0)
 """Values of a number that only shapes an effect that are tried beside the typical one, over it."""
 FINE_GRID = tuple(np.geomspace(SIZE_GRID[0], 7.0, 24).round(3).tolist())
-"""Sizes at which an effect is simulated that rings: between those of `GRID` it would be out of
-step, and only a dull one fits."""
+"""Sizes at which an effect is simulated that rings: between those of `SIZE_GRID` it would be out of
+step, and only a dull one fits. The largest is a period of 2 s, the bound of `compliance`."""
 REFERENCE_GRID = SIZE_GRID[:4]
 """Sizes at which effects are simulated on the reference: small ones of the field's, as many effects
 begin at a threshold."""

@@ -148,7 +148,7 @@ class SubsetTable:
         """Try all single effects, and larger subsets that contain one of the best of the size below."""
 
         def net(subset: Subset) -> float:
-            return self.score(subset).total - sum(price[name] for name in subset)
+            return self.score(subset).total - sum(price[name] for name in sorted(subset))
 
         single = sorted((frozenset({name}) for name in self.shapes), key=net, reverse=True)
         level = [a | b for a, b in combinations(single[: BEAM_WIDTH + 1], 2)]
@@ -158,18 +158,22 @@ class SubsetTable:
         for _ in range(2, most + 1):
             before = net(best[0])
             level = self._extend([one for one in best if len(one) < most])
-            best = sorted({*best, *level}, key=lambda one: (-net(one), sorted(one)))[:BEAM_WIDTH]
+            every = sorted({*best, *level}, key=sorted)
+            best = sorted(every, key=net, reverse=True)[:BEAM_WIDTH]
             if net(best[0]) <= before:
                 return
 
-    def _extend(self, subsets: Sequence[Subset]) -> set[Subset]:
-        """Return all subsets with one effect more."""
-        larger = set()
+    def _extend(self, subsets: Sequence[Subset]) -> list[Subset]:
+        """Return all subsets with one effect more, by name.
+
+        Fits begin at what was scored before, so the order must not be that of a hash table.
+        """
+        larger: set[Subset] = set()
         for subset in subsets:
             for name in self.shapes:
                 if name not in subset:
                     larger.add(subset | {name})
-        return larger
+        return sorted(larger, key=sorted)
 
 
 @dataclass(frozen=True)

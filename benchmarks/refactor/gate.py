@@ -39,7 +39,7 @@ import numpy as np
 import yaml
 
 SALT = "0123456789abcdef0123456789abcdef"
-"""Of the labels of the exams: drawn by chance where none is given, and it decides their hash."""
+"""Salt of the exams' labels. It decides their hash, and is random where none is given."""
 
 # --- What is run -------------------------------------------------------------
 # Each command is `python -m brokk_rl <words> session.out={part}/<name>`. {part}: folder of the

@@ -364,7 +364,8 @@ class PageServer:
     async def _handle_connection(self, connection: ServerConnection) -> None:
         assert connection.request is not None
         handle = self._handlers[connection.request.path.partition("?")[0]]
-        # Counted before the handler runs, so that many slow handshakes cannot exceed the limit.
+        # `_answer` has compared the count with its limit before the handshake: handshakes at the same
+        # time may exceed it by their number.
         self._num_open += 1
         try:
             with contextlib.suppress(ConnectionClosed):
