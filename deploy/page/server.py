@@ -65,8 +65,8 @@ BUFFER_BYTES = 1 << 16
 CONNECTIONS = 3
 """WebSockets that one page opens."""
 STATE, FRAMES, CONTROL = "/state", "/frames", "/control"
-POLICY_VIOLATION = 1008
-"""Close code of a WebSocket (RFC 6455)."""
+POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013
+"""Close codes of a WebSocket (RFC 6455 and the registry of its codes at IANA)."""
 
 
 class PageExtension(Protocol):
@@ -355,17 +355,15 @@ class PageServer:
         if not is_ours or (needs_origin and origin is None):
             log.warning("refused a connection from another origin")
             return _build_refusal(HTTPStatus.FORBIDDEN, "another origin")
-        if self._num_open >= CONNECTIONS * self._page.clients:
-            return _build_refusal(
-                HTTPStatus.SERVICE_UNAVAILABLE, "too many pages; see page.clients"
-            )
         return None
 
     async def _handle_connection(self, connection: ServerConnection) -> None:
         assert connection.request is not None
         handle = self._handlers[connection.request.path.partition("?")[0]]
-        # `_answer` has compared the count with its limit before the handshake: handshakes at the same
-        # time may exceed it by their number.
+        # Compared after the handshake: before it, handshakes at the same time would all be let in.
+        if self._num_open >= CONNECTIONS * self._page.clients:
+            await connection.close(TRY_AGAIN_LATER, "too many pages; see page.clients")
+            return
         self._num_open += 1
         try:
             with contextlib.suppress(ConnectionClosed):

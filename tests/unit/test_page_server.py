@@ -10,10 +10,11 @@ from typing import Any
 
 import pytest
 from browser import TOKEN, Scripted, served
-from websockets.asyncio.client import connect
+from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from deploy.page.protocol import PageState
+from deploy.page.server import CONNECTIONS
 
 
 @pytest.fixture
@@ -107,6 +108,25 @@ def test_who_never_reads_or_answers_costs_the_others_nothing(feed: Scripted, por
     count, waiting = asyncio.run(run())
     assert waiting == 4, "newest values only, and no more than four that were not drawn"
     assert count > 10
+
+
+def test_connections_that_come_together_do_not_exceed_the_limit(feed: Scripted) -> None:
+    async def count(port: int) -> int:
+        address = f"ws://localhost:{port}/state"
+        sockets = await asyncio.gather(*(connect(address, proxy=None) for _ in range(12)))
+        closed = await asyncio.gather(*(drain(socket) for socket in sockets))
+        await asyncio.gather(*(socket.close() for socket in sockets))
+        return closed.count("too many pages; see page.clients")
+
+    async def drain(socket: ClientConnection) -> str:
+        try:
+            while True:
+                await asyncio.wait_for(socket.recv(), 0.5)
+        except (TimeoutError, ConnectionClosed):
+            return socket.close_reason or ""
+
+    with served(feed, clients=2) as port:
+        assert asyncio.run(count(port)) == 12 - 2 * CONNECTIONS
 
 
 def test_a_page_that_says_nonsense_is_closed(port: int) -> None:
