@@ -49,9 +49,7 @@ def measure_time_scale(machine: Machine) -> float:
     A machine answers a command after its dead time. What is shorter than some control periods, no
     recording shows: the longer of the two counts.
     """
-    return max(
-        machine.period_s / REFERENCE_PERIOD_S, machine.dead_time_s / REFERENCE_DEAD_TIME_S
-    )
+    return max(machine.period_s / REFERENCE_PERIOD_S, machine.dead_time_s / REFERENCE_DEAD_TIME_S)
 
 
 def choose_horizon_s(machine: Machine) -> float:

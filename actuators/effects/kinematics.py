@@ -33,7 +33,9 @@ class LinkLength(EffectSpec):
     extra_m: Value
     side = "kinematics"
     stage = "kinematics"
-    numbers: ClassVar = {"extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3), scale="reach")}
+    numbers: ClassVar = {
+        "extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3), scale="reach")
+    }
 
     def tool(
         self,

@@ -242,10 +242,16 @@ def _explain_idle(
     """Return the message about numbers that the machine does not have, with those that it has."""
     others = []
     for name, number in numbers.items():
-        if name.rpartition(".")[0] == effect and number.masses is not None and number.is_on(machine):
+        if (
+            name.rpartition(".")[0] == effect
+            and number.masses is not None
+            and number.is_on(machine)
+        ):
             others.append(name)
     known = "has known masses" if machine.has_bodies else "is known by its joints only"
-    mend = "" if machine.has_bodies else ", or add joints[].body (axis, origin, mass, …) to its file"
+    mend = (
+        "" if machine.has_bodies else ", or add joints[].body (axis, origin, mass, …) to its file"
+    )
     return (
         f"{where}.{', '.join(names)}: machine '{machine.name}' {known}, so that they do nothing; "
         f"give {', '.join(others)}{mend}"

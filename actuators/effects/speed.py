@@ -98,7 +98,9 @@ class Backlash(EffectSpec):
     joints: Joints
     gap_rad: Value
     side = "speed"
-    numbers: ClassVar = {"gap_rad": EffectNumber("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2), scale="travel")}
+    numbers: ClassVar = {
+        "gap_rad": EffectNumber("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2), scale="travel")
+    }
 
     def begin(self, now: StepInputs) -> Memory:
         """A moving joint lies against the side in front; a resting one in the middle."""

@@ -139,11 +139,7 @@ def test_a_range_over_the_typical_size_is_mirrored_about_the_neutral_value(
 
 
 @pytest.mark.parametrize(
-    "spec",
-    [
-        Creep(joints="all", sink_rad_s=0.002),
-        LoadDependence(joints="all", sensitivity=0.5),
-    ],
+    "spec", [Creep(joints="all", sink_rad_s=0.002), LoadDependence(joints="all", sensitivity=0.5)]
 )
 def test_a_weight_on_a_machine_without_masses_is_still_refused(spec: Any) -> None:
     small = option("machine", "mini_excavator")
