@@ -34,6 +34,11 @@ class GuardState(Enum):
     READY = 2
     ACTIVE = 3
 
+    @property
+    def sends(self) -> bool:
+        """True if anything is sent at all in this state."""
+        return self is not GuardState.SILENT
+
 
 class GuardTrip(Enum):
     """Why the guard does not pass a requested command."""
@@ -46,7 +51,9 @@ class GuardTrip(Enum):
     LEVERS_STALE = "remote missing"
     JOINTS_STALE = "joint positions missing"
     JOINTS_INVALID = "joint positions not plausible"
-    CHANNEL_INVALID = "messages corrupted"
+    CHANNEL_INVALID = "messages corrupted or from two senders"
+    CONTROLS_STALE = "operator's switches missing"
+    ROUND_TRIP = "way to the gateway and back unknown or too long"
     SECOND_SENDER = "somebody else sends commands"
     LEVER = "operator moves a lever"
     IGNORED = "the gateway does not follow"
@@ -74,6 +81,9 @@ class GuardInput:
         bus_up: Whether the bus works.
         alone: Whether nobody else sends valve commands.
         followed: Whether the gateway says that it goes by our commands.
+        controls_age_s: Age of the switches that arm; they matter only while armed.
+        round_trip_s: Time from the gateway to here and back to it, as the gateway measured it on
+            our commands; it matters only while armed, since nothing is sent otherwise.
     """
 
     q: Numbers
@@ -88,6 +98,8 @@ class GuardInput:
     bus_up: bool
     alone: bool
     followed: bool
+    controls_age_s: float
+    round_trip_s: float
 
 
 @dataclass(frozen=True)
@@ -122,7 +134,7 @@ class GuardDecision:
     @property
     def sends(self) -> bool:
         """True if anything is sent at all."""
-        return self.state is not GuardState.SILENT
+        return self.state.sends
 
 
 class Guard:
@@ -164,6 +176,8 @@ class Guard:
             )
         if self._state is GuardState.SILENT:
             self._state, self._cause = GuardState.LATCHED, GuardTrip.NOT_ARMED
+        if wrong is GuardTrip.NONE:
+            wrong = self._check_way(seen)
         if wrong is GuardTrip.NONE and self._state is GuardState.ACTIVE and seen.deadman:
             wrong = self._check_request(request)
         if wrong is not GuardTrip.NONE:
@@ -203,6 +217,14 @@ class Guard:
             (seen.lever <= limits.neutral, GuardTrip.LEVER),
         )
         return next((trip for fine, trip in checks if not fine), GuardTrip.NONE)
+
+    def _check_way(self, seen: GuardInput) -> GuardTrip:
+        """Return the fault of what only matters where commands are sent."""
+        if not seen.controls_age_s <= self._limits.controls_s:
+            return GuardTrip.CONTROLS_STALE
+        if not seen.round_trip_s <= self._limits.round_trip_s:
+            return GuardTrip.ROUND_TRIP
+        return GuardTrip.NONE
 
     def _check_request(self, request: CommandRequest | None) -> GuardTrip:
         """Return the fault of a request."""

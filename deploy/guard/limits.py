@@ -30,6 +30,8 @@ class GuardLimits:
         request_s: Age of a command from which it is stale.
         ignored_s: Time for which the gateway may give the valves to another sender, or none, while
             commands are sent.
+        controls_s: Age of the operator's switches from which they are stale.
+        round_trip_s: Time from the gateway to this computer and back from which it is too long.
         gap_s: Time between two cycles above which the process was stopped, or the computer asleep.
         jump_margin: Speed over the machine's fastest, beyond which a joint has jumped.
         jump_slack: Jump (rad or m) that noise alone may make.
@@ -48,6 +50,8 @@ class GuardLimits:
     status_s: float
     request_s: float
     ignored_s: float
+    controls_s: float
+    round_trip_s: float
     gap_s: float
     jump_margin: float
     jump_slack: float
@@ -65,6 +69,8 @@ class GuardLimits:
             "status_s",
             "request_s",
             "ignored_s",
+            "controls_s",
+            "round_trip_s",
             "gap_s",
             "jump_slack",
             "range_slack",

@@ -80,7 +80,7 @@ def test_the_checklist_runs_with_an_operator_and_finds_a_sound_machine(
     brokk: Callable[..., Any], machine: Machine, tmp_path: Path
 ) -> None:
     bus_port, port = free_port(), free_port()
-    wire = CanBus(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port)
+    wire = CanBus(interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=bus_port, hops=0)
     twin = Twin(
         wire=wire,
         dbc=DBC,
