@@ -13,13 +13,16 @@ Pure: no clock, no bus, no file, no tensor; the caller hands in everything.
     ACTIVE or READY --anything wrong--> LATCHED
     any --no longer armed--> SILENT
 
-Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once.
+Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once. A
+joint that has changed its direction `max_reversals_1_s` times within a second gets zero instead of a
+further change.
 Nothing is ever sent that the guard has not checked in the same cycle.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
@@ -151,6 +154,10 @@ class Guard:
         self._state, self._cause = GuardState.SILENT, GuardTrip.NONE
         # NaN stands for never: no comparison with it holds
         self._sent, self._before_s, self._followed_s = self._still, math.nan, math.nan
+        # Last direction of each joint, and when its last changes were, newest last.
+        self._directions = [0.0] * len(self._still)
+        most = limits.max_reversals_1_s
+        self._reversed_s = [deque[float]([-math.inf] * most, most) for _ in self._still]
 
     def decide(
         self, now_s: float, armed: bool, seen: GuardInput, request: CommandRequest | None
@@ -259,7 +266,19 @@ class Guard:
                 value < 0 and at <= lower + limits.stop_margin
             )
             values.append(0.0 if outward else value)
-        return tuple(values)
+        return tuple(self._limit_reversals(joint, value) for joint, value in enumerate(values))
+
+    def _limit_reversals(self, joint: int, value: float) -> float:
+        """Return the command of a joint, or zero where it would change its direction too often."""
+        if value == 0.0:
+            return value
+        before, reversed_s = self._directions[joint], self._reversed_s[joint]
+        if value * before < 0:
+            if self._before_s - reversed_s[0] < 1.0:
+                return 0.0
+            reversed_s.append(self._before_s)
+        self._directions[joint] = math.copysign(1.0, value)
+        return value
 
     def _conclude(self, u: Numbers, trip: GuardTrip) -> GuardDecision:
         self._sent = u

@@ -19,6 +19,7 @@ class GuardLimits:
     Attributes:
         max_command: Largest command, of full.
         max_rate_1_s: Largest growth of a command per second.
+        max_reversals_1_s: Changes of a joint's direction within a second; more are withheld.
         overrun: Command beyond full that counts as rounding; a larger one is refused.
         neutral: Deflection of the operator's own levers, of full, below which they count as
             released.
@@ -42,6 +43,7 @@ class GuardLimits:
 
     max_command: float
     max_rate_1_s: float
+    max_reversals_1_s: int
     overrun: float
     neutral: float
     stop_margin: float
@@ -84,9 +86,11 @@ class GuardLimits:
             or not 0 < self.neutral < 1
             or self.jump_margin < 1
             or self.num_jumps < 1
+            or self.max_reversals_1_s < 1
         ):
             raise ConfigError(
-                "guard: expected overrun and stop_margin of 0 or more, neutral in (0, 1), jump_margin and num_jumps of 1 or more"
+                "guard: expected overrun and stop_margin of 0 or more, neutral in (0, 1), "
+                "jump_margin, num_jumps and max_reversals_1_s of 1 or more"
             )
 
 

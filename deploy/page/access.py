@@ -15,9 +15,7 @@ from typing import Literal
 
 from deploy.page.protocol import REQUEST_KINDS, OperatorRequest, PageState
 
-RefusalReason = Literal[
-    "token", "malformed", "deadman", "target", "nowhere", "busy", "unconfirmed"
-]
+RefusalReason = Literal["token", "malformed", "deadman", "target", "nowhere", "busy", "unconfirmed"]
 """Why a request was refused: wrong token; no such request; the dead-man is not held; no such
 target; nothing is measured where the person points; the loop does not take it; the guard does not
 confirm the stop."""

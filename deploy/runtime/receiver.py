@@ -225,9 +225,7 @@ class BusReceiver:
     def _is_alone(self, now_s: float) -> bool:
         return now_s - self._stranger_s > STRANGER_S
 
-    def _find_sent_s(
-        self, layout: MessageLayout, values: dict[str, float], now_s: float
-    ) -> float:
+    def _find_sent_s(self, layout: MessageLayout, values: dict[str, float], now_s: float) -> float:
         """Return when a message was sent; `-inf` where its stamp makes no sense."""
         stamp_s, wrap_s = values.get(STAMP, 0.0), layout.stamp_wrap_s
         if not wrap_s:

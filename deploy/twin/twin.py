@@ -19,8 +19,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
-from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.c_header import generate_c_header
+from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import GATEWAY, STAMP, BusDescription
 from deploy.runtime.process import CycleTimer, Stop, ask_for_priority
 from deploy.twin.faults import ActiveFaults, FaultPort

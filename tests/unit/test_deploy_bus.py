@@ -23,9 +23,9 @@ from hypothesis import strategies as st
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from deploy.bus import description as described
+from deploy.bus.c_header import generate_c_header
 from deploy.bus.can_bus import BusReplay, CanBus, CanFrame
 from deploy.bus.clock import GatewayClock
-from deploy.bus.c_header import generate_c_header
 from deploy.bus.description import BusDescription
 from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel, compute_crc8
 
@@ -496,7 +496,11 @@ def test_the_header_decides_about_messages_as_the_python_side_does(
     for k in range(10_000):
         calm = (k // 200) % 2
         flood = k % 400 > 370
-        now_ms += 0 if flood else chance.choice([20] * 20 if calm else [20] * 12 + [0, 1, 7, 40, 90, 700, 5000])
+        now_ms += (
+            0
+            if flood
+            else chance.choice([20] * 20 if calm else [20] * 12 + [0, 1, 7, 40, 90, 700, 5000])
+        )
         counter += chance.choice([1] * 30 if calm else [1] * 12 + [0, 2, 4, 5, 9])
         late_ms = 0 if calm or chance.random() < 0.9 else chance.choice([30, 200, 600])
         stamp_ms = max(0, now_ms - late_ms) % wrap_ms

@@ -21,11 +21,11 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.signals import Frame
 from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
+from deploy.page.connections import ConnectionBudget, SendWindow
 from deploy.page.demo import DemoMachine
 from deploy.page.files import load_files
 from deploy.page.protocol import OperatorRequest, SourceAge
 from deploy.page.scene import plan_approach
-from deploy.page.connections import ConnectionBudget, SendWindow
 from deploy.page.server import build_link
 
 MINE = access.list_own_hosts("127.0.0.1", 8170, ())

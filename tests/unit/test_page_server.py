@@ -13,8 +13,8 @@ from browser import TOKEN, Scripted, served
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from deploy.page.protocol import PageState
 from deploy.page.connections import UNPROVEN, WATCHING
+from deploy.page.protocol import PageState
 
 
 @pytest.fixture
@@ -173,7 +173,7 @@ def test_a_stop_is_done_when_the_guard_says_so(feed: Scripted, port: int) -> Non
     said = [json.dumps({"token": TOKEN}), '{"kind": "stop", "value": ""}']
     begun_s = time.monotonic()
     assert talk(port, "/control", said)[1] == {"refused": "unconfirmed", "kind": "stop"}
-    assert 0.3 <= time.monotonic() - begun_s
+    assert time.monotonic() - begun_s >= 0.3
     feed.confirms = True
     assert talk(port, "/control", said)[1] == {"done": "stop", "kind": "stop"}
 
