@@ -120,6 +120,7 @@ class Bridge:
 
     def clear(self) -> None:
         """Carry everything as it is."""
+        self._waiting.clear()
         self.delay_s: dict[str, float | Callable[[float], float]] = {}
         self.echo_s: dict[str, float] = {}
         self.half, self.second_remote, self.begun_ms = "", False, self._stage.ms
@@ -296,10 +297,9 @@ class Stage:
         self.arm()
         self.wanted = tuple(side * u for u in WANTED)
         self._write("target", t_s=self.now_s, center_in_base_m=(2.5, 0.7 * side, 0.75))
-        self.go(0.6)  # a channel that was disturbed needs half a second
-        self.go(
-            1.2, lambda: bool(self.memory.state.peek("alone"))
-        )  # a second sender is remembered for a second
+        # A channel that was disturbed needs half a second, a second sender is remembered for one.
+        self.go(0.7)
+        self.go(1.2, lambda: all(map(self.memory.state.peek, ("alone", "trusted"))))
         if self.mode != "collect":
             self.go(2.0, lambda: self.advised)
             assert self.advised, self.view

@@ -131,9 +131,11 @@ class ProtectedChannel:
         # A stamp that goes back belongs to a late copy. It must not disturb the counter of the
         # sender that it copies. After a long silence back and forth look alike.
         before_s, half_s = self._stamp_s, self._wrap_s / 2
+        step_s = 0.0
         if before_s is not None and elapsed_s < half_s:
-            if (stamp_s - before_s) % self._wrap_s > half_s:
-                return self.refuse(MessageFault.LATE)
+            step_s = (stamp_s - before_s) % self._wrap_s
+        if step_s > half_s:
+            return self.refuse(MessageFault.LATE)
         self._stamp_s = stamp_s
         before, self._last = self._last, counter
         if before is None:

@@ -114,11 +114,11 @@ class ConnectionBudget(Generic[C]):
 
     def admit_unproven(self, connection: C) -> C | None:
         """Let in a connection that still has to show its token; return the one that has to go."""
-        return _admit(self._unproven, connection, UNPROVEN)
+        return _take_place(self._unproven, connection, UNPROVEN)
 
     def admit_operator(self, connection: C) -> C | None:
         """Let in a connection that has shown the token; return the one that has to go."""
-        return _admit(self._operators, connection, OPERATING * self._clients)
+        return _take_place(self._operators, connection, OPERATING * self._clients)
 
     def release(self, connection: C) -> None:
         """Free the place of a connection, whatever it was."""
@@ -127,7 +127,7 @@ class ConnectionBudget(Generic[C]):
         self._operators.pop(connection, None)
 
 
-def _admit(places: dict[C, None], connection: C, limit: int) -> C | None:
+def _take_place(places: dict[C, None], connection: C, limit: int) -> C | None:
     evicted = next(iter(places)) if len(places) >= limit else None
     if evicted is not None:
         del places[evicted]

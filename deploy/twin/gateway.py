@@ -29,6 +29,8 @@ REMOTE_S = 0.13
 """Age of the remote's last message from which it is lost: six of its periods, and a half."""
 ROUND_TRIP_S = 0.15
 """Age of the stamp in a command above which it is refused: the 150 ms that are promised for delay."""
+ROUNDING_S = 1e-6
+"""Of differences of times."""
 LARGEST_ROUND_TRIP_S = 0.51
 """Of the signal `RoundTrip` in the example DBC; stands for "not measured" too."""
 FORGET_S = 1.0
@@ -91,7 +93,10 @@ class Gateway:
             channel.refuse(values)
             return
         stamp_s = values.get(STAMP, 0.0)
-        age_s = (now_s - stamp_s) % layout.stamp_wrap_s if layout.stamp_wrap_s else 0.0
+        age_s = 0.0
+        if layout.stamp_wrap_s:
+            # A stamp of this very moment must not seem to lie in the future, through rounding.
+            age_s = (now_s - stamp_s + ROUNDING_S) % layout.stamp_wrap_s
         if layout is self._command:
             self.round_trip_s, self._round_trip_t_s = age_s, now_s
         if age_s > self._most_s[layout.name]:
