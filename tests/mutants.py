@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import gc
 import importlib
 import io
 import json
@@ -21,9 +22,10 @@ import signal
 import sys
 import types
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 TESTS = Path(__file__).parent
 EXPLAINED = TESTS / "survivors.json"
@@ -38,7 +40,8 @@ CORE = {
     "deploy.policy.policy_process": ["test_deploy_adviser.py"],
 }
 """Modules that decide what reaches the valves, and the tests of each."""
-PYTEST = ["-x", "-q", "-p", "no:cacheprovider", "--no-header"]
+PYTEST = ["-x", "-q", "--no-header", "--assert=plain"]
+PYTEST += ["-p", "no:cacheprovider", "-p", "no:unraisableexception", "-p", "no:threadexception"]
 LONGEST_S = 120
 """Time for the tests of one mutant."""
 COMPARED = {
@@ -155,6 +158,10 @@ def survivors(module: str, tests: Sequence[str]) -> tuple[list[str], int]:
     # mutants
     if pytest.main([*PYTEST, *tests]):
         raise SystemExit(f"{tests} fail without any mutant")
+    cache_slow_parts()
+    forget_modules()
+    pytest.main([*PYTEST, *tests])
+    gc.freeze()
     for words, tree in mutants(ast.parse(source), source):
         count += 1
         child = os.fork()
@@ -168,15 +175,42 @@ def survivors(module: str, tests: Sequence[str]) -> tuple[list[str], int]:
     return found, count
 
 
+def forget_modules() -> None:
+    """Lets the next import read `deploy` and the tests anew; the tests' helpers hold on to what they have imported."""
+    for name, one in list(sys.modules.items()):
+        file = getattr(one, "__file__", None) or ""
+        is_test = file.startswith(str(TESTS)) and name not in ("__main__", "mutants")
+        if name.startswith("deploy.") or is_test:
+            del sys.modules[name]
+
+
+def cache_slow_parts() -> None:
+    """Lets every mutant share what takes longest and depends on none of them: the DBC as read, composed options."""
+    import cantools
+    import hydra
+
+    if not hasattr(hydra.compose, "cache"):
+        hydra.compose = _cache(hydra.compose)
+        cantools.database.load_file = _cache(cantools.database.load_file)
+
+
+def _cache(function: Callable[..., Any]) -> Callable[..., Any]:
+    cache: dict[str, Any] = {}
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        key = repr((args, kwargs))
+        if key not in cache:
+            cache[key] = function(*args, **kwargs)
+        return cache[key]
+
+    call.cache = cache  # type: ignore[attr-defined]
+    return call
+
+
 def _killed(module: str, tree: ast.Module, tests: Sequence[str], pytest: types.ModuleType) -> int:
     """Runs the tests against a mutant; 0 where they all pass."""
     made = types.ModuleType(module)
-    for name, one in list(sys.modules.items()):
-        file = getattr(one, "__file__", None) or ""
-        # Helpers of the tests hold on to what they have imported.
-        is_test = file.startswith(str(TESTS)) and name != "__main__"
-        if name.startswith("deploy.") or is_test:
-            del sys.modules[name]
+    forget_modules()
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         try:
             parent, _, name = module.rpartition(".")

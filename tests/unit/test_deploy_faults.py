@@ -45,6 +45,7 @@ STOPS: list[tuple[str, str, float]] = [
     ("delay", "JointPos1", LOST), ("delay", "JointPos2", LOST), ("delay", "LeverState", LOST), ("silent", "", LOST),
     ("jump", "", UNLIKELY), ("out_of_range", "", UNLIKELY), ("sign", "", UNLIKELY), ("invalid", "", AT_ONCE),
     ("estop", "", AT_ONCE), ("deadman_released", "", AT_ONCE), ("remote_off", "", AT_ONCE), ("second_sender", "", AT_ONCE),
+    ("second_remote", "", UNTRUSTED),
 ]  # fmt: skip
 """Faults that end a motion, and within which time."""
 HARMLESS = [

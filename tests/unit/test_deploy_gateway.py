@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from desk import DBC
 from sender import BUS, MACHINE
 
+from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
+from deploy.bus.description import BusDescription
 from deploy.twin.gateway import LEVERS, NOBODY, PC, Gateway, GatewayState
 
 U = {"Command_q1": 0.4, "Command_q3": -0.2}
@@ -20,8 +24,8 @@ HELD = {"DeadMan": 1, "RemoteOn": 1}
 class Around:
     """Remote and PC around a gateway, each with its counter, on one clock."""
 
-    def __init__(self) -> None:
-        self.gateway, self.now_s = Gateway(BUS, MACHINE), 500.0
+    def __init__(self, bus: BusDescription = BUS) -> None:
+        self.bus, self.gateway, self.now_s = bus, Gateway(bus, MACHINE), 500.0
         self.counters = {"ValveCmd": 0, "LeverState": 0}
         self.remote: dict[str, float] = dict(HELD)
         self.command: dict[str, float] = U | {"CommandMode": 1}
@@ -29,12 +33,12 @@ class Around:
 
     def send(self, name: str, skip: int = 1, **values: float) -> None:
         self.counters[name] += skip
-        layout, sent_s = BUS.layouts[name], self.now_s - self.late_s[name]
+        layout, sent_s = self.bus.layouts[name], self.now_s - self.late_s[name]
         # On the grid of the stamp: the delay is this one and up to one step more.
-        known: dict[str, float] = {"Stamp": sent_s - sent_s % layout.stamp_step_s}
+        known: dict[str, float] = {"Stamp": sent_s - sent_s % (layout.stamp_step_s or 1.0)}
         known |= (self.remote if name == "LeverState" else self.command) | values
-        data = BUS.encode(name, known, self.counters[name])
-        self.gateway.take(CanFrame(BUS.layouts[name].frame_id, data), self.now_s)
+        data = self.bus.encode(name, known, self.counters[name])
+        self.gateway.take(CanFrame(self.bus.layouts[name].frame_id, data), self.now_s)
 
     def go(self, seconds: float, *left_out: str) -> None:
         """Let both send every 20 ms, but for some."""
@@ -85,6 +89,66 @@ def test_without_idle_commands_first_nothing_flows() -> None:
     around = Around()
     around.go(1.0)
     assert around.is_still(GatewayState.IDLE)
+
+
+@pytest.mark.parametrize("cause", ["silence", "estop", "levers", "remote", "corrupt"])
+@pytest.mark.parametrize(("idle", "state"), [(2, GatewayState.IDLE), (3, GatewayState.PC)])
+def test_after_every_interruption_three_idle_commands_are_wanted_anew(
+    around: Around, cause: str, idle: int, state: GatewayState
+) -> None:
+    if cause == "silence":
+        around.go(0.1, "ValveCmd")
+    elif cause == "corrupt":
+        for _ in range(2):
+            around.gateway.take(CanFrame(BUS.command.frame_id, bytes(8)), around.now_s)
+        # the twenty-fifth good message is the first that is used again
+        around.go(0.5)
+    else:
+        around.gateway.estop = cause == "estop"
+        around.remote["Lever_left_theta"] = 0.5 * (cause == "levers")
+        around.remote["RemoteOn"] = int(cause != "remote")
+        around.go(0.02)
+        assert around.flow()[1] != PC
+    around.gateway.estop = False
+    around.remote |= {"Lever_left_theta": 0, "RemoteOn": 1}
+    around.go(0.02)
+    assert around.is_still(GatewayState.IDLE)
+    around.command["CommandMode"] = 0
+    around.go(0.02 * idle)
+    around.command["CommandMode"] = 1
+    around.go(0.02)
+    assert around.flow()[2] is state
+
+
+def test_numbers_on_the_bus_mean_what_the_description_says() -> None:
+    signals = BUS._messages["MachineStatus"]
+    states = signals.get_signal_by_name("GatewayState").choices
+    sources = signals.get_signal_by_name("FlowSource").choices
+    assert states is not None and sources is not None
+    assert {one.value: one.name.lower() for one in GatewayState} == {
+        number: str(name) for number, name in states.items()
+    }
+    assert {number: str(name) for number, name in sources.items()} == {
+        NOBODY: "nobody",
+        LEVERS: "levers",
+        PC: "pc",
+    }
+
+
+def test_only_commands_measure_the_way_there_and_back(around: Around) -> None:
+    around.late_s["LeverState"] = 0.1
+    around.send("LeverState")
+    assert around.gateway.round_trip_s < 0.017
+
+
+def test_a_gateway_of_a_bus_without_stamps_knows_no_delay(tmp_path: Path) -> None:
+    lines = resolve_package_path(DBC).read_text().splitlines()
+    path = tmp_path / "other.dbc"
+    path.write_text("\n".join(line for line in lines if " SG_ Stamp " not in line) + "\n")
+    around = Around(BusDescription(str(path), MACHINE))
+    around.late_s = dict.fromkeys(around.late_s, 0.6)
+    around.get_going()
+    assert around.gateway.round_trip_s == 0.0
 
 
 def test_idle_commands_stop_and_commands_may_follow_at_once(around: Around) -> None:
@@ -171,9 +235,10 @@ def test_the_right_button_selects_the_exclusive_joint(around: Around) -> None:
 
 
 def test_the_exclusive_joint_moves_alone(around: Around) -> None:
-    around.command["Command_q2"] = 0.4
-    around.go(0.02)
-    assert around.is_still(GatewayState.IDLE)
+    for others in (U, {"Command_q3": 0}):
+        around.command |= {"Command_q2": 0.4} | others
+        around.go(0.02)
+        assert around.is_still(GatewayState.IDLE)
     around.command |= {"Command_q1": 0, "Command_q3": 0}
     around.go(0.02)
     assert around.flow()[:2] == (pytest.approx([0, 0.4, 0, 0, 0]), PC)

@@ -263,8 +263,23 @@ def test_the_newest_stamp_stays_when_an_older_one_comes_and_a_clock_that_begins_
         assert clock.newest_s == newest_s
     clock.learn(50.0, CLOCK_WRAP_S, 11.0)
     assert clock.find_sent_s(50.0, CLOCK_WRAP_S, 11.0) != 11.0, "one second may be a delay"
-    clock.learn(3.0, CLOCK_WRAP_S, 12.1)
-    assert clock.newest_s == 3.0 and clock.find_sent_s(3.0, CLOCK_WRAP_S, 12.1) == 12.1
+    # 0.8 s later by its own clock, 1.1 s by ours: a delay, or a gateway that began anew
+    clock.learn(50.8, CLOCK_WRAP_S, 12.1)
+    assert clock.newest_s == 50.8 and clock.find_sent_s(50.8, CLOCK_WRAP_S, 12.1) == 12.1
+    assert GatewayClock().newest_s == 0.0
+
+
+def test_a_stamp_up_to_half_a_turn_ahead_is_newer_and_three_quarters_late_is_late() -> None:
+    clock = GatewayClock()
+    clock.learn(1.0, 2.048, 10.0)
+    clock.learn(1.9, 2.048, 10.9)
+    assert clock.newest_s == 1.9
+    clock.learn((1.9 + 1.1) % 2.048, 2.048, 10.95)
+    assert clock.newest_s == 1.9
+    other = GatewayClock()
+    other.learn(1.0, CLOCK_WRAP_S, 10.0)
+    assert other.find_sent_s(1.49, 2.048, 10.0) == -math.inf
+    assert other.find_sent_s((1.0 - 1.53) % 2.048, 2.048, 10.0) == pytest.approx(8.47)
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00", b"\x12\x34\x56\x78\x9a\xbc\xde\xf0", b"\xff" * 8])
