@@ -68,6 +68,7 @@ class ValveFit:
         """
         del seed, device  # deterministic, numpy
         data = SpeedData([*train, *validation], machine, np.array(self.actuator.knots))
+        data.check_motion()
         dynamics = np.zeros((machine.num_joints, 4))
         with Progress(transient=True) as progress:
             rounds = [(turn, j) for turn in range(2) for j in range(machine.num_joints)]
@@ -75,7 +76,7 @@ class ValveFit:
             for turn, j in progress.track(rounds, description=f"{self.name}: dead times and lags"):
                 if turn and known is None:
                     known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
-                dynamics[j] = self._dynamics(
+                dynamics[j] = self.fit_dynamics(
                     data, j, known[j] if known else None, dynamics[j] if turn else None
                 )
         fitted = self._spec(data, dynamics)
@@ -107,11 +108,11 @@ class ValveFit:
         dynamics = np.array(by_joint)
         assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
         demand = np.array([fitted.demand[name] for name in machine.joint_names])
-        return self._spec(
-            SpeedData(recordings, machine, np.array(self.actuator.knots)), dynamics, demand
-        )
+        data = SpeedData(recordings, machine, np.array(self.actuator.knots))
+        data.check_motion()
+        return self._spec(data, dynamics, demand)
 
-    def _dynamics(
+    def fit_dynamics(
         self, data: SpeedData, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None
     ) -> np.ndarray:
         """Return the dead time, play, spool lag and speed lag that explain joint `j` best.
@@ -134,10 +135,8 @@ class ValveFit:
         )
 
         def left(x: np.ndarray) -> np.ndarray:
-            features = data.features(j, x, known)
-            return (data.way[j] - features @ data.curve(features, data.way[j])) / np.sqrt(
-                data.scale[j]
-            )
+            features, way = data.features(j, x, known)[data.known], data.way[j][data.known]
+            return (way - features @ data.curve(features, way)) / np.sqrt(data.scale[j])
 
         if start is None:
             delays = np.arange(0.0, most[0] + 1e-9, machine.period_s)

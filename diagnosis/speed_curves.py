@@ -1,0 +1,369 @@
+"""Speed over command of each joint, measured and simulated, and what differs between the two.
+
+One model, that of `actuators.identify.speed_data`, is fitted twice to the same commands: to the measured
+motion and to that of the simulator. It has dead time, play, lags, a speed curve on each side,
+pose and pump. What it cannot describe is the same in both fits, so that it cancels in the difference.
+The difference of two curves is then read as effects: dead band, saturation and gains of the two sides.
+The bootstrap draws blocks of the recordings, the same for both fits. Where the simulator was fitted to a
+reference, fits that left out parts of it add their scatter (jackknife).
+
+Axes: `J` joints, `I` increments, `K` knots of a side, `C` numbers of a curve (both sides, `2 (K - 1)`),
+`B` draws, `P` blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from actuators.identify.speed_data import WIDTH, SpeedData
+from actuators.identify.valve_fit import ValveFit
+from brokk_rl.machine import Machine
+from diagnosis.baseline import SimulatorComparison
+from diagnosis.closure import Estimate
+
+# Chosen by hand; not searched.
+NUM_DRAWS = 200
+"""Bootstrap draws; the ends of a 95 % interval vary by 5 % of its width."""
+BLOCK_S = 30.0
+"""Length of the blocks that are drawn, s: the speed of a machine wanders over some seconds."""
+TIME_STEP, PLAY_STEP = 0.02, 0.02
+"""Finite differences of times, s, and of the play, of full command."""
+MAX_BAND, MIN_LEVEL = 0.9, 0.1
+"""Largest dead band and smallest saturation, of full command."""
+GAIN_BOUNDS = (0.1, 4.0)
+"""Smallest and largest ratio of speeds."""
+SIZE_PRIOR = 0.003
+"""Pull of each number to no effect, over the mean square of the weighted curve: breaks ties."""
+
+DYNAMICS = ("dead_time_s", "play", "spool_s", "speed_s")
+CURVE_NUMBERS = ("dead_band_extend", "dead_band_retract", "saturation", "extend_gain", "retract_gain")
+NEUTRAL = np.array([0.0, 0.0, 1.0, 1.0, 1.0])
+"""Values of `CURVE_NUMBERS` that change nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedCurve:
+    """Speed curve of one joint, with its bootstrap.
+
+    Attributes:
+        curve: Speed at each knot but 0, positive side first, over the machine's full speed, `(C,)`.
+        dynamics: `DYNAMICS`, `(4,)`.
+        draws: Draws of both, `(B, C + 4)`.
+        information: Information of the recordings on the curve, `(C, C)`.
+    """
+
+    curve: np.ndarray
+    dynamics: np.ndarray
+    draws: np.ndarray
+    information: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class CurveDifference:
+    """What changes the simulated speed curve of a joint into the measured one.
+
+    Attributes:
+        measured: Of the machine.
+        simulated: Of the simulator under the same commands.
+        values: `CURVE_NUMBERS`, then the differences of `DYNAMICS`, `(9,)`.
+        deviation: Their standard errors, `(9,)`.
+        points: Measured speed over the stroke of the valve at single increments, `(I, 2)`.
+    """
+
+    measured: FittedCurve
+    simulated: FittedCurve
+    values: np.ndarray
+    deviation: np.ndarray
+    points: np.ndarray
+
+    def estimates(self) -> dict[str, Estimate]:
+        """Return the numbers by name, each with its 95 % interval."""
+        found = {}
+        names = [*CURVE_NUMBERS, *(f"{name}_added" for name in DYNAMICS)]
+        for name, value, error in zip(names, self.values, self.deviation, strict=True):
+            found[name] = Estimate(float(value), (value - 1.96 * error, value + 1.96 * error))
+        return found
+
+
+@dataclass(frozen=True, eq=False)
+class SpeedCurves:
+    """Speed curves of all joints.
+
+    Attributes:
+        knots: Strokes of the valve, `(K,)`.
+        joints: By name; joints that hardly move are absent.
+    """
+
+    knots: np.ndarray
+    joints: dict[str, CurveDifference]
+
+
+def measure_curves(
+    field: SimulatorComparison,
+    others: Sequence[SimulatorComparison],
+    machine: Machine,
+    fit: ValveFit,
+    generator: np.random.Generator,
+) -> SpeedCurves:
+    """Fit the curves of the machine and of the simulator, and read their difference.
+
+    Args:
+        field: The simulator against the field.
+        others: Fits of the simulator that left out a part of the reference, against the field.
+        machine: The machine.
+        fit: Gives the knots and the bounds of the model.
+        generator: Draws blocks.
+    """
+    knots = np.array(fit.actuator.knots)
+    recordings = list(field.recordings)
+    data = SpeedData(recordings, machine, knots)
+    simulated = data.replace_motion(_list_steps(field, data))
+    measured = data.replace_motion(_mask_steps(field, data))
+    rest = [data.replace_motion(_list_steps(one, data)) for one in others]
+    blocks = _number_blocks(data, machine)
+    draws = _draw_blocks(blocks, generator)
+    found = {}
+    both = [_fit_dynamics(fit, one) for one in (measured, simulated)]
+    for j, name in enumerate(machine.joint_names):
+        if not (measured.moves[j] and simulated.moves[j]):
+            continue
+        pair = []
+        for one, (dynamics, factors) in zip((measured, simulated), both, strict=True):
+            pair.append(_fit_curve(one, j, dynamics[j], factors[j], blocks, draws))
+        scatter = [
+            _fit_curve(one, j, both[1][0][j], both[1][1][j], blocks, draws[:1]).draws[0]
+            for one in rest
+        ]
+        found[name] = _compare_curves(*pair, knots, scatter, _list_points(measured, j, both[0][0]))
+    return SpeedCurves(knots, found)
+
+
+def _list_steps(field: SimulatorComparison, data: SpeedData) -> list[np.ndarray]:
+    """Return the simulated motion from each sample to the next, `(T, J)`, NaN outside of windows."""
+    return _place_steps(field, data, field.residuals.base)
+
+
+def _mask_steps(field: SimulatorComparison, data: SpeedData) -> list[np.ndarray]:
+    """Return the measured motion, NaN outside of windows."""
+    return _place_steps(field, data, field.residuals.simulator.cut.measured)
+
+
+def _place_steps(
+    field: SimulatorComparison, data: SpeedData, paths: np.ndarray
+) -> list[np.ndarray]:
+    start = field.residuals.start[:, None]
+    steps = np.diff(np.concatenate([start, paths], 1), axis=1)
+    number = {id(one): n for n, one in enumerate(field.recordings)}
+    found = []
+    for recording in data.used:
+        mine = np.flatnonzero(field.source == number[id(recording)])
+        by_sample = np.full(recording.q.shape, np.nan)
+        for window in mine:
+            # A step belongs to the sample at which it begins.
+            first = field.row[window] - 1
+            by_sample[first : first + steps.shape[1]] = steps[window]
+        found.append(by_sample)
+    return found
+
+
+def _number_blocks(data: SpeedData, machine: Machine) -> np.ndarray:
+    """Return the number of the block of each increment, `(I,)`."""
+    size = max(1, round(BLOCK_S / (WIDTH * machine.period_s)))
+    found, first = [], 0
+    for count in data.num_increments:
+        found.append(first + np.arange(count) // size)
+        first = int(found[-1][-1]) + 1 if count else first
+    return np.concatenate(found)
+
+
+def _draw_blocks(blocks: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Return how often each block is drawn, `(1 + B, P)`; the first row is the sample itself."""
+    count = int(blocks.max()) + 1
+    drawn = generator.multinomial(count, np.full(count, 1.0 / count), NUM_DRAWS)
+    return np.concatenate([np.ones((1, count)), drawn])
+
+
+def _fit_dynamics(
+    fit: ValveFit, data: SpeedData
+) -> tuple[np.ndarray, list[list[np.ndarray]]]:
+    """Return the dynamics of all joints, `(J, 4)`, and the factors of pose and pump."""
+    joints = range(data.machine.num_joints)
+    dynamics = np.zeros((data.machine.num_joints, len(DYNAMICS)))
+    for j in joints:
+        if data.moves[j]:
+            dynamics[j] = fit.fit_dynamics(data, j, None, None)
+    factors = data.factors(data.statics(dynamics, fit.sweeps), dynamics)
+    for j in joints:
+        if data.moves[j]:
+            dynamics[j] = fit.fit_dynamics(data, j, factors[j], dynamics[j])
+    return dynamics, factors
+
+
+def _fit_curve(
+    data: SpeedData,
+    j: int,
+    dynamics: np.ndarray,
+    factors: Sequence[np.ndarray],
+    blocks: np.ndarray,
+    draws: np.ndarray,
+) -> FittedCurve:
+    """Return the curve of joint `j`, drawn together with its dynamics, which are linearised."""
+    features = data.features(j, dynamics, factors)
+    way, weight = data.way[j], data.weights[j]
+    curve = data.curve(features, way, free=weight)
+    columns = [features]
+    for k in range(len(DYNAMICS)):
+        step = PLAY_STEP if DYNAMICS[k] == "play" else TIME_STEP
+        moved = dynamics.copy()
+        moved[k] += step
+        later = data.features(j, moved, factors) @ curve
+        columns.append(((later - features @ curve) / step)[:, None])
+    slopes = np.hstack(columns)
+    left = way - features @ curve
+    noise = float(np.average(left**2, weights=np.maximum(weight, 1e-9)))
+    count, size = draws.shape[1], slopes.shape[1]
+    normal, right = np.zeros((count, size, size)), np.zeros((count, size))
+    for block in range(count):
+        rows = blocks == block
+        weighted = slopes[rows] * weight[rows, None]
+        normal[block] = weighted.T @ slopes[rows]
+        right[block] = weighted.T @ left[rows]
+    pull = data.pull(noise, size)
+    start = np.concatenate([curve, dynamics])
+    # The pull acts on the curve itself, not on its change.
+    held = pull @ np.concatenate([curve, np.zeros(len(DYNAMICS))])
+    drawn = []
+    for row in draws:
+        drawn.append(
+            np.linalg.solve(
+                np.tensordot(row, normal, 1) + pull, np.tensordot(row, right, 1) - held
+            )
+        )
+    # The fit of the sample itself is the curve: its own small step is taken off.
+    away = np.stack(drawn) - drawn[0]
+    information = normal.sum(0)[: len(curve), : len(curve)] / noise
+    return FittedCurve(curve, dynamics, start + away, information)
+
+
+def _compare_curves(
+    measured: FittedCurve,
+    simulated: FittedCurve,
+    knots: np.ndarray,
+    scatter: Sequence[np.ndarray],
+    points: np.ndarray,
+) -> CurveDifference:
+    """Return what changes the simulated curve into the measured one, with standard errors."""
+    size = len(measured.curve)
+    root = np.linalg.cholesky(
+        measured.information + 1e-9 * np.trace(measured.information) * np.eye(size)
+    ).T
+    weight = root / max(1e-9, float(np.sqrt(np.mean(np.square(root @ measured.curve)))))
+
+    def compute_left(x: np.ndarray, curve: np.ndarray, target: np.ndarray) -> np.ndarray:
+        changed = change_curve(curve, knots, x)
+        return np.concatenate([weight @ (changed - target), SIZE_PRIOR * (x - NEUTRAL)])
+
+    low = np.array([0.0, 0.0, MIN_LEVEL, GAIN_BOUNDS[0], GAIN_BOUNDS[0]])
+    high = np.array([MAX_BAND, MAX_BAND, 1.0, GAIN_BOUNDS[1], GAIN_BOUNDS[1]])
+    found = None
+    for start in _list_starts(measured.curve, simulated.curve, knots):
+        one = least_squares(
+            compute_left,
+            np.clip(start, low + 1e-6, high - 1e-6),
+            bounds=(low, high),
+            diff_step=1e-3,
+            args=(simulated.curve, measured.curve),
+        )
+        found = one if found is None or one.cost < found.cost else found
+    assert found is not None
+    step = np.linalg.pinv(found.jac)
+    base = compute_left(found.x, simulated.curve, measured.curve)
+    drawn = []
+    for theirs, mine in zip(simulated.draws[1:], measured.draws[1:], strict=True):
+        left = compute_left(found.x, theirs[:size], mine[:size])
+        drawn.append(np.concatenate([-step @ (left - base), mine[size:] - theirs[size:]]))
+    variance = np.var(drawn, axis=0)
+    if len(scatter) > 1:
+        moved = []
+        for one in scatter:
+            left = compute_left(found.x, one[:size], measured.curve)
+            moved.append(np.concatenate([-step @ (left - base), -one[size:]]))
+        # Jackknife over the parts left out.
+        variance = variance + (len(moved) - 1) * np.var(moved, axis=0)
+    values = np.concatenate([found.x, measured.dynamics - simulated.dynamics])
+    return CurveDifference(measured, simulated, values, np.sqrt(variance), points)
+
+
+def change_curve(curve: np.ndarray, knots: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+    """Return a speed curve `(C,)` with dead band, saturation and gains, `CURVE_NUMBERS`.
+
+    A command is first cut at the saturation; beyond the dead band it then rises to a full one. This
+    is the order in which the effects of the library act.
+    """
+    half, changed = len(knots) - 1, []
+    for side, (band, gain) in enumerate(zip(numbers[:2], numbers[3:], strict=True)):
+        own = np.concatenate([[0.0], curve[side * half : (side + 1) * half]])
+        command = np.minimum(knots, numbers[2])
+        opened = np.maximum(command - band, 0.0) / (1.0 - band)
+        changed.append(gain * np.interp(opened, knots, own)[1:])
+    return np.concatenate(changed)
+
+
+def _list_starts(
+    measured: np.ndarray, simulated: np.ndarray, knots: np.ndarray
+) -> list[np.ndarray]:
+    """Return numbers from which to begin: nothing, and what the measured curve shows to the eye."""
+    half, shown = len(knots) - 1, NEUTRAL.copy()
+    levels = []
+    for side in (0, 1):
+        mine, own = slice(side * half, (side + 1) * half), knots[1:]
+        fast = measured[mine].max()
+        moving = own[measured[mine] > 0.05 * fast]
+        shown[side] = max(0.0, float(moving[0]) - 0.05) if len(moving) else 0.0
+        levels.append(float(own[np.argmax(measured[mine] > 0.9 * fast)]))
+    shown[2] = min(1.0, max(levels))
+    plain = change_curve(simulated, knots, shown)
+    for side in (0, 1):
+        mine = slice(side * half, (side + 1) * half)
+        shown[3 + side] = measured[mine].max() / max(1e-3, float(plain[mine].max()))
+    middle = 0.5 * (shown + NEUTRAL)
+    return [NEUTRAL, shown, middle]
+
+
+def _list_points(data: SpeedData, j: int, dynamics: np.ndarray) -> np.ndarray:
+    """Return stroke and speed over the machine's full speed of each increment that counts, `(I, 2)`."""
+    full = data.machine.max_speed[j] * data.machine.period_s * WIDTH
+    counts = data.weights[j] > 0
+    return np.stack([data.strokes(j, dynamics[j])[counts], data.way[j][counts] / full], 1)
+
+
+def serialize_curves(curves: SpeedCurves) -> dict[str, Any]:
+    """Return the curves for `diagnosis.json`: knots, both curves with intervals, and their difference."""
+    found: dict[str, Any] = {}
+    for name, one in curves.joints.items():
+        found[name] = {
+            "measured": _serialize_curve(one.measured, len(curves.knots)),
+            "simulated": _serialize_curve(one.simulated, len(curves.knots)),
+            "difference": {
+                key: {"mean": e.mean, "ci95": list(e.ci95)} for key, e in one.estimates().items()
+            },
+        }
+    return {"knots": curves.knots.tolist(), "joints": found}
+
+
+def _serialize_curve(one: FittedCurve, num_knots: int) -> dict[str, Any]:
+    half = num_knots - 1
+    low, high = np.quantile(one.draws[:, : 2 * half], [0.025, 0.975], 0)
+    sides = {}
+    for side, mine in (("extend", slice(0, half)), ("retract", slice(half, 2 * half))):
+        sides[side] = {
+            "speed": [0.0, *one.curve[mine].tolist()],
+            "low": [0.0, *np.minimum(low[mine], one.curve[mine]).tolist()],
+            "high": [0.0, *np.maximum(high[mine], one.curve[mine]).tolist()],
+        }
+    return {**sides, **dict(zip(DYNAMICS, one.dynamics.tolist(), strict=True))}
