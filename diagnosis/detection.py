@@ -19,6 +19,7 @@ from diagnosis import (
     refine,
     residual_model,
     sensors,
+    speed_curves,
     timing,
 )
 from diagnosis.baseline import Baseline
@@ -33,6 +34,7 @@ from diagnosis.responses import (
     choose_rays,
     fit_joint_faults,
 )
+from diagnosis.speed_curves import SpeedCurves
 from diagnosis.search import (
     MAX_EFFECTS,
     EffectSet,
@@ -165,6 +167,7 @@ class EffectSearch:
         kinds: The library.
         penalties: Penalties of effects.
         tell: Receives the name and the progress of each step.
+        curves: Speed curves of machine and simulator, which may show a set at once.
     """
 
     case: GapCase
@@ -172,6 +175,7 @@ class EffectSearch:
     kinds: Sequence[EffectType]
     penalties: Penalties
     tell: ProgressCallback
+    curves: SpeedCurves | None = None
 
     def run(self) -> DetectionResult:
         """Return the chosen set, its fit and the remaining residuals."""
@@ -189,10 +193,13 @@ class EffectSearch:
         effects = self._simulate_effects(residuals)
         price = self._build_price(effects)
         search = self._choose(effects, price, np.ones(self.case.machine.num_joints))
-        if search.fitted and nonadditive_refit.is_needed(
+        shown = self._fit_shown_effects(search, price)
+        if shown:
+            search = self._refit_beside(search, shown, price)
+        elif search.fitted and nonadditive_refit.is_needed(
             residuals, search.fitted, _sum_scores(search.tables, search.chosen)
         ):
-            search = self._refit_beside(search, search.fitted, price)
+            search = self._refit_beside(search, [search.fitted], price)
         self.tell("frames", 0.8)
         error = residuals.compute_error(search.fitted.after if search.fitted else residuals.base)
         late, search = self._detect_late_frames(search, error)
@@ -315,13 +322,41 @@ class EffectSearch:
             tables[-1].explore(flat, 3 if z is None else MAX_EFFECTS)
         return tables
 
-    def _refit_beside(
-        self, search: SearchState, fitted: FittedSet, price: PenaltyFunction
-    ) -> SearchState:
-        """Continue from a set whose responses do not add up: simulate all effects beside it, fit sizes together."""
+    def _fit_shown_effects(
+        self, search: SearchState, price: PenaltyFunction
+    ) -> list[FittedSet]:
+        """Return sets to continue from where the speed curves show one that the search did not find, the best first; else none.
+
+        Responses that do not add up hide what a curve shows plainly: a dead band of half the command
+        changes all other responses.
+        """
+        if self.curves is None:
+            return []
         effects, residuals = search.effects, search.effects.residuals
-        tried, scatter = [fitted], np.ones(self.case.machine.num_joints)
-        wide = nonadditive_refit.simulate_beside(residuals, effects.rays, fitted)
+        proposed = speed_curves.propose_effects(self.curves, self.kinds, self.case.machine)
+        subsets, start = [], []
+        for mine, shapes in zip(proposed, effects.shapes, strict=True):
+            own = {name: numbers for name, numbers in mine.items() if name in shapes}
+            subsets.append(frozenset(own))
+            start.append(
+                {name: refine.size_rays(effects.rays[name], own[name]) for name in sorted(own)}
+            )
+        if not any(subsets):
+            return []
+        self.tell("what the speed curves show", 0.71)
+        shown = fit_set(residuals, subsets, effects.rays, start)
+        tried = [shown, *([search.fitted] if search.fitted else [])]
+        both = nonadditive_refit.combine_best(residuals, effects.rays, tried, price)
+        is_new = both and refine.list_subsets(both) != list(search.chosen.subsets)
+        return [both, *tried] if both and is_new else []
+
+    def _refit_beside(
+        self, search: SearchState, known: Sequence[FittedSet], price: PenaltyFunction
+    ) -> SearchState:
+        """Continue from sets whose responses do not add up: simulate all effects beside the first, fit sizes together."""
+        effects, residuals = search.effects, search.effects.residuals
+        tried, scatter = list(known), np.ones(self.case.machine.num_joints)
+        wide = nonadditive_refit.simulate_beside(residuals, effects.rays, known[0])
         for turn in range(MAX_REFITS):
             self.tell("simulating around what was found", 0.72 + 0.04 * turn)
             before, search = search, self._choose(effects, price, scatter, wide)

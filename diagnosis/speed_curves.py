@@ -21,29 +21,42 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from actuators.identify.speed_data import WIDTH, SpeedData
-from actuators.identify.valve_fit import ValveFit
+from actuators.identify.valve_fit import fit_dynamics
 from brokk_rl.machine import Machine
 from diagnosis.baseline import SimulatorComparison
 from diagnosis.closure import Estimate
+from diagnosis.effect_library import EffectType
 
 # Chosen by hand; not searched.
 NUM_DRAWS = 200
 """Bootstrap draws; the ends of a 95 % interval vary by 5 % of its width."""
 BLOCK_S = 30.0
 """Length of the blocks that are drawn, s: the speed of a machine wanders over some seconds."""
+KNOTS = (0.0, 0.03, 0.06, 0.09, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Strokes at which the curves are given, of full stroke: denser where valves open."""
+LONGEST_LAG_S, SWEEPS, ITERATIONS = 0.5, 6, 6
+"""Bound of each lag, turns of curve, pose and pump, steps of the search: as in `fit=valve`."""
 TIME_STEP, PLAY_STEP = 0.02, 0.02
 """Finite differences of times, s, and of the play, of full command."""
-MAX_BAND, MIN_LEVEL = 0.9, 0.1
-"""Largest dead band and smallest saturation, of full command."""
-GAIN_BOUNDS = (0.1, 4.0)
-"""Smallest and largest ratio of speeds."""
-SIZE_PRIOR = 0.003
-"""Pull of each number to no effect, over the mean square of the weighted curve: breaks ties."""
+BAND_BOUNDS, LEVEL_BOUNDS, GAIN_BOUNDS = (-0.5, 0.9), (0.1, 1.0), (0.1, 4.0)
+"""Bounds of dead band and saturation, of full command, and of the ratio of speeds."""
+NEUTRAL_PULL = 0.003
+"""Pull of each number to no effect, over the root mean square of the weighted curve: breaks ties."""
+MIN_SCORE = 2.0
+"""Standard errors from no effect below which a number of the curve is left out."""
 
 DYNAMICS = ("dead_time_s", "play", "spool_s", "speed_s")
-CURVE_NUMBERS = ("dead_band_extend", "dead_band_retract", "saturation", "extend_gain", "retract_gain")
+CURVE_NUMBERS = (
+    "dead_band_extend",
+    "dead_band_retract",
+    "saturation",
+    "extend_gain",
+    "retract_gain",
+)
 NEUTRAL = np.array([0.0, 0.0, 1.0, 1.0, 1.0])
 """Values of `CURVE_NUMBERS` that change nothing."""
+ADDED = ("dead_time_s", "play", "lag_s")
+"""Differences of the dynamics; the two lags cannot be told apart at 20 Hz, so that they are added."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,8 +83,8 @@ class CurveDifference:
     Attributes:
         measured: Of the machine.
         simulated: Of the simulator under the same commands.
-        values: `CURVE_NUMBERS`, then the differences of `DYNAMICS`, `(9,)`.
-        deviation: Their standard errors, `(9,)`.
+        values: `CURVE_NUMBERS`, then `ADDED`, `(8,)`.
+        deviation: Their standard errors, `(8,)`; 0 for a number that is left out.
         points: Measured speed over the stroke of the valve at single increments, `(I, 2)`.
     """
 
@@ -84,7 +97,7 @@ class CurveDifference:
     def estimates(self) -> dict[str, Estimate]:
         """Return the numbers by name, each with its 95 % interval."""
         found = {}
-        names = [*CURVE_NUMBERS, *(f"{name}_added" for name in DYNAMICS)]
+        names = [*CURVE_NUMBERS, *(f"{name}_added" for name in ADDED)]
         for name, value, error in zip(names, self.values, self.deviation, strict=True):
             found[name] = Estimate(float(value), (value - 1.96 * error, value + 1.96 * error))
         return found
@@ -107,7 +120,6 @@ def measure_curves(
     field: SimulatorComparison,
     others: Sequence[SimulatorComparison],
     machine: Machine,
-    fit: ValveFit,
     generator: np.random.Generator,
 ) -> SpeedCurves:
     """Fit the curves of the machine and of the simulator, and read their difference.
@@ -116,46 +128,42 @@ def measure_curves(
         field: The simulator against the field.
         others: Fits of the simulator that left out a part of the reference, against the field.
         machine: The machine.
-        fit: Gives the knots and the bounds of the model.
         generator: Draws blocks.
+
+    Raises:
+        RecordingError: no recording is long enough.
     """
-    knots = np.array(fit.actuator.knots)
-    recordings = list(field.recordings)
-    data = SpeedData(recordings, machine, knots)
-    simulated = data.replace_motion(_list_steps(field, data))
-    measured = data.replace_motion(_mask_steps(field, data))
-    rest = [data.replace_motion(_list_steps(one, data)) for one in others]
+    knots = np.array(KNOTS)
+    data = SpeedData(list(field.recordings), machine, knots)
+    measured = data.replace_motion(
+        _place_steps(field, data, field.residuals.simulator.cut.measured)
+    )
+    simulated = data.replace_motion(_place_steps(field, data, field.residuals.base))
+    rest = []
+    for one in others:
+        rest.append(data.replace_motion(_place_steps(one, data, one.residuals.base)))
     blocks = _number_blocks(data, machine)
     draws = _draw_blocks(blocks, generator)
+    moving = measured.moves & simulated.moves
+    fits = [_fit_dynamics(one, moving) for one in (measured, simulated)]
     found = {}
-    both = [_fit_dynamics(fit, one) for one in (measured, simulated)]
-    for j, name in enumerate(machine.joint_names):
-        if not (measured.moves[j] and simulated.moves[j]):
-            continue
+    for j in np.flatnonzero(moving):
         pair = []
-        for one, (dynamics, factors) in zip((measured, simulated), both, strict=True):
+        for one, (dynamics, factors) in zip((measured, simulated), fits, strict=True):
             pair.append(_fit_curve(one, j, dynamics[j], factors[j], blocks, draws))
-        scatter = [
-            _fit_curve(one, j, both[1][0][j], both[1][1][j], blocks, draws[:1]).draws[0]
-            for one in rest
-        ]
-        found[name] = _compare_curves(*pair, knots, scatter, _list_points(measured, j, both[0][0]))
+        dynamics, factors = fits[1][0][j], fits[1][1][j]
+        scatter = []
+        for one in rest:
+            scatter.append(_fit_curve(one, j, dynamics, factors, blocks, draws[:1]).draws[0])
+        points = _list_points(measured, j, fits[0][0][j])
+        found[machine.joint_names[j]] = _compare_curves(*pair, knots, scatter, points)
     return SpeedCurves(knots, found)
-
-
-def _list_steps(field: SimulatorComparison, data: SpeedData) -> list[np.ndarray]:
-    """Return the simulated motion from each sample to the next, `(T, J)`, NaN outside of windows."""
-    return _place_steps(field, data, field.residuals.base)
-
-
-def _mask_steps(field: SimulatorComparison, data: SpeedData) -> list[np.ndarray]:
-    """Return the measured motion, NaN outside of windows."""
-    return _place_steps(field, data, field.residuals.simulator.cut.measured)
 
 
 def _place_steps(
     field: SimulatorComparison, data: SpeedData, paths: np.ndarray
 ) -> list[np.ndarray]:
+    """Return the motion of `paths` `(W, K, J)` from each sample to the next, `(T, J)`, NaN outside of windows."""
     start = field.residuals.start[:, None]
     steps = np.diff(np.concatenate([start, paths], 1), axis=1)
     number = {id(one): n for n, one in enumerate(field.recordings)}
@@ -189,18 +197,15 @@ def _draw_blocks(blocks: np.ndarray, generator: np.random.Generator) -> np.ndarr
 
 
 def _fit_dynamics(
-    fit: ValveFit, data: SpeedData
+    data: SpeedData, moving: np.ndarray
 ) -> tuple[np.ndarray, list[list[np.ndarray]]]:
     """Return the dynamics of all joints, `(J, 4)`, and the factors of pose and pump."""
-    joints = range(data.machine.num_joints)
     dynamics = np.zeros((data.machine.num_joints, len(DYNAMICS)))
-    for j in joints:
-        if data.moves[j]:
-            dynamics[j] = fit.fit_dynamics(data, j, None, None)
-    factors = data.factors(data.statics(dynamics, fit.sweeps), dynamics)
-    for j in joints:
-        if data.moves[j]:
-            dynamics[j] = fit.fit_dynamics(data, j, factors[j], dynamics[j])
+    for j in np.flatnonzero(moving):
+        dynamics[j] = fit_dynamics(data, j, None, None, LONGEST_LAG_S, ITERATIONS)
+    factors = data.factors(data.statics(dynamics, SWEEPS), dynamics)
+    for j in np.flatnonzero(moving):
+        dynamics[j] = fit_dynamics(data, j, factors[j], dynamics[j], LONGEST_LAG_S, ITERATIONS)
     return dynamics, factors
 
 
@@ -257,53 +262,96 @@ def _compare_curves(
     scatter: Sequence[np.ndarray],
     points: np.ndarray,
 ) -> CurveDifference:
-    """Return what changes the simulated curve into the measured one, with standard errors."""
+    """Return what changes the simulated curve into the measured one, with standard errors.
+
+    Numbers within `MIN_SCORE` standard errors of no effect are left out one by one: dead band,
+    saturation and gains replace each other where few commands were large.
+    """
     size = len(measured.curve)
-    root = np.linalg.cholesky(
-        measured.information + 1e-9 * np.trace(measured.information) * np.eye(size)
-    ).T
+    information = measured.information
+    root = np.linalg.cholesky(information + 1e-9 * np.trace(information) * np.eye(size)).T
     weight = root / max(1e-9, float(np.sqrt(np.mean(np.square(root @ measured.curve)))))
+    free = np.ones(len(NEUTRAL), dtype=bool)
+    while True:
+        values, error = _fit_change(measured, simulated, knots, weight, free, scatter)
+        score = np.abs(values - NEUTRAL) / np.maximum(error, 1e-9)
+        if not free.any() or score[free].min() >= MIN_SCORE:
+            break
+        free[np.flatnonzero(free)[score[free].argmin()]] = False
+    added, of_added = _compare_dynamics(measured, simulated, scatter)
+    return CurveDifference(
+        measured,
+        simulated,
+        np.concatenate([values, added]),
+        np.concatenate([error, of_added]),
+        points,
+    )
+
+
+def _fit_change(
+    measured: FittedCurve,
+    simulated: FittedCurve,
+    knots: np.ndarray,
+    weight: np.ndarray,
+    free: np.ndarray,
+    scatter: Sequence[np.ndarray],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `CURVE_NUMBERS` and their standard errors, `(5,)` each; those not `free` stay neutral."""
+    values, error = NEUTRAL.copy(), np.zeros(len(NEUTRAL))
+    if not free.any():
+        return values, error
+    size = len(measured.curve)
 
     def compute_left(x: np.ndarray, curve: np.ndarray, target: np.ndarray) -> np.ndarray:
-        changed = change_curve(curve, knots, x)
-        return np.concatenate([weight @ (changed - target), SIZE_PRIOR * (x - NEUTRAL)])
+        numbers = NEUTRAL.copy()
+        numbers[free] = x
+        changed = change_curve(curve, knots, numbers)
+        return np.concatenate([weight @ (changed - target), NEUTRAL_PULL * (x - NEUTRAL[free])])
 
-    low = np.array([0.0, 0.0, MIN_LEVEL, GAIN_BOUNDS[0], GAIN_BOUNDS[0]])
-    high = np.array([MAX_BAND, MAX_BAND, 1.0, GAIN_BOUNDS[1], GAIN_BOUNDS[1]])
-    found = None
+    bounds = [BAND_BOUNDS, BAND_BOUNDS, LEVEL_BOUNDS, GAIN_BOUNDS, GAIN_BOUNDS]
+    low, high = np.array(bounds).T[:, free]
+    best = None
     for start in _list_starts(measured.curve, simulated.curve, knots):
-        one = least_squares(
-            compute_left,
-            np.clip(start, low + 1e-6, high - 1e-6),
-            bounds=(low, high),
-            diff_step=1e-3,
-            args=(simulated.curve, measured.curve),
-        )
-        found = one if found is None or one.cost < found.cost else found
-    assert found is not None
-    step = np.linalg.pinv(found.jac)
-    base = compute_left(found.x, simulated.curve, measured.curve)
+        inside = np.clip(start[free], low + 1e-6, high - 1e-6)
+        given = (simulated.curve, measured.curve)
+        one = least_squares(compute_left, inside, bounds=(low, high), diff_step=1e-3, args=given)
+        best = one if best is None or one.cost < best.cost else best
+    assert best is not None
+    step, base = np.linalg.pinv(best.jac), compute_left(best.x, simulated.curve, measured.curve)
     drawn = []
     for theirs, mine in zip(simulated.draws[1:], measured.draws[1:], strict=True):
-        left = compute_left(found.x, theirs[:size], mine[:size])
-        drawn.append(np.concatenate([-step @ (left - base), mine[size:] - theirs[size:]]))
+        drawn.append(step @ (compute_left(best.x, theirs[:size], mine[:size]) - base))
     variance = np.var(drawn, axis=0)
     if len(scatter) > 1:
-        moved = []
-        for one in scatter:
-            left = compute_left(found.x, one[:size], measured.curve)
-            moved.append(np.concatenate([-step @ (left - base), -one[size:]]))
-        # Jackknife over the parts left out.
-        variance = variance + (len(moved) - 1) * np.var(moved, axis=0)
-    values = np.concatenate([found.x, measured.dynamics - simulated.dynamics])
-    return CurveDifference(measured, simulated, values, np.sqrt(variance), points)
+        moved = [step @ compute_left(best.x, one[:size], measured.curve) for one in scatter]
+        variance = variance + _compute_jackknife_variance(np.stack(moved))
+    values[free], error[free] = best.x, np.sqrt(variance)
+    return values, error
+
+
+def _compute_jackknife_variance(values: np.ndarray) -> np.ndarray:
+    """Return the variance of an estimate from its values with a part left out each, `(parts, …)`."""
+    return (len(values) - 1) * np.var(values, axis=0)
+
+
+def _compare_dynamics(
+    measured: FittedCurve, simulated: FittedCurve, scatter: Sequence[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `ADDED` and their standard errors, `(3,)` each."""
+    size, sums = len(measured.curve), np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1]])
+    drawn = (measured.draws - simulated.draws)[1:, size:] @ sums.T
+    variance = np.var(drawn, axis=0)
+    if len(scatter) > 1:
+        variance = variance + _compute_jackknife_variance(np.stack(scatter)[:, size:] @ sums.T)
+    return sums @ (measured.dynamics - simulated.dynamics), np.sqrt(variance)
 
 
 def change_curve(curve: np.ndarray, knots: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """Return a speed curve `(C,)` with dead band, saturation and gains, `CURVE_NUMBERS`.
 
     A command is first cut at the saturation; beyond the dead band it then rises to a full one. This
-    is the order in which the effects of the library act.
+    is the order in which the effects of the library act. A negative dead band is one that the
+    simulator has and the machine lacks.
     """
     half, changed = len(knots) - 1, []
     for side, (band, gain) in enumerate(zip(numbers[:2], numbers[3:], strict=True)):
@@ -339,7 +387,7 @@ def _list_points(data: SpeedData, j: int, dynamics: np.ndarray) -> np.ndarray:
     """Return stroke and speed over the machine's full speed of each increment that counts, `(I, 2)`."""
     full = data.machine.max_speed[j] * data.machine.period_s * WIDTH
     counts = data.weights[j] > 0
-    return np.stack([data.strokes(j, dynamics[j])[counts], data.way[j][counts] / full], 1)
+    return np.stack([data.strokes(j, dynamics)[counts], data.way[j][counts] / full], 1)
 
 
 def serialize_curves(curves: SpeedCurves) -> dict[str, Any]:
@@ -367,3 +415,47 @@ def _serialize_curve(one: FittedCurve, num_knots: int) -> dict[str, Any]:
             "high": [0.0, *np.maximum(high[mine], one.curve[mine]).tolist()],
         }
     return {**sides, **dict(zip(DYNAMICS, one.dynamics.tolist(), strict=True))}
+
+
+def propose_effects(
+    curves: SpeedCurves, kinds: Sequence[EffectType], machine: Machine
+) -> list[dict[str, dict[str, float]]]:
+    """Return the effects of the library that the curves show, with their numbers, by joint and name.
+
+    Gains that do not differ between the sides are one of both. The play of a valve has no effect of
+    its own in the library.
+    """
+    known = {kind.name for kind in kinds}
+    found: list[dict[str, dict[str, float]]] = []
+    for name in machine.joint_names:
+        one = curves.joints.get(name)
+        proposed = _read_effects(one) if one else {}
+        found.append({effect: numbers for effect, numbers in proposed.items() if effect in known})
+    return found
+
+
+def _read_effects(one: CurveDifference) -> dict[str, dict[str, float]]:
+    """Return the numbers of the effects that a difference shows, by effect."""
+    names = (*CURVE_NUMBERS, *ADDED)
+    value = dict(zip(names, one.values.tolist(), strict=True))
+    error = dict(zip(names, one.deviation.tolist(), strict=True))
+    found: dict[str, dict[str, float]] = {}
+    bands = {side: max(0.0, value[f"dead_band_{side}"]) for side in ("extend", "retract")}
+    if max(bands.values()) > 0.0:
+        found["dead_band"] = bands
+    if value["saturation"] < 1.0:
+        found["saturation"] = {"level": value["saturation"]}
+    gains = {name: value[name] for name in ("extend_gain", "retract_gain")}
+    if any(gain != 1.0 for gain in gains.values()):
+        apart = abs(gains["extend_gain"] - gains["retract_gain"])
+        if apart < MIN_SCORE * np.hypot(error["extend_gain"], error["retract_gain"]):
+            found["flow_gain"] = {"gain": float(np.mean(list(gains.values())))}
+        else:
+            found["asymmetry"] = gains
+    for effect, name, number in (
+        ("dead_time", "dead_time_s", "dead_time_s"),
+        ("lag", "lag_s", "time_constant_s"),
+    ):
+        if value[name] > MIN_SCORE * error[name]:
+            found[effect] = {number: value[name]}
+    return found
