@@ -19,7 +19,7 @@ from diagnosis import (
     refine,
     residual_model,
     sensors,
-    speed_curves,
+    shown_effects,
     timing,
 )
 from diagnosis.baseline import Baseline
@@ -34,7 +34,6 @@ from diagnosis.responses import (
     choose_rays,
     fit_joint_faults,
 )
-from diagnosis.speed_curves import SpeedCurves
 from diagnosis.search import (
     MAX_EFFECTS,
     EffectSet,
@@ -44,6 +43,7 @@ from diagnosis.search import (
     bind_shared_sizes,
     choose_set,
 )
+from diagnosis.speed_curves import SpeedCurves
 
 log = logging.getLogger(__name__)
 
@@ -187,13 +187,18 @@ class EffectSearch:
         on_tool = geometry.find_geometry_errors(
             self.case, self.kinds, penalties.joint, penalties.name
         )
-        residuals = _adjust_residuals(
+        residuals = sensors.adjust_residuals(
             self.base.field.residuals, self.case, [*on_sensors, *on_tool.found]
         )
         effects = self._simulate_effects(residuals)
         price = self._build_price(effects)
         search = self._choose(effects, price, np.ones(self.case.machine.num_joints))
-        shown = self._fit_shown_effects(search, price)
+        self.tell("what the speed curves show", 0.71)
+        shown = []
+        if self.curves is not None:
+            proposed = shown_effects.propose_effects(self.curves, self.kinds, self.case.machine)
+            parts = (effects.rays, effects.shapes, search.fitted, price)
+            shown = shown_effects.fit_shown_effects(residuals, proposed, *parts)
         if shown:
             search = self._refit_beside(search, shown, price)
         elif search.fitted and nonadditive_refit.is_needed(
@@ -321,34 +326,6 @@ class EffectSearch:
             tables.append(SubsetTable(joint, scaled, residuals.block))
             tables[-1].explore(flat, 3 if z is None else MAX_EFFECTS)
         return tables
-
-    def _fit_shown_effects(
-        self, search: SearchState, price: PenaltyFunction
-    ) -> list[FittedSet]:
-        """Return sets to continue from where the speed curves show one that the search did not find, the best first; else none.
-
-        Responses that do not add up hide what a curve shows plainly: a dead band of half the command
-        changes all other responses.
-        """
-        if self.curves is None:
-            return []
-        effects, residuals = search.effects, search.effects.residuals
-        proposed = speed_curves.propose_effects(self.curves, self.kinds, self.case.machine)
-        subsets, start = [], []
-        for mine, shapes in zip(proposed, effects.shapes, strict=True):
-            own = {name: numbers for name, numbers in mine.items() if name in shapes}
-            subsets.append(frozenset(own))
-            start.append(
-                {name: refine.size_rays(effects.rays[name], own[name]) for name in sorted(own)}
-            )
-        if not any(subsets):
-            return []
-        self.tell("what the speed curves show", 0.71)
-        shown = fit_set(residuals, subsets, effects.rays, start)
-        tried = [shown, *([search.fitted] if search.fitted else [])]
-        both = nonadditive_refit.combine_best(residuals, effects.rays, tried, price)
-        is_new = both and refine.list_subsets(both) != list(search.chosen.subsets)
-        return [both, *tried] if both and is_new else []
 
     def _refit_beside(
         self, search: SearchState, known: Sequence[FittedSet], price: PenaltyFunction
@@ -510,26 +487,3 @@ def _rewhiten_effects(effects: CandidateEffects, noisy: Residuals) -> CandidateE
 def _sum_scores(tables: Sequence[SubsetTable], chosen: EffectSet) -> float:
     scored = zip(tables, chosen.subsets, strict=True)
     return sum(table.score(subset).total for table, subset in scored)
-
-
-def _adjust_residuals(
-    residuals: Residuals, case: GapCase, found: Sequence[DetectedEffect]
-) -> Residuals:
-    """Return the residuals with encoder errors in the simulator, and with the added noise of sensors."""
-    of_sensors = [one for one in found if one.kind.target.side == "measurement"]
-    steady = [(one.kind, one.values()) for one in of_sensors if _is_steady(one.kind)]
-    simulator = residuals.simulator
-    simulator = replace(simulator, fixed=[*simulator.fixed, *steady])
-    residuals = replace(residuals, simulator=simulator)
-    rough = [one.joints for one in of_sensors if not _is_steady(one.kind)]
-    if not rough:
-        return residuals
-    assert residuals.noise is not None, "noise is known by now"
-    excess = sensors.measure_excess_scatter(case.field, case.reference, case.machine)
-    reading = (excess * np.any(rough, 0)).tolist()
-    pairs = zip(residuals.noise, reading, strict=True)
-    return replace(residuals, noise=[replace(one, reading=more) for one, more in pairs])
-
-
-def _is_steady(kind: EffectType) -> bool:
-    return kind.target.smooth and not kind.target.stochastic

@@ -439,22 +439,6 @@ def drop_windows(residuals: Residuals, each: int) -> Residuals:
     )
 
 
-def size_rays(rays_: Sequence[ParameterRay], numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the size along each ray of an effect with these numbers, `(R,)`.
-
-    A ray of all numbers at once takes the mean of their sizes.
-    """
-    found = []
-    for ray in rays_:
-        names = [ray.name] if ray.name else [n for n in ray.kind.fitted if n in numbers]
-        sizes = []
-        for name in names:
-            none = ray.kind.numbers[name].none or 0.0
-            sizes.append((numbers[name] - none) / ray.kind.size(name))
-        found.append(float(np.mean(sizes)))
-    return np.array(found)
-
-
 def look_up_sizes(rays_: Sequence[ParameterRay], fitted: FittedSet) -> np.ndarray:
     """Return the sizes that are known already, 0 where none is, `(R, J)`."""
     sizes = {(ray.kind.name, ray.name): fitted.sizes[k] for k, ray in enumerate(fitted.rays)}

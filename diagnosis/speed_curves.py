@@ -24,8 +24,7 @@ from actuators.identify.speed_data import WIDTH, SpeedData
 from actuators.identify.valve_fit import fit_dynamics
 from brokk_rl.machine import Machine
 from diagnosis.baseline import SimulatorComparison
-from diagnosis.closure import Estimate
-from diagnosis.effect_library import EffectType
+from diagnosis.closure import Estimate, serialize_estimate
 
 # Chosen by hand; not searched.
 NUM_DRAWS = 200
@@ -42,6 +41,10 @@ BAND_BOUNDS, LEVEL_BOUNDS, GAIN_BOUNDS = (-0.5, 0.9), (0.1, 1.0), (0.1, 4.0)
 """Bounds of dead band and saturation, of full command, and of the ratio of speeds."""
 NEUTRAL_PULL = 0.003
 """Pull of each number to no effect, over the root mean square of the weighted curve: breaks ties."""
+NORMAL_95 = 1.96
+"""Half width of a 95 % interval of a normal distribution, in standard errors."""
+MAX_POINTS = 300
+"""Increments of a joint that `diagnosis.json` keeps for the figure."""
 MIN_SCORE = 2.0
 """Standard errors from no effect below which a number of the curve is left out."""
 
@@ -94,12 +97,14 @@ class CurveDifference:
     deviation: np.ndarray
     points: np.ndarray
 
-    def estimates(self) -> dict[str, Estimate]:
-        """Return the numbers by name, each with its 95 % interval."""
-        found = {}
+    def estimates(self) -> dict[str, Estimate | None]:
+        """Return the numbers by name with 95 % intervals; `None` for one that is left out."""
+        found: dict[str, Estimate | None] = {}
         names = [*CURVE_NUMBERS, *(f"{name}_added" for name in ADDED)]
         for name, value, error in zip(names, self.values, self.deviation, strict=True):
-            found[name] = Estimate(float(value), (value - 1.96 * error, value + 1.96 * error))
+            wide = float(NORMAL_95 * error)
+            at = float(value)
+            found[name] = Estimate(at, (at - wide, at + wide)) if error > 0.0 else None
         return found
 
 
@@ -147,7 +152,7 @@ def measure_curves(
     moving = measured.moves & simulated.moves
     fits = [_fit_dynamics(one, moving) for one in (measured, simulated)]
     found = {}
-    for j in np.flatnonzero(moving):
+    for j in np.flatnonzero(moving).tolist():
         pair = []
         for one, (dynamics, factors) in zip((measured, simulated), fits, strict=True):
             pair.append(_fit_curve(one, j, dynamics[j], factors[j], blocks, draws))
@@ -156,7 +161,7 @@ def measure_curves(
         for one in rest:
             scatter.append(_fit_curve(one, j, dynamics, factors, blocks, draws[:1]).draws[0])
         points = _list_points(measured, j, fits[0][0][j])
-        found[machine.joint_names[j]] = _compare_curves(*pair, knots, scatter, points)
+        found[machine.joint_names[j]] = _compare_curves(pair[0], pair[1], knots, scatter, points)
     return SpeedCurves(knots, found)
 
 
@@ -196,15 +201,13 @@ def _draw_blocks(blocks: np.ndarray, generator: np.random.Generator) -> np.ndarr
     return np.concatenate([np.ones((1, count)), drawn])
 
 
-def _fit_dynamics(
-    data: SpeedData, moving: np.ndarray
-) -> tuple[np.ndarray, list[list[np.ndarray]]]:
+def _fit_dynamics(data: SpeedData, moving: np.ndarray) -> tuple[np.ndarray, list[list[np.ndarray]]]:
     """Return the dynamics of all joints, `(J, 4)`, and the factors of pose and pump."""
     dynamics = np.zeros((data.machine.num_joints, len(DYNAMICS)))
-    for j in np.flatnonzero(moving):
+    for j in np.flatnonzero(moving).tolist():
         dynamics[j] = fit_dynamics(data, j, None, None, LONGEST_LAG_S, ITERATIONS)
     factors = data.factors(data.statics(dynamics, SWEEPS), dynamics)
-    for j in np.flatnonzero(moving):
+    for j in np.flatnonzero(moving).tolist():
         dynamics[j] = fit_dynamics(data, j, factors[j], dynamics[j], LONGEST_LAG_S, ITERATIONS)
     return dynamics, factors
 
@@ -245,9 +248,7 @@ def _fit_curve(
     drawn = []
     for row in draws:
         drawn.append(
-            np.linalg.solve(
-                np.tensordot(row, normal, 1) + pull, np.tensordot(row, right, 1) - held
-            )
+            np.linalg.solve(np.tensordot(row, normal, 1) + pull, np.tensordot(row, right, 1) - held)
         )
     # The fit of the sample itself is the curve: its own small step is taken off.
     away = np.stack(drawn) - drawn[0]
@@ -391,15 +392,22 @@ def _list_points(data: SpeedData, j: int, dynamics: np.ndarray) -> np.ndarray:
 
 
 def serialize_curves(curves: SpeedCurves) -> dict[str, Any]:
-    """Return the curves for `diagnosis.json`: knots, both curves with intervals, and their difference."""
+    """Return the curves for `diagnosis.json`: knots, both curves with intervals, their difference.
+
+    Speeds are parts of the machine's full speed. A number of the difference that is not needed is
+    `null`.
+    """
     found: dict[str, Any] = {}
     for name, one in curves.joints.items():
+        difference = {}
+        for key, estimate in one.estimates().items():
+            difference[key] = estimate and serialize_estimate(estimate)
+        every = -(-len(one.points) // MAX_POINTS)
         found[name] = {
             "measured": _serialize_curve(one.measured, len(curves.knots)),
             "simulated": _serialize_curve(one.simulated, len(curves.knots)),
-            "difference": {
-                key: {"mean": e.mean, "ci95": list(e.ci95)} for key, e in one.estimates().items()
-            },
+            "difference": difference,
+            "points": one.points[::every].round(4).tolist(),
         }
     return {"knots": curves.knots.tolist(), "joints": found}
 
@@ -415,47 +423,3 @@ def _serialize_curve(one: FittedCurve, num_knots: int) -> dict[str, Any]:
             "high": [0.0, *np.maximum(high[mine], one.curve[mine]).tolist()],
         }
     return {**sides, **dict(zip(DYNAMICS, one.dynamics.tolist(), strict=True))}
-
-
-def propose_effects(
-    curves: SpeedCurves, kinds: Sequence[EffectType], machine: Machine
-) -> list[dict[str, dict[str, float]]]:
-    """Return the effects of the library that the curves show, with their numbers, by joint and name.
-
-    Gains that do not differ between the sides are one of both. The play of a valve has no effect of
-    its own in the library.
-    """
-    known = {kind.name for kind in kinds}
-    found: list[dict[str, dict[str, float]]] = []
-    for name in machine.joint_names:
-        one = curves.joints.get(name)
-        proposed = _read_effects(one) if one else {}
-        found.append({effect: numbers for effect, numbers in proposed.items() if effect in known})
-    return found
-
-
-def _read_effects(one: CurveDifference) -> dict[str, dict[str, float]]:
-    """Return the numbers of the effects that a difference shows, by effect."""
-    names = (*CURVE_NUMBERS, *ADDED)
-    value = dict(zip(names, one.values.tolist(), strict=True))
-    error = dict(zip(names, one.deviation.tolist(), strict=True))
-    found: dict[str, dict[str, float]] = {}
-    bands = {side: max(0.0, value[f"dead_band_{side}"]) for side in ("extend", "retract")}
-    if max(bands.values()) > 0.0:
-        found["dead_band"] = bands
-    if value["saturation"] < 1.0:
-        found["saturation"] = {"level": value["saturation"]}
-    gains = {name: value[name] for name in ("extend_gain", "retract_gain")}
-    if any(gain != 1.0 for gain in gains.values()):
-        apart = abs(gains["extend_gain"] - gains["retract_gain"])
-        if apart < MIN_SCORE * np.hypot(error["extend_gain"], error["retract_gain"]):
-            found["flow_gain"] = {"gain": float(np.mean(list(gains.values())))}
-        else:
-            found["asymmetry"] = gains
-    for effect, name, number in (
-        ("dead_time", "dead_time_s", "dead_time_s"),
-        ("lag", "lag_s", "time_constant_s"),
-    ):
-        if value[name] > MIN_SCORE * error[name]:
-            found[effect] = {number: value[name]}
-    return found
