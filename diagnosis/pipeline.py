@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from brokk_rl.contracts.actuator import Excitation
+from brokk_rl.contracts.actuator import CurveFit, Excitation
 from brokk_rl.errors import StorageError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
@@ -67,6 +67,7 @@ class DiagnosisPipeline:
         calibration: Calibration of the probabilities.
         thresholds: When a stretch of a recording is worth telling.
         excitations: Experiments that could follow, by name.
+        curve_fit: Reads the speed curves of machine and simulator.
         generator: Draws bootstraps, permutations and excitations.
     """
 
@@ -77,6 +78,7 @@ class DiagnosisPipeline:
     calibration: ProbabilityModel
     thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
+    curve_fit: CurveFit
     generator: np.random.Generator
 
     def run(self, tell: ProgressCallback) -> Outcome:
@@ -93,6 +95,7 @@ class DiagnosisPipeline:
             self.base.field,
             [self.base.field.with_base(one.base) for one in self._list_left_out()],
             self.case.machine,
+            self.curve_fit,
             np.random.default_rng(CURVE_SEED),
         )
         search = detection.EffectSearch(

@@ -1,6 +1,6 @@
 """Speed over command of each joint, measured and simulated, and what differs between the two.
 
-One model, that of `actuators.identify.speed_data`, is fitted twice to the same commands: to the measured
+One model (`conf/curve_fit`) is fitted twice to the same commands: to the measured
 motion and to that of the simulator. It has dead time, play, lags, a speed curve on each side,
 pose and pump. What it cannot describe is the same in both fits, so that it cancels in the difference.
 The difference of two curves is then read as effects: dead band, saturation and gains of the two sides.
@@ -20,23 +20,12 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from actuators.identify.speed_data import WIDTH, SpeedData
-from actuators.identify.valve_fit import fit_dynamics
+from brokk_rl.contracts.actuator import CurveFit, FittedCurve
 from brokk_rl.machine import Machine
 from diagnosis.baseline import SimulatorComparison
 from diagnosis.closure import Estimate, serialize_estimate
 
 # Chosen by hand; not searched.
-NUM_DRAWS = 200
-"""Bootstrap draws; the ends of a 95 % interval vary by 5 % of its width."""
-BLOCK_S = 30.0
-"""Length of the blocks that are drawn, s: the speed of a machine wanders over some seconds."""
-KNOTS = (0.0, 0.03, 0.06, 0.09, 0.12, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
-"""Strokes at which the curves are given, of full stroke: denser where valves open."""
-LONGEST_LAG_S, SWEEPS, ITERATIONS = 0.5, 6, 6
-"""Bound of each lag, turns of curve, pose and pump, steps of the search: as in `fit=valve`."""
-TIME_STEP, PLAY_STEP = 0.02, 0.02
-"""Finite differences of times, s, and of the play, of full command."""
 BAND_BOUNDS, LEVEL_BOUNDS, GAIN_BOUNDS = (-0.5, 0.9), (0.1, 1.0), (0.1, 4.0)
 """Bounds of dead band and saturation, of full command, and of the ratio of speeds."""
 NEUTRAL_PULL = 0.003
@@ -63,39 +52,20 @@ ADDED = ("dead_time_s", "play", "lag_s")
 
 
 @dataclass(frozen=True, eq=False)
-class FittedCurve:
-    """Speed curve of one joint, with its bootstrap.
-
-    Attributes:
-        curve: Speed at each knot but 0, positive side first, over the machine's full speed, `(C,)`.
-        dynamics: `DYNAMICS`, `(4,)`.
-        draws: Draws of both, `(B, C + 4)`.
-        information: Information of the recordings on the curve, `(C, C)`.
-    """
-
-    curve: np.ndarray
-    dynamics: np.ndarray
-    draws: np.ndarray
-    information: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
 class CurveDifference:
-    """What changes the simulated speed curve of a joint into the measured one.
+    """Change of the simulated speed curve of a joint into the measured one.
 
     Attributes:
         measured: Of the machine.
         simulated: Of the simulator under the same commands.
         values: `CURVE_NUMBERS`, then `ADDED`, `(8,)`.
         deviation: Their standard errors, `(8,)`; 0 for a number that is left out.
-        points: Measured speed over the stroke of the valve at single increments, `(I, 2)`.
     """
 
     measured: FittedCurve
     simulated: FittedCurve
     values: np.ndarray
     deviation: np.ndarray
-    points: np.ndarray
 
     def estimates(self) -> dict[str, Estimate | None]:
         """Return the numbers by name with 95 % intervals; `None` for one that is left out."""
@@ -125,6 +95,7 @@ def measure_curves(
     field: SimulatorComparison,
     others: Sequence[SimulatorComparison],
     machine: Machine,
+    fit: CurveFit,
     generator: np.random.Generator,
 ) -> SpeedCurves:
     """Fit the curves of the machine and of the simulator, and read their difference.
@@ -133,50 +104,32 @@ def measure_curves(
         field: The simulator against the field.
         others: Fits of the simulator that left out a part of the reference, against the field.
         machine: The machine.
+        fit: Fits the curves.
         generator: Draws blocks.
 
     Raises:
         RecordingError: no recording is long enough.
     """
-    knots = np.array(KNOTS)
-    data = SpeedData(list(field.recordings), machine, knots)
-    measured = data.replace_motion(
-        _place_steps(field, data, field.residuals.simulator.cut.measured)
-    )
-    simulated = data.replace_motion(_place_steps(field, data, field.residuals.base))
-    rest = []
-    for one in others:
-        rest.append(data.replace_motion(_place_steps(one, data, one.residuals.base)))
-    blocks = _number_blocks(data, machine)
-    draws = _draw_blocks(blocks, generator)
-    moving = measured.moves & simulated.moves
-    fits = [_fit_dynamics(one, moving) for one in (measured, simulated)]
-    found = {}
-    for j in np.flatnonzero(moving).tolist():
-        pair = []
-        for one, (dynamics, factors) in zip((measured, simulated), fits, strict=True):
-            pair.append(_fit_curve(one, j, dynamics[j], factors[j], blocks, draws))
-        dynamics, factors = fits[1][0][j], fits[1][1][j]
-        scatter = []
-        for one in rest:
-            scatter.append(_fit_curve(one, j, dynamics, factors, blocks, draws[:1]).draws[0])
-        points = _list_points(measured, j, fits[0][0][j])
-        found[machine.joint_names[j]] = _compare_curves(pair[0], pair[1], knots, scatter, points)
+    measured = _place_steps(field, field.residuals.simulator.cut.measured)
+    motions = [measured, _place_steps(field, field.residuals.base)]
+    further = [_place_steps(one, one.residuals.base) for one in others]
+    curves = fit.fit_curves(machine, field.recordings, motions, further, generator)
+    knots, found = np.array(fit.knots), {}
+    for name, own in zip(machine.joint_names, curves, strict=True):
+        if own:
+            scatter = [one.draws[0] for one in own[2:]]
+            found[name] = _compare_curves(own[0], own[1], knots, scatter)
     return SpeedCurves(knots, found)
 
 
-def _place_steps(
-    field: SimulatorComparison, data: SpeedData, paths: np.ndarray
-) -> list[np.ndarray]:
+def _place_steps(field: SimulatorComparison, paths: np.ndarray) -> list[np.ndarray]:
     """Return the motion of `paths` `(W, K, J)` from each sample to the next, `(T, J)`, NaN outside of windows."""
     start = field.residuals.start[:, None]
     steps = np.diff(np.concatenate([start, paths], 1), axis=1)
-    number = {id(one): n for n, one in enumerate(field.recordings)}
     found = []
-    for recording in data.used:
-        mine = np.flatnonzero(field.source == number[id(recording)])
+    for number, recording in enumerate(field.recordings):
         by_sample = np.full(recording.q.shape, np.nan)
-        for window in mine:
+        for window in np.flatnonzero(field.source == number):
             # A step belongs to the sample at which it begins.
             first = field.row[window] - 1
             by_sample[first : first + steps.shape[1]] = steps[window]
@@ -184,84 +137,8 @@ def _place_steps(
     return found
 
 
-def _number_blocks(data: SpeedData, machine: Machine) -> np.ndarray:
-    """Return the number of the block of each increment, `(I,)`."""
-    size = max(1, round(BLOCK_S / (WIDTH * machine.period_s)))
-    found, first = [], 0
-    for count in data.num_increments:
-        found.append(first + np.arange(count) // size)
-        first = int(found[-1][-1]) + 1 if count else first
-    return np.concatenate(found)
-
-
-def _draw_blocks(blocks: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """Return how often each block is drawn, `(1 + B, P)`; the first row is the sample itself."""
-    count = int(blocks.max()) + 1
-    drawn = generator.multinomial(count, np.full(count, 1.0 / count), NUM_DRAWS)
-    return np.concatenate([np.ones((1, count)), drawn])
-
-
-def _fit_dynamics(data: SpeedData, moving: np.ndarray) -> tuple[np.ndarray, list[list[np.ndarray]]]:
-    """Return the dynamics of all joints, `(J, 4)`, and the factors of pose and pump."""
-    dynamics = np.zeros((data.machine.num_joints, len(DYNAMICS)))
-    for j in np.flatnonzero(moving).tolist():
-        dynamics[j] = fit_dynamics(data, j, None, None, LONGEST_LAG_S, ITERATIONS)
-    factors = data.factors(data.statics(dynamics, SWEEPS), dynamics)
-    for j in np.flatnonzero(moving).tolist():
-        dynamics[j] = fit_dynamics(data, j, factors[j], dynamics[j], LONGEST_LAG_S, ITERATIONS)
-    return dynamics, factors
-
-
-def _fit_curve(
-    data: SpeedData,
-    j: int,
-    dynamics: np.ndarray,
-    factors: Sequence[np.ndarray],
-    blocks: np.ndarray,
-    draws: np.ndarray,
-) -> FittedCurve:
-    """Return the curve of joint `j`, drawn together with its dynamics, which are linearised."""
-    features = data.features(j, dynamics, factors)
-    way, weight = data.way[j], data.weights[j]
-    curve = data.curve(features, way, free=weight)
-    columns = [features]
-    for k in range(len(DYNAMICS)):
-        step = PLAY_STEP if DYNAMICS[k] == "play" else TIME_STEP
-        moved = dynamics.copy()
-        moved[k] += step
-        later = data.features(j, moved, factors) @ curve
-        columns.append(((later - features @ curve) / step)[:, None])
-    slopes = np.hstack(columns)
-    left = way - features @ curve
-    noise = float(np.average(left**2, weights=np.maximum(weight, 1e-9)))
-    count, size = draws.shape[1], slopes.shape[1]
-    normal, right = np.zeros((count, size, size)), np.zeros((count, size))
-    for block in range(count):
-        rows = blocks == block
-        weighted = slopes[rows] * weight[rows, None]
-        normal[block] = weighted.T @ slopes[rows]
-        right[block] = weighted.T @ left[rows]
-    pull = data.pull(noise, size)
-    start = np.concatenate([curve, dynamics])
-    # The pull acts on the curve itself, not on its change.
-    held = pull @ np.concatenate([curve, np.zeros(len(DYNAMICS))])
-    drawn = []
-    for row in draws:
-        drawn.append(
-            np.linalg.solve(np.tensordot(row, normal, 1) + pull, np.tensordot(row, right, 1) - held)
-        )
-    # The fit of the sample itself is the curve: its own small step is taken off.
-    away = np.stack(drawn) - drawn[0]
-    information = normal.sum(0)[: len(curve), : len(curve)] / noise
-    return FittedCurve(curve, dynamics, start + away, information)
-
-
 def _compare_curves(
-    measured: FittedCurve,
-    simulated: FittedCurve,
-    knots: np.ndarray,
-    scatter: Sequence[np.ndarray],
-    points: np.ndarray,
+    measured: FittedCurve, simulated: FittedCurve, knots: np.ndarray, scatter: Sequence[np.ndarray]
 ) -> CurveDifference:
     """Return what changes the simulated curve into the measured one, with standard errors.
 
@@ -281,11 +158,7 @@ def _compare_curves(
         free[np.flatnonzero(free)[score[free].argmin()]] = False
     added, of_added = _compare_dynamics(measured, simulated, scatter)
     return CurveDifference(
-        measured,
-        simulated,
-        np.concatenate([values, added]),
-        np.concatenate([error, of_added]),
-        points,
+        measured, simulated, np.concatenate([values, added]), np.concatenate([error, of_added])
     )
 
 
@@ -384,13 +257,6 @@ def _list_starts(
     return [NEUTRAL, shown, middle]
 
 
-def _list_points(data: SpeedData, j: int, dynamics: np.ndarray) -> np.ndarray:
-    """Return stroke and speed over the machine's full speed of each increment that counts, `(I, 2)`."""
-    full = data.machine.max_speed[j] * data.machine.period_s * WIDTH
-    counts = data.weights[j] > 0
-    return np.stack([data.strokes(j, dynamics)[counts], data.way[j][counts] / full], 1)
-
-
 def serialize_curves(curves: SpeedCurves) -> dict[str, Any]:
     """Return the curves for `diagnosis.json`: knots, both curves with intervals, their difference.
 
@@ -402,12 +268,13 @@ def serialize_curves(curves: SpeedCurves) -> dict[str, Any]:
         difference = {}
         for key, estimate in one.estimates().items():
             difference[key] = estimate and serialize_estimate(estimate)
-        every = -(-len(one.points) // MAX_POINTS)
+        points = one.measured.points
+        every = -(-len(points) // MAX_POINTS)
         found[name] = {
             "measured": _serialize_curve(one.measured, len(curves.knots)),
             "simulated": _serialize_curve(one.simulated, len(curves.knots)),
             "difference": difference,
-            "points": one.points[::every].round(4).tolist(),
+            "points": points[::every].round(4).tolist(),
         }
     return {"knots": curves.knots.tolist(), "joints": found}
 

@@ -60,9 +60,8 @@ class SpeedData:
     """Recordings as increments, and the model on them.
 
     Attributes:
-        used: Recordings that are long enough.
         way: Increments, `(J, I)`.
-        known: Whether each increment counts, `(I,)` bool.
+        known: Increments that count, `(I,)` bool.
         scale: Mean square of the increments, `(J,)`.
     """
 
@@ -73,8 +72,9 @@ class SpeedData:
         self._period_s = machine.period_s
         # what came before the recording is not known
         self._skip = max(1, round((machine.num_history + 1.0 / machine.period_s) / WIDTH))
-        used = [r for r in recordings if r.num_samples > WIDTH * (self._skip + 4)]
-        self.used = used
+        least = WIDTH * (self._skip + 4)
+        self._places = [n for n, r in enumerate(recordings) if r.num_samples > least]
+        used = [recordings[n] for n in self._places]
         if not used:
             raise RecordingError(
                 f"too little data: none of the {len(self.recordings)} recordings lasts long enough to fit to"
@@ -98,7 +98,7 @@ class SpeedData:
 
     @property
     def moves(self) -> np.ndarray:
-        """Whether each joint moves at all, `(J,)` bool."""
+        """Joints that move at all, `(J,)` bool."""
         return self.scale >= STILL
 
     @property
@@ -135,11 +135,12 @@ class SpeedData:
         """Return the same commands and poses with another motion.
 
         Args:
-            steps: Motion from each sample to the next of each used recording, `(T, J)`; increments
-                with NaN count nothing.
+            steps: Motion from each sample to the next of each recording, `(T, J)`; increments with
+                NaN count nothing.
         """
         other = copy.copy(self)
-        way = np.concatenate([self._increments(part) for part in steps]).T
+        used = [steps[n] for n in self._places]
+        way = np.concatenate([self._increments(part) for part in used]).T
         other.known = np.isfinite(way).all(0)
         other.way, other._free = np.where(other.known, way, 0.0), self._free * other.known
         other._measure_scale()

@@ -67,6 +67,7 @@ def diagnosed(
         certainty,
         thresholds,
         excitations,
+        option("curve_fit", "valve"),
         generator,
     )
     outcome = work.run(lambda doing, done: None)
