@@ -67,7 +67,9 @@ class SensingArm:
         }
         self._bus = CommandBus(bus, machine.period_s)
         self._spools = PilotedSpools(n)
-        self._hydraulics = SensingHydraulics(n, machine, self._causes.back_flow)
+        self._hydraulics = SensingHydraulics(
+            n, machine, self._causes.back_flow, self._causes.pump_lag
+        )
         self._linkage = Linkage(n, machine, self._causes.mounting_rad)
         self._weight, self._encoders = Arm(machine, n), SteppedEncoders(n)
         self._q = np.tile(machine.home, (len(parameters), 1))
@@ -145,7 +147,8 @@ class SensingArm:
         """Return the factor on all flows by the oil's viscosity, `(N, J)`.
 
         The temperature rises with one time constant, and the logarithm of the viscosity falls with
-        it (Reynolds' law), so the flow rises late and then fast.
+        it (Reynolds' law), so the flow rises early and then
+        slowly.
         """
         n, run_s = self._n, run_s[:, None]
         own = 1.0 + n["warm_change"] * _compute_warming(run_s / 900.0)  # s: the nuisance's tank

@@ -8,7 +8,8 @@ silted_spool     a spool that rests silts up; it sticks until the pilot force ha
 ajar_check       after a motion the load-holding valve stays ajar for seconds: the joint sinks on
 supply_voltage   commands are scaled by a supply voltage that falls and recovers with its charger
 moved_stop       a stop that moved into the travel
-back_flow        a missing load check: a start under load first goes the wrong way
+back_flow        a missing load check and a pump that wakes slowly: a start under load first goes the
+                 wrong way
 stale_readings   the encoder repeats its reading for some tenths of a second, then jumps
 coarse_driver    the valve's driver knows a few currents only
 levelling        a levelling cylinder takes up part of the next joint's motion
@@ -29,12 +30,12 @@ CAUSES = (
 )  # fmt: skip
 
 # Sizes at severity 1, chosen by hand so that each shows plainly in the motion.
-SILT_STROKE = 0.5
-SILT_S = 1.5
+SILT_STROKE = 0.8
+SILT_S = 1.0
 AJAR_SPEED, AJAR_S = 0.12, 2.0
 VOLTAGE_LOSS, CHARGER_S, CHARGER_SHARE = 0.25, 24.0, 0.5
 STOP_TRAVEL = 0.4
-BACK_FLOW = 2.0
+BACK_FLOW, WAKING = 2.0, 0.3
 STALE_EVERY_S, STALE_S = 2.5, 0.6
 DRIVER_LEVELS = 3.0
 LEVELLING_SHARE = 0.3
@@ -80,6 +81,7 @@ class OutsideCauses:
         )
         self.mounting_rad = MOUNTING_RAD * self._of.get("moved_mounting", none)
         self.back_flow = BACK_FLOW * self._of.get("back_flow", none)
+        self.pump_lag = 1.0 + WAKING * self._of.get("back_flow", none).max(1, keepdims=True)
         self._rest_s, self._since_s = none.copy(), none + 1e3
         self._direction, self._pause_s = none.copy(), none.copy()
         self._stale_s, self._held = none[:, 0].copy(), none.copy()

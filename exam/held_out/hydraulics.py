@@ -143,10 +143,13 @@ class SensingHydraulics:
         machine: Full speeds, yield forces, stiffness.
         back_flow: Share of an oil flow from the cylinder back to the pump that the check valves let
             pass, `(N, J)`.
+        pump_lag: Factor on the time constant of the pump, `(N, 1)`.
     """
 
-    def __init__(self, numbers: ArmParameters, machine: Machine, back_flow: np.ndarray) -> None:
-        self._n, self._back_flow = numbers, back_flow
+    def __init__(
+        self, numbers: ArmParameters, machine: Machine, back_flow: np.ndarray, pump_lag: np.ndarray
+    ) -> None:
+        self._n, self._back_flow, self._pump_lag = numbers, back_flow, pump_lag
         shape = numbers["notch"].shape
         self.speed = np.zeros(shape)
         self._bore, self._rod = np.zeros(shape), np.zeros(shape)
@@ -275,7 +278,7 @@ class SensingHydraulics:
     def _follow_load(self, sensed: np.ndarray, flow: np.ndarray, slope: np.ndarray) -> None:
         """Move the pump's pressure on by a step."""
         n, dt = self._n, STEP_S
-        lag_s, power = n["pump_s"][:, :1], n["power"][:, :1]
+        lag_s, power = n["pump_s"][:, :1] * self._pump_lag, n["power"][:, :1]
         wanted = np.clip(sensed.max(1, keepdims=True) + MARGIN, STANDBY, 1.0)
         rise = (wanted - self._supply) * (1.0 - np.exp(-dt / lag_s))
         asked = (n["demand"] * flow).sum(1, keepdims=True)
