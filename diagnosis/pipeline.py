@@ -427,7 +427,7 @@ def _build_node(one: Selected, kind: EffectType) -> dict:
     node: dict = {"_target_": f"{target.__module__}.{target.__name__}"}
     if "joints" in target.__annotations__:
         node["joints"] = list(one.joints) or "all"
-    for name, number in kind.numbers.items():
+    for name, number in kind.target.numbers.items():
         values = {
             joint: float(f"{value.mean:.6g}")
             for joint, value in one.parameters.get(name, {}).items()

@@ -94,7 +94,7 @@ def find_sensor_effects(
     case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
 ) -> list[DetectedEffect]:
     """Return the effects on sensors that the scatter of the field's samples shows."""
-    reference, machine = split_recordings(case.reference), case.machine
+    reference, machine = split_recordings(case.reference, case.machine), case.machine
     if len(reference) < 2:
         return []
     fits = []
@@ -192,7 +192,7 @@ def _estimate_parameters(
         ends = np.array(estimate_interval(SIZES, fit.likelihood[:, j]))
         for name in fit.kind.fitted:
             mean, low, high = (
-                float(v) for v in fit.kind.numbers[name].none + fit.kind.size(name) * ends
+                float(v) for v in fit.kind.numbers[name].none + fit.kind.size(name)[j] * ends
             )
             parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(mean, (low, high))
     return parameters
@@ -239,7 +239,7 @@ def _measure(kind: EffectType, size: float, recording: Recording, machine: Machi
         torch.manual_seed(0)
         model = kind.wrap(StationaryModel(), machine, len(q), torch.device("cpu"))
     for name in kind.fitted:
-        value = kind.clipped(name, np.array(kind.numbers[name].none + size * kind.size(name)))
-        model.parameters[name].fill_(float(value))
+        value = kind.clipped(name, kind.numbers[name].none + size * kind.size(name))
+        model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
     with torch.inference_mode():
         return model.measure(q).numpy().astype(float)

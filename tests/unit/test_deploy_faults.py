@@ -168,6 +168,7 @@ def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(
         ({"wanted": (0.3, 0, 1.2, 0, 0)}, 0.07), ({"wanted": (0.3, 0.3, 0, 0, 0)}, 0.07),
     ):  # fmt: skip
         stage.get_going()
+        stage.go(0.4, lambda: 3 < stage.ms % 400 <= 20)  # a request has just been made
         for name, value in change.items():
             setattr(stage, name, value)
         assert stage.stops_within_s() <= limit_s

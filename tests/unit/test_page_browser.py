@@ -237,7 +237,9 @@ def test_safety_and_connection_are_told_apart_in_words(
     latched = change_state(SHOWN, guard=GuardState.LATCHED, trip=GuardTrip.CHANNEL_INVALID)
     feed.now = replace(latched, commands=True)
     page.wait_for_selector("#safety.bad")
-    assert page.locator("#safety").inner_text() == "LATCHED – messages corrupted"
+    assert (
+        page.locator("#safety").inner_text() == "LATCHED – messages corrupted or from two senders"
+    )
     feed.now = change_state(SHOWN, estop=True, trip=GuardTrip.ESTOP)
     until(page, "document.getElementById('safety').textContent.includes('EMERGENCY STOP')")
     page.wait_for_selector("#deadman.careful")
