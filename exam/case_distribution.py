@@ -60,7 +60,7 @@ class PlantFamily(Protocol):
 
     @property
     def is_held_out(self) -> bool:
-        """Whether only sealed exams may draw from it."""
+        """True if only sealed exams may draw from it."""
         ...
 
     @property

@@ -11,7 +11,7 @@ import json
 import os
 import signal
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,16 +154,24 @@ def write_cases(
     size = max(1, min(BLOCK_CASES, -(-len(todo) // workers)))
     blocks = [todo[begin : begin + size] for begin in range(0, len(todo), size)]
     _append_private(path, [{"salt": salt}] if not found else [])
+
+    def keep(done: Future[list[dict[str, Any]]]) -> None:
+        fresh = [label for label in done.result() if label["case"] not in found]
+        _append_private(path, fresh)
+        found.update({label["case"]: label for label in fresh})
+        progress.advance(len(fresh))
+
     with ProcessPoolExecutor(workers, initializer=end_on_interrupt) as pool:
         pending = [pool.submit(cases.write, block) for block in blocks]
         try:
             for done in as_completed(pending):
-                labels = done.result()
-                _append_private(path, labels)
-                found |= {label["case"]: label for label in labels}
-                progress.advance(len(labels))
+                keep(done)
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
+            # what is finished is kept, in whatever order it comes
+            for job in pending:
+                if job.done() and not job.cancelled() and job.exception() is None:
+                    keep(job)
             raise
     return [found[name] for name in sorted(found)]
 

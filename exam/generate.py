@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -125,7 +126,7 @@ class RecordingJob:
 
     @property
     def is_field(self) -> bool:
-        """Whether the machine is recorded as it is."""
+        """True if the machine is recorded as it is."""
         return self.name != "reference"
 
     def stream(self, name: str) -> np.random.Generator:
@@ -319,3 +320,17 @@ class CaseRecorder:
                 path.append(opened.read().q)
                 opened.send(Command(command.astype(float)))
         return np.stack(path).astype(np.float32)
+
+
+def restrict_machine(machine: Machine, known: str) -> Machine:
+    """Return the machine as candidates know it: `full`, or by its `joints` only."""
+    if known == "full":
+        return machine
+    joints = tuple(dataclasses.replace(joint, body=None) for joint in machine.joints)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return dataclasses.replace(  # pyright: ignore[reportCallIssue]
+        machine,  # pyright: ignore[reportArgumentType]
+        name=f"{machine.name}_joints",
+        mjcf=None,
+        tool_m=None,
+        joints=joints,
+    )

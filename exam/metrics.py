@@ -123,7 +123,7 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
         "closed_of_oracle": bootstrap_over_cases(known, compute_closed_of_oracle),
         "closed_examined": bootstrap_over_cases(known, compute_examined_share),
         "closed_differs": _rate_items(_select_examined(known), attrgetter("differs")),
-        "closed_missing": _rate_items(_select_named(scores), _lacks_closed),
+        "closed_missing": _rate_items(_select_named(scores), _is_without_share),
         "predicted_off": bootstrap_over_cases(known, compute_prediction_error),
         "seconds": {"median": _take_median(seconds), "most": max(seconds, default=None)},
         "by_effect": summarize_effects(scores),
@@ -344,7 +344,7 @@ def _select_named(scores: Sequence[CaseScore]) -> list[CaseScore]:
     return [score for score in scores if score.named]
 
 
-def _lacks_closed(score: CaseScore) -> bool:
+def _is_without_share(score: CaseScore) -> bool:
     return score.closed is None
 
 

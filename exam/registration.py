@@ -1,4 +1,4 @@
-"""What is committed before anyone sits an exam: hash of the labels, identity of the engine.
+"""Registration of an exam before anyone sits it: hash of the labels, identity of the engine.
 
 `registration.jsonl` in the folder of an exam grows by a line an event: `made`, `registered`,
 `opened`. `run` compares the engine with the last one that was registered. The ledger, a file that
@@ -66,7 +66,7 @@ def _list_engine_files() -> dict[str, Path]:
 
 @dataclass(frozen=True)
 class RegistrationState:
-    """What the registration of an exam says before a run.
+    """State of an exam and of the engine before a run.
 
     Attributes:
         engine: The engine that runs now.
@@ -146,7 +146,7 @@ def note_opening(folder: Path, facts: Mapping[str, Any], ledger: str | None) -> 
 
 
 def list_warnings(run: Path, engines: Sequence[str]) -> list[str]:
-    """Return what makes answers less than answers to a sealed exam, in words.
+    """Return the reasons why answers are less than answers to a sealed exam, in words.
 
     Args:
         run: What `exam.do=run` noted in the folder of the answers.

@@ -96,37 +96,37 @@ def compute_notch_area(opening: np.ndarray, notch: np.ndarray) -> np.ndarray:
     ) * (opening > 0)
 
 
-def _wait_longer(n: ArmParameters, size: EffectSizes) -> None:
+def _add_dead_time(n: ArmParameters, size: EffectSizes) -> None:
     n["wait_s"] = n["wait_s"] + size["dead_time_s"]
 
 
-def _queue_frames(n: ArmParameters, size: EffectSizes) -> None:
+def _add_delay_jitter(n: ArmParameters, size: EffectSizes) -> None:
     n["queue_s"] = n["queue_s"] + size["jitter_s"]
 
 
-def _lose_frames(n: ArmParameters, size: EffectSizes) -> None:
+def _add_frame_loss(n: ArmParameters, size: EffectSizes) -> None:
     n["loss"] = n["loss"] + size["probability"]
 
 
-def _stamp_late(n: ArmParameters, size: EffectSizes) -> None:
+def _add_clock_offset(n: ArmParameters, size: EffectSizes) -> None:
     n["late_s"] = n["late_s"] + size["offset_s"]
 
 
-def _widen_overlap(n: ArmParameters, size: EffectSizes) -> None:
+def _add_dead_band(n: ArmParameters, size: EffectSizes) -> None:
     for side in ("extend", "retract"):
         own = n[f"overlap_{side}"]
         n[f"overlap_{side}"] = own + size[side] * (1.0 - own)
 
 
-def _set_stop(n: ArmParameters, size: EffectSizes) -> None:
+def _add_saturation(n: ArmParameters, size: EffectSizes) -> None:
     n["stop"] = np.minimum(n["stop"], size["level"])
 
 
-def _throttle_pilot(n: ArmParameters, size: EffectSizes) -> None:
+def _add_rate_limit(n: ArmParameters, size: EffectSizes) -> None:
     n["stroke_s"] = n["stroke_s"] + size["stroke_s"]
 
 
-def _clog_pilot(n: ArmParameters, size: EffectSizes) -> None:
+def _add_lag(n: ArmParameters, size: EffectSizes) -> None:
     n["added_fill_s"] = n["added_fill_s"] + size["time_constant_s"]
 
 
@@ -138,7 +138,7 @@ USUAL_START = 0.08
 """Command at which a usual joint starts."""
 
 
-def _seize_pins(n: ArmParameters, size: EffectSizes) -> None:
+def _add_stiction(n: ArmParameters, size: EffectSizes) -> None:
     """Add friction at rest, and a bleed orifice that only a larger opening overcomes."""
     start = size["start"]
     has = start > 0
@@ -149,76 +149,92 @@ def _seize_pins(n: ArmParameters, size: EffectSizes) -> None:
     n["bleed"] = np.where(has, flow / np.sqrt(np.maximum(n["breakaway"], 1e-6)), 0.0)
 
 
-def _set_spring(n: ArmParameters, size: EffectSizes) -> None:
+def _add_flow_gain(n: ArmParameters, size: EffectSizes) -> None:
     n["spring"] = n["spring"] * size["gain"] ** 2  # flow grows with the root of the drop
 
 
-def _wear_edge(n: ArmParameters, size: EffectSizes) -> None:
+def _add_asymmetry(n: ArmParameters, size: EffectSizes) -> None:
     n["area_extend"] = n["area_extend"] * size["extend_gain"]
     n["area_retract"] = n["area_retract"] * size["retract_gain"]
 
 
-def _loosen_compensator(n: ArmParameters, size: EffectSizes) -> None:
+def _add_load_dependence(n: ArmParameters, size: EffectSizes) -> None:
     n["loose"] = n["loose"] + size["sensitivity"]
 
 
-def _wear_pump(n: ArmParameters, size: EffectSizes) -> None:
+def _add_flow_sharing(n: ArmParameters, size: EffectSizes) -> None:
     """Let the mean demand of all joints be that of the effect; joints keep their own shares."""
     wanted = size["demand"]
     share = n["demand"] / n["demand"].mean()
     n["demand"] = np.where(wanted > 0, np.maximum(n["demand"], share * wanted), n["demand"])
 
 
-def _leak_check_valve(n: ArmParameters, size: EffectSizes) -> None:
+def _add_creep(n: ArmParameters, size: EffectSizes) -> None:
     n["sink"] = n["sink"] + size["sink_rad_s"]
 
 
-def _fill_other_oil(n: ArmParameters, size: EffectSizes) -> None:
+def _add_thermal_drift(n: ArmParameters, size: EffectSizes) -> None:
     n["oil_change"], n["oil_s"] = n["oil_change"] + size["change"], size["time_s"]
 
 
-def _wear_pins(n: ArmParameters, size: EffectSizes) -> None:
+def _add_backlash(n: ArmParameters, size: EffectSizes) -> None:
     n["added_play_rad"] = n["added_play_rad"] + size["gap_rad"]
 
 
-def _soften_hoses(n: ArmParameters, size: EffectSizes) -> None:
+def _add_compliance(n: ArmParameters, size: EffectSizes) -> None:
     n["soft_s"], n["soft_damping"] = n["soft_s"] + size["ringing_s"], size["damping"]
 
 
-def _coarsen_encoder(n: ArmParameters, size: EffectSizes) -> None:
+def _add_quantisation(n: ArmParameters, size: EffectSizes) -> None:
     n["step_rad"] = n["step_rad"] + size["step_rad"]
 
 
-def _disturb_encoder(n: ArmParameters, size: EffectSizes) -> None:
+def _add_sensor_noise(n: ArmParameters, size: EffectSizes) -> None:
     n["sigma_rad"] = n["sigma_rad"] + size["sigma_rad"]
 
 
-def _shift_encoder(n: ArmParameters, size: EffectSizes) -> None:
+def _add_encoder_bias(n: ArmParameters, size: EffectSizes) -> None:
     n["bias_rad"] = n["bias_rad"] + size["bias_rad"]
 
 
-def _scale_encoder(n: ArmParameters, size: EffectSizes) -> None:
+def _add_encoder_scale(n: ArmParameters, size: EffectSizes) -> None:
     n["scale"] = n["scale"] * size["scale"]
 
 
-def _lengthen_link(n: ArmParameters, size: EffectSizes) -> None:
+def _add_link_length(n: ArmParameters, size: EffectSizes) -> None:
     n["extra_m"] = n["extra_m"] + size["extra_m"]
 
 
-def _tilt_base(n: ArmParameters, size: EffectSizes) -> None:
+def _add_base_tilt(n: ArmParameters, size: EffectSizes) -> None:
     for name in ("roll_rad", "pitch_rad"):
         n[name] = n[name] + size[name]
 
 
 CHANGES: dict[str, Callable[[ArmParameters, EffectSizes], None]] = {
-    "dead_time": _wait_longer, "delay_jitter": _queue_frames, "frame_loss": _lose_frames, "clock_offset": _stamp_late,
-    "dead_band": _widen_overlap, "saturation": _set_stop, "rate_limit": _throttle_pilot, "lag": _clog_pilot,
-    "stiction": _seize_pins, "flow_gain": _set_spring, "asymmetry": _wear_edge,
-    "load_dependence": _loosen_compensator, "flow_sharing": _wear_pump, "creep": _leak_check_valve,
-    "thermal_drift": _fill_other_oil, "backlash": _wear_pins, "compliance": _soften_hoses,
-    "quantisation": _coarsen_encoder, "sensor_noise": _disturb_encoder, "encoder_bias": _shift_encoder,
-    "encoder_scale": _scale_encoder, "link_length": _lengthen_link, "base_tilt": _tilt_base,
-}  # fmt: skip
+    "dead_time": _add_dead_time,
+    "delay_jitter": _add_delay_jitter,
+    "frame_loss": _add_frame_loss,
+    "clock_offset": _add_clock_offset,
+    "dead_band": _add_dead_band,
+    "saturation": _add_saturation,
+    "rate_limit": _add_rate_limit,
+    "lag": _add_lag,
+    "stiction": _add_stiction,
+    "flow_gain": _add_flow_gain,
+    "asymmetry": _add_asymmetry,
+    "load_dependence": _add_load_dependence,
+    "flow_sharing": _add_flow_sharing,
+    "creep": _add_creep,
+    "thermal_drift": _add_thermal_drift,
+    "backlash": _add_backlash,
+    "compliance": _add_compliance,
+    "quantisation": _add_quantisation,
+    "sensor_noise": _add_sensor_noise,
+    "encoder_bias": _add_encoder_bias,
+    "encoder_scale": _add_encoder_scale,
+    "link_length": _add_link_length,
+    "base_tilt": _add_base_tilt,
+}
 """Change of the parameters by effect, in place. `extrinsics` is not among them: a case has no
 estimates of boreholes to see it by."""
 

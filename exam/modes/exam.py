@@ -6,8 +6,8 @@ import dataclasses
 import json
 import logging
 import secrets
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -24,22 +24,22 @@ from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
-from diagnosis import answer, effect_library
+from diagnosis import effect_library
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.detection import Penalties
-from exam import dataset, oracle, registration, report, run_cases, score
+from exam import dataset, oracle, registration, report, run_cases
+from exam.answer_scoring import RUN_FILE, AnswerScoring
 from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family
 from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
 from exam.dataset import CaseSet, end_on_interrupt
-from exam.examiner import examine_case
-from exam.generate import CaseRecorder, Half, HalfPlan
+from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
 from exam.metrics import compute_metrics
 from exam.progress import CaseProgress
 from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
 
-ORACLE_FILE, RUN_FILE, EXAMINED_FILE = "oracle.json", "run.json", "examined.json"
+ORACLE_FILE, EXAMINED_FILE = "oracle.json", "examined.json"
 
 
 @spec
@@ -400,6 +400,12 @@ class Exam:
             self.session.folder,
         )
 
+    def _read_oracle(self) -> dict[str, float | None]:
+        """Return the share that the true effects close by case; empty where nobody asked."""
+        if self.exam.oracles is None:
+            return {}
+        return json.loads((Path(self.exam.oracles) / ORACLE_FILE).read_text())
+
     def _of_machine(self) -> list[str]:
         shared = []
         for name, trouble in self.exam.mix.troubles.items():
@@ -414,141 +420,31 @@ class Exam:
         """Open the labels; write marks, answers, labels, report and ledger; print the table."""
         labels, facts = self._open_labels(), self._facts
         folders = {name: Path(folder) for name, folder in answers.items()}
-        examined = self._examine(labels, folders)
+        out = self.session.folder
+        marking = AnswerScoring(
+            exam=self._folder,
+            labels=labels,
+            machine=self._known,
+            fit=self.exam.oracle,
+            classes=self.exam.mix.classes,
+            of_machine=self._of_machine(),
+            oracle=self._read_oracle(),
+        )
+        examined = marking.examine(folders, out / EXAMINED_FILE, self.exam.workers)
         tables = {}
         for name, folder in folders.items():
-            tables[name] = self._table(folder, labels, examined.get(name, {}))
-        out = self.session.folder
+            tables[name] = marking.build_table(folder, examined.get(name, {}))
         write_json(out / "marks.json", {"exam": facts, "candidates": tables})
         report.write_report(out, facts, tables)
         # what anybody needs to score them again stands beside the score
         write_text(out / "labels.json", (self._folder / dataset.LABELS_FILE).read_text())
         for name, folder in folders.items():
-            publish_answers(folder, labels, out / f"answers_{name}.jsonl")
+            marking.publish(folder, out / f"answers_{name}.jsonl")
             line = {**facts, **report.collect_headlines(name, tables[name])}
             line |= {"engines": tables[name]["engines"], "warnings": tables[name]["warnings"]}
             registration.append_event(self._folder, "scored", line, self.exam.ledger)
         _show(tables)
         log.info("report: %s", out / report.REPORT_FILE)
-
-    def _examine(
-        self, labels: Sequence[Mapping[str, Any]], folders: Mapping[str, Path]
-    ) -> dict[str, dict[str, Any]]:
-        """Return the examiner's figures by candidate and case; empty without withheld recordings.
-
-        They are kept in `examined.json`, so that an interrupted score goes on.
-        """
-        place = self.session.folder / EXAMINED_FILE
-        found: dict[str, dict[str, Any]] = {name: {} for name in folders}
-        if place.is_file():
-            found |= json.loads(place.read_text())
-        todo = []
-        for label in labels:
-            case = label["case"]
-            if label["kind"] not in ("one", "several"):
-                continue
-            if not (self._folder / dataset.WITHHELD_FOLDER / case).is_dir():
-                continue
-            begun = [name for name in folders if run_cases.is_begun(folders[name] / case)]
-            missing = [name for name in begun if case not in found[name]]
-            if missing:
-                todo.append((case, missing))
-        if not todo:
-            return found
-        with (
-            CaseProgress("repairs examined", len(todo)) as progress,
-            ProcessPoolExecutor(self.exam.workers, initializer=end_on_interrupt) as pool,
-        ):
-            jobs = {}
-            for case, names in todo:
-                places = [folders[name] / case for name in names]
-                job = pool.submit(
-                    examine_case, self._folder, self.exam.oracle, self._known, case, places
-                )
-                jobs[job] = (case, names)
-            for job in as_completed(jobs):
-                case, names = jobs[job]
-                for name, result in zip(names, job.result(), strict=True):
-                    found[name][case] = result
-                write_json(place, found)
-                progress.advance()
-        return found
-
-    def _table(
-        self, folder: Path, labels: list[dict[str, Any]], examined: Mapping[str, Any]
-    ) -> dict[str, Any]:
-        """Return the figures of the answers in `folder`, their engines, and warnings about them."""
-        mix, marks = self.exam.mix, []
-        best = (
-            {}
-            if self.exam.oracles is None
-            else json.loads((Path(self.exam.oracles) / ORACLE_FILE).read_text())
-        )
-        of_machine = self._of_machine()
-        begun = [label for label in labels if run_cases.is_begun(folder / label["case"])]
-        if len(begun) < len(labels):
-            log.warning(
-                "%s: %d of %d cases sat; the others are left out", folder, len(begun), len(labels)
-            )
-        engines = set()
-        for label in begun:
-            place = folder / label["case"]
-            said = (
-                answer.read_answer(place / answer.ANSWER_FILE)
-                if (place / answer.ANSWER_FILE).is_file()
-                else None
-            )
-            engines.add(run_cases.read_note(place).get("engine"))
-            marks.append(
-                score.score_answer(
-                    label,
-                    said,
-                    mix.classes,
-                    of_machine,
-                    run_cases.read_seconds(place),
-                    best.get(label["case"]),
-                    examined.get(label["case"]),
-                )
-            )
-        if all(mark.verdict == "failed" for mark in marks):
-            raise RecordingError(
-                f"exam.answers: {folder} holds no answer to any case of {self._folder}"
-            )
-        known = sorted(filter(None, engines))
-        warnings = registration.list_warnings(folder / RUN_FILE, known)
-        for text in warnings:
-            log.warning("%s: %s", folder, text)
-        table = compute_metrics(marks, len(labels) - len(begun))
-        return {**table, "engines": known, "warnings": warnings}
-
-
-def restrict_machine(machine: Machine, known: str) -> Machine:
-    """Return the machine as candidates know it: `full`, or by its `joints` only."""
-    if known == "full":
-        return machine
-    joints = tuple(dataclasses.replace(joint, body=None) for joint in machine.joints)  # pyright: ignore[reportArgumentType, reportCallIssue]
-    return dataclasses.replace(  # pyright: ignore[reportCallIssue]
-        machine,  # pyright: ignore[reportArgumentType]
-        name=f"{machine.name}_joints",
-        mjcf=None,
-        tool_m=None,
-        joints=joints,
-    )
-
-
-def publish_answers(folder: Path, labels: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Write all answers in `folder` into one file, a line a case, with time and engine."""
-    lines = []
-    for label in labels:
-        place = folder / label["case"]
-        if not run_cases.is_begun(place):
-            continue
-        said = None
-        if (place / answer.ANSWER_FILE).is_file():
-            said = json.loads((place / answer.ANSWER_FILE).read_text())
-        note = run_cases.read_note(place)
-        lines.append(json.dumps({"case": label["case"], "note": note, "answer": said}) + "\n")
-    write_text(path, "".join(lines))
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:

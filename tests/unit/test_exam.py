@@ -17,6 +17,7 @@ import pytest
 from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
+from small_exam import SMALL
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
@@ -28,12 +29,6 @@ from exam.baselines import ConstantAnswer
 from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
 from exam.progress import CaseProgress
 from exam.residual_forest import ResidualForest
-
-SMALL = (
-    "mode=exam", "exam.mix.num_cases=2", "exam.mix.shares={none: 0.5, faint: 0, one: 0.5, several: 0, outside: 0}",
-    "exam.reference.programs=[[levels]]", "exam.reference.file_s=12", "exam.field.programs=[[levels],[levels]]",
-    "exam.field.file_s=8", "exam.withheld.programs=[[levels]]", "exam.withheld.file_s=10",
-)  # fmt: skip
 
 
 def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDesign]:
@@ -182,13 +177,18 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
     assert opened["event"] == "opened" and line["event"] == "scored"
     assert line["candidate"] == "none" and line["num_cases"] == 2 and line["seed"] == 0
     assert line["labels_sha256"] == (exam / dataset.HASH_FILE).read_text().split()[0]
-    assert line["engine"] == registration.compute_engine_id() and line["engines"] == [line["engine"]]
+    assert line["engine"] == registration.compute_engine_id() and line["engines"] == [
+        line["engine"]
+    ]
     # labels and answers are published beside the score
     assert (marks / "labels.json").read_bytes() == (exam / dataset.LABELS_FILE).read_bytes()
     said = [json.loads(text) for text in (marks / "answers_none.jsonl").read_text().splitlines()]
     assert [one["answer"]["verdict"] for one in said] == ["none", "none"]
     # whoever says "none" repairs nothing, by the examiner's own simulation
-    assert all(one["before"] == one["after"] for one in json.loads((marks / "examined.json").read_text())["none"].values())
+    assert all(
+        one["before"] == one["after"]
+        for one in json.loads((marks / "examined.json").read_text())["none"].values()
+    )
 
 
 def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
@@ -204,7 +204,12 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
         == 1
     )
     run_cases.answer_cases(
-        ConstantAnswer(effect=None, probability=0.5), [second], answers, machine, 1, CaseProgress("", 1)
+        ConstantAnswer(effect=None, probability=0.5),
+        [second],
+        answers,
+        machine,
+        1,
+        CaseProgress("", 1),
     )
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
     for expected, missed in (({"value": 2, "of": 2}, 1), ({"value": 1, "of": 2}, 0)):
