@@ -22,7 +22,7 @@ from deploy.bus.description import BusDescription
 from deploy.bus.protection import MessageFault
 from deploy.guard.limits import GuardLimits
 from deploy.runtime.bus_process import BusProcessConfig
-from deploy.runtime.operator_state import OperatorControls, RequestedCommand
+from deploy.runtime.operator_state import OperatorControls, RequestedCommand, StopRequest
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import request_fault
@@ -140,6 +140,12 @@ class Desk:
             recording_failed=False,
         )
         self.memory.controls.write(controls)
+
+    def press_stop(self) -> float:
+        """Presses the page's stop, straight to the bus process; returns when."""
+        now_s = time.monotonic()
+        self.memory.stop.write(StopRequest(now_s))
+        return now_s
 
     def heard(self, message: str, seconds: float) -> list[tuple[float, dict[str, float]]]:
         """Returns what was said on the bus from now on, with when."""

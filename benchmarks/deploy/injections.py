@@ -21,6 +21,9 @@ import numpy as np  # noqa: E402
 from composed import option  # noqa: E402
 from stage import Stage  # noqa: E402
 
+from deploy.guard.guard import GuardState  # noqa: E402
+
+LATCHED = GuardState.LATCHED
 WATCHED_S = 4.0
 MESSAGES = ("JointPos1", "JointPos2", "LeverState", "MachineStatus", "ValveFeedback", "ValveCmd")
 
@@ -123,10 +126,10 @@ def measure_stop(stage: Stage, inject: Callable[[Stage, int], None], trial: int)
 
 
 def measure_constant_delay(stage: Stage) -> dict[str, object]:
-    """0.5 s of delay to the PC for 90 s, then a new press: does the machine move?"""
+    """0.5 s of delay to the PC for 150 s, then a new press: does the machine move?"""
     stage.get_going()
     stage.bridge.delay_s = {"to_pc": 0.5}
-    stage.go(90.0)
+    stage.go(150.0)
     stage.fault("deadman_released")
     stage.go(1.0)
     stage.fault("none")
@@ -158,7 +161,12 @@ def measure_drift(stage: Stage) -> dict[str, object]:
     stage.bridge.begun_ms = stage.ms
     stage.bridge.delay_s = {"to_pc": lambda since_s: 1e-3 * since_s}
     begun_ms = stage.ms
-    stage.go(300.0, lambda: not stage.moves)
+    for _ in range(100):
+        # To and fro, so that no joint comes to its end.
+        stage.wanted = tuple(-u for u in stage.wanted)
+        stage.go(4.0, lambda: stage.memory.state.peek("guard") == LATCHED.value)
+        if stage.memory.state.peek("guard") == LATCHED.value:
+            break
     seconds = (stage.ms - begun_ms) / 1e3
     return {"delay_ms": round(seconds, 1), "stopped": not stage.moves}
 

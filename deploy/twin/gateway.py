@@ -131,7 +131,6 @@ class Gateway:
             flow = self._map.command(self._lever * self._axis_full_rad, self._button)
             return flow, LEVERS, GatewayState.LEVERS
         if now_s - self._u_s > TIMEOUT_S or not self._trusts(self._command.name):
-            self._idle = 0
             return nothing, NOBODY, GatewayState.TIMEOUT
         if not self._deadman or self._mode != 1 or self._idle < IDLE_FRAMES:
             return nothing, NOBODY, GatewayState.IDLE
