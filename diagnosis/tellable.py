@@ -150,7 +150,7 @@ class TellableEffects:
         noise = self.error.expect_noise(machine, reading)
         cut, running_s, seconds = cut_motions(motions, machine, self.num_windows)
         residuals = self._hold(machine, cut, running_s, noise)
-        moving = [kind for kind in kinds if _moves_joints(kind)]
+        moving = [kind for kind in kinds if _is_seen_in_motion(kind)]
         columns, rows, sizes = simulate_responses(
             residuals, moving, SIZES, lambda doing, done: tell(doing, 0.05 + 0.5 * done)
         )
@@ -162,7 +162,7 @@ class TellableEffects:
         tell("effects and pairs", 0.95)
         limits = list(self._list_limits(machine, moving, table, compared))
         for kind in kinds:
-            if not _moves_joints(kind):
+            if not _is_seen_in_motion(kind):
                 limits += self._list_other_limits(machine, kind, residuals, noise, seconds / used_s)
         return PreviewResult(
             minutes=seconds / 60.0,
@@ -389,7 +389,7 @@ def _name_unit(machine: Machine, unit: str, joints: Sequence[int]) -> str:
     return unit.replace("rad", machine.joints[joints[0]].unit)
 
 
-def _moves_joints(kind: EffectType) -> bool:
+def _is_seen_in_motion(kind: EffectType) -> bool:
     """Return whether free runs show the effect; see `diagnosis.detection`."""
     target = kind.target
     return not (
