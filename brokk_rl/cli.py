@@ -37,6 +37,7 @@ from brokk_rl import distributed, extensions, gpu_pool, registry
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.session import read_earlier_job, remove_empty_folders
 from brokk_rl.sweep import SweepFolder
+from brokk_rl.task_choice import choose_task
 
 log = logging.getLogger(__name__)
 
@@ -116,7 +117,7 @@ def run_job(cfg: DictConfig) -> float | None:
 def _run(cfg: DictConfig) -> float | None:
     """Instantiate the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
-    cfg = _drop_consumed_groups(_rename_targets(cfg))
+    cfg = _drop_consumed_groups(choose_task(_rename_targets(cfg)))
     if "session" not in cfg:
         distributed.check_together(get_class(str(cfg._target_)), sweep)
         return instantiate(cfg, _convert_="all").run()

@@ -63,6 +63,10 @@ class ToolPoseGoal(Protocol):
         """Return `success`, `paper_success` (bool) and `closeness`, each `(N,)`."""
         ...
 
+    def describe_success(self) -> dict[str, float]:
+        """Return the bounds of the strict criterion by name, with units, for `policy.json`."""
+        ...
+
 
 @dataclass
 class ToolPoseOptions:
@@ -299,6 +303,8 @@ class ToolPoseProcess:
         description |= {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
         if options.advice:
             description["advice"] = asdict(options.advice)
+        success = self.goal.describe_success()
+        description["stop"] = {"joint_margin": options.limit_margin, "success": success}
         return description
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:

@@ -19,6 +19,7 @@ from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.spec import spec
+from brokk_rl.task_description import TaskDescription
 
 log = logging.getLogger(__name__)
 
@@ -26,6 +27,10 @@ ITERATIONS_PER_ROUND = 10
 """Iterations between two changes of the desired divergence; processes that train together must
 agree on it."""
 
+
+NUM_ANSWERS = 256
+"""Observations at most, of as many environments, that a checkpoint holds with the network's own
+commands. Chosen by hand: many phases of an episode, and 150 kB."""
 
 SETTLED_PART = 0.9
 """Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
@@ -109,6 +114,14 @@ class TrainingConfig:
         return desired * (
             1.0 - SETTLED_PART * min(1.0, (share_spent - 1.0 + self.settling) / self.settling)
         )
+
+    def describe_network(self) -> dict[str, Any]:
+        """Return configuration and observation groups of the actor, as plain JSON data."""
+        config = self.runner_config()
+        return {
+            "actor": config["actor"],
+            "obs_groups": {"actor": list(config["obs_groups"]["actor"])},
+        }
 
     def runner_config(self) -> dict[str, Any]:
         """Return a copy for rsl-rl, which writes into it, without keys whose value is `null`."""
@@ -259,6 +272,9 @@ class TrainingRunner(OnPolicyRunner):
             "others": parts[1:],
             "book": self._book.state_dict(),
             "fingerprint": self.env.machine.fingerprint(),
+            "task": self.env.description.to_json(),
+            "network": self.training.describe_network(),
+            "answers": self.record_answers(),
         }
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
         part = path.with_suffix(".part")
@@ -279,6 +295,13 @@ class TrainingRunner(OnPolicyRunner):
         for old in list_checkpoints(self.folder)[: -self.training.keep_checkpoints]:
             old.unlink()
 
+    def record_answers(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return observations of running episodes and the network's own commands for them.
+
+        An export is compared with them; see `ControlLoop.record_answers`.
+        """
+        return self.env.record_answers(self.alg.get_policy(), NUM_ANSWERS)
+
     def save(self, path: str, infos: dict | None = None) -> None:
         """Do nothing: rsl-rl would save amid an iteration; `checkpoint` follows every `learn`."""
 
@@ -297,6 +320,7 @@ class TrainingRunner(OnPolicyRunner):
         """
         content = read_checkpoint(Path(path), self.device)
         self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
+        self._check_task(content, path)
         try:
             self.alg.load(content, None, strict=True)
             own = [content, *content.get("others", [])][self.group.rank.index :][:1]
@@ -315,6 +339,26 @@ class TrainingRunner(OnPolicyRunner):
                 "Resume with the run's own resolved.yaml."
             ) from error
         return {}
+
+    def _check_task(self, content: dict[str, Any], path: str) -> None:
+        """Refuse a checkpoint of a training for another task; the message names what differs."""
+        if "task" not in content:
+            log.warning("%s does not say which task it trains; assumed: the one given", path)
+            return
+        own, here = TaskDescription.from_json(content["task"], path), self.env.description
+        differences = own.compare(here)
+        if own.name != here.name:
+            differences = {"": (own.name, here.name)}
+        if differences:
+            values = []
+            for key, (there, given) in differences.items():
+                name = f"task.{key}" if key else "task"
+                values.append(f"{name} is {there} there, {given} here")
+            raise CheckpointError(
+                f"{path} belongs to a training for another task: {'; '.join(values)}. Resume with "
+                "the run's own resolved.yaml: brokk --config-dir <run> --config-name resolved "
+                "resume=<run> session.out=<run>"
+            )
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ import onnxruntime
 
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, TargetScaling
+from brokk_rl.observation import restore_encoder
 from brokk_rl.registry import resolve_package_path
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
@@ -55,17 +55,7 @@ class PolicyBundle:
                 f"{folder}: the policy's task cannot be deployed, so there is no {ONNX}; see "
                 "brokk_rl.contracts.task.DeployableTask"
             )
-        pitch = observation.get("pitch")
-        scaling = TargetScaling(
-            target_mean_m=observation["target"]["mean_m"],
-            target_std_m=observation["target"]["std_m"],
-            pitch_rad=(pitch["mean_rad"], pitch["std_rad"]) if pitch else None,
-        )
-        self.encoder = ObservationEncoder(
-            machine,
-            scaling,
-            with_proposals=any("proposals" in part for part in observation["order"]),
-        )
+        self.encoder = restore_encoder(machine, observation)
         expected = self.encoder.describe()
         for key, value in expected.items():
             if key != "size" and _is_different(value, observation.get(key)):

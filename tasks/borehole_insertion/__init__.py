@@ -1,6 +1,7 @@
 """Inserting the chisel into a vertical borehole in a concrete block (the paper's task)."""
 
 import math
+from typing import ClassVar
 
 import torch
 
@@ -104,6 +105,18 @@ class BoreholeInsertion:
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
 
+    behaviour: ClassVar[tuple[str, ...]] = (
+        "depth_m",
+        "memory",
+        "advice",
+        "noise.filter",
+        "switch",
+        "action",
+        "scaling",
+        "classical",
+    )
+    """Fields that a policy has learned with; see `brokk_rl.task_description`."""
+
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""
         return ToolPoseProcess(
@@ -162,8 +175,7 @@ class InsertionGoal:
         rules, rim = self._task.success, start["target_m"]
         lateral = (tip_m - rim)[:, :2].norm(dim=1)
         below = rim[:, 2] - tip_m[:, 2]
-        clearance = self._task.hole.radius_m - rules.chisel_radius_m + rules.slack_m
-        inside = lateral <= clearance
+        inside = lateral <= self._clearance_m
         target = rim.clone()
         target[:, 2] -= self._task.depth_m
         distance = (target - tip_m).norm(dim=1)
@@ -178,6 +190,17 @@ class InsertionGoal:
                 distance, lateral, turn, below * inside, rules.strict_depth_m
             ),
         }
+
+    def describe_success(self) -> dict[str, float]:
+        """Return depth and lateral error; see `tasks.process.ToolPoseGoal`."""
+        depth_m = self._task.success.strict_depth_m
+        return {"least_depth_below_target_m": depth_m, "largest_lateral_m": self._clearance_m}
+
+    @property
+    def _clearance_m(self) -> float:
+        """Distance from the hole's axis up to which the tip is inside."""
+        rules = self._task.success
+        return self._task.hole.radius_m - rules.chisel_radius_m + rules.slack_m
 
 
 def _measure_closeness(

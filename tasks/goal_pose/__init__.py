@@ -1,5 +1,7 @@
 """Moving the tool to a pose in the open: a point and a pitch (the paper's outlook)."""
 
+from typing import ClassVar
+
 import torch
 
 from brokk_rl.contracts.task import TaskProcess
@@ -99,6 +101,17 @@ class GoalPose:
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
 
+    behaviour: ClassVar[tuple[str, ...]] = (
+        "memory",
+        "advice",
+        "noise.filter",
+        "switch",
+        "action",
+        "scaling",
+        "classical",
+    )
+    """Fields that a policy has learned with; see `brokk_rl.task_description`."""
+
     def check(self) -> None:
         if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:
             raise ConfigError(
@@ -167,6 +180,14 @@ class ReachingGoal:
             "paper_success": (1 / (1 + distance) >= rules.paper_alignment)
             & (1 / (1 + turn) >= rules.paper_alignment),
             "closeness": _measure_closeness(distance, turn),
+        }
+
+    def describe_success(self) -> dict[str, float]:
+        """Return distance and pitch error; see `tasks.process.ToolPoseGoal`."""
+        rules = self._task.tolerance
+        return {
+            "largest_distance_m": rules.strict_distance_m,
+            "largest_pitch_error_rad": rules.strict_pitch_rad,
         }
 
 
