@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from brokk_rl.bounds import require_number
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -33,6 +34,15 @@ class TargetScaling:
     target_mean_m: tuple[float, float, float]
     target_std_m: tuple[float, float, float]
     pitch_rad: tuple[float, float] | None
+
+    def check(self) -> None:
+        for index, std_m in enumerate(self.target_std_m):
+            require_number(f"task.scaling.target_std_m[{index}]", std_m, above=0)
+        for index, mean_m in enumerate(self.target_mean_m):
+            require_number(f"task.scaling.target_mean_m[{index}]", mean_m)
+        if self.pitch_rad is not None:
+            require_number("task.scaling.pitch_rad: mean", self.pitch_rad[0])
+            require_number("task.scaling.pitch_rad: standard deviation", self.pitch_rad[1], above=0)
 
 
 def compute_size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:

@@ -5,7 +5,7 @@ and command. A policy has learned with these numbers and is another policy with 
 a task is the conditions of an examination, such as ranges, time limit and noise, and stays the
 caller's, as the plant does.
 
-`adopt_behaviour` gives a task the behaviour of a policy. Values that the caller asked for and that
+`apply_behaviour` gives a task the behaviour of a policy. Values that the caller asked for and that
 contradict it are refused by name. This module needs neither torch nor the configuration's language.
 """
 
@@ -146,7 +146,7 @@ def restore_task(task: T, description: TaskDescription) -> T:
     return task
 
 
-def adopt_behaviour(task: T, own: TaskDescription, asked: Collection[str], who: str) -> T:
+def apply_behaviour(task: T, own: TaskDescription, asked: Collection[str], who: str) -> T:
     """Return `task` with the behaviour of the policy `who`; the rest of it stays.
 
     Args:

@@ -14,10 +14,10 @@ from rich.table import Table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
 from brokk_rl.rl.policy import TrainedPolicy
+from brokk_rl.rl.settings import Evaluation
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.video import render_video
@@ -33,31 +33,6 @@ class PolicySpec(Protocol):
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Return the policy for the control loop."""
         ...
-
-
-@spec
-class Evaluation:
-    """Number of episodes, their seed, and how many to record and show.
-
-    Attributes:
-        episodes: Number of episodes, one from each start.
-        seed: Seed of starts and noise; the same for every policy and run, so that results can be
-            compared.
-        num_recorded: Episodes recorded, of which the video shows one.
-        video: Whether to render a video.
-    """
-
-    episodes: int
-    seed: int
-    num_recorded: int
-    video: bool
-
-    def check(self) -> None:
-        if not 1 <= self.num_recorded <= self.episodes:
-            raise ConfigError(
-                "evaluation: expected 1 <= num_recorded <= episodes, "
-                f"got {self.num_recorded} and {self.episodes}"
-            )
 
 
 @spec
@@ -125,7 +100,7 @@ def evaluate_policies(
         policies: By name; the first is the one in question and stands at the top of
             `evaluation.json`.
         asked: Keys of the configuration that the caller gave; see
-            `brokk_rl.task_description.adopt_behaviour`.
+            `brokk_rl.task_description.apply_behaviour`.
 
     Returns:
         The content of `evaluation.json`.

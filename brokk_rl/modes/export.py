@@ -16,7 +16,7 @@ from brokk_rl.rl.policy import make_actor, observe_once, write_bundle
 from brokk_rl.rl.runner import read_checkpoint
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from brokk_rl.task_description import TaskDescription, adopt_behaviour, describe_task
+from brokk_rl.task_description import TaskDescription, apply_behaviour, describe_task
 
 log = logging.getLogger(__name__)
 
@@ -59,7 +59,7 @@ class Export:
                 "which writes a checkpoint that does."
             )
         own = TaskDescription.from_json(content["task"], str(path))
-        spec_of_task = adopt_behaviour(self.task, own, self.asked, f"the policy in {path}")
+        spec_of_task = apply_behaviour(self.task, own, self.asked, f"the policy in {path}")
         task = spec_of_task.build(self.machine, 1, cpu)
         deployable: object = task
         if not supports_deployment(deployable):

@@ -15,7 +15,7 @@ from brokk_rl.contracts.task import Task, supports_classical_control, supports_d
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
+from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves
@@ -26,7 +26,8 @@ from brokk_rl.rl.policy import (
     load_initial_weights,
     write_bundle,
 )
-from brokk_rl.rl.runner import TrainingConfig, TrainingRunner, list_checkpoints
+from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
+from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.tracking import NoTracking, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session

@@ -36,11 +36,11 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
-from brokk_rl.rl.runner import TrainingConfig
+from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import write_json
 from brokk_rl.spec import spec
-from brokk_rl.task_description import TaskDescription, adopt_behaviour, read_description
+from brokk_rl.task_description import TaskDescription, apply_behaviour, read_description
 
 log = logging.getLogger(__name__)
 
@@ -123,7 +123,7 @@ class TrainedPolicy:
             task: The task as it was composed.
             machine: The machine.
             asked: Keys of the configuration that the caller gave; see
-                `brokk_rl.task_description.adopt_behaviour`.
+                `brokk_rl.task_description.apply_behaviour`.
 
         Raises:
             CheckpointError: The bundle cannot be read, or is of another machine.
@@ -133,7 +133,7 @@ class TrainedPolicy:
         own = read_description(folder, read_contract(folder, machine))
         if own is None:  # `build` says what is assumed, and checks it
             return task
-        return adopt_behaviour(task, own, asked, f"the policy in {folder}")
+        return apply_behaviour(task, own, asked, f"the policy in {folder}")
 
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Return the policy.
@@ -272,6 +272,7 @@ def _make_contract(
     process: object = task
     observation = process.describe() if supports_deployment(process) else None
     stop = (observation or {}).pop("stop", {})
+    masked = (observation or {}).pop("masked", True)
     contract = {
         "schema": SCHEMA,
         "task": description.to_json(),
@@ -293,7 +294,7 @@ def _make_contract(
         "command": {
             "range": [-1.0, 1.0],
             "order": names,
-            "masked": True,
+            "masked": masked,
             "unit": "share of full valve opening, + towards larger positions; held for one period",
         },
         "observation": observation,

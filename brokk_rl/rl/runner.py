@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
 import logging
 import os
@@ -14,11 +13,11 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.errors import CheckpointError, ConfigError, StorageError
+from brokk_rl.errors import CheckpointError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
-from brokk_rl.spec import spec
 from brokk_rl.task_description import TaskDescription
 
 log = logging.getLogger(__name__)
@@ -31,104 +30,6 @@ agree on it."""
 NUM_ANSWERS = 256
 """Observations at most, of as many environments, that a checkpoint holds with the network's own
 commands. Chosen by hand: many phases of an episode, and 150 kB."""
-
-SETTLED_PART = 0.9
-"""Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
-`TrainingConfig.settling`."""
-
-
-@spec
-class TrainingBudget:
-    """When training ends: with the first of these that is spent; `null` for no bound.
-
-    Attributes:
-        max_env_steps: Control steps over all environments.
-        max_seconds: Seconds of training, those before a resume included.
-    """
-
-    max_env_steps: int | None
-    max_seconds: float | None
-
-    def check(self) -> None:
-        if self.max_env_steps is None and self.max_seconds is None:
-            raise ConfigError(
-                "rl.budget: give max_env_steps, max_seconds or both; "
-                "training without an end is not possible"
-            )
-
-    def share_spent(self, env_steps: int, seconds: float) -> float:
-        """Return the spent share of the budget, 1 or more when all of it is spent."""
-        return max(
-            env_steps / (self.max_env_steps or float("inf")),
-            seconds / (self.max_seconds or float("inf")),
-        )
-
-
-@spec
-class TrainingConfig:
-    """Numbers of a training with rsl-rl's PPO.
-
-    Attributes:
-        num_envs: Environments, of each process where several train together; `null` for the number
-            of the simulator's configuration.
-        num_starts: Number of valid starts from which resets draw.
-        budget: When training ends.
-        save_interval: Iterations between checkpoints; a killed run loses no more. As often several
-            processes prove that they agree.
-        keep_checkpoints: Newest checkpoints kept.
-        settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
-            learn fast, small ones keep it.
-        max_fault_rate: Share of control steps that may end in a diverged or overflowing world
-            before the run stops with an error.
-        fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
-            compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
-            less than half of a control step of few worlds, far more.
-        random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at
-            once.
-        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`,
-            `num_steps_per_env`, …), handed on as it is.
-    """
-
-    num_envs: int | None
-    num_starts: int
-    budget: TrainingBudget
-    save_interval: int
-    keep_checkpoints: int
-    settling: float
-    max_fault_rate: float
-    fuse: bool
-    random_episode_lengths: bool
-    runner: dict[str, Any]
-
-    def check(self) -> None:
-        if not 0.0 <= self.settling <= 1.0:
-            raise ConfigError(
-                f"rl.settling: expected a part of the budget, 0 to 1, got {self.settling}"
-            )
-
-    def divergence(self, share_spent: float) -> float | None:
-        """Return the `desired_kl` of updates when this share of the budget is spent."""
-        desired = self.runner["algorithm"].get("desired_kl")
-        if desired is None or share_spent <= 1.0 - self.settling:
-            return desired
-        return desired * (
-            1.0 - SETTLED_PART * min(1.0, (share_spent - 1.0 + self.settling) / self.settling)
-        )
-
-    def describe_network(self) -> dict[str, Any]:
-        """Return configuration and observation groups of the actor, as plain JSON data."""
-        config = self.runner_config()
-        return {
-            "actor": config["actor"],
-            "obs_groups": {"actor": list(config["obs_groups"]["actor"])},
-        }
-
-    def runner_config(self) -> dict[str, Any]:
-        """Return a copy for rsl-rl, which writes into it, without keys whose value is `null`."""
-        return _drop_nulls(copy.deepcopy(self.runner)) | {
-            "save_interval": 10**9,
-            "check_for_nan": False,
-        }
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -423,13 +324,3 @@ def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str)
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
-
-
-def _drop_nulls(value: Any) -> Any:
-    if isinstance(value, dict):
-        kept = {}
-        for key, item in value.items():
-            if item is not None:
-                kept[key] = _drop_nulls(item)
-        return kept
-    return value

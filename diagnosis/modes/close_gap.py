@@ -18,10 +18,10 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
+from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.modes.train import Train
 from brokk_rl.rl.policy import CONTRACT, TrainedPolicy
-from brokk_rl.rl.runner import TrainingConfig
+from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.tracking import Tracking
 from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session, write_json

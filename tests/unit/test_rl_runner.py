@@ -15,7 +15,8 @@ import training as runs
 from brokk_rl.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import find_checkpoint
-from brokk_rl.rl.runner import TrainingBudget, list_checkpoints, read_checkpoint
+from brokk_rl.rl.runner import list_checkpoints, read_checkpoint
+from brokk_rl.rl.settings import TrainingBudget
 
 ITERATION = 16 * runs.STEPS
 """Control steps of one iteration."""
