@@ -346,11 +346,6 @@ def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[st
         weights = load_file(folder / WEIGHTS)
     except (OSError, ValueError, SafetensorError) as error:
         raise CheckpointError(_say_corrupt(folder, error)) from error
-    if stamp != contract.get("task", {}).get("fingerprint"):
-        raise CheckpointError(
-            f"{folder}: {WEIGHTS} and {CONTRACT} are of different policies; export the policy "
-            "again (mode=export)"
-        )
     bad = []
     for name, value in weights.items():
         if not torch.isfinite(value).all():
@@ -358,6 +353,11 @@ def read_bundle(folder: Path, machine: Machine) -> tuple[dict[str, Any], dict[st
     if bad:
         raise CheckpointError(
             f"the policy in {folder} holds NaN or infinite weights in {', '.join(bad[:3])}"
+        )
+    if stamp != contract.get("task", {}).get("fingerprint"):
+        raise CheckpointError(
+            f"{folder}: {WEIGHTS} and {CONTRACT} are of different policies; export the policy "
+            "again (mode=export)"
         )
     return contract, weights
 
