@@ -44,7 +44,7 @@ def choose_task(cfg: DictConfig) -> DictConfig:
         name = _read_policy_task(cfg)
         offered = {option.name for option in registry.list_options() if option.group == "task"}
         if name in offered and name != name_target(cfg.task._target_) and "task" not in asked:
-            cfg = _compose([*lines, f"task={name}"])
+            cfg = hydra.compose(MAIN, [*lines, f"task={name}"])
     OmegaConf.set_readonly(cfg, False)
     cfg.asked = sorted(asked)
     return cfg
@@ -81,7 +81,7 @@ def _find_brought(cfg: DictConfig, overrides: list[Override]) -> set[str]:
     if FOLLOWER in choices:
         kept.append(f"{FOLLOWER}={choices[FOLLOWER]}")
     name = name_target(cfg.task._target_)
-    plain = _compose([f"mode={choices['mode']}", *kept, f"task={name}"])
+    plain = hydra.compose(MAIN, [f"mode={choices['mode']}", *kept, f"task={name}"])
     here, there = (OmegaConf.to_container(one.task, resolve=True) for one in (cfg, plain))
     return {key for key, _ in compare_tables(here, there, "task")}
 
@@ -96,11 +96,6 @@ def _read_policy_task(cfg: DictConfig) -> str | None:
         path = Path(str(checkpoint))
         return read_task_name(path.parent if path.suffix == ".pt" else path)
     return None
-
-
-def _compose(overrides: list[str]) -> DictConfig:
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        return hydra.compose(MAIN, overrides=overrides)
 
 
 def _make_plain(value: Any) -> Any:
