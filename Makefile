@@ -4,7 +4,7 @@ BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
 SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode
 
-.PHONY: help train test test-all check setup clean
+.PHONY: help train test test-all mutants check setup clean
 
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -17,6 +17,9 @@ test: setup             ## the tests that need no GPU, without the slow ones
 
 test-all: setup         ## the slow tests too
 	$(BIN)/python -m pytest -q -m "not gpu"
+
+mutants: setup          ## one small change at a time to what decides about the valves: do the tests notice?
+	$(BIN)/python tests/mutants.py
 
 check: setup            ## format, lint, types
 	$(BIN)/ruff format --check .

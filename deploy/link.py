@@ -174,6 +174,8 @@ class CanLink:
         memory, now_s = self._opened(), time.monotonic()
         assert memory.request is not None
         memory.request.write(RequestedCommand(now_s, u))
+        # The switches must not grow old while somebody asks for commands.
+        self._arm()
         return now_s
 
     def _wait_for_operator(self) -> None:
@@ -193,7 +195,15 @@ class CanLink:
         self._was_active = True
 
     def _arm(self) -> None:
-        armed = OperatorControls(time.monotonic(), armed=True, recording=False, recording_t_s=0.0)
+        now_s = time.monotonic()
+        armed = OperatorControls(
+            t_s=now_s,
+            armed=True,
+            armed_t_s=now_s,
+            recording=False,
+            recording_t_s=0.0,
+            recording_failed=False,
+        )
         self._opened().controls.write(armed)
 
     def _average_growth(self, wanted: np.ndarray) -> np.ndarray:

@@ -25,8 +25,9 @@ from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.scales import choose_horizon_s, scale_time
 from diagnosis import residual_model
-from diagnosis.case import HORIZON_S, GapCase, estimate_running_s, split_recordings
+from diagnosis.case import GapCase, estimate_running_s, split_recordings
 from diagnosis.effect_library import EffectSimulator, EffectType, EffectValues
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.refine import drop_windows
@@ -49,7 +50,7 @@ log = logging.getLogger(__name__)
 TUNING_STEPS = 3
 """Gauss-Newton steps."""
 TIME_STEP_S = 0.004
-"""Finite difference of a time, s."""
+"""Finite difference of a time on the reference of `brokk_rl.scales`, s."""
 NUMBER_STEP = 0.01
 """Finite difference of a number without a unit."""
 TUNING_PRIOR = 4.0
@@ -64,7 +65,8 @@ def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
         return {}
     names = list(own)
     start = np.stack([own[name][0].numpy().astype(float) for name in names])  # (P, J)
-    size = np.array([TIME_STEP_S if name.endswith("_s") else NUMBER_STEP for name in names])[
+    time_step_s = scale_time(first.machine, TIME_STEP_S)
+    size = np.array([time_step_s if name.endswith("_s") else NUMBER_STEP for name in names])[
         :, None
     ]
     reach = first.machine.num_history * first.machine.period_s - 2.0 * first.machine.period_s
@@ -186,12 +188,13 @@ def compare_simulator(
     actuator: Actuator, begun: StartedRecordings, machine: Machine, seed: int
 ) -> SimulatorComparison:
     """Return `actuator` held against all whole windows of recordings."""
-    before, steps = open_loop.count_samples_before(machine), round(HORIZON_S / machine.period_s)
+    before, horizon_s = open_loop.count_samples_before(machine), choose_horizon_s(machine)
+    steps = round(horizon_s / machine.period_s)
     cuts, source, row, running = [], [], [], []
     for number, (recording, begun_s) in enumerate(begun):
         if recording.num_samples < before + steps:
             continue
-        cut = open_loop.cut_windows([recording], machine, HORIZON_S, HORIZON_S)
+        cut = open_loop.cut_windows([recording], machine, horizon_s, horizon_s)
         rows = before + steps * np.arange(len(cut.q))
         cuts.append(replace(cut, run=np.full(len(cut.q), f"{number}")))
         source += [number] * len(rows)
@@ -199,7 +202,7 @@ def compare_simulator(
         running += (begun_s + recording.t_s[rows]).tolist()
     if not cuts:
         raise RecordingError(
-            f"too little data: no recording is long enough for a free run of {HORIZON_S:g} s"
+            f"too little data: no recording is long enough for a free run of {horizon_s:g} s"
         )
     windows = open_loop.join_windows(cuts)
     valid_mask = np.ones((len(windows.q), machine.num_joints), dtype=bool)
@@ -226,7 +229,7 @@ def fit_baseline(
         RecordingError: too little reference.
     """
     machine = case.machine
-    reference = split_recordings(case.reference)
+    reference = split_recordings(case.reference, machine)
     if len(reference) < 2:
         raise RecordingError(
             f"too little data: the reference lasts {sum(r.duration_s for r in case.reference):.0f} s; a simulator that is "
@@ -281,7 +284,7 @@ def accept_simulator(
     """
     machine = case.machine
     field = compare_simulator(actuator, _list_started(case.field), machine, seed)
-    pieces, left_out = split_recordings(case.field), []
+    pieces, left_out = split_recordings(case.field, machine), []
     try:
         if len(pieces) > 1 and not case.doubts():
             left_out = _cross_validate(case.field, pieces, fit, machine, folder, seed, device)[1]
@@ -470,7 +473,7 @@ def _expand_values(
 ) -> dict[str, np.ndarray]:
     """Return the numbers of an effect at sizes along its rays, the same on all joints, each `(1, J)`."""
     found = {
-        name: np.full((1, kind.num_joints), kind.numbers[name].typical) for name in kind.shaping
+        name: np.broadcast_to(kind.typical(name), (1, kind.num_joints)) for name in kind.shaping
     }
     for ray, size in zip(ways, sizes, strict=True):
         found |= ray.values(np.full((1, kind.num_joints), size))

@@ -14,15 +14,16 @@ from brokk_rl import open_loop, record
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.scales import choose_horizon_s
 from brokk_rl.split import COMMANDED
 
-HORIZON_S = 5.0
-MIN_TOTAL_S = 60.0
-"""Field recordings that are shorter in all say nothing that holds beyond them."""
+# Chosen by hand, in free runs of `brokk_rl.scales`: 60 s and 150 s where they last 5 s.
+MIN_TOTAL_RUNS = 12
+"""Field recordings of fewer free runs in all say nothing that holds beyond them."""
 MIN_TRAVEL_SHARE = 0.01
 """A joint that moved less, of its travel, in all field recordings shows nothing."""
-MAX_PART_S = 150.0
-"""Longest part of a recording that stays together when some are left out."""
+MAX_PART_RUNS = 30
+"""Longest part of a recording that stays together when some are left out, in free runs."""
 PAUSE_S = 4.0 * 3600.0
 """After so long without a recording the machine has been off."""
 
@@ -48,12 +49,16 @@ class GapCase:
         """Return reasons why these recordings cannot tell anything, in words for people; none where they can."""
         found = []
         total_s = sum(recording.duration_s for recording in self.field)
-        if total_s < MIN_TOTAL_S:
+        horizon_s = choose_horizon_s(self.machine)
+        least_s = MIN_TOTAL_RUNS * horizon_s
+        if total_s < least_s:
             found.append(
-                f"the field recordings last {total_s:.0f} s in all; {MIN_TOTAL_S:.0f} s or more are needed"
+                f"the field recordings last {total_s:.0f} s in all; {least_s:.0f} s or more are needed"
             )
-        if open_loop.find_longest_horizon_s(self.field, self.machine) < HORIZON_S:
-            found.append(f"no field recording is long enough for a free run of {HORIZON_S:g} s")
+        # Half a period forgives the rounding of durations.
+        shortest_s = horizon_s - 0.5 * self.machine.period_s
+        if open_loop.find_longest_horizon_s(self.field, self.machine) < shortest_s:
+            found.append(f"no field recording is long enough for a free run of {horizon_s:g} s")
         if not self.reference and len(self.field) == 1:
             found.append(
                 "there is one recording only, and no reference: nothing to judge by that it was not fitted to"
@@ -131,11 +136,11 @@ def estimate_running_s(recordings: Sequence[Recording]) -> list[float]:
     return found.tolist()
 
 
-def split_recordings(recordings: Sequence[Recording]) -> list[Recording]:
-    """Return the recordings, those longer than `PART_S` cut into equal parts, each part a run by itself."""
-    found = []
+def split_recordings(recordings: Sequence[Recording], machine: Machine) -> list[Recording]:
+    """Return the recordings, those longer than `MAX_PART_RUNS` cut into equal parts, each part a run by itself."""
+    found, longest_s = [], MAX_PART_RUNS * choose_horizon_s(machine)
     for number, recording in enumerate(recordings):
-        count = max(1, round(recording.duration_s / MAX_PART_S))
+        count = max(1, round(recording.duration_s / longest_s))
         for part, rows in enumerate(np.array_split(np.arange(recording.num_samples), count)):
             rows = slice(rows[0], rows[-1] + 1)
             extra = {name: values[rows] for name, values in recording.extra.items()}

@@ -286,17 +286,18 @@ def estimate_numbers(
         if ray.kind.name != kind.name:
             continue
         for name in (ray.name,) if ray.name else kind.fitted:
-            number, unit = kind.numbers[name], kind.size(name)
+            number, unit, (least, most) = kind.numbers[name], kind.size(name), kind.limits(name)
             for j in np.flatnonzero(mask):
+                place = j if number.per_joint else 0
                 interval = size[j] + np.array([-1.96, 0.0, 1.96]) * deviation[j]
-                ends = number.none + unit * calibration.widen_interval(interval, form)
+                ends = number.none + unit[place] * calibration.widen_interval(interval, form)
                 # A unit below 0 turns the ends around.
-                low, mean, high = np.sort(np.clip(ends, *number.bounds)).tolist()
+                low, mean, high = np.sort(np.clip(ends, least[place], most[place])).tolist()
                 joint = machine.joint_names[j] if number.per_joint else "machine"
                 found.setdefault(name, {})[joint] = Estimate(mean, (low, high))
     for ray in fitted.rays:
         for name, part in ray.shape.items() if ray.kind.name == kind.name else ():
-            values = kind.clipped(name, part * kind.numbers[name].typical)
+            values = kind.clipped(name, part * kind.typical(name))
             places = np.flatnonzero(fitted.joints_of(kind))
             given = {machine.joint_names[j]: float(values[j]) for j in places}
             found[name] = {joint: Estimate(value, (value, value)) for joint, value in given.items()}

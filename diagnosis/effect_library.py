@@ -40,17 +40,25 @@ class EffectType:
     Attributes:
         name: As in `effect=[name]`.
         target: The spec.
-        num_joints: `J` of the machine that it is used on.
+        machine: The machine that it is used on.
     """
 
     name: str
     target: Any
-    num_joints: int
+    machine: Machine
 
     @property
+    def num_joints(self) -> int:
+        """Number of joints, `J`."""
+        return self.machine.num_joints
+
+    @cached_property
     def numbers(self) -> dict[str, Any]:
-        """Facts about each of its numbers: `none`, `typical`, `bounds`, `unit`, `per_joint`."""
-        return self.target.numbers
+        """Facts about each of its numbers on this machine: `none`, `trials`, `unit`, `per_joint`.
+
+        Their `typical` and `bounds` are those of the reference machine; see `typical` and `limits`.
+        """
+        return {n: one for n, one in self.target.numbers.items() if one.is_on(self.machine)}
 
     @property
     def stage(self) -> str:
@@ -89,7 +97,7 @@ class EffectType:
         """The spec with every number at its neutral or, for one that has none, at its typical value."""
         values = {
             n: number.typical if number.none is None else number.none
-            for n, number in self.numbers.items()
+            for n, number in self.target.numbers.items()
         }
         if any(field.name == "joints" for field in fields(self.target)):
             values["joints"] = "all"
@@ -101,14 +109,29 @@ class EffectType:
         """Return `model` with the effect around it, at its neutral value; numbers are written into `parameters`."""
         return self.neutral.wrap(model, machine, num_envs, device)
 
-    def size(self, name: str) -> float:
-        """Return typical less neutral value: the natural unit of a number. One without a neutral value: its typical value."""
-        number = self.numbers[name]
-        return number.typical - (number.none or 0.0)
+    def typical(self, name: str) -> np.ndarray:
+        """Return the typical value of a number on each joint, `(J,)`, or `(1,)` without joints."""
+        return self.numbers[name].scale_to(self.machine, self.numbers[name].typical)
+
+    def limits(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smallest and largest value of a number, each `(J,)` or `(1,)`."""
+        return self.numbers[name].limit_on(self.machine)
+
+    def size(self, name: str) -> np.ndarray:
+        """Return typical less neutral value, `(J,)` or `(1,)`: the natural unit of a number.
+
+        One without a neutral value: its typical value.
+        """
+        return self.typical(name) - (self.numbers[name].none or 0.0)
+
+    def size_on(self, name: str, joint: int | None) -> float:
+        """Return the natural unit of a number on one joint; `None`: of one that joints do not have."""
+        size = self.size(name)
+        return float(size[joint if joint is not None and len(size) > 1 else 0])
 
     def clipped(self, name: str, value: np.ndarray) -> np.ndarray:
-        """Return `value` within the bounds of number `name`."""
-        return np.clip(value, *self.numbers[name].bounds)
+        """Return `value`, `(…, J)` or `(…, 1)`, within the bounds of number `name`."""
+        return np.clip(value, *self.limits(name))
 
 
 def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[EffectType]:
@@ -130,7 +153,7 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[E
                 f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}"
             ) from error
         if hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
-            found[option.name] = EffectType(option.name, target, machine.num_joints)
+            found[option.name] = EffectType(option.name, target, machine)
     for name in names or ():
         if name not in found:
             raise ConfigError(
@@ -214,8 +237,8 @@ class DetectedEffect:
                 row = np.array([estimates["machine"].mean])
             else:
                 number = self.kind.numbers[name]
-                off = number.typical if number.none is None else number.none
-                row = np.full(len(self.joints), float(off))
+                off = self.kind.typical(name) if number.none is None else number.none
+                row = np.broadcast_to(off, len(self.joints)).astype(float)
                 row[self.joints] = [one.mean for one in estimates.values()]
             found[name] = np.repeat(row[None], count, 0)
         return found

@@ -16,7 +16,8 @@ import numpy as np
 from brokk_rl.machine import Machine
 from diagnosis.free_runs import WindowedRuns
 
-HORIZONS_S = (0.05, 0.5, 2.0, 5.0)
+HORIZON_SHARES = (0.01, 0.1, 0.4, 1.0)
+"""Times at which errors are compared, over the length of a free run: 0.05, 0.5, 2 and 5 s of 5 s."""
 READINGS = {
     "none": "no more than the floor",
     "flat": "there at once and constant: a sensor's noise, steps or offset",
@@ -71,11 +72,7 @@ def measure_growth(
 ) -> dict[str, ErrorGrowth]:
     """Return the growth of each joint's error."""
     steps = runs.simulated.shape[1]
-    at = [
-        min(max(round(h / machine.period_s), 1), steps) - 1
-        for h in HORIZONS_S
-        if round(h / machine.period_s) <= steps
-    ]
+    at = sorted({max(round(share * steps), 1) - 1 for share in HORIZON_SHARES})
     rmse = compute_rmse_curve(runs)[at]
     floor = compute_rmse_curve(reference)[at] if reference else None
     overall = None if whole is None else np.sqrt(np.nanmean(whole.error**2, (0, 1)))

@@ -20,10 +20,11 @@ import numpy as np
 from brokk_rl import open_loop
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.scales import choose_horizon_s
 from diagnosis import motion_floor
 from diagnosis.baseline import Baseline
 from diagnosis.bootstrap import draw_weights, summarise_draws
-from diagnosis.case import HORIZON_S, estimate_running_s
+from diagnosis.case import estimate_running_s
 from diagnosis.closure import Estimate, Gap, JointClosed
 from diagnosis.detection import DetectionResult
 from diagnosis.motion_floor import LeftOutErrors, collect_left_out
@@ -243,16 +244,16 @@ def evaluate_unseen(
         RecordingError: no recording is long enough.
     """
     assert result.fitted is not None, "there is something to carry"
-    begun = estimate_running_s(recordings)
+    begun, horizon_s = estimate_running_s(recordings), choose_horizon_s(machine)
     cuts, running = [], []
     for one, at in zip(recordings, begun, strict=True):
         if _is_long(one, machine):
-            cuts.append(open_loop.cut_windows([one], machine, HORIZON_S, HORIZON_S))
+            cuts.append(open_loop.cut_windows([one], machine, horizon_s, horizon_s))
             running.append(at)
     cut = (
         open_loop.join_windows(cuts)
         if cuts
-        else open_loop.cut_windows(recordings, machine, HORIZON_S, HORIZON_S)
+        else open_loop.cut_windows(recordings, machine, horizon_s, horizon_s)
     )
     running_at = np.repeat(running, [len(one.q) for one in cuts])
     simulator = replace(result.residuals.simulator, cut=cut, running_s=running_at)
@@ -262,11 +263,12 @@ def evaluate_unseen(
     joints = {
         name: vars(one) for name, one in _describe_joints(machine, before, after, None).items()
     }
-    return {"seconds": HORIZON_S * len(cut.q), "recordings": len(cuts), "joints": joints}
+    return {"seconds": horizon_s * len(cut.q), "recordings": len(cuts), "joints": joints}
 
 
 def _is_long(recording: Recording, machine: Machine) -> bool:
-    return open_loop.find_longest_horizon_s([recording], machine) >= HORIZON_S
+    longest_s = open_loop.find_longest_horizon_s([recording], machine)
+    return longest_s > choose_horizon_s(machine) - 0.5 * machine.period_s
 
 
 def _compute_joint_rmse(paths: Sequence[np.ndarray], measured: Sequence[np.ndarray]) -> np.ndarray:

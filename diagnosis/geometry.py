@@ -352,7 +352,7 @@ def _list_errors(
         for joint in [None] if joined else range(machine.num_joints):
             columns = []
             for name in kind.fitted:
-                step = DIFFERENCE_STEP * kind.size(name)
+                step = DIFFERENCE_STEP * kind.size_on(name, joint)
                 moved = (
                     _compute_tool_points(
                         kind,
@@ -390,7 +390,7 @@ def _compute_nonlinearity(
         n: _shift_from_neutral(cause.kind, n, cause.joint, value, machine)
         for n, value in zip(cause.names, values, strict=True)
     }
-    steps = {n: DIFFERENCE_STEP * cause.kind.size(n) for n in cause.names}
+    steps = {n: DIFFERENCE_STEP * cause.kind.size_on(n, cause.joint) for n in cause.names}
     small = [
         _compute_tool_points(
             cause.kind,
@@ -424,7 +424,7 @@ def _fit(causes: Sequence[_GeometryError], off: np.ndarray, size_m: float) -> Se
     """Fit a set of errors by least squares with a normal prior."""
     x = np.concatenate([cause.columns for cause in causes], 1)
     unit = np.concatenate(
-        [[abs(cause.kind.size(name)) for name in cause.names] for cause in causes]
+        [[abs(one.kind.size_on(name, one.joint)) for name in one.names] for one in causes]
     )
     # instruments err together for a while: a sample a second counts as a third of one
     normal = x.T @ x / size_m**2 / 3.0 + np.diag(1.0 / (3.0 * unit) ** 2)
@@ -443,7 +443,8 @@ def _split(
 
 def _measure_size(cause: _GeometryError, values: np.ndarray) -> float:
     return max(
-        abs(value / cause.kind.size(name)) for name, value in zip(cause.names, values, strict=True)
+        abs(value / cause.kind.size_on(name, cause.joint))
+        for name, value in zip(cause.names, values, strict=True)
     )
 
 

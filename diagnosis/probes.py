@@ -20,6 +20,7 @@ import torch
 
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
+from brokk_rl.scales import scale_time
 from brokk_rl.split import COMMANDED
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.permutation_test import number_parts
@@ -74,7 +75,7 @@ def _measure_lateness(
     runs: WindowedRuns, label: np.ndarray, joint: int, machine: Machine
 ) -> Iterator[float]:
     """Yield for each start within a window how much later the machine moves, s."""
-    ahead = round(TRANSIENT_S / machine.period_s)
+    ahead = max(3, round(scale_time(machine, TRANSIENT_S) / machine.period_s))
     is_start = label == REGIMES.index("start")
     error, path = runs.error[..., joint], runs.simulated[..., joint]
     for window, begin in zip(*np.nonzero(is_start[:, 1:] & ~is_start[:, :-1]), strict=True):
@@ -108,7 +109,8 @@ def _measure_ringing(runs: WindowedRuns, label: list[np.ndarray], joint: int) ->
 
 
 SPAN_S = 0.25
-"""Time over which speeds are taken, s; chosen by hand: shorter ones are noise, longer ones blur."""
+"""Time over which speeds are taken on the reference of `brokk_rl.scales`, s; chosen by hand: shorter
+ones are noise, longer ones blur."""
 LARGE_COMMAND = 0.7
 """Smallest of the large commands, of full; chosen by hand."""
 CLEAR_Z = 4.0
@@ -252,10 +254,11 @@ def _fit_coefficients(
     runs: WindowedRuns, machine: Machine, dead_time_s: np.ndarray
 ) -> dict[tuple[str, str], tuple[float, float]]:
     """Return the coefficient of each probe and its standard error, by effect and joint."""
-    span = max(1, round(SPAN_S / machine.period_s))
-    lacks = _subtract_earlier(runs.error, span) / SPAN_S
-    speed = _subtract_earlier(runs.simulated, span) / SPAN_S
-    acceleration = _subtract_earlier(speed, span) / SPAN_S
+    span = max(1, round(scale_time(machine, SPAN_S) / machine.period_s))
+    span_s = span * machine.period_s
+    lacks = _subtract_earlier(runs.error, span) / span_s
+    speed = _subtract_earlier(runs.simulated, span) / span_s
+    acceleration = _subtract_earlier(speed, span) / span_s
     clues = _ProbeColumns(runs, machine, dead_time_s)
     block = np.broadcast_to(number_parts(runs)[:, None], lacks.shape[:2])
     found = {}

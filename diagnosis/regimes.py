@@ -14,6 +14,7 @@ import torch
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.scales import scale_time
 from brokk_rl.split import COMMANDED
 
 REGIMES = (
@@ -34,7 +35,8 @@ DIRECTIONS = ("not commanded", "extending", "retracting")
 LOADS = ("not commanded", "level", "lifting", "lowering")
 """Against gravity, with it, or with less than `LEVEL` of the joint's largest load."""
 TRANSIENT_S = 0.6
-"""Length of a transient, s: lag, play and ringing are over after it; chosen by hand."""
+"""Length of a transient on the reference of `brokk_rl.scales`, s: lag, play and ringing are over after
+it; chosen by hand."""
 NEAR_STOP = 0.05
 """Share of the travel near an end stop; chosen by hand."""
 CREEP_COMMAND = 0.3
@@ -107,7 +109,7 @@ def label_regimes(
     acting: np.ndarray, q: np.ndarray, machine: Machine, rate_hz: float
 ) -> np.ndarray:
     """Return the number of the regime of each sample, `(T, J)`."""
-    shortly = round(TRANSIENT_S * rate_hz)
+    shortly = round(scale_time(machine, TRANSIENT_S) * rate_hz)
     moving = np.abs(acting) > COMMANDED
     sign = np.where(moving, np.sign(acting), 0.0)
     before = np.concatenate([sign[:1], sign[:-1]])

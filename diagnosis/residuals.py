@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from scipy.optimize import minimize
 
+from brokk_rl.scales import scale_time
 from diagnosis.effect_library import EffectSimulator, EffectType
 
 INCREMENT_SAMPLES = 5
@@ -138,7 +139,7 @@ interpolated."""
 
 GAIN_FAULT, TIME_FAULT_S, NUMBER_FAULT = 0.01, 0.004, 0.01
 """What a simulator gets wrong from day to day, and what is no effect: speeds by a percent, times in
-s, other numbers."""
+s on the reference of `brokk_rl.scales`, other numbers."""
 
 MEAN_FORM_ERROR = 0.5
 """What effects of chance change on average is known up to so much of it: their forms differ."""
@@ -172,7 +173,7 @@ class ParameterRay:
             found[name] = self.kind.clipped(name, number.none + step * self.kind.size(name))
         for name, part in self.shape.items():
             number = self.kind.numbers[name]
-            value = self.kind.clipped(name, part * number.typical)
+            value = self.kind.clipped(name, part * self.kind.typical(name))
             found[name] = np.repeat(
                 value[None] if number.per_joint else value[None, :1], len(size), 0
             )
@@ -195,7 +196,8 @@ def build_rays(kind: EffectType, grid: Sequence[float] = SIZE_GRID) -> list[Para
 def _find_size_bounds(kind: EffectType, name: str) -> tuple[float, float]:
     """Return the smallest and largest size of a number within its bounds."""
     number = kind.numbers[name]
-    ends = [(bound - number.none) / kind.size(name) for bound in number.bounds]
+    # typical size and bounds grow alike from joint to joint
+    ends = [(bound - number.none) / (number.typical - number.none) for bound in number.bounds]
     return min(ends), max(ends)
 
 
@@ -354,7 +356,8 @@ class Residuals:
         simulator = self.simulator
         model: Any = simulator.base.build(simulator.machine, 1, torch.device("cpu"))
         for name, value in (getattr(model, "parameters", None) or {}).items():
-            by = TIME_FAULT_S if name.endswith("_s") else NUMBER_FAULT
+            time_fault_s = scale_time(simulator.machine, TIME_FAULT_S)
+            by = time_fault_s if name.endswith("_s") else NUMBER_FAULT
             moved = (
                 to_increments(simulator.simulate([], 1, {name: value.numpy() + by})[0], self.start)
                 - self.increments

@@ -18,6 +18,7 @@ import numpy as np
 from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
+from brokk_rl.scales import choose_horizon_s
 
 MIN_STRETCHES = 5
 """Least number of ignored stretches; chosen by hand: fewer may share a condition by coincidence."""
@@ -167,8 +168,8 @@ by 10 to 4000."""
 MIN_SATURATED_ROWS = 10
 """Least number of consecutive samples at the extreme of a sensor, away from the stops, that count
 as saturation; chosen by hand: half a second at 20 Hz."""
-MIN_COMMANDED_S = 10.0
-"""Least time with a command, s; chosen by hand: two windows of 5 s."""
+MIN_COMMANDED_RUNS = 2
+"""Least time with a command, in free runs; chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -472,7 +473,7 @@ def _check_excitation(
         seconds = sum(
             float((np.abs(r.u[:, j]) > thresholds.commanded).sum()) / r.rate_hz for r in recordings
         )
-        if seconds < MIN_COMMANDED_S:
+        if seconds < MIN_COMMANDED_RUNS * choose_horizon_s(machine):
             total_s = sum(recording.duration_s for recording in recordings)
             text = f"commanded for {seconds:.1f} s of {total_s:.0f} s"
             yield _make_remark("joint at rest", name, "all recordings", (0.0, total_s), 1, text)

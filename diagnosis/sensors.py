@@ -9,7 +9,7 @@ Axes: `T` time, `J` joints, `P` parts of the reference, `F` statistics.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
 from diagnosis.effect_library import DetectedEffect, EffectType, StationaryModel, estimate_interval
+from diagnosis.residuals import Residuals
 
 SIZES = np.geomspace(0.05, 40.0, 40)
 """Sizes that are tried, of typical; steps of 19 %, up to what a broken sensor shows. Steps chosen by
@@ -94,7 +95,7 @@ def find_sensor_effects(
     case: GapCase, kinds: Sequence[EffectType], price: float, name_price: float
 ) -> list[DetectedEffect]:
     """Return the effects on sensors that the scatter of the field's samples shows."""
-    reference, machine = split_recordings(case.reference), case.machine
+    reference, machine = split_recordings(case.reference, case.machine), case.machine
     if len(reference) < 2:
         return []
     fits = []
@@ -192,7 +193,7 @@ def _estimate_parameters(
         ends = np.array(estimate_interval(SIZES, fit.likelihood[:, j]))
         for name in fit.kind.fitted:
             mean, low, high = (
-                float(v) for v in fit.kind.numbers[name].none + fit.kind.size(name) * ends
+                float(v) for v in fit.kind.numbers[name].none + fit.kind.size(name)[j] * ends
             )
             parameters.setdefault(name, {})[machine.joint_names[j]] = Estimate(mean, (low, high))
     return parameters
@@ -239,7 +240,30 @@ def _measure(kind: EffectType, size: float, recording: Recording, machine: Machi
         torch.manual_seed(0)
         model = kind.wrap(StationaryModel(), machine, len(q), torch.device("cpu"))
     for name in kind.fitted:
-        value = kind.clipped(name, np.array(kind.numbers[name].none + size * kind.size(name)))
-        model.parameters[name].fill_(float(value))
+        value = kind.clipped(name, kind.numbers[name].none + size * kind.size(name))
+        model.parameters[name].copy_(torch.as_tensor(value, dtype=torch.float32))
     with torch.inference_mode():
         return model.measure(q).numpy().astype(float)
+
+
+def adjust_residuals(
+    residuals: Residuals, case: GapCase, found: Sequence[DetectedEffect]
+) -> Residuals:
+    """Return the residuals with encoder errors in the simulator, and with the added noise of sensors."""
+    of_sensors = [one for one in found if one.kind.target.side == "measurement"]
+    steady = [(one.kind, one.values()) for one in of_sensors if _is_steady(one.kind)]
+    simulator = residuals.simulator
+    simulator = replace(simulator, fixed=[*simulator.fixed, *steady])
+    residuals = replace(residuals, simulator=simulator)
+    rough = [one.joints for one in of_sensors if not _is_steady(one.kind)]
+    if not rough:
+        return residuals
+    assert residuals.noise is not None, "noise is known by now"
+    excess = measure_excess_scatter(case.field, case.reference, case.machine)
+    reading = (excess * np.any(rough, 0)).tolist()
+    pairs = zip(residuals.noise, reading, strict=True)
+    return replace(residuals, noise=[replace(one, reading=more) for one, more in pairs])
+
+
+def _is_steady(kind: EffectType) -> bool:
+    return kind.target.smooth and not kind.target.stochastic

@@ -23,6 +23,7 @@ from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.scales import scale_time
 from diagnosis.answer import JointGap, RegimeGap, Stage, Where
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points
@@ -227,8 +228,8 @@ def _assess_timing(
     part, texts = 0.0, []
     clear = [probe for probe in known.probes if probe.effect == "dead_time" and probe.is_clear]
     late = {probe.joint: probe for probe in clear}
-    span = max(1, round(SPAN_S / machine.period_s))
-    speed = (runs.simulated[:, span:] - runs.simulated[:, :-span]) / SPAN_S
+    span = max(1, round(scale_time(machine, SPAN_S) / machine.period_s))
+    speed = (runs.simulated[:, span:] - runs.simulated[:, :-span]) / (span * machine.period_s)
     for j, (name, joint) in enumerate(known.location.joints.items()):
         if name in late:
             probe = late[name]

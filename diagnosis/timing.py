@@ -286,9 +286,10 @@ def detect_timing_effect(
     machine = changes.residuals.simulator.machine
     parameters = {}
     for name in best.fitted:
-        values = best.numbers[name].none + best.size(name) * ends
-        mean, low, high = (float(value) for value in best.clipped(name, values))
-        parameters[name] = {joint: Estimate(mean, (low, high)) for joint in machine.joint_names}
+        values = best.clipped(name, best.numbers[name].none + best.size(name) * ends[:, None])
+        for joint, row in zip(machine.joint_names, values.T.tolist(), strict=True):
+            mean, low, high = row
+            parameters.setdefault(name, {})[joint] = Estimate(mean, (low, high))
     for name, value in shapes[best.name].items():
         tried = Estimate(value, (value, value))
         parameters[name] = dict.fromkeys(machine.joint_names, tried)
@@ -372,9 +373,8 @@ def _draw_delays(
     sizes = np.repeat(JITTER_SIZES, DRAWS_PER_WINDOW)[:, None]
     values = {}
     for name in kind.fitted:
-        values[name] = np.repeat(
-            kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name)), joints, 1
-        )
+        value = kind.clipped(name, kind.numbers[name].none + sizes * kind.size(name))
+        values[name] = np.broadcast_to(value, (len(sizes), joints)).copy()
     for name, value in shape.items():
         values[name] = np.full((len(sizes), joints), value)
     paths = residuals.simulator.simulate([(kind, values)], len(sizes))

@@ -160,7 +160,8 @@ def mark_bounds(
             for joint, value in found.get(name, {}).items():
                 j = machine.joint_names.index(joint) if joint != "machine" else 0
                 size = sizes[j] if joint != "machine" else sizes[np.abs(sizes).argmax()]
-                at_bound = is_at_bound(float(size), ray) or _is_clipped(value.mean, kind, name)
+                clipped = _is_clipped(value.mean, kind, name, j if joint != "machine" else None)
+                at_bound = is_at_bound(float(size), ray) or clipped
                 found[name][joint] = replace(value, at_bound=at_bound)
     return found
 
@@ -172,8 +173,9 @@ def is_at_bound(size: float, ray: ParameterRay) -> bool:
     return any(end != 0.0 and abs(size - end) <= BOUND_TOLERANCE for end in ends)
 
 
-def _is_clipped(value: float, kind: EffectType, name: str) -> bool:
+def _is_clipped(value: float, kind: EffectType, name: str, joint: int | None) -> bool:
     number = kind.numbers[name]
-    tolerance = BOUND_TOLERANCE * abs(kind.size(name))
-    ends = [bound for bound in number.bounds if bound != number.none]
+    tolerance = BOUND_TOLERANCE * abs(kind.size_on(name, joint))
+    limits = [float(end[joint or 0]) for end in kind.limits(name)]
+    ends = [bound for bound in limits if bound != number.none]
     return any(abs(value - bound) <= tolerance for bound in ends)

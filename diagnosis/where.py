@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.machine import Machine
+from brokk_rl.scales import scale_time
 from diagnosis.error_growth import ErrorGrowth, measure_growth
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.permutation_test import (
@@ -39,8 +40,8 @@ BANDS_HZ = (0.3, 1.0, 3.0)
 NUM_AGES = 4
 """Number of parts of the running time; chosen by hand."""
 INCREMENT_S = 0.25
-"""Time of the increments that the tests compare, s; chosen by hand: increments are less dependent
-than the error, which stays."""
+"""Time of the increments that the tests compare on the reference of `brokk_rl.scales`, s; chosen by
+hand: increments are less dependent than the error, which stays."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ def sum_by_time(runs: WindowedRuns, machine: Machine) -> dict[str, GroupSums]:
 
 def _measure_increments(runs: WindowedRuns, machine: Machine) -> np.ndarray:
     """Return the absolute increment of the error within `INCREMENT_S`, `(W, K, J)`."""
-    span = max(1, round(INCREMENT_S / machine.period_s))
+    span = max(1, round(scale_time(machine, INCREMENT_S) / machine.period_s))
     before = np.pad(runs.error, ((0, 0), (span, 0), (0, 0)))[:, : runs.error.shape[1]]
     return np.nan_to_num(np.abs(runs.error - before))
 

@@ -6,7 +6,7 @@ penalty from the reference, sets that do not grow from their best member, and th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -74,7 +74,10 @@ MAX_EFFECTS = 4
 
 @spec
 class ForwardSelection:
-    """Add the best effect to each joint as long as it pays.
+    """Add the best effect to each joint as long as it gains more than chance does.
+
+    Chance is measured on repeats of the same case: parts of the reference held against a simulator
+    that was fitted to the rest. What the best effect gains there, no effect has to be there for.
 
     Attributes:
         fit: How the simulator is made from the reference.
@@ -93,16 +96,32 @@ class ForwardSelection:
         """
         gains: dict[str, dict[str, float]] = {}
         score = score_held_out if self.rule == "held_out" else score_bic
-        evidence = oracle.load_case_evidence(case, self.fit, machine)
-        for joint, errors in zip(machine.joint_names, evidence.errors, strict=True):
-            for name, gain in select_forward(errors, score).items():
+        evidence = oracle.load_case_evidence(case, self.fit, machine, with_repeats=True)
+        for j, (joint, errors) in enumerate(zip(machine.joint_names, evidence.errors, strict=True)):
+            least = learn_threshold([repeat[j] for repeat in evidence.repeats], score)
+            for name, gain in select_forward(errors, score, least).items():
                 gains.setdefault(name, {})[joint] = gain
         out.mkdir(parents=True, exist_ok=True)
         _build_answer(gains).write(out / ANSWER_FILE)
 
 
-def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
-    """Return the effects that a joint gets, and how much each was worth when it came."""
+def learn_threshold(repeats: Sequence[JointErrors], worth: SetScore) -> float:
+    """Return the largest gain of a single effect on repeats in which nothing changed, or 0."""
+    largest = 0.0
+    for errors in repeats:
+        for name in errors.shapes:
+            largest = max(largest, worth(errors, frozenset({name})))
+    return largest
+
+
+def select_forward(errors: JointErrors, worth: SetScore, least: float) -> dict[str, float]:
+    """Return the effects that a joint gets, and how much each was worth when it came.
+
+    Args:
+        errors: Of the joint.
+        worth: Gain of a set in log likelihood.
+        least: Gain that each further effect must exceed.
+    """
     chosen: frozenset[str] = frozenset()
     found: dict[str, float] = {}
     before = 0.0
@@ -112,7 +131,7 @@ def select_forward(errors: JointErrors, worth: SetScore) -> dict[str, float]:
             if name not in chosen:
                 worths[name] = worth(errors, chosen | {name})
         best = max(worths, key=worths.__getitem__, default=None)
-        if best is None or worths[best] <= before:
+        if best is None or worths[best] <= before + least:
             break
         chosen, found[best], before = chosen | {best}, worths[best] - before, worths[best]
     return found

@@ -8,7 +8,6 @@ on penalties.
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -78,7 +77,7 @@ def load_weighed_cases(folders: Sequence[Path]) -> list[WeighedCase]:
         exam = folder.parent  # answers may lie in the folder of their exam
         if not (exam / dataset.LABELS_FILE).is_file():
             exam = Path(yaml.safe_load((folder / "resolved.yaml").read_text())["exam"]["folder"])
-        if json.loads((exam / "exam.json").read_text())["sealed"]:
+        if dataset.is_sealed(exam):
             raise ConfigError(
                 f"exam.answers: {exam} is a sealed exam; prices are fitted to development exams only"
             )

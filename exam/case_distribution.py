@@ -6,8 +6,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Literal, Protocol
 
 import numpy as np
@@ -58,8 +59,18 @@ class PlantFamily(Protocol):
     """A spec in `conf/exam_plants`: machines of many makes, written apart from the library."""
 
     @property
+    def is_held_out(self) -> bool:
+        """True if only sealed exams may draw from it."""
+        ...
+
+    @property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects that its plants can have."""
+        ...
+
+    @property
+    def outside_not_on(self) -> Mapping[str, tuple[str, ...]]:
+        """Joints on which nothing of a fault outside the library would be seen, by its name."""
         ...
 
     @property
@@ -184,7 +195,11 @@ class CaseDistribution:
             raise ConfigError("exam.mix: expected num_cases of 1 or more, and some troubles")
 
     def questions(
-        self, machine: Machine, outside_faults: Sequence[str], generator: np.random.Generator
+        self,
+        machine: Machine,
+        outside_faults: Sequence[str],
+        generator: np.random.Generator,
+        outside_not_on: Mapping[str, Sequence[str]] = MappingProxyType({}),
     ) -> list[CaseDesign]:
         """Return the cases in random order; effects and outside faults are equally frequent."""
         kinds: list[str] = []
@@ -206,11 +221,15 @@ class CaseDistribution:
                 faults = [self._fault(name, machine, self.sizes, generator) for name in names]
             elif kind == "outside":
                 size = float(generator.uniform(*self.sizes))
-                chosen = self._some(
-                    np.flatnonzero(~machine.is_exclusive), generator
-                )  # much of it shows in company only
+                # much of it shows in company only
+                chosen = self._some(np.flatnonzero(~machine.is_exclusive), generator)
+                name = next(strange)
+                hidden = np.isin(machine.joint_names, outside_not_on.get(name, ()))
+                # drawn anew only then: cases of earlier exams can be made again from their salt
+                if hidden[chosen].any():
+                    chosen = self._some(np.flatnonzero(~machine.is_exclusive & ~hidden), generator)
                 outside_fault = UnknownFault(
-                    next(strange), size * np.isin(np.arange(machine.num_joints), chosen)
+                    name, size * np.isin(np.arange(machine.num_joints), chosen)
                 )
                 joints = tuple(machine.joint_names[j] for j in chosen)
             tracked = tracked or any(self.troubles[fault.effect].needs_tool for fault in faults)
@@ -221,6 +240,18 @@ class CaseDistribution:
                 )
             )
         return [found[i] for i in generator.permutation(len(found))]
+
+    def restrict(self, effects: Collection[str]) -> CaseDistribution:
+        """Return the same for machines without a measured tool, with these effects only.
+
+        Raises:
+            ConfigError: none is left.
+        """
+        kept = {}
+        for name, trouble in self.troubles.items():
+            if name in effects and not trouble.needs_tool:
+                kept[name] = trouble
+        return replace(self, tracked_share=0.0, troubles=kept)
 
     def _counts(self) -> dict[str, int]:
         """Return the number of cases of each kind by largest remainders."""

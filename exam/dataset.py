@@ -9,7 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Sequence
+import signal
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +22,8 @@ from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
 from exam.case_distribution import CaseDesign, CaseFault
-from exam.generate import CaseRecorder, HalfPlan, RecordedHalf
+from exam.generate import CaseRecorder, Half, HalfPlan, RecordedHalf
+from exam.progress import CaseProgress
 
 LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
 
@@ -37,6 +41,7 @@ def seal_labels(folder: Path, labels: dict[str, Any], salt: str) -> str:
         with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
             file.write(text)
         write_text(folder / HASH_FILE, f"{found}  {LABELS_FILE}\n")  # as sha256sum writes it
+        (folder / PARTIAL_FILE).unlink(missing_ok=True)
     except FileExistsError as error:
         raise StorageError(
             f"{path} exists: the exam in this folder is sealed; choose another session.out=<folder>"
@@ -68,33 +73,141 @@ def open_labels(folder: Path) -> dict[str, Any]:
     return json.loads(text)
 
 
-CASES_FOLDER = "cases"
+def is_sealed(folder: Path) -> bool:
+    """Return whether the exam in `folder` is sealed: by its facts, or by its labels themselves.
+
+    The labels are protected by their hash, so that a changed `exam.json` opens nothing.
+    """
+    if json.loads((folder / "exam.json").read_text())["sealed"]:
+        return True
+    facts = open_labels(folder) if (folder / LABELS_FILE).is_file() else {}
+    return bool(facts.get("sealed") or facts.get("held_out"))
+
+
+CASES_FOLDER, WITHHELD_FOLDER = "cases", "withheld"
+PARTIAL_FILE = "labels.partial.jsonl"
+"""Salt and labels of an exam that is being made."""
+BLOCK_CASES = 12
+"""Cases recorded side by side: 48 runs of a step in one array. More are hardly faster a case, and
+an interruption loses more."""
 HORIZON_S = 5.0
 """Window of `moved_rad`, s. Chosen by hand; not searched."""
 
 
+@dataclass(frozen=True)
+class CaseSet:
+    """All cases of an exam before they are recorded.
+
+    Attributes:
+        recorder: Records them.
+        questions: The cases.
+        halves: Plan of each half, and of the withheld part.
+        machine: The machine.
+        folder: Of the exam.
+    """
+
+    recorder: CaseRecorder
+    questions: Sequence[CaseDesign]
+    halves: Mapping[Half, HalfPlan]
+    machine: Machine
+    folder: Path
+
+    def write(self, numbers: Sequence[int]) -> list[dict[str, Any]]:
+        """Record the cases with these numbers and return their labels as plain JSON."""
+        questions = [self.questions[number] for number in numbers]
+        names = [f"{number:04d}" for number in numbers]
+        # all halves are planned before anything is recorded: a plan without room fails at once
+        jobs = {}
+        for half, plan in self.halves.items():
+            jobs[half] = self.recorder.planned(questions, plan, half)
+        made: dict[Half, list[RecordedHalf]] = {}
+        for half, of_half in jobs.items():
+            parent = WITHHELD_FOLDER if half == "withheld" else CASES_FOLDER
+            folders = [self.folder / parent / name for name in names]
+            made[half] = self.recorder.record(of_half, folders)
+        labels = []
+        for name, question, half in zip(names, questions, made["field"], strict=True):
+            labels.append(make_label(name, question, half, self.machine))
+        return labels
+
+
 def write_cases(
-    workshop: CaseRecorder,
-    questions: Sequence[CaseDesign],
-    reference: HalfPlan,
-    field: HalfPlan,
-    machine: Machine,
-    folder: Path,
-    workers: int,
-    advance: Callable[[int], None],
+    cases: CaseSet, salt: str, workers: int, progress: CaseProgress
 ) -> list[dict[str, Any]]:
-    """Record all cases into `folder/cases/<id>` and return their labels as plain JSON."""
-    names = [f"{number:04d}" for number in range(len(questions))]
-    folders = [folder / CASES_FOLDER / name for name in names]
-    # both halves are planned before anything is recorded: a plan without room fails at once
-    reference_jobs = workshop.planned(questions, reference, is_field=False)
-    field_jobs = workshop.planned(questions, field, is_field=True)
-    workshop.record(reference_jobs, folders, workers, advance)
-    made = workshop.record(field_jobs, folders, workers, advance)
-    labels = []
-    for name, question, half in zip(names, questions, made, strict=True):
-        labels.append(make_label(name, question, half, machine))
-    return labels
+    """Record all cases in blocks and return their labels.
+
+    Labels of finished blocks stand in a file that only its owner can read, so that an interrupted
+    exam goes on after them.
+
+    Args:
+        cases: The cases.
+        salt: Of the labels.
+        workers: Processes.
+        progress: Told how many cases are done.
+    """
+    path = cases.folder / PARTIAL_FILE
+    found = _read_partial(path, salt)
+    progress.skip(len(found))
+    count = len(cases.questions)
+    todo = [number for number in range(count) if f"{number:04d}" not in found]
+    # a block for each process at least, so that none is idle
+    size = max(1, min(BLOCK_CASES, -(-len(todo) // workers)))
+    blocks = [todo[begin : begin + size] for begin in range(0, len(todo), size)]
+    _append_private(path, [{"salt": salt}] if not found else [])
+
+    def keep(done: Future[list[dict[str, Any]]]) -> None:
+        fresh = [label for label in done.result() if label["case"] not in found]
+        _append_private(path, fresh)
+        found.update({label["case"]: label for label in fresh})
+        progress.advance(len(fresh))
+
+    with ProcessPoolExecutor(workers, initializer=end_on_interrupt) as pool:
+        pending = [pool.submit(cases.write, block) for block in blocks]
+        try:
+            for done in as_completed(pending):
+                keep(done)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            # what is finished is kept, in whatever order it comes
+            for job in pending:
+                if job.done() and not job.cancelled() and job.exception() is None:
+                    keep(job)
+            raise
+    return [found[name] for name in sorted(found)]
+
+
+def end_on_interrupt() -> None:
+    """Let this process end at once when the person interrupts the command."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def read_partial_salt(folder: Path) -> str | None:
+    """Return the salt of an exam that was interrupted while it was made, `None` without one."""
+    try:
+        return json.loads((folder / PARTIAL_FILE).read_text().splitlines()[0])["salt"]
+    except (OSError, IndexError):
+        return None
+
+
+def _read_partial(path: Path, salt: str) -> dict[str, dict[str, Any]]:
+    """Return the labels of the cases that are finished, by name."""
+    try:
+        lines = [json.loads(line) for line in path.read_text().splitlines()]
+    except OSError:
+        return {}
+    if not lines or lines[0].get("salt") != salt:
+        raise StorageError(f"{path} is of another exam: choose another session.out=<folder>")
+    return {line["case"]: line for line in lines[1:]}
+
+
+def _append_private(path: Path, lines: Sequence[Mapping[str, Any]]) -> None:
+    flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND
+    try:
+        with os.fdopen(os.open(path, flags, 0o600), "a") as file:
+            for line in lines:
+                file.write(json.dumps(line) + "\n")
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error.strerror}") from error
 
 
 def make_label(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -36,9 +36,17 @@ same."""
 EPOCH_S = FIRST_DAY.timestamp()
 
 
+Half = Literal["reference", "field", "withheld"]
+"""Parts of a case. The withheld one is of the machine as it is, and no candidate gets it."""
+STREAMS: dict[Half, int] = {"reference": 0, "field": 1, "withheld": 2}
+"""Number of each in the streams of chance."""
+UNCHANGED_FOLDER = "unchanged"
+"""Folder, beside withheld recordings, of the same machine without what the case is about."""
+
+
 @spec
 class HalfPlan:
-    """Plan of the recordings of one half of a case, `reference` or `field`.
+    """Plan of the recordings of one half of a case, `reference` or `field`, or of the withheld part.
 
     Attributes:
         programs: Names of the excitations of each file.
@@ -93,37 +101,38 @@ class RecordingJob:
         case: Its number.
         number: Number of the file in its half.
         half: How that is recorded.
-        is_field: Whether it is the field.
+        name: Which half.
         elapsed_s: How long the machine has run before.
         created: When, as recordings say it.
         plan: The excitation.
     """
 
     plan: ExcitationPlan
+    name: Half
 
     def __init__(
-        self, question: CaseDesign, case: int, number: int, half: HalfPlan, is_field: bool
+        self, question: CaseDesign, case: int, number: int, half: HalfPlan, name: Half
     ) -> None:
-        self.question, self.case, self.number, self.half, self.is_field = (
-            question,
-            case,
-            number,
-            half,
-            is_field,
-        )
+        self.question, self.case, self.number = question, case, number
+        self.half, self.name = half, name
         share = (number + float(self.stream("elapsed").random())) / len(half.programs)
         low_s, high_s = half.elapsed_s
         self.elapsed_s = low_s + share * (
             high_s - low_s
         )  # files follow one another through the day
         self.created = record.add_seconds(
-            FIRST_DAY.isoformat(timespec="milliseconds"), self.elapsed_s + 86400.0 * is_field
+            FIRST_DAY.isoformat(timespec="milliseconds"), self.elapsed_s + 86400.0 * self.is_field
         )
+
+    @property
+    def is_field(self) -> bool:
+        """True if the machine is recorded as it is."""
+        return self.name != "reference"
 
     def stream(self, name: str) -> np.random.Generator:
         """Return a stream of chance that is this file's alone."""
         return np.random.default_rng(
-            [self.question.chance, self.number, int(self.is_field), *name.encode()]
+            [self.question.chance, self.number, STREAMS[self.name], *name.encode()]
         )
 
 
@@ -153,6 +162,7 @@ class CaseRecorder:
         roughness: Which of the family's.
         excitations: By name.
         approach: How start poses are taken up.
+        known: The machine as candidates know it; its name and fingerprint stamp the files.
     """
 
     def __init__(
@@ -162,13 +172,15 @@ class CaseRecorder:
         roughness: str,
         excitations: Mapping[str, Excitation],
         approach: Approach,
+        known: Machine,
     ) -> None:
         self._machine, self._plants, self._roughness = machine, plants, roughness
+        self._known = known
         self._excitations, self._approach = excitations, approach
         self._guards = CommandGuards(max_command=1.0, max_tool_speed_m_s=None)
 
     def planned(
-        self, questions: Sequence[CaseDesign], half: HalfPlan, is_field: bool
+        self, questions: Sequence[CaseDesign], half: HalfPlan, name: Half
     ) -> list[RecordingJob]:
         """Return the files of one half of all cases with their plans, before anything is recorded.
 
@@ -178,39 +190,25 @@ class CaseRecorder:
         jobs = []
         for n, question in enumerate(questions):
             for k in range(len(half.programs)):
-                job = RecordingJob(question, n, k, half, is_field)
+                job = RecordingJob(question, n, k, half, name)
                 job.plan = self._plan(job)
                 jobs.append(job)
         return jobs
 
-    def record(
-        self,
-        jobs: Sequence[RecordingJob],
-        folders: Sequence[Path],
-        workers: int,
-        advance: Callable[[int], None],
-    ) -> list[RecordedHalf]:
+    def record(self, jobs: Sequence[RecordingJob], folders: Sequence[Path]) -> list[RecordedHalf]:
         """Write the files of one half of each case into its folder; return their content by case.
 
         Args:
-            jobs: The files.
+            jobs: The files. They are the same whatever is recorded beside them.
             folders: Where each case's files go.
-            workers: Processes; files are the same however many there are.
-            advance: Told how many files are done.
         """
         specimens = list(map(self._specimen, jobs))
         makes = self._plants.makes(self._machine, specimens)
-        batches = _split_by_make(makes, min(SIDE_BY_SIDE, -(-len(jobs) // workers)))
-        found: dict[int, RecordedHalf] = {}
-        with ExitStack() as stack:
-            run = map if workers == 1 else stack.enter_context(ProcessPoolExecutor(workers)).map
-            batched_jobs = [_take(jobs, batch) for batch in batches]
-            batched_specimens = [_take(specimens, batch) for batch in batches]
-            results = run(self._batch, batched_jobs, batched_specimens, [folders] * len(batches))
-            for batch, made in zip(batches, results, strict=True):
-                found |= dict(zip(batch, made, strict=True))
-                advance(len(batch))
         done = [RecordedHalf([], [], []) for _ in folders]
+        found: dict[int, RecordedHalf] = {}
+        for batch in _split_by_make(makes, SIDE_BY_SIDE):
+            made = self._batch(_take(jobs, batch), _take(specimens, batch), folders)
+            found |= dict(zip(batch, made, strict=True))
         for i, job in enumerate(jobs):  # a case's files are in order
             for name in ("u", "q", "without_q"):
                 getattr(done[job.case], name).extend(getattr(found[i], name))
@@ -253,7 +251,7 @@ class CaseRecorder:
         self, jobs: Sequence[RecordingJob], specimens: Sequence[PlantRun], folders: Sequence[Path]
     ) -> list[RecordedHalf]:
         """Record files of one half, of machines of one make; return the content of each."""
-        half, is_field = jobs[0].half, jobs[0].is_field
+        half = jobs[0].half
         machine = self._machine
         plan = ExcitationPlan(
             runs=tuple(job.plan.runs[0] for job in jobs),
@@ -269,14 +267,18 @@ class CaseRecorder:
         for name in samples[0].extra:
             extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
         u, q = track.u.astype(np.float32), track.q.astype(np.float32)
-        without = self._without(specimens, u, half) if is_field else q
+        without = self._without(specimens, u, half) if jobs[0].is_field else q
         t_s = track.t_s - track.t_s[0]
         recorded = []
         for n, job in enumerate(jobs):
             columns = {}
             if job.question.tracked:
                 columns = {name: values[n] for name, values in extra.items()}
-            self._write(job, t_s, u[:, n], q[:, n], columns, folders[job.case])
+            place = folders[job.case] / job.name
+            if job.name == "withheld":  # it has a folder of its own, beside those of the cases
+                place = folders[job.case]
+                self._write(job, t_s, u[:, n], without[:, n], {}, place / UNCHANGED_FOLDER)
+            self._write(job, t_s, u[:, n], q[:, n], columns, place)
             recorded.append(RecordedHalf([u[:, n]], [q[:, n]], [without[:, n]]))
         return recorded
 
@@ -289,8 +291,8 @@ class CaseRecorder:
         columns: dict[str, np.ndarray],
         folder: Path,
     ) -> None:
-        """Write the file of a job into the folder of its case."""
-        machine = self._machine
+        """Write a file of a job, stamped as of the machine as the candidates know it."""
+        machine = self._known
         recording = record.Recording(
             machine=machine.name,
             joints=machine.joint_names,
@@ -302,7 +304,7 @@ class CaseRecorder:
             extra=columns,
             metadata={"created": job.created, "fingerprint": record.format_fingerprint(machine)},
         )
-        path = folder / ("field" if job.is_field else "reference") / f"{job.number:02d}.parquet"
+        path = folder / f"{job.number:02d}.parquet"
         record.write_recording(recording, path)
         # the same time for all cases: the time of a file tells nothing about its case
         os.utime(path, (EPOCH_S, EPOCH_S))
@@ -318,3 +320,17 @@ class CaseRecorder:
                 path.append(opened.read().q)
                 opened.send(Command(command.astype(float)))
         return np.stack(path).astype(np.float32)
+
+
+def restrict_machine(machine: Machine, known: str) -> Machine:
+    """Return the machine as candidates know it: `full`, or by its `joints` only."""
+    if known == "full":
+        return machine
+    joints = tuple(dataclasses.replace(joint, body=None) for joint in machine.joints)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    return dataclasses.replace(  # pyright: ignore[reportCallIssue]
+        machine,  # pyright: ignore[reportArgumentType]
+        name=f"{machine.name}_joints",
+        mjcf=None,
+        tool_m=None,
+        joints=joints,
+    )

@@ -121,6 +121,9 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
         "cover_90": _rate_items(numbers, attrgetter("in_90")),
         "cover_95": _rate_items(numbers, attrgetter("in_95")),
         "closed_of_oracle": bootstrap_over_cases(known, compute_closed_of_oracle),
+        "closed_examined": bootstrap_over_cases(known, compute_examined_share),
+        "closed_differs": _rate_items(_select_examined(known), attrgetter("differs")),
+        "closed_missing": _rate_items(_select_named(scores), _is_without_share),
         "predicted_off": bootstrap_over_cases(known, compute_prediction_error),
         "seconds": {"median": _take_median(seconds), "most": max(seconds, default=None)},
         "by_effect": summarize_effects(scores),
@@ -328,15 +331,43 @@ def compute_parameter_error(scores: Sequence[CaseScore]) -> float | None:
     return _take_median(map(attrgetter("error"), _collect_numbers(scores)))
 
 
+def _select_examined(scores: Sequence[CaseScore]) -> list[CaseScore]:
+    """Return the cases with a share of the examiner's and one of the answer's."""
+    found = []
+    for score in scores:
+        if score.examined is not None and score.closed is not None:
+            found.append(score)
+    return found
+
+
+def _select_named(scores: Sequence[CaseScore]) -> list[CaseScore]:
+    return [score for score in scores if score.named]
+
+
+def _is_without_share(score: CaseScore) -> bool:
+    return score.closed is None
+
+
+def compute_examined_share(scores: Sequence[CaseScore]) -> float | None:
+    """Return the median closed share of the gap by the examiner's own simulation."""
+    return _take_median(score.examined for score in scores if score.examined is not None)
+
+
 def compute_closed_of_oracle(scores: Sequence[CaseScore]) -> float | None:
     """Return the median ratio of the closed share of the gap to that of the oracle.
 
-    The median, as the gap itself is a difference of two errors: where it is small, its shares vary
+    The closed share is the examiner's; only where nobody examined the answers, it is their own. The
+    median, as the gap itself is a difference of two errors: where it is small, its shares vary
     wildly.
     """
     shares = []
     for score in scores:
-        if score.oracle is not None and score.oracle > MIN_ORACLE_CLOSED:
+        if score.oracle is None or score.oracle <= MIN_ORACLE_CLOSED:
+            continue
+        if score.was_examined:
+            if score.examined is not None:
+                shares.append(score.examined / score.oracle)
+        else:
             shares.append((score.closed or 0.0) / score.oracle)
     return _take_median(shares)
 

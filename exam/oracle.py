@@ -20,8 +20,8 @@ from brokk_rl.machine import Machine
 from diagnosis import baseline, case, effect_library
 from diagnosis.baseline import Baseline
 from diagnosis.gap import GapClosure
-from diagnosis.refine import fit_set
-from diagnosis.residuals import ParameterRay, build_rays
+from diagnosis.refine import drop_windows, fit_set
+from diagnosis.residuals import ParameterRay, Residuals, build_rays
 from diagnosis.responses import Response, fit_sizes
 
 MIN_RESPONSE = 1e-3
@@ -59,17 +59,36 @@ class CaseEvidence:
         base: The simulator, against field and reference.
         rays: Ways in which each effect grows.
         errors: Of each joint.
+        repeats: The same of repeats: parts of the reference against simulators that were fitted to
+            the rest of it. Nothing changed there.
     """
 
     base: Baseline
     rays: dict[str, Sequence[ParameterRay]]
     errors: list[JointErrors]
+    repeats: list[list[JointErrors]]
+
+
+REPEAT_WINDOWS = 3
+"""One of so many stretches of the reference is a repeat: as long as the field, which is a third of
+it."""
 
 
 def load_case_evidence(
-    folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[str] | None = None
+    folder: Path,
+    fit: ActuatorFit,
+    machine: Machine,
+    names: Sequence[str] | None = None,
+    with_repeats: bool = False,
 ) -> CaseEvidence:
     """Return the residuals of a case, for the effects `names`, or for all that a free run can show.
+
+    Args:
+        folder: The case.
+        fit: How the simulator is made from the reference.
+        machine: The machine.
+        names: The effects; `None`: all.
+        with_repeats: Whether the repeats are simulated too.
 
     Raises:
         RecordingError: the simulator cannot be fitted.
@@ -78,12 +97,22 @@ def load_case_evidence(
         base = baseline.fit_baseline(
             case.load_case(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
         )
-    residuals, grown = base.field.residuals, {}
-    shapes: list[dict[str, list[Response]]] = [{} for _ in range(machine.num_joints)]
+    grown: dict[str, Sequence[ParameterRay]] = {}
     for kind in effect_library.load_effects(machine, None if names is None else tuple(names)):
-        if kind.target.stochastic or kind.target.side == "kinematics":
-            continue
-        ways = grown[kind.name] = build_rays(kind)
+        if not kind.target.stochastic and kind.target.side != "kinematics":
+            grown[kind.name] = build_rays(kind)
+    repeats = []
+    for one in base.left_out if with_repeats else ():
+        repeats.append(collect_errors(drop_windows(one.residuals, REPEAT_WINDOWS), grown))
+    return CaseEvidence(base, grown, collect_errors(base.field.residuals, grown), repeats)
+
+
+def collect_errors(
+    residuals: Residuals, rays: Mapping[str, Sequence[ParameterRay]]
+) -> list[JointErrors]:
+    """Return errors and responses of each joint; effects without a response there are left out."""
+    shapes: list[dict[str, list[Response]]] = [{} for _ in residuals.z]
+    for name, ways in rays.items():
         responses = [residuals.response(ray) for ray in ways]
         for j, mine in enumerate(shapes):
             own, largest = [], 0.0
@@ -91,11 +120,11 @@ def load_case_evidence(
                 own.append(Response(ray.sizes, response[j]))
                 largest = max(largest, np.abs(response[j]).max())
             if largest > MIN_RESPONSE:
-                mine[kind.name] = own
+                mine[name] = own
     errors = []
     for z, mine in zip(residuals.z, shapes, strict=True):
         errors.append(JointErrors(z, mine, residuals.fold))
-    return CaseEvidence(base, grown, errors)
+    return errors
 
 
 def close_gap(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,14 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from brokk_rl.errors import StorageError
 from brokk_rl.plot import BLUE, GREY, ORANGE, add_legend, make_figure
 from brokk_rl.report import DPI, MISSING, Cell, Report
-from brokk_rl.session import describe_commit, write_text
+from brokk_rl.session import write_text
 
 HEADLINES = (
     "top1", "top1_strictly", "macro_f1", "joints", "exact_set", "set_f1", "false_alarms",
     "unknown_recall", "unknown_auroc", "ece", "parameter_error", "cover_90", "closed_of_oracle",
-    "predicted_off",
+    "closed_examined", "closed_differs", "closed_missing", "predicted_off",
 )  # fmt: skip
 """Metrics of a line of the ledger."""
 REPORT_FILE = "exam.html"
@@ -42,6 +40,9 @@ ROWS = {
     "cover_90": ("90 % intervals cover", None),
     "cover_95": ("95 % intervals cover", None),
     "closed_of_oracle": ("gap closed, of the oracle's", True),
+    "closed_examined": ("gap closed on withheld parts, by the examiner, median", True),
+    "closed_differs": ("stated closing disagrees with the examiner's", False),
+    "closed_missing": ("effects named without a share", False),
     "predicted_off": ("predicted closing off by, median", False),
 }
 """Label of each metric, and whether more of it is better."""
@@ -55,31 +56,16 @@ CAPTIONS = {
 }
 
 
-def append_to_ledger(
-    path: Path, when: str, exam: dict[str, Any], name: str, table: dict[str, Any]
-) -> None:
-    """Append the headlines of one candidate to the ledger, one line a scoring run.
+def collect_headlines(name: str, table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the headlines of one candidate for a line of the ledger.
 
     Args:
-        path: The ledger.
-        when: Time, ISO 8601.
-        exam: Seed, whether sealed, roughness, number of cases, hash of the labels.
         name: The candidate.
         table: Its metrics; see `metrics.compute_metrics`.
-
-    Raises:
-        StorageError: it cannot be written.
     """
     figures = {key: _round_float(table[key]["value"]) for key in HEADLINES}
     figures["seconds"] = _round_float(table["seconds"]["median"])
-    figures["sat"], figures["failed"] = table["sat"]["value"], table["failed"]
-    line = {"when": when, "commit": describe_commit(), "candidate": name, **exam, **figures}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a") as file:
-            file.write(json.dumps(line) + "\n")
-    except OSError as error:
-        raise StorageError(f"cannot append to the ledger {path}: {error.strerror}") from error
+    return {"candidate": name, **figures, "sat": table["sat"]["value"], "failed": table["failed"]}
 
 
 def _round_float(value: Any) -> Any:
@@ -155,6 +141,9 @@ def write_report(
             page.add_text(
                 f"{name} sat {sat['value']} of {sat['of']} cases; the others are left out.", "warn"
             )
+    for name, table in tables.items():
+        for warning in table["warnings"]:
+            page.add_text(f"{name}: {warning}", "warn")
     if not exam["sealed"]:
         page.add_text(
             "A development seed: the authors of the candidates may have looked at its cases.",
@@ -168,7 +157,10 @@ def write_report(
     )
     for name, table in tables.items():
         _add_candidate(page, folder, name, table)
-    page.add_facts({"labels, SHA-256": exam["labels_sha256"]})
+    facts = {"labels, SHA-256": exam["labels_sha256"]}
+    for name, table in tables.items():
+        facts[f"engine of {name}"] = ", ".join(table["engines"]) or MISSING
+    page.add_facts(facts)
     page.write(folder / REPORT_FILE)
     write_text(folder / TABLE_FILE, format_markdown(tables))
 

@@ -8,7 +8,6 @@ one minute of the reference to the next. Needs scikit-learn.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from functools import cache
 from itertools import compress
@@ -49,10 +48,15 @@ LARGEST_FEATURE = 50.0
 TOOL_COLUMNS = ("ee_x_m", "ee_y_m", "ee_z_m")
 
 
-def extract_features(case: Path, machine: Machine) -> np.ndarray:
+def read_half(case: Path, half: str, machine: Machine) -> list[Recording]:
+    """Return the recordings of one half of a case."""
+    return record.read_recordings(str(case / half / "*.parquet"), machine)
+
+
+def extract_features(
+    reference: Sequence[Recording], field: Sequence[Recording], machine: Machine
+) -> np.ndarray:
     """Return the features of each joint of a case, `(J, F)`."""
-    reference = record.read_recordings(str(case / "reference" / "*.parquet"), machine)
-    field = record.read_recordings(str(case / "field" / "*.parquet"), machine)
     rows = []
     for joint in range(machine.num_joints):
         weights = _fit_reference(reference, joint)
@@ -183,13 +187,11 @@ class ResidualForest:
         exam: Folder of the development exam it learns from, another than the one it sits; it cannot
             do without.
         trees: Number of trees.
-        least: Probability from which an effect is named.
         seed: Of the forest.
     """
 
     exam: str | None
     trees: int
-    least: float
     seed: int
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
@@ -203,13 +205,31 @@ class ResidualForest:
                 "exam_candidate=trees: expected exam.candidate.exam=<folder of a development exam>, to learn from"
             )
         forest = _learn_forest(Path(self.exam), self.trees, self.seed, _MachineKey(machine))
-        chances = forest.predict_proba(extract_features(case, machine))  # (J, classes)
+        reference = read_half(case, "reference", machine)
+        features = extract_features(reference, read_half(case, "field", machine), machine)
+        chances = forest.predict_proba(features)  # (J, classes)
+        names = forest.classes_.tolist()
+        least = _learn_least(forest, reference, machine)
         out.mkdir(parents=True, exist_ok=True)
-        _build_answer(
-            dict(zip(forest.classes_.tolist(), chances.T, strict=True)),
-            machine.joint_names,
-            self.least,
-        ).write(out / ANSWER_FILE)
+        _build_answer(dict(zip(names, chances.T, strict=True)), machine.joint_names, least).write(
+            out / ANSWER_FILE
+        )
+
+
+def _learn_least(forest: Any, reference: Sequence[Recording], machine: Machine) -> float:
+    """Return the largest probability of a change on repeats of the reference, where none is.
+
+    Each of its files in turn is held against the others.
+    """
+    names = forest.classes_.tolist()
+    changed = [k for k, name in enumerate(names) if name != NONE]
+    largest = 0.0
+    for number in range(len(reference)):
+        rest = [*reference[:number], *reference[number + 1 :]]
+        if rest:
+            features = extract_features(rest, [reference[number]], machine)
+            largest = max(largest, float(forest.predict_proba(features)[:, changed].max()))
+    return largest
 
 
 class _MachineKey:
@@ -234,13 +254,16 @@ def _learn_forest(folder: Path, trees: int, seed: int, key: _MachineKey) -> Any:
         raise ConfigError(
             "exam_candidate=trees needs scikit-learn: pip install 'brokk-rl[exam]'"
         ) from error
-    if json.loads((folder / "exam.json").read_text())["sealed"]:
+    if dataset.is_sealed(folder):
         raise ConfigError(
             f"candidate.exam={folder} is a sealed exam; a candidate learns from development seeds only"
         )
     names, rows = [], []
     for label in dataset.open_labels(folder)["cases"]:
-        rows.append(extract_features(folder / dataset.CASES_FOLDER / label["case"], key.machine))
+        place = folder / dataset.CASES_FOLDER / label["case"]
+        reference = read_half(place, "reference", key.machine)
+        field = read_half(place, "field", key.machine)
+        rows.append(extract_features(reference, field, key.machine))
         names += [_classify_joint(label, joint) for joint in key.machine.joint_names]
     forest = ExtraTreesClassifier(
         trees, min_samples_leaf=2, class_weight="balanced_subsample", random_state=seed
@@ -274,7 +297,7 @@ def _build_answer(chances: dict[str, np.ndarray], joints: tuple[str, ...], least
         has = chances[name] >= min(least, chances[name].max())
         having = tuple(compress(joints, has))
         ranking.append(Ranked(name, having, chance))
-        if chance >= least:
+        if chance > least:
             selected.append(
                 Selected(
                     effect=name, joints=having, probability=chance, parameters={}, gap_closed=None
@@ -284,7 +307,7 @@ def _build_answer(chances: dict[str, np.ndarray], joints: tuple[str, ...], least
     verdict: Verdict = "none"
     if selected and selected[0].probability >= unknown:
         verdict = "effects"
-    elif unknown >= least:
+    elif unknown > least:
         verdict = "unknown"
     return Answer(
         verdict=verdict,

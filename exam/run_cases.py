@@ -2,28 +2,36 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
+
+import yaml
 
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.session import write_json
+from brokk_rl.session import write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis.answer import ANSWER_FILE
+from exam.progress import CaseProgress
 
 log = logging.getLogger(__name__)
 
 NOTE_FILE = "sitting.json"
+MACHINE_FILE = "machine.yaml"
+INTERRUPTED = (-signal.SIGINT, 128 + signal.SIGINT)
+"""Exit codes of a program that an interruption of the command ended too."""
 LAST_CHARACTERS = 2000
 """Last characters of a program's output that an error quotes. Chosen by hand; not searched."""
 
@@ -45,8 +53,8 @@ class CommandCandidate:
     """A program that diagnoses one case, started anew for each, without a way to the labels.
 
     Attributes:
-        command: Program and arguments; `{case}` and `{out}` stand for the two folders. `brokk` is
-            the one that runs now.
+        command: Program and arguments; `{case}` and `{out}` stand for the two folders, `{machine}`
+            for a file with the machine as far as it is known. `brokk` is the one that runs now.
         limit_s: Time after which it is ended.
         threads: CPU threads for its numerical libraries.
     """
@@ -64,7 +72,9 @@ class CommandCandidate:
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
         """Start the program in an empty folder and waits for it."""
-        words = [word.format(case=case, out=out) for word in self.command]
+        file = case.parent / MACHINE_FILE
+        write_text(file, yaml.safe_dump(describe_spec(machine), sort_keys=False))
+        words = [word.format(case=case, out=out, machine=file) for word in self.command]
         if words[0] == "brokk":
             words[:1] = [sys.executable, "-P", "-m", "brokk_rl"]
         threads = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
@@ -86,6 +96,8 @@ class CommandCandidate:
                 raise RecordingError(f"no answer within {self.limit_s:g} s") from error
             except OSError as error:
                 raise RecordingError(f"{words[0]} cannot be started: {error.strerror}") from error
+        if done.returncode in INTERRUPTED:
+            raise InterruptedError("the person interrupted the exam")
         if done.returncode:
             raise RecordingError(
                 (done.stderr or done.stdout)[-LAST_CHARACTERS:].strip()
@@ -99,7 +111,8 @@ def answer_cases(
     folder: Path,
     machine: Machine,
     workers: int,
-    advance: Callable[[], None],
+    progress: CaseProgress,
+    engine: str | None = None,
 ) -> int:
     """Have every case answered that is not yet; returns how many have no answer in the end.
 
@@ -113,22 +126,23 @@ def answer_cases(
         folder: Where the answers go.
         machine: The machine.
         workers: Cases answered at once.
-        advance: Told when a case is done.
+        progress: Told when a case is done.
+        engine: Identity of the engine, noted beside each answer.
     """
     todo = [case for case in cases if not (folder / case.name / ANSWER_FILE).is_file()]
-    for _ in range(len(cases) - len(todo)):
-        advance()
+    progress.skip(len(cases) - len(todo))
     is_alone = workers == 1 or isinstance(
         candidate, CommandCandidate
     )  # a program has processes of its own
     with ThreadPoolExecutor(workers) if is_alone else ProcessPoolExecutor(workers) as pool:
         pending = []
         for case in todo:
-            pending.append(pool.submit(_answer_case, candidate, case, folder / case.name, machine))
+            place = folder / case.name
+            pending.append(pool.submit(_answer_case, candidate, case, place, machine, engine))
         try:
             for done in as_completed(pending):
                 done.result()
-                advance()
+                progress.advance()
         except BaseException:
             for job in pending:
                 job.cancel()  # those that run are waited for; the rest is for the next time
@@ -136,8 +150,14 @@ def answer_cases(
     return sum(not (folder / case.name / ANSWER_FILE).is_file() for case in cases)
 
 
-def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
-    """Answer one case from a copy under a neutral name: no path leads from there to the labels."""
+def _answer_case(
+    candidate: Candidate, case: Path, out: Path, machine: Machine, engine: str | None
+) -> None:
+    """Answer one case from a copy under a neutral name: no path leads from there to the labels.
+
+    Raises:
+        KeyboardInterrupt: the person interrupted the program that answers; nothing is noted then.
+    """
     begun, error = time.monotonic(), None
     with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
         copy, place = Path(scratch) / "case", Path(scratch) / "answer"
@@ -146,6 +166,8 @@ def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) 
             candidate.answer(copy, place, machine)
             if not (place / ANSWER_FILE).is_file():
                 error = f"it left no {ANSWER_FILE}"
+        except InterruptedError as failure:
+            raise KeyboardInterrupt from failure
         except Exception as failure:  # whoever answers may break in any way: that is an answer missed, and no end of the exam
             error = str(failure) or repr(failure)
         seconds = time.monotonic() - begun
@@ -154,7 +176,8 @@ def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) 
         else:
             out.mkdir(parents=True, exist_ok=True)
             log.warning("case %s: no answer: %s", case.name, error.splitlines()[-1])
-    write_json(out / NOTE_FILE, {"seconds": round(seconds, 2), "error": error})
+    note = {"seconds": round(seconds, 2), "error": error, "engine": engine}
+    write_json(out / NOTE_FILE, note)
 
 
 def is_begun(answer: Path) -> bool:
@@ -162,10 +185,27 @@ def is_begun(answer: Path) -> bool:
     return (answer / NOTE_FILE).is_file() or (answer / ANSWER_FILE).is_file()
 
 
+def read_note(answer: Path) -> dict[str, Any]:
+    """Return the note beside an answer, empty where there is none."""
+    try:
+        return json.loads((answer / NOTE_FILE).read_text())
+    except (OSError, ValueError):
+        return {}
+
+
 def read_seconds(answer: Path) -> float | None:
     """Return how long the answer in a folder took, `None` where there is none."""
-    try:
-        note = json.loads((answer / NOTE_FILE).read_text())
-    except (OSError, ValueError):
-        return None
-    return None if note["error"] else float(note["seconds"])
+    note = read_note(answer)
+    return None if not note or note["error"] else float(note["seconds"])
+
+
+def describe_spec(value: Any) -> Any:
+    """Return a spec as the plain data of an option file: targets, lists and numbers."""
+    if isinstance(value, (list, tuple)):
+        return [describe_spec(one) for one in value]
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        return value
+    node: dict[str, Any] = {"_target_": f"{type(value).__module__}.{type(value).__name__}"}
+    for field in dataclasses.fields(value):
+        node[field.name] = describe_spec(getattr(value, field.name))
+    return node

@@ -76,6 +76,10 @@ class CaseScore:
         moved_rad: Change of the motion by the cause over 5 s, on the joint with the largest.
         closed: Share of the gap closed, by the answer's own account.
         predicted: Share of the gap that the answer said would be closed, before it looked.
+        examined: Share of the gap closed on withheld recordings, by the examiner's simulation of
+            `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
+        was_examined: Whether the examiner simulated the answer.
+        differs: Whether the examiner's share and the answer's own disagree.
         oracle: Share of the gap that the true effects close when fitted, where somebody computed
             it.
         seconds: Time the answer took.
@@ -98,6 +102,9 @@ class CaseScore:
     moved_rad: float
     closed: float | None
     predicted: float | None
+    examined: float | None
+    was_examined: bool
+    differs: bool
     oracle: float | None
     seconds: float | None
     outside: str | None
@@ -110,6 +117,7 @@ def score_answer(
     of_machine: Sequence[str],
     seconds: float | None = None,
     oracle: float | None = None,
+    examination: Mapping[str, Any] | None = None,
 ) -> CaseScore:
     """Return the score of `answer`; `None` is a missing answer.
 
@@ -120,6 +128,7 @@ def score_answer(
         of_machine: Effects that all joints have together; nobody is asked for their joints.
         seconds: Time it took.
         oracle: Share of the gap that the true effects close.
+        examination: The examiner's own figures; see `examiner.Examination`.
     """
     kind = label["kind"]
     true = {one["effect"]: one for one in label["effects"]} if kind not in QUIET_KINDS else {}
@@ -171,6 +180,9 @@ def score_answer(
         moved_rad=max(label["moved_rad"].values()),
         closed=gap.closed.mean if gap and gap.closed else None,
         predicted=predicted["mean"] if isinstance(predicted, Mapping) else predicted,
+        examined=examination["closed"] if examination else None,
+        was_examined=examination is not None,
+        differs=bool(examination and examination["differs"]),
         oracle=oracle,
         seconds=seconds,
         outside=outside["ailment"] if outside else None,

@@ -60,7 +60,7 @@ SHOWN = PageState(
     t_s=0.0, alive=True, guiding=True, advice=ShownAdvice(True, "valid", 1, LEVERS, None), state=STATE,
     commands=False,
     streams=tuple(SourceAge(name, 0.0, 1e6) for name in ("positions", "levers", "advice", "borehole")),
-    recording=RecordingStatus(False, 0.0, 0),
+    recording=RecordingStatus(False, 0.0, 0, failed=False),
     targets=(
         BoreholeChoice("A", (2.6, 0.0, 0.75), (0.0, 0.0, 1.0), 0.05, 0.002, 0.97, True),
         BoreholeChoice("B", (2.2, 0.4, 0.75), (0.0, 0.0, 1.0), 0.05, None, None, False),
@@ -87,7 +87,7 @@ class Scripted:
     """A feed that shows `now` and remembers requests and draw reports."""
 
     def __init__(self, now: PageState = SHOWN) -> None:
-        self.now, self.picture = now, None
+        self.now, self.picture, self.confirms = now, None, True
         self.requests: list[OperatorRequest] = []
         self.seen: list[DrawReport] = []
 
@@ -103,6 +103,9 @@ class Scripted:
     def submit(self, request: OperatorRequest) -> bool:
         self.requests.append(request)
         return True
+
+    def confirms_stop(self) -> bool:
+        return self.confirms
 
     def report_drawn(self, report: DrawReport) -> None:
         self.seen.append(report)

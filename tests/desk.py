@@ -8,6 +8,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -21,7 +22,7 @@ from deploy.bus.description import BusDescription
 from deploy.bus.protection import MessageFault
 from deploy.guard.limits import GuardLimits
 from deploy.runtime.bus_process import BusProcessConfig
-from deploy.runtime.operator_state import OperatorControls, RequestedCommand
+from deploy.runtime.operator_state import OperatorControls, RequestedCommand, StopRequest
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import request_fault
@@ -43,6 +44,10 @@ def command(stop: Callable[[], bool], home: np.ndarray, memory: LoopMemory) -> N
             away = state.q - home
             u = np.where(np.abs(away) > REACH_RAD, -np.sign(away) * np.abs(u), u)
         memory.request.write(RequestedCommand(time.monotonic(), u))
+        # In place of the supervisor, whose switches may not grow old.
+        switches = memory.controls.read()
+        if switches is not None:
+            memory.controls.write(replace(switches, t_s=time.monotonic()))
         time.sleep(0.05)
 
 
@@ -56,7 +61,7 @@ def free_port() -> int:
 def wire() -> CanBus:
     """Returns a bus that nobody else uses."""
     return CanBus(
-        interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port()
+        interface="udp_multicast", channel="239.74.163.77", bitrate=None, port=free_port(), hops=0
     )
 
 
@@ -124,8 +129,23 @@ class Desk:
 
     def arm(self, armed: bool = True) -> None:
         """Arms or disarms."""
-        controls = OperatorControls(time.monotonic(), armed, recording=False, recording_t_s=0.0)
+        # The commander keeps the switches fresh, as the supervisor does.
+        now_s = time.monotonic()
+        controls = OperatorControls(
+            t_s=now_s,
+            armed=armed,
+            armed_t_s=now_s,
+            recording=False,
+            recording_t_s=0.0,
+            recording_failed=False,
+        )
         self.memory.controls.write(controls)
+
+    def press_stop(self) -> float:
+        """Presses the page's stop, straight to the bus process; returns when."""
+        now_s = time.monotonic()
+        self.memory.stop.write(StopRequest(now_s))
+        return now_s
 
     def heard(self, message: str, seconds: float) -> list[tuple[float, dict[str, float]]]:
         """Returns what was said on the bus from now on, with when."""

@@ -1,25 +1,49 @@
-"""Mutants of a module: one small change each, to see whether the tests notice.
+"""Mutants of the core: one small change each, to see whether the tests notice.
 
-    python tests/mutants.py deploy.guard.guard tests/unit/test_deploy_guard.py
+    python tests/mutants.py                          # all of the core, about half an hour
+    python tests/mutants.py deploy.guard.guard       # one module
 
 Comparisons turned, off by one boundary, negated conditions, arithmetic exchanged, constants
-changed, statements dropped. Each mutant runs in a forked process; what survives is printed. A
-mutant that only changes a text, a type or an error message is none.
+changed, statements dropped. Each mutant runs in a forked process. What survives stands in
+`survivors.json` with the reason; anything else that survives is an error. A mutant that only
+changes a text, a type or an error message is none.
 """
 
 from __future__ import annotations
 
 import ast
 import copy
+import gc
 import importlib
 import io
+import json
 import os
+import signal
 import sys
 import types
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
+TESTS = Path(__file__).parent
+EXPLAINED = TESTS / "survivors.json"
+CORE = {
+    "deploy.bus.protection": ["test_deploy_protection.py"],
+    "deploy.bus.clock": ["test_deploy_protection.py"],
+    "deploy.guard.guard": ["test_deploy_guard.py"],
+    "deploy.guard.plausibility": ["test_deploy_guard.py"],
+    "deploy.runtime.receiver": ["test_deploy_receiver.py"],
+    "deploy.runtime.bus_logic": ["test_deploy_logic.py"],
+    "deploy.twin.gateway": ["test_deploy_gateway.py"],
+    "deploy.policy.policy_process": ["test_deploy_adviser.py"],
+}
+"""Modules that decide what reaches the valves, and the tests of each."""
+PYTEST = ["-x", "-q", "--no-header", "--assert=plain"]
+PYTEST += ["-p", "no:cacheprovider", "-p", "no:unraisableexception", "-p", "no:threadexception"]
+LONGEST_S = 120
+"""Time for the tests of one mutant."""
 COMPARED = {
     ast.Lt: (ast.LtE, ast.Gt), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.Lt), ast.GtE: (ast.Gt, ast.Lt), ast.Eq:
     (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,), ast.In: (ast.NotIn,), ast.NotIn: (ast.In,),
@@ -78,8 +102,12 @@ def _is_type(node: ast.BinOp) -> bool:
     return isinstance(node.op, ast.BitOr)
 
 
-def mutants(tree: ast.Module) -> Iterator[tuple[str, ast.Module]]:
-    """Yields every mutant of a module, and where and how it differs."""
+def mutants(tree: ast.Module, source: str) -> Iterator[tuple[str, ast.Module]]:
+    """Yields every mutant of a module, and where and how it differs.
+
+    A place is named by its line, not by its number: the list of survivors outlives other changes.
+    """
+    lines, seen = source.splitlines(), Counter[str]()
     dead = {
         id(one)
         for node in ast.walk(tree)
@@ -96,14 +124,19 @@ def mutants(tree: ast.Module) -> Iterator[tuple[str, ast.Module]]:
         and field not in ("annotation", "returns", "decorator_list", "bases")
     ]
     for parent, field, index in places:
-        if isinstance(parent, ast.Module):
-            continue
         value = getattr(parent, field)
         original = value[index] if isinstance(value, list) else value
+        # Of a module's own statements only the numbers of constants matter.
+        if isinstance(parent, ast.Module):
+            continue
         for words, changed in changes(original):
+            number = getattr(original, "lineno", getattr(parent, "lineno", 0))
+            name = f"{lines[number - 1].strip()} :: {words}"
+            seen[name] += 1
+            if seen[name] > 1:
+                name += f" ({seen[name]})"
             _put(parent, field, index, changed)
-            line = getattr(original, "lineno", getattr(parent, "lineno", 0))
-            yield f"line {line}: {words}", ast.fix_missing_locations(copy.deepcopy(tree))
+            yield name, ast.fix_missing_locations(copy.deepcopy(tree))
             _put(parent, field, index, original)
 
 
@@ -115,20 +148,25 @@ def _put(parent: ast.AST, field: str, index: int, child: ast.AST) -> None:
         setattr(parent, field, child)
 
 
-def survivors(module: str, tests: str) -> tuple[list[str], int]:
-    """Returns the mutants of `module` that `tests`, a file, does not notice, and how many there were."""
+def survivors(module: str, tests: Sequence[str]) -> tuple[list[str], int]:
+    """Returns the mutants of `module` that `tests`, files, do not notice, and how many there were."""
     import pytest
 
     source = Path(importlib.import_module(module).__file__ or "").read_text()
     found, count = [], 0
     # once as it is: it must pass, and everything that the tests import is then there for all
     # mutants
-    if pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", tests]):
-        raise SystemExit(f"{tests} fails without any mutant")
-    for words, tree in mutants(ast.parse(source)):
+    if pytest.main([*PYTEST, *tests]):
+        raise SystemExit(f"{tests} fail without any mutant")
+    cache_slow_parts()
+    forget_modules()
+    pytest.main([*PYTEST, *tests])
+    gc.freeze()
+    for words, tree in mutants(ast.parse(source), source):
         count += 1
         child = os.fork()
         if child == 0:
+            signal.alarm(LONGEST_S)  # a mutant that loops for ever is noticed
             os._exit(_killed(module, tree, tests, pytest))
         _, status = os.waitpid(child, 0)
         if os.waitstatus_to_exitcode(status) == 0:
@@ -137,29 +175,75 @@ def survivors(module: str, tests: str) -> tuple[list[str], int]:
     return found, count
 
 
-def _killed(module: str, tree: ast.Module, tests: str, pytest: types.ModuleType) -> int:
+def forget_modules() -> None:
+    """Lets the next import read `deploy` and the tests anew; the tests' helpers hold on to what they have imported."""
+    for name, one in list(sys.modules.items()):
+        file = getattr(one, "__file__", None) or ""
+        is_test = file.startswith(str(TESTS)) and name not in ("__main__", "mutants")
+        if name.startswith("deploy.") or is_test:
+            del sys.modules[name]
+
+
+def cache_slow_parts() -> None:
+    """Lets every mutant share what takes longest and depends on none of them: the DBC as read, composed options."""
+    import cantools
+    import hydra
+
+    if not hasattr(hydra.compose, "cache"):
+        hydra.compose = _cache(hydra.compose)
+        cantools.database.load_file = _cache(cantools.database.load_file)
+
+
+def _cache(function: Callable[..., Any]) -> Callable[..., Any]:
+    cache: dict[str, Any] = {}
+
+    def call(*args: Any, **kwargs: Any) -> Any:
+        key = repr((args, kwargs))
+        if key not in cache:
+            cache[key] = function(*args, **kwargs)
+        return cache[key]
+
+    call.cache = cache  # type: ignore[attr-defined]
+    return call
+
+
+def _killed(module: str, tree: ast.Module, tests: Sequence[str], pytest: types.ModuleType) -> int:
     """Runs the tests against a mutant; 0 where they all pass."""
     made = types.ModuleType(module)
-    for name in [
-        name
-        for name in sys.modules
-        if name.startswith("deploy.") or name.split(".")[-1] == Path(tests).stem
-    ]:
-        del sys.modules[name]
-    sys.modules[module] = made
+    forget_modules()
     with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
         try:
-            exec(compile(tree, module, "exec"), made.__dict__)
             parent, _, name = module.rpartition(".")
+            importlib.import_module(parent)
+            sys.modules[module] = made
+            exec(compile(tree, module, "exec"), made.__dict__)
             setattr(sys.modules[parent], name, made)
-            return int(pytest.main(["-x", "-q", "-p", "no:cacheprovider", "--no-header", tests]))
+            return int(pytest.main([*PYTEST, *tests]))
         except BaseException:
             return 1
 
 
+def main(modules: Sequence[str]) -> int:
+    """Tries the mutants of `modules`; 1 where one survives that is not explained, or an explanation is of no use any more."""
+    explained = json.loads(EXPLAINED.read_text())
+    wrong = 0
+    for module in modules:
+        left, count = survivors(module, [str(TESTS / "unit" / name) for name in CORE[module]])
+        reasons = explained.get(module, {})
+        new = [one for one in left if one not in reasons]
+        gone = [one for one in reasons if one not in left]
+        wrong += len(new) + len(gone)
+        sys.stdout.write(
+            f"{module}: {count} mutants, {len(left)} survive, {len(new)} unexplained\n"
+        )
+        for one in new:
+            sys.stdout.write(f"  unexplained: {one}\n")
+        for one in gone:
+            sys.stdout.write(f"  explained, but does not survive: {one}\n")
+        sys.stdout.flush()
+    return int(wrong > 0)
+
+
 if __name__ == "__main__":
-    left, number = survivors(sys.argv[1], sys.argv[2])
-    sys.stdout.write(
-        "\n".join([*left, f"{len(left)} of {number} mutants of {sys.argv[1]} survive"]) + "\n"
-    )
-    sys.exit(bool(left))
+    sys.path[:0] = [str(TESTS.parent), str(TESTS)]
+    sys.exit(main(sys.argv[1:] or list(CORE)))

@@ -6,9 +6,11 @@ times are exact to a millisecond.
 
 from __future__ import annotations
 
+import heapq
+import itertools
 import json
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -24,16 +26,18 @@ from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.bus.can_bus import CanBus, CanFrame
+from deploy.bus.description import BusDescription
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
 from deploy.runtime.bus_process import BusProcess, BusProcessConfig
 from deploy.runtime.operator_state import LoopSnapshot
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import FaultPort
+from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import RunningTwin, Twin
 
 DBC = "deploy:dbc/example_gateway.dbc"
-NO_WIRE = CanBus(interface="virtual", channel="air", bitrate=None, port=None)
+NO_WIRE = CanBus(interface="virtual", channel="air", bitrate=None, port=None, hops=None)
 BEGIN_S = 65.536 * 20 - 1.0
 """The gateway's clock wraps a second after the beginning."""
 WANTED = (0.3, 0.0, -0.3, 0.0, 0.2)
@@ -73,7 +77,7 @@ class Air:
         if self.broken:
             raise LinkError("bus: cannot send")
         self.sent.append(frame)
-        self._stage.twin.hear(frame, self._stage.now_s)
+        self._stage.bridge.carry(frame, to_gateway=True)
         if self.echo:
             self.inbox.append(frame)
 
@@ -89,7 +93,91 @@ class Gateway:
     def recv(self, timeout_s: float) -> None: ...
 
     def send(self, frame: CanFrame) -> None:
-        self._stage.air.inbox.append(frame)
+        self._stage.bridge.carry(frame, to_gateway=False)
+
+
+class Bridge:
+    """A bridge between gateway and PC, as a radio link, a repeater or a stranger would be.
+
+    Attributes:
+        delay_s: Of frames by message name, or by a direction ("to_pc", "to_gateway"): a time, or a
+            function of the time since the bridge was told.
+        echo_s: Delay after which a message comes once more.
+        half: Message of which every second frame has a wrong bit.
+        second_remote: Whether a second remote sends, its dead-man held.
+        foreign: Values of a foreign sender of `ValveCmd`; `None`: there is none.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._waiting: list[tuple[int, int, CanFrame, bool]] = []
+        self._order, self._counts = itertools.count(), Counter[int]()
+        self._remote = RadioRemote(BusDescription(DBC, stage.machine))
+        self._remote.deadman = True
+        self._names = {one.frame_id: one.name for one in self._remote._description.layouts.values()}
+        self._foreign_counter = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Carry everything as it is."""
+        self._waiting.clear()
+        self.delay_s: dict[str, float | Callable[[float], float]] = {}
+        self.echo_s: dict[str, float] = {}
+        self.half, self.second_remote, self.begun_ms = "", False, self._stage.ms
+        self.foreign: dict[str, float] | None = None
+        self.remote_every_ms, self.foreign_every_ms, self.remote_offset = 20, 20, 0
+
+    def carry(self, frame: CanFrame, to_gateway: bool) -> None:
+        """Carry a frame."""
+        name = self._names.get(frame.frame_id, "")
+        if not to_gateway and hasattr(self._remote, "hear"):
+            self._remote.hear(frame, self._stage.now_s)
+        self._counts[frame.frame_id] += 1
+        if name and name == self.half and self._counts[frame.frame_id] % 2:
+            frame = CanFrame(frame.frame_id, bytes([frame.data[0] ^ 1, *frame.data[1:]]))
+        way = "to_gateway" if to_gateway else "to_pc"
+        delay = self.delay_s.get(name, self.delay_s.get(way, 0.0))
+        since_s = (self._stage.ms - self.begun_ms) / 1e3
+        self._deliver(frame, to_gateway, delay(since_s) if callable(delay) else delay)
+        if name in self.echo_s:
+            self._deliver(frame, to_gateway, self.echo_s[name])
+
+    def tick(self) -> None:
+        """Deliver what is due, and let strangers send."""
+        stage = self._stage
+        while self._waiting and self._waiting[0][0] <= stage.ms:
+            _, _, frame, to_gateway = heapq.heappop(self._waiting)
+            self._arrive(frame, to_gateway)
+        if self.second_remote and stage.ms % self.remote_every_ms == 7:
+            counter = stage.twin._remote._counter + self.remote_offset
+            self._arrive(self._remote.build_frame(counter % 16), to_gateway=True)
+            self._arrive(self._remote.build_frame(counter % 16), to_gateway=False)
+        if self.foreign is not None and stage.ms % self.foreign_every_ms == 9:
+            self._foreign_counter += 1
+            description, command = self._remote._description, "ValveCmd"
+            values = self.foreign | {"Stamp": stage.now_s}
+            data = description.encode(command, values, self._foreign_counter)
+            frame = CanFrame(description.layouts[command].frame_id, data)
+            self._arrive(frame, to_gateway=True)
+            self._arrive(frame, to_gateway=False)
+
+    def _deliver(self, frame: CanFrame, to_gateway: bool, delay_s: float) -> None:
+        if delay_s <= 0:
+            self._arrive(frame, to_gateway)
+            return
+        due_ms = self._stage.ms + round(1e3 * delay_s)
+        heapq.heappush(self._waiting, (due_ms, next(self._order), frame, to_gateway))
+
+    def _arrive(self, frame: CanFrame, to_gateway: bool) -> None:
+        stage = self._stage
+        if not to_gateway:
+            stage.air.inbox.append(frame)
+        elif self._names.get(frame.frame_id) == "LeverState":
+            # The twin takes its own remote's messages for its own; the gateway hears all of them.
+            stage.twin._gateway.take(frame, stage.now_s)
+            stage.twin._apply_flow(stage.now_s)
+        else:
+            stage.twin.hear(frame, stage.now_s)
 
 
 class Stage:
@@ -108,6 +196,7 @@ class Stage:
         self.machine, self.mode, self.ms = machine, mode, 0
         self.memory = LoopMemory.new(machine.num_joints, commands=mode != "listen")
         self.air, self.request_s, self.wanted = Air(self), 0.05, WANTED
+        self.bridge, self.supervised = Bridge(self), True
         self.stopped_ms: int | None = None
         self._times = 0
         with self._time():
@@ -135,7 +224,7 @@ class Stage:
             if mode == "collect":
                 self.adviser = None
             self._write("target", t_s=self.now_s, center_in_base_m=(2.6, 0.0, 0.75))
-            self._write("controls", t_s=self.now_s, armed=mode != "listen")
+            self.arm()
 
     @property
     def now_s(self) -> float:
@@ -159,8 +248,11 @@ class Stage:
     def tick(self) -> None:
         """Lets a millisecond go by."""
         self.ms += 1
+        self.bridge.tick()
         if self.ms % 10 == 0:
             self.twin.cycle(self.now_s)
+        if self.ms % 50 == 1 and self.supervised:
+            self._write("controls", t_s=self.now_s, **self._switches)
         if self.mode != "collect" and self.ms % 50 == 3 and self.adviser is not None:
             self.adviser.run_cycle(0, self.now_s)
         if self.mode == "collect" and self.ms % round(1e3 * self.request_s) == 3:
@@ -169,6 +261,18 @@ class Stage:
             self.stopped_ms = self.ms if self.stopped_ms is None else self.stopped_ms
         else:
             self.stopped_ms = None
+
+    def arm(self, armed: bool | None = None) -> None:
+        """Arm or disarm, as the supervisor does; without a word as the mode has it."""
+        armed = self.mode != "listen" if armed is None else armed
+        self._switches: dict[str, Any] = {"armed": armed}
+        if hasattr(self.memory, "stop"):
+            self._switches["armed_t_s"] = self.now_s
+        self._write("controls", t_s=self.now_s, **self._switches)
+
+    def stop(self) -> None:
+        """Press the page's stop: straight to the bus process."""
+        self._write("stop", t_s=self.now_s)
 
     @property
     def moves(self) -> bool:
@@ -188,12 +292,14 @@ class Stage:
             self._times % 2
         )  # to and fro: no joint comes to its end, no policy to its goal
         self.air.broken, self.air.echo, self.request_s = False, False, 0.05
+        self.bridge.clear()
+        self.supervised = True
+        self.arm()
         self.wanted = tuple(side * u for u in WANTED)
         self._write("target", t_s=self.now_s, center_in_base_m=(2.5, 0.7 * side, 0.75))
-        self.go(0.4)
-        self.go(
-            1.2, lambda: bool(self.memory.state.peek("alone"))
-        )  # a second sender is remembered for a second
+        # A channel that was disturbed needs half a second, a second sender is remembered for one.
+        self.go(0.7)
+        self.go(1.2, lambda: all(map(self.memory.state.peek, ("alone", "trusted"))))
         if self.mode != "collect":
             self.go(2.0, lambda: self.advised)
             assert self.advised, self.view

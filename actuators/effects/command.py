@@ -71,7 +71,9 @@ class RateLimit(EffectSpec):
     joints: Joints
     stroke_s: Value
     side = "command"
-    numbers: ClassVar = {"stroke_s": EffectNumber("s", none=0.0, typical=0.4, bounds=(0.0, 5.0))}
+    numbers: ClassVar = {
+        "stroke_s": EffectNumber("s", none=0.0, typical=0.4, bounds=(0.0, 5.0), scale="time")
+    }
 
     def begin(self, now: StepInputs) -> Memory:
         """Commands so far have been slow enough."""

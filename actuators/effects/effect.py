@@ -54,6 +54,8 @@ class MachineTensors:
         self.period_s = machine.period_s
         self.full_step = tensor(machine.max_speed * machine.period_s)
         self.lower, self.upper = tensor(machine.lower), tensor(machine.upper)
+        self.has_masses = machine.has_bodies
+        self._slides = torch.tensor([j.kind == "slide" for j in machine.joints], device=device)
         self._machine, self._device = machine, device
         if weighed:
             self.weight(torch.zeros(1, machine.num_joints, device=device))
@@ -74,6 +76,15 @@ class MachineTensors:
     def weight(self, q: torch.Tensor) -> torch.Tensor:
         """Return gravity load over yield force at `q`, positive direction, `(N, J)`."""
         return self.gravity.load(q) / self.yield_force
+
+    def read_pose(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return cosine and sine of the angles from mid-travel, each `(N, J)`.
+
+        A sliding joint has 1, and its place in the travel from -1 to 1.
+        """
+        away, half = q - 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
+        cos = torch.where(self._slides, torch.ones_like(q), torch.cos(away))
+        return cos, torch.where(self._slides, away / half, torch.sin(away))
 
     @cached_property
     def kinematics(self) -> Kinematics:
@@ -123,7 +134,7 @@ class EffectSpec:
         stochastic: Whether it draws random numbers in every step.
         smooth: Whether its numbers can be fitted by gradient.
         delays: Whether it shifts all commands that the inner model sees, not only the newest.
-        weighed: Whether it asks for the weight on the joints.
+        weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
         alike: Whether a shared effect has about the same size on all joints.
@@ -271,7 +282,7 @@ class EffectChain:
         self._motions = {name: e for name, e in effects.items() if e.side in MOTION}
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
-        self._weighed = any(effect.weighed for effect in self._motions.values())
+        self._weighed = machine.has_bodies and any(e.weighed for e in self._motions.values())
         self._plant = MachineTensors(machine, device, self._weighed, placed=bool(self._placed))
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._memory = self._build_memory(machine, num_envs, device)

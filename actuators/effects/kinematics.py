@@ -14,7 +14,9 @@ def _describe_angle(typical_rad: float) -> EffectNumber:
 
 
 def _describe_shift(typical_m: float) -> EffectNumber:
-    return EffectNumber("m", none=0.0, typical=typical_m, bounds=(-0.5, 0.5), per_joint=False)
+    return EffectNumber(
+        "m", none=0.0, typical=typical_m, bounds=(-0.5, 0.5), per_joint=False, scale="reach"
+    )
 
 
 @spec
@@ -31,7 +33,9 @@ class LinkLength(EffectSpec):
     extra_m: Value
     side = "kinematics"
     stage = "kinematics"
-    numbers: ClassVar = {"extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3))}
+    numbers: ClassVar = {
+        "extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3), scale="reach")
+    }
 
     def tool(
         self,

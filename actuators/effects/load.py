@@ -17,29 +17,46 @@ static formula."""
 class LoadDependence(EffectSpec):
     """Speed depends on pose and weight: slower lifting, faster lowering.
 
+    Where masses are not known, the weight is a function of the joint's own position: the first
+    harmonic of its angle, or a line over the travel of a sliding joint.
+
     Attributes:
         joints: Joints it acts on, or `all`.
         sensitivity: Share of the weight, over the machine's `yield_force`, that is missing from the
             pressure over the valve.
         lowering: Share of that by which lowering is faster: 1 for a plain valve, 0 where a pump that
             senses the load is short of pressure only when it lifts.
+        pose_cos: Share that the weight takes from the pressure over the valve in the middle of the
+            travel, positive direction, where masses are not known; it follows the cosine of the
+            angle from there.
+        pose_sin: The same with the sine of the angle (over half the travel for a sliding joint).
     """
 
     joints: Joints
     sensitivity: Value
     lowering: Value = 1.0  # a plain valve, as files from before this number mean
+    pose_cos: Value = 0.0  # neutral: files from before this number lack it
+    pose_sin: Value = 0.0  # neutral: files from before this number lack it
     side = "speed"
     weighed = True
     numbers: ClassVar = {
-        "sensitivity": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 1.5)),
+        "sensitivity": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 1.5), masses=True),
         "lowering": EffectNumber("1", none=None, typical=1.0, bounds=(0.0, 1.0), trials=(0.0, 1.0)),
+        # A stretched-out boom bears half the yield force, of which a half is missing.
+        "pose_cos": EffectNumber("1", none=0.0, typical=0.25, bounds=(-0.9, 0.9), masses=False),
+        "pose_sin": EffectNumber("1", none=0.0, typical=0.25, bounds=(-0.9, 0.9), masses=False),
     }
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`moved (sqrt(1 + sensitivity load / yield_force) - 1)`: orifice; load + where lowered."""
-        load = now.moved.sign() * _weight(now)
+        if now.plant.has_masses:
+            weight, sensitivity = _weight(now), now.value["sensitivity"]
+        else:
+            cos, sin = now.plant.read_pose(now.history.q[:, -1])
+            weight, sensitivity = now.value["pose_cos"] * cos + now.value["pose_sin"] * sin, 1.0
+        load = now.moved.sign() * weight
         load = load * torch.where(load > 0.0, now.value["lowering"], 1.0)
-        head = 1.0 + now.value["sensitivity"] * load
+        head = 1.0 + sensitivity * load
         return now.moved * (head.clamp(LEAST_HEAD, MOST_HEAD).sqrt() - 1.0), {}
 
 
@@ -51,18 +68,28 @@ class Creep(EffectSpec):
         joints: Joints it acts on, or `all`.
         sink_rad_s: Speed under a weight as large as the machine's `yield_force` (m/s for a sliding
             joint); a stretched-out boom bears about half of that, a slewing joint none.
+        drift_rad_s: Speed where masses are not known, in the positive direction.
     """
 
     joints: Joints
     sink_rad_s: Value
+    drift_rad_s: Value = 0.0  # neutral: files from before this number lack it
     side = "speed"
     weighed = True
     numbers: ClassVar = {
-        "sink_rad_s": EffectNumber("rad/s", none=0.0, typical=0.004, bounds=(0.0, 0.1))
+        "sink_rad_s": EffectNumber(
+            "rad/s", none=0.0, typical=0.004, bounds=(0.0, 0.1), scale="speed", masses=True
+        ),
+        # Half of that: a boom bears about half of its yield force.
+        "drift_rad_s": EffectNumber(
+            "rad/s", none=0.0, typical=0.002, bounds=(-0.05, 0.05), scale="speed", masses=False
+        ),
     }
 
     def extra(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`sink weight / yield_force period`, in the direction of the weight, moving or not."""
+        if not now.plant.has_masses:
+            return now.value["drift_rad_s"] * now.plant.period_s + 0.0 * now.moved, {}
         return now.value["sink_rad_s"] * _weight(now) * now.plant.period_s, {}
 
 

@@ -25,7 +25,7 @@ class Quantisation(EffectSpec):
     stage = "sensing"
     smooth = False
     numbers: ClassVar = {
-        "step_rad": EffectNumber("rad", none=0.0, typical=0.003, bounds=(0.0, 0.1))
+        "step_rad": EffectNumber("rad", none=0.0, typical=0.003, bounds=(0.0, 0.1), scale="travel")
     }
 
     def measured(
@@ -51,7 +51,7 @@ class SensorNoise(EffectSpec):
     stage = "sensing"
     stochastic = True
     numbers: ClassVar = {
-        "sigma_rad": EffectNumber("rad", none=0.0, typical=0.002, bounds=(0.0, 0.1))
+        "sigma_rad": EffectNumber("rad", none=0.0, typical=0.002, bounds=(0.0, 0.1), scale="travel")
     }
 
     def measured(
@@ -76,7 +76,7 @@ class EncoderBias(EffectSpec):
     side = "measurement"
     stage = "sensing"
     numbers: ClassVar = {
-        "bias_rad": EffectNumber("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3))
+        "bias_rad": EffectNumber("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3), scale="travel")
     }
 
     def measured(

@@ -9,13 +9,17 @@ import numpy as np
 import torch
 
 from actuators.models import random_draws
-from actuators.models.parameters import expand_per_joint
+from actuators.models.parameters import OTHER, expand_per_joint
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.scales import Scale, measure_scale
 
-Value = float | tuple[float, float] | dict[str, float | tuple[float, float]]
-"""A number, a range `[low, high]` drawn per environment and joint at each reset, or either by joint
-name (`other` for the rest)."""
+TypicalRange = tuple[float, float, Literal["typical"]]
+"""A range `[low, high, typical]` over the typical size of each joint; see `EffectNumber.scale_to`."""
+Range = float | tuple[float, float] | TypicalRange
+Value = Range | dict[str, Range]
+"""A number, a range `[low, high]` drawn per environment and joint at each reset, the same over the
+typical size, or any of them by joint name (`other` for the rest)."""
 Joints = Literal["all"] | tuple[str, ...]
 """Joints that an effect acts on."""
 
@@ -33,11 +37,14 @@ class EffectNumber:
         unit: SI unit, `1` for none; `rad` and `rad/s` read m and m/s for a sliding joint.
         none: Value at which the effect changes nothing. `None` for a number that only shapes the
             effect (a time constant), which is off when the others are.
-        typical: Size on a machine that has the effect.
-        bounds: Smallest and largest value that make sense.
+        typical: Size on a machine that has the effect, on the reference of `brokk_rl.scales`.
+        bounds: Smallest and largest value that make sense there.
         per_joint: Whether each joint has its own; otherwise one number an environment, `(N, 1)`.
         trials: Values of a number that only shapes the effect which a diagnosis tries; empty for
             multiples of the typical one.
+        scale: Property of the joint with which typical size and bounds grow; empty for none.
+        masses: Machines that have the number: `True` for those with known masses, `False` for those
+            without, `None` for all. On others it stays neutral.
     """
 
     unit: str
@@ -46,6 +53,26 @@ class EffectNumber:
     bounds: tuple[float, float]
     per_joint: bool = True
     trials: tuple[float, ...] = ()
+    scale: Scale = ""
+    masses: bool | None = None
+
+    def is_on(self, machine: Machine) -> bool:
+        """Return whether the machine has this number."""
+        return self.masses is None or self.masses == machine.has_bodies
+
+    def scale_to(self, machine: Machine, value: float) -> np.ndarray:
+        """Return a value of the reference on each joint of `machine`, `(J,)` or `(1,)`.
+
+        The distance from the neutral value grows with `scale`.
+        """
+        neutral = self.none or 0.0
+        scaled = neutral + (value - neutral) * measure_scale(machine, self.scale)
+        return np.broadcast_to(scaled, (machine.num_joints if self.per_joint else 1,)).copy()
+
+    def limit_on(self, machine: Machine) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smallest and largest value on each joint of `machine`, `(J,)` or `(1,)`."""
+        low, high = (self.scale_to(machine, bound) for bound in self.bounds)
+        return low, high
 
 
 class ParameterRanges:
@@ -88,6 +115,8 @@ class ParameterRanges:
     ) -> None:
         self.value: dict[str, torch.Tensor] = {}
         drawn: dict[str, _Column] = {}
+        idle: dict[str, list[str]] = {}
+        active: set[str] = set()
         for column, (name, number) in enumerate(numbers.items()):
             effect, _, _ = name.rpartition(".")
             acted_on = joints[effect] if isinstance(joints, Mapping) else joints
@@ -96,6 +125,12 @@ class ParameterRanges:
             )
             low, high = _resolve_range(fields[name], number, chosen, machine, f"{where}.{name}")
             neutral = low if number.none is None else np.full_like(low, number.none)
+            if number.none is not None and not number.is_on(machine):
+                if (low != neutral).any() or (high != neutral).any():
+                    idle.setdefault(effect, []).append(name)
+                low, high = neutral, neutral
+            elif (low != neutral).any() or (high != neutral).any():
+                active.add(effect)
             if (low < high).any() or (shares.get(effect, 1.0) < 1 and (low != neutral).any()):
                 drawn[name] = _Column(
                     low, high, neutral, column * 256 + np.arange(len(low)), effect
@@ -106,6 +141,9 @@ class ParameterRanges:
                     .expand(num_envs, -1)
                     .clone()
                 )
+        for effect, names in idle.items():
+            if effect not in active:
+                raise ConfigError(_explain_idle(machine, names, where, numbers, effect))
         self._draw = (
             random_draws.start_counter(num_envs, salt, device) if stochastic or drawn else None
         )
@@ -194,6 +232,32 @@ def _select_joints(joints: Joints, machine: Machine, where: str) -> np.ndarray:
     return np.array([name in joints for name in machine.joint_names])
 
 
+def _explain_idle(
+    machine: Machine,
+    names: Sequence[str],
+    where: str,
+    numbers: Mapping[str, EffectNumber],
+    effect: str,
+) -> str:
+    """Return the message about numbers that the machine does not have, with those that it has."""
+    others = []
+    for name, number in numbers.items():
+        if (
+            name.rpartition(".")[0] == effect
+            and number.masses is not None
+            and number.is_on(machine)
+        ):
+            others.append(name)
+    known = "has known masses" if machine.has_bodies else "is known by its joints only"
+    mend = (
+        "" if machine.has_bodies else ", or add joints[].body (axis, origin, mass, …) to its file"
+    )
+    return (
+        f"{where}.{', '.join(names)}: machine '{machine.name}' {known}, so that they do nothing; "
+        f"give {', '.join(others)}{mend}"
+    )
+
+
 def _resolve_range(
     value: Value, number: EffectNumber, chosen: np.ndarray, machine: Machine, where: str
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -203,30 +267,42 @@ def _resolve_range(
             raise ConfigError(
                 f"{where}: expected a number or a range [low, high], got {dict(value)}: joints do not differ in it"
             )
-        ends = tuple(np.array([side]) for side in _as_range(value))
+        low, high = _resolve_ends(value, number, machine)
     else:
-        tables = value if isinstance(value, Mapping) else {"other": value}
-        bounds = []
-        for side in (0, 1):
-            bounds.append(
-                expand_per_joint(
-                    {name: _as_range(v)[side] for name, v in tables.items()}, machine, where
-                )
-            )
-        ends = tuple(bounds)
+        table = value if isinstance(value, Mapping) else {OTHER: value}
+        expand_per_joint(dict.fromkeys(table, 0.0), machine, where)  # refuses unknown names
+        low, high = np.empty(machine.num_joints), np.empty(machine.num_joints)
+        for j, name in enumerate(machine.joint_names):
+            ends = _resolve_ends(table[name if name in table else OTHER], number, machine)
+            low[j], high[j] = ends[0][j], ends[1][j]
         if number.none is not None:
-            ends = tuple(np.where(chosen, side, number.none) for side in ends)
-    low, high = ends
-    least, most = number.bounds
+            low, high = (np.where(chosen, side, number.none) for side in (low, high))
+    # Files from before sizes grew with the joints keep their meaning: the reference's bounds count too.
+    least, most = number.limit_on(machine)
+    least, most = np.minimum(least, number.bounds[0]), np.maximum(most, number.bounds[1])
     if (low > high).any():
         raise ConfigError(f"{where}: expected a range [low, high] with low <= high, got {value}")
     if (low < least).any() or (high > most).any():
         raise ConfigError(
-            f"{where}: expected {least:g} to {most:g} {number.unit.replace('1', '')}".rstrip()
+            f"{where}: expected {least.min():.3g} to {most.max():.3g} {number.unit.replace('1', '')}".rstrip()
             + f", got {value}"
         )
     return low, high
 
 
-def _as_range(value: float | tuple[float, float]) -> tuple[float, float]:
-    return value if isinstance(value, tuple) else (value, value)
+def _resolve_ends(
+    value: Range, number: EffectNumber, machine: Machine
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the ends of a number or range on all joints, each `(J,)` or `(1,)`."""
+    count = machine.num_joints if number.per_joint else 1
+    if not isinstance(value, tuple):
+        return np.full(count, value), np.full(count, value)
+    if len(value) == 2:
+        return np.full(count, value[0]), np.full(count, value[1])
+    low, high, _ = value
+    if low > high:
+        return np.full(count, low), np.full(count, high)
+    neutral = number.none or 0.0
+    size = number.scale_to(machine, number.typical) - neutral
+    ends = neutral + low * size, neutral + high * size
+    return np.minimum(*ends), np.maximum(*ends)

@@ -67,7 +67,9 @@ class Lag(EffectSpec):
     time_constant_s: Value
     side = "speed"
     numbers: ClassVar = {
-        "time_constant_s": EffectNumber("s", none=0.0, typical=0.12, bounds=(0.0, 2.0))
+        "time_constant_s": EffectNumber(
+            "s", none=0.0, typical=0.12, bounds=(0.0, 2.0), scale="time"
+        )
     }
 
     def begin(self, now: StepInputs) -> Memory:
@@ -96,7 +98,9 @@ class Backlash(EffectSpec):
     joints: Joints
     gap_rad: Value
     side = "speed"
-    numbers: ClassVar = {"gap_rad": EffectNumber("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2))}
+    numbers: ClassVar = {
+        "gap_rad": EffectNumber("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2), scale="travel")
+    }
 
     def begin(self, now: StepInputs) -> Memory:
         """A moving joint lies against the side in front; a resting one in the middle."""
@@ -125,7 +129,7 @@ class Compliance(EffectSpec):
     damping: Value
     side = "speed"
     numbers: ClassVar = {
-        "ringing_s": EffectNumber("s", none=0.0, typical=0.3, bounds=(0.0, 2.0)),
+        "ringing_s": EffectNumber("s", none=0.0, typical=0.3, bounds=(0.0, 2.0), scale="time"),
         # Trials reach from a ringing boom to a joint that only gives way: oil with air, long hoses.
         "damping": EffectNumber(
             "1", none=None, typical=0.12, bounds=(0.02, 0.95), trials=(0.05, 0.12, 0.3, 0.6, 0.9)
@@ -186,7 +190,8 @@ class ThermalDrift(EffectSpec):
     shared = True
     numbers: ClassVar = {
         "change": EffectNumber("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
-        # Trials reach from a small tank in the cold to a whole shift.
+        # Trials reach from a small tank in the cold to a whole shift: oil warms as slowly on a small
+        # machine, so the time does not grow with the joints.
         "time_s": EffectNumber(
             "s",
             none=None,

@@ -47,7 +47,7 @@ class DeadTime(_Delayed):
     joints: Joints
     dead_time_s: Value
     numbers: ClassVar = {
-        "dead_time_s": EffectNumber("s", none=0.0, typical=0.1, bounds=(-0.3, 0.5))
+        "dead_time_s": EffectNumber("s", none=0.0, typical=0.1, bounds=(-0.3, 0.5), scale="time")
     }
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
@@ -70,7 +70,9 @@ class ClockOffset(_Delayed):
     joints: Joints
     offset_s: Value
     shared = True
-    numbers: ClassVar = {"offset_s": EffectNumber("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3))}
+    numbers: ClassVar = {
+        "offset_s": EffectNumber("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3), scale="time")
+    }
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`u(t - offset)`."""
@@ -92,7 +94,9 @@ class DelayJitter(EffectSpec):
     stage = "timing"
     stochastic = True
     shared = True
-    numbers: ClassVar = {"jitter_s": EffectNumber("s", none=0.0, typical=0.03, bounds=(0.0, 0.5))}
+    numbers: ClassVar = {
+        "jitter_s": EffectNumber("s", none=0.0, typical=0.03, bounds=(0.0, 0.5), scale="time")
+    }
 
     def begin(self, now: StepInputs) -> Memory:
         """Frames have been in time."""

@@ -57,12 +57,15 @@ class CanBus:
         bitrate: Bits per second, for adapters that are set by the program; `null` where the system
             sets it (socketcan).
         port: Port of `udp_multicast`; `null` elsewhere.
+        hops: Networks that a frame of `udp_multicast` may cross; 0: it stays on this computer, so
+            that two benches on one network do not mix; `null` elsewhere.
     """
 
     interface: Literal["socketcan", "udp_multicast", "virtual"]
     channel: str
     bitrate: int | None
     port: int | None
+    hops: int | None
 
     def open(self, frame_ids: Sequence[int] | None = None) -> OpenCanBus:
         """Open the bus.
@@ -74,7 +77,7 @@ class CanBus:
         Raises:
             LinkError: there is no such bus.
         """
-        options = {"bitrate": self.bitrate, "port": self.port}
+        options = {"bitrate": self.bitrate, "port": self.port, "hop_limit": self.hops}
         # Adapters refuse options that they do not know, even when these are `None`.
         options = {key: value for key, value in options.items() if value is not None}
         # Classic frames only: the gateway does not understand CAN FD.

@@ -3,19 +3,16 @@
 Signals are found by their names, whatever message they travel in. A DBC of another gateway takes
 the place of the example as long as it names them alike: `Command_<joint>`, `CommandMode`,
 `Position_<joint>`, `Valid_<joint>`, `Flow_<joint>`, `FlowSource`, `Lever_<left|right>_<theta|psi>`,
-`ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`. Optional are `Stamp`,
-`OilTemperature` and all others, which are recorded. Protected messages have a `Counter`, a `Crc` of
-one whole byte and the attribute `E2EDataId`. Cycle times are the DBC's (`GenMsgCycleTime`): no rate
-is written down twice.
-
-`generate_c_header` writes a header for the gateway's firmware. cantools generates the C source that
-packs and unpacks (`cantools generate_c_source <dbc>`); the header adds the end-to-end protection
-and the times, so that gateway and PC go by one file.
+`ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`. Optional are `Stamp` (without it
+a message is as old as its arrival), `RoundTrip` (without it a delay that is there from the beginning
+is not seen), `OilTemperature` and all others, which are recorded. Protected messages have a
+`Counter`, a `Crc` of one whole byte and the attribute `E2EDataId`. Cycle times are the DBC's
+(`GenMsgCycleTime`): no rate is written down twice.
 """
 
 from __future__ import annotations
 
-import re
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -26,17 +23,15 @@ from cantools.database.can import Message
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
-from deploy.bus.protection import FINAL, MAX_STEP, START, TABLE, MessageFault, compute_crc8
+from deploy.bus.protection import MessageFault, ProtectedChannel, compute_crc8
 
-COUNTER, CRC = "Counter", "Crc"
-"""Signals of the end-to-end protection."""
+COUNTER, CRC, STAMP = "Counter", "Crc", "Stamp"
+"""Signals of the end-to-end protection; for the stamp see `deploy.bus.clock`."""
+ROUNDING = 1e-6
+"""Part of a step by which a stamp may miss it through rounding."""
 CRC_BITS = 8
 PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
 """Nodes of the bus."""
-PREFIX = "BROKK"
-"""Of all names in the C header."""
-ROW_BYTES = 16
-"""Of the CRC table in a row of the C header."""
 LEVER_AXES = ("left_theta", "left_psi", "right_theta", "right_psi")
 
 
@@ -54,6 +49,8 @@ class MessageLayout:
         data_id: Goes into the CRC; `None`: not protected.
         crc_byte: Where the CRC stands.
         modulus: The counter counts 0 … modulus - 1.
+        stamp_step_s: Resolution of its stamp; 0: it has none.
+        stamp_wrap_s: Time after which its stamp wraps; 0: it has none.
     """
 
     name: str
@@ -65,6 +62,12 @@ class MessageLayout:
     data_id: int | None
     crc_byte: int
     modulus: int
+    stamp_step_s: float
+    stamp_wrap_s: float
+
+    def open_channel(self) -> ProtectedChannel:
+        """Return the receiver's side of the message."""
+        return ProtectedChannel(self.modulus, self.period_s, self.stamp_wrap_s)
 
 
 class BusDescription:
@@ -117,6 +120,10 @@ class BusDescription:
         self.command = self.layouts[self.message_of(f"Command_{machine.joint_names[0]}")]
         """The message with the valve commands."""
 
+    def has_signal(self, signal: str) -> bool:
+        """Return whether any message has `signal`."""
+        return signal in self._home
+
     def message_of(self, signal: str) -> str:
         """Return the message in which `signal` travels.
 
@@ -146,9 +153,16 @@ class BusDescription:
         return [layout for layout in self.layouts.values() if layout.sender == node]
 
     def encode(self, name: str, values: Mapping[str, float], counter: int) -> bytes:
-        """Return the data of message `name`, with counter and CRC; missing signals are 0."""
+        """Return the data of message `name`, with counter and CRC; missing signals are 0.
+
+        `Stamp` is a time in s that is wrapped and rounded down here.
+        """
         layout, message = self.layouts[name], self._messages[name]
         data = {signal.name: values.get(signal.name, 0) for signal in message.signals}
+        if layout.stamp_step_s:
+            steps = math.floor(data[STAMP] / layout.stamp_step_s + ROUNDING)
+            num_steps = round(layout.stamp_wrap_s / layout.stamp_step_s)
+            data[STAMP] = steps % num_steps * layout.stamp_step_s
         if layout.data_id is None:
             return message.encode(data)
         encoded = bytearray(message.encode(data | {COUNTER: counter % layout.modulus, CRC: 0}))
@@ -203,6 +217,8 @@ def _build_layout(message: Message, dbc: str) -> MessageLayout:
             crc.start // CRC_BITS,
             1 << counter.length,
         )
+    stamp = signals.get(STAMP)
+    step_s = 0.0 if stamp is None else float(stamp.scale)
     return MessageLayout(
         name=message.name,
         frame_id=message.frame_id,
@@ -213,57 +229,6 @@ def _build_layout(message: Message, dbc: str) -> MessageLayout:
         data_id=data_id,
         crc_byte=crc_byte,
         modulus=modulus,
+        stamp_step_s=step_s,
+        stamp_wrap_s=0.0 if stamp is None else step_s * (1 << stamp.length),
     )
-
-
-def generate_c_header(description: BusDescription) -> str:
-    """Return the text of the header."""
-    lines = [
-        f"/* Made from {description.name}: do not edit. Packing and unpacking: cantools generate_c_source. */",
-        f"#ifndef {PREFIX}_BUS_H",
-        f"#define {PREFIX}_BUS_H",
-        "#include <stdint.h>",
-        "",
-        f"#define {PREFIX}_COUNTER_MAX_STEP {MAX_STEP}u",
-    ]
-    for layout in description.layouts.values():
-        name = f"{PREFIX}_{_convert_to_upper_snake(layout.name)}"
-        lines += [
-            "",
-            f"#define {name}_ID 0x{layout.frame_id:X}u",
-            f"#define {name}_EXTENDED {int(layout.extended)}",
-            f"#define {name}_LENGTH {layout.length}u",
-            f"#define {name}_PERIOD_MS {round(1e3 * layout.period_s)}u",
-        ]
-        if layout.data_id is not None:
-            lines += [
-                f"#define {name}_DATA_ID 0x{layout.data_id:X}u",
-                f"#define {name}_CRC_BYTE {layout.crc_byte}u",
-                f"#define {name}_COUNTER_MODULUS {layout.modulus}u",
-            ]
-    rows = []
-    for first in range(0, len(TABLE), ROW_BYTES):
-        row = ", ".join(f"0x{value:02X}" for value in TABLE[first : first + ROW_BYTES])
-        rows.append(f"  {row},")
-    rows[-1] = rows[-1].removesuffix(",")
-    lines += [
-        "",
-        "/* CRC-8 SAE J1850 over the data, its CRC byte taken as zero, then the data id, low byte first. */",
-        "static const uint8_t brokk_crc8_table[256] = {",
-        *rows,
-        "};",
-        "static inline uint8_t brokk_crc8(const uint8_t *data, uint8_t length, uint8_t crc_byte, uint16_t data_id) {",
-        f"  uint8_t crc = 0x{START:02X}u, i;",
-        "  for (i = 0; i < length; i++) crc = brokk_crc8_table[crc ^ (i == crc_byte ? 0u : data[i])];",
-        "  crc = brokk_crc8_table[crc ^ (data_id & 0xFFu)];",
-        f"  return (uint8_t)(brokk_crc8_table[crc ^ (data_id >> 8)] ^ 0x{FINAL:02X}u);",
-        "}",
-        "#endif",
-        "",
-    ]
-    return "\n".join(lines)
-
-
-def _convert_to_upper_snake(name: str) -> str:
-    """Return `ValveCmd` as `VALVE_CMD`."""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).upper()

@@ -13,13 +13,16 @@ Pure: no clock, no bus, no file, no tensor; the caller hands in everything.
     ACTIVE or READY --anything wrong--> LATCHED
     any --no longer armed--> SILENT
 
-Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once.
+Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once. A
+joint that has changed its direction `max_reversals_1_s` times within a second gets zero instead of a
+further change.
 Nothing is ever sent that the guard has not checked in the same cycle.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
@@ -34,6 +37,11 @@ class GuardState(Enum):
     READY = 2
     ACTIVE = 3
 
+    @property
+    def sends(self) -> bool:
+        """True if anything is sent at all in this state."""
+        return self is not GuardState.SILENT
+
 
 class GuardTrip(Enum):
     """Why the guard does not pass a requested command."""
@@ -46,7 +54,9 @@ class GuardTrip(Enum):
     LEVERS_STALE = "remote missing"
     JOINTS_STALE = "joint positions missing"
     JOINTS_INVALID = "joint positions not plausible"
-    CHANNEL_INVALID = "messages corrupted"
+    CHANNEL_INVALID = "messages corrupted or from two senders"
+    CONTROLS_STALE = "operator's switches missing"
+    ROUND_TRIP = "way to the gateway and back unknown or too long"
     SECOND_SENDER = "somebody else sends commands"
     LEVER = "operator moves a lever"
     IGNORED = "the gateway does not follow"
@@ -74,6 +84,9 @@ class GuardInput:
         bus_up: Whether the bus works.
         alone: Whether nobody else sends valve commands.
         followed: Whether the gateway says that it goes by our commands.
+        controls_age_s: Age of the switches that arm; they matter only while armed.
+        round_trip_s: Time from the gateway to here and back to it, as the gateway measured it on
+            our commands; it matters only while armed, since nothing is sent otherwise.
     """
 
     q: Numbers
@@ -88,6 +101,8 @@ class GuardInput:
     bus_up: bool
     alone: bool
     followed: bool
+    controls_age_s: float
+    round_trip_s: float
 
 
 @dataclass(frozen=True)
@@ -122,7 +137,7 @@ class GuardDecision:
     @property
     def sends(self) -> bool:
         """True if anything is sent at all."""
-        return self.state is not GuardState.SILENT
+        return self.state.sends
 
 
 class Guard:
@@ -139,6 +154,10 @@ class Guard:
         self._state, self._cause = GuardState.SILENT, GuardTrip.NONE
         # NaN stands for never: no comparison with it holds
         self._sent, self._before_s, self._followed_s = self._still, math.nan, math.nan
+        # Last direction of each joint, and when its last changes were, newest last.
+        self._directions = [0.0] * len(self._still)
+        most = limits.max_reversals_1_s
+        self._reversed_s = [deque[float]([-math.inf] * most, most) for _ in self._still]
 
     def decide(
         self, now_s: float, armed: bool, seen: GuardInput, request: CommandRequest | None
@@ -164,6 +183,8 @@ class Guard:
             )
         if self._state is GuardState.SILENT:
             self._state, self._cause = GuardState.LATCHED, GuardTrip.NOT_ARMED
+        if wrong is GuardTrip.NONE:
+            wrong = self._check_way(seen)
         if wrong is GuardTrip.NONE and self._state is GuardState.ACTIVE and seen.deadman:
             wrong = self._check_request(request)
         if wrong is not GuardTrip.NONE:
@@ -204,6 +225,14 @@ class Guard:
         )
         return next((trip for fine, trip in checks if not fine), GuardTrip.NONE)
 
+    def _check_way(self, seen: GuardInput) -> GuardTrip:
+        """Return the fault of what only matters where commands are sent."""
+        if not seen.controls_age_s <= self._limits.controls_s:
+            return GuardTrip.CONTROLS_STALE
+        if not seen.round_trip_s <= self._limits.round_trip_s:
+            return GuardTrip.ROUND_TRIP
+        return GuardTrip.NONE
+
     def _check_request(self, request: CommandRequest | None) -> GuardTrip:
         """Return the fault of a request."""
         if request is None or not request.age_s <= self._limits.request_s:
@@ -237,7 +266,19 @@ class Guard:
                 value < 0 and at <= lower + limits.stop_margin
             )
             values.append(0.0 if outward else value)
-        return tuple(values)
+        return tuple(self._limit_reversals(joint, value) for joint, value in enumerate(values))
+
+    def _limit_reversals(self, joint: int, value: float) -> float:
+        """Return the command of a joint, or zero where it would change its direction too often."""
+        if value == 0.0:
+            return value
+        before, reversed_s = self._directions[joint], self._reversed_s[joint]
+        if value * before < 0:
+            if self._before_s - reversed_s[0] < 1.0:
+                return 0.0
+            reversed_s.append(self._before_s)
+        self._directions[joint] = math.copysign(1.0, value)
+        return value
 
     def _conclude(self, u: Numbers, trip: GuardTrip) -> GuardDecision:
         self._sent = u

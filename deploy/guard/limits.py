@@ -19,6 +19,7 @@ class GuardLimits:
     Attributes:
         max_command: Largest command, of full.
         max_rate_1_s: Largest growth of a command per second.
+        max_reversals_1_s: Changes of a joint's direction within a second; more are withheld.
         overrun: Command beyond full that counts as rounding; a larger one is refused.
         neutral: Deflection of the operator's own levers, of full, below which they count as
             released.
@@ -30,6 +31,8 @@ class GuardLimits:
         request_s: Age of a command from which it is stale.
         ignored_s: Time for which the gateway may give the valves to another sender, or none, while
             commands are sent.
+        controls_s: Age of the operator's switches from which they are stale.
+        round_trip_s: Time from the gateway to this computer and back from which it is too long.
         gap_s: Time between two cycles above which the process was stopped, or the computer asleep.
         jump_margin: Speed over the machine's fastest, beyond which a joint has jumped.
         jump_slack: Jump (rad or m) that noise alone may make.
@@ -40,6 +43,7 @@ class GuardLimits:
 
     max_command: float
     max_rate_1_s: float
+    max_reversals_1_s: int
     overrun: float
     neutral: float
     stop_margin: float
@@ -48,6 +52,8 @@ class GuardLimits:
     status_s: float
     request_s: float
     ignored_s: float
+    controls_s: float
+    round_trip_s: float
     gap_s: float
     jump_margin: float
     jump_slack: float
@@ -65,6 +71,8 @@ class GuardLimits:
             "status_s",
             "request_s",
             "ignored_s",
+            "controls_s",
+            "round_trip_s",
             "gap_s",
             "jump_slack",
             "range_slack",
@@ -78,9 +86,11 @@ class GuardLimits:
             or not 0 < self.neutral < 1
             or self.jump_margin < 1
             or self.num_jumps < 1
+            or self.max_reversals_1_s < 1
         ):
             raise ConfigError(
-                "guard: expected overrun and stop_margin of 0 or more, neutral in (0, 1), jump_margin and num_jumps of 1 or more"
+                "guard: expected overrun and stop_margin of 0 or more, neutral in (0, 1), "
+                "jump_margin, num_jumps and max_reversals_1_s of 1 or more"
             )
 
 

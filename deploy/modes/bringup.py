@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from rich.console import Console
 
+from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from deploy.bringup import BringupChecklist
+from deploy.bringup import REPORT, BringupChecklist
 
 
 @spec
@@ -19,10 +20,10 @@ class BringupMode:
     bringup: BringupChecklist
 
     def run(self) -> float:
-        """Write `bringup.json` and the capture; return the number of checks that failed.
+        """Write `bringup.json` and the capture; return 0.
 
         Raises:
-            LinkError: nothing is heard from the machine.
+            LinkError: nothing is heard from the machine, or a check has failed.
         """
         console = Console()
 
@@ -30,4 +31,10 @@ class BringupMode:
             console.print(text, highlight=False)
 
         results = self.bringup.run(self.machine, self.session, say)
-        return float(sum(not one.passed for one in results))
+        failed = [one.check for one in results if not one.passed]
+        if failed:
+            raise LinkError(
+                f"bring-up: {len(failed)} of {len(results)} checks failed: {', '.join(failed)}; "
+                f"their reasons stand above and in {self.session.folder / REPORT}"
+            )
+        return 0.0

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+
+from rich.console import Console
+
 from brokk_rl.contracts.link import Connection
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
@@ -24,4 +28,14 @@ class TwinMode:
         Raises:
             LinkError: the bus cannot be opened.
         """
-        self.twin.run(lambda: False, self.machine, self.link, self.session)
+        twin, console = self.twin, Console(stderr=True)
+        port = "none" if twin.fault_port is None else f"UDP port {twin.fault_port}"
+        console.print(
+            f"twin of {self.machine.name} on {twin.wire.interface} {twin.wire.channel}; "
+            f"remote: {'its own' if twin.remote else 'on the bus'}; faults: {port}; "
+            "beside it: brokk mode=deploy bus=udp; Ctrl-C ends it",
+            soft_wrap=True,
+            highlight=False,
+        )
+        with contextlib.suppress(KeyboardInterrupt):
+            twin.run(lambda: False, self.machine, self.link, self.session)

@@ -15,9 +15,10 @@ from typing import Literal
 
 from deploy.page.protocol import REQUEST_KINDS, OperatorRequest, PageState
 
-RefusalReason = Literal["token", "malformed", "deadman", "target", "nowhere", "busy"]
+RefusalReason = Literal["token", "malformed", "deadman", "target", "nowhere", "busy", "unconfirmed"]
 """Why a request was refused: wrong token; no such request; the dead-man is not held; no such
-target; nothing is measured where the person points; the loop does not take it."""
+target; nothing is measured where the person points; the loop does not take it; the guard does not
+confirm the stop."""
 LOCAL = ("localhost", "127.0.0.1", "[::1]")
 ANY_ADDRESS = ("0.0.0.0", "::")
 POINT = re.compile(r"0?\.\d{1,6},0?\.\d{1,6}")

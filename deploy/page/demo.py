@@ -143,7 +143,7 @@ class DemoFeed:
             state=state,
             commands=False,
             streams=self._measure_ages(t_s, number),
-            recording=RecordingStatus(self._recording, recorded_s, 0),
+            recording=RecordingStatus(self._recording, recorded_s, 0, failed=False),
             targets=targets,
             path_in_base_m=self._plan_path(state.q, targets),
             block_in_base_m=BLOCK_M,
@@ -166,6 +166,10 @@ class DemoFeed:
             self._recording, self._recorded_s = request.value == "on", self._clock()
         else:
             self._guiding = request.kind == "start"
+        return True
+
+    def confirms_stop(self) -> bool:
+        """See `PageFeed`; nothing ever moves here."""
         return True
 
     def report_drawn(self, report: DrawReport) -> None:

@@ -2,13 +2,14 @@
 
 The slots that it reads are overwritten by their writers, who wait for nobody; it writes into two
 pipes that count their losses. However slow a browser is, or if this process dies, the loop feels
-nothing of it.
+nothing of it. `stop` has a slot of its own, which the bus process reads in each cycle.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -35,7 +36,7 @@ from deploy.page.scene import locate_borehole, plan_approach
 from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
 from deploy.runtime.bus_process import TEXT
-from deploy.runtime.operator_state import LoopSnapshot, PolicyAdvice
+from deploy.runtime.operator_state import LoopSnapshot, PolicyAdvice, StopRequest
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -110,7 +111,7 @@ class LoopFeed:
     ) -> None:
         # Guidance is on at the start: a page that opens late must not find it switched off.
         self._config, self._memory, self._clock = config, memory, clock
-        self._guiding = True
+        self._guiding, self._stopped_s = True, -math.inf
         machine = config.machine
         self._full_rad = find_full_angles_rad(config.guidance.levers or machine.levers)
         self._exclusive = machine.is_exclusive
@@ -170,7 +171,13 @@ class LoopFeed:
                 "std_m": place.std_m,
                 "t_s": place.t_s,
             }
-        values = {"kind": request.kind, "value": request.value}
+        values: dict[str, Any] = {"kind": request.kind, "value": request.value}
+        if request.kind == "stop":
+            # Straight to the bus process: the supervisor may hang.
+            self._stopped_s = self._clock()
+            self._memory.stop.write(StopRequest(self._stopped_s))
+        if request.kind in ("start", "stop"):
+            facts = {"asked_s": self._clock()}
         # The request goes through a pipe: this process may not touch the loop's slots.
         taken = self._memory.requests.put(json.dumps(values | facts).encode())
         self._log_text("wish", values | {"taken": taken} | facts)
@@ -179,6 +186,13 @@ class LoopFeed:
             self._guiding = request.kind == "start"
             return taken or request.kind == "stop"
         return taken
+
+    def confirms_stop(self) -> bool:
+        """See `PageFeed`."""
+        state = self._memory.state.read()
+        if self._memory.request is None:
+            return True
+        return state is not None and state.t_s > self._stopped_s and not state.guard.sends
 
     def report_drawn(self, report: DrawReport) -> None:
         """See `PageFeed`; goes into the recording as topic `drawn`."""
@@ -230,7 +244,8 @@ class LoopFeed:
         seconds = snapshot.t_s - controls.recording_t_s if controls is not None and on else 0.0
         # Before the first state nothing can have been lost.
         dropped = snapshot.log_dropped if snapshot.state is not None else 0
-        return RecordingStatus(on, seconds, dropped)
+        failed = controls is not None and controls.recording_failed
+        return RecordingStatus(on, seconds, dropped, failed)
 
     def _read_frame_t_s(self) -> float | None:
         return self._memory.frame and self._memory.frame.peek("t_s")

@@ -69,11 +69,13 @@ class RecordingStatus:
         on: Whether it is running.
         seconds: Its length so far.
         dropped: Records that found no room: the recording has gaps.
+        failed: Whether the last recording has ended unasked: an alarm.
     """
 
     on: bool
     seconds: float
     dropped: int
+    failed: bool
 
 
 @dataclass(frozen=True)
@@ -240,6 +242,10 @@ class PageFeed(Protocol):
 
     def submit(self, request: OperatorRequest) -> bool:
         """Pass a request on; return whether it was accepted."""
+        ...
+
+    def confirms_stop(self) -> bool:
+        """Return whether the guard sends nothing any more, after the last `stop` was submitted."""
         ...
 
     def report_drawn(self, report: DrawReport) -> None:

@@ -3,9 +3,11 @@
 `/state` sends the newest `PageState` as JSON, `/frames` the newest frame, `/control` takes
 requests. A page answers every message when it has drawn it, and gets no more while a few are not
 drawn. A page that is slow, asleep or not reading gets fewer messages and always the newest, and
-costs neither
-memory nor the loop anything. The files are read once at the start: nothing on the disk can be
-reached through the server.
+costs neither memory nor the loop anything. The files are read once at the start: nothing on the disk
+can be reached through the server.
+
+Watchers, connections without their token yet, and those of the operator are counted apart. Mute
+watchers give way to new ones, and the operator's requests always find a place.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import secrets
 import time
 from collections.abc import Callable, Coroutine, Mapping
 from http import HTTPStatus
-from typing import Generic, Protocol, TypeVar
+from typing import Protocol
 
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.datastructures import Headers
@@ -31,6 +33,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
+from deploy.page.connections import ConnectionBudget, LatestValue, SendWindow
 from deploy.page.files import FILES, SECURITY, load_files
 from deploy.page.protocol import DrawReport, PageFeed, PageState
 from deploy.page.settings import LINK, PageSettings
@@ -62,9 +65,11 @@ TOKEN_BYTES = 24
 """Of a new token: 192 bits."""
 BUFFER_BYTES = 1 << 16
 """Of a connection: about a third of a frame."""
-CONNECTIONS = 3
-"""WebSockets that one page opens."""
+CONFIRM_S, CONFIRM_POLL_S = 0.3, 0.005
+"""Time for the guard to confirm a stop, and between looks. Its cycle is 10 ms; the person is told
+within 0.3 s that the stop is not confirmed."""
 STATE, FRAMES, CONTROL = "/state", "/frames", "/control"
+Handler = Callable[[ServerConnection], Coroutine[None, None, None]]
 POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013
 """Close codes of a WebSocket (RFC 6455 and the registry of its codes at IANA)."""
 
@@ -143,61 +148,6 @@ def write_link(session: Session, address: str) -> None:
         file.write(address + "\n")
 
 
-T = TypeVar("T")
-
-
-class LatestValue(Generic[T]):
-    """A value that is replaced and never queued.
-
-    It has many readers, none of whom can hold up the writer or another reader.
-
-    Args:
-        value: The first.
-    """
-
-    def __init__(self, value: T) -> None:
-        self.value, self.number = value, 0
-        self._changed = asyncio.Condition()
-
-    async def put(self, value: T) -> None:
-        """Replace the value."""
-        self.value, self.number = value, self.number + 1
-        async with self._changed:
-            self._changed.notify_all()
-
-    async def wait_after(self, number: int) -> tuple[int, T]:
-        """Wait for a value that is newer than the `number`-th; return its number and the value."""
-        async with self._changed:
-            await self._changed.wait_for(lambda: self.number > number)
-        return self.number, self.value
-
-
-class SendWindow:
-    """Keeps a page from having more than `limit` messages that it has not drawn."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit, self._undrawn, self._free = limit, list[int](), asyncio.Event()
-        self._free.set()
-
-    def note_sent(self, number: int) -> None:
-        """Note that message `number` went out."""
-        self._undrawn.append(number)
-        if len(self._undrawn) >= self._limit:
-            self._free.clear()
-
-    def note_drawn(self, number: int) -> None:
-        """Note that message `number` was drawn; those before it are of no use any more."""
-        # A page draws the newest message and skips older ones, so a later number answers for all
-        # before it.
-        self._undrawn = [one for one in self._undrawn if one > number]
-        if len(self._undrawn) < self._limit:
-            self._free.set()
-
-    async def wait(self) -> None:
-        """Wait until another message may go out."""
-        await self._free.wait()
-
-
 class PageServer:
     """See the module.
 
@@ -232,8 +182,9 @@ class PageServer:
         self._hosts: frozenset[str] = frozenset()
         self._state: LatestValue[tuple[PageState | None, str]] = LatestValue((None, ""))
         self._frame = LatestValue(b"")
-        self._num_open, self._num_pages = 0, 0
-        self._guess = asyncio.Lock()
+        self._num_pages = 0
+        self._budget = ConnectionBudget[ServerConnection](page.clients)
+        self._guess, self._closing = asyncio.Lock(), set[asyncio.Task[None]]()
 
     async def run(self, stop: Callable[[], bool], begin: Callable[[int], None]) -> None:
         """Serve until `stop` says so; call `begin` with the port once browsers can connect.
@@ -322,7 +273,7 @@ class PageServer:
         while True:
             # Pictures are large; they are encoded only while somebody looks.
             await asyncio.sleep(FRAME_POLL_S)
-            if not self._num_open or time.monotonic() < due_s:
+            if not self._budget.num_watchers or time.monotonic() < due_s:
                 continue
             frame = self._feed.read_frame(taken_s)
             if frame is None:
@@ -359,17 +310,40 @@ class PageServer:
 
     async def _handle_connection(self, connection: ServerConnection) -> None:
         assert connection.request is not None
-        handle = self._handlers[connection.request.path.partition("?")[0]]
+        path = connection.request.path.partition("?")[0]
+        with contextlib.suppress(ConnectionClosed):
+            if path in (STATE, FRAMES):
+                await self._serve_watcher(connection, self._handlers[path])
+            elif await self._check_token(connection):
+                await self._serve_operator(connection, self._handlers[path])
+
+    async def _serve_watcher(self, connection: ServerConnection, handle: Handler) -> None:
         # Compared after the handshake: before it, handshakes at the same time would all be let in.
-        if self._num_open >= CONNECTIONS * self._page.clients:
+        admitted, evicted = self._budget.admit_watcher(connection, time.monotonic())
+        self._close_later(evicted)
+        if not admitted:
             await connection.close(TRY_AGAIN_LATER, "too many pages; see page.clients")
             return
-        self._num_open += 1
         try:
-            with contextlib.suppress(ConnectionClosed):
-                await handle(connection)
+            await handle(connection)
         finally:
-            self._num_open -= 1
+            self._budget.release(connection)
+
+    async def _serve_operator(self, connection: ServerConnection, handle: Handler) -> None:
+        self._close_later(self._budget.admit_operator(connection))
+        try:
+            await connection.send(json.dumps({"ready": True}))
+            await handle(connection)
+        finally:
+            self._budget.release(connection)
+
+    def _close_later(self, connection: ServerConnection | None) -> None:
+        """Close a connection without waiting for its answer: a mute one gives none."""
+        if connection is None:
+            return
+        task = asyncio.create_task(connection.close(TRY_AGAIN_LATER, "others need the place"))
+        self._closing.add(task)
+        task.add_done_callback(self._closing.discard)
 
     async def _send_states(self, connection: ServerConnection) -> None:
         self._num_pages += 1
@@ -378,6 +352,7 @@ class PageServer:
 
         async def listen() -> None:
             async for text in connection:
+                self._budget.note_heard(connection, time.monotonic())
                 answer = clock.read_acknowledgement(text, time.monotonic())
                 if answer is None:
                     await connection.close(POLICY_VIOLATION, "malformed")
@@ -404,6 +379,7 @@ class PageServer:
 
         async def listen() -> None:
             async for text in connection:
+                self._budget.note_heard(connection, time.monotonic())
                 if not str(text).isdecimal():
                     await connection.close(POLICY_VIOLATION, "malformed")
                     return
@@ -421,31 +397,32 @@ class PageServer:
         await _run_both(listen(), speak())
 
     async def _serve_extension(self, connection: ServerConnection) -> None:
-        if self._extension and await self._check_token(connection):
-            await self._extension.talk(connection)
+        assert self._extension is not None
+        await self._extension.talk(connection)
 
     async def _take_requests(self, connection: ServerConnection) -> None:
-        if await self._check_token(connection):
-            async for text in connection:
-                await connection.send(json.dumps(self._submit(text)))
+        async for text in connection:
+            await connection.send(json.dumps(await self._submit(text)))
 
     async def _check_token(self, connection: ServerConnection) -> bool:
-        """Ask for the token, and confirm it; close the connection where it is wrong."""
+        """Ask for the token; close the connection where it is wrong or does not come."""
+        self._close_later(self._budget.admit_unproven(connection))
         try:
             given = json.loads(await asyncio.wait_for(connection.recv(), TOKEN_PATIENCE_S))
         except (ValueError, TimeoutError):
             given = None
+        finally:
+            self._budget.release(connection)
         token = given.get("token") if isinstance(given, dict) else None
-        if not access.compare_tokens(token, self._token):
-            async with self._guess:  # one guess at a time, whoever guesses
-                await asyncio.sleep(WRONG_TOKEN_S)
-            log.warning("refused a page with a wrong token")
-            await connection.close(POLICY_VIOLATION, "token")
-            return False
-        await connection.send(json.dumps({"ready": True}))
-        return True
+        if access.compare_tokens(token, self._token):
+            return True
+        async with self._guess:  # one guess at a time, whoever guesses
+            await asyncio.sleep(WRONG_TOKEN_S)
+        log.warning("refused a page with a wrong token")
+        await connection.close(POLICY_VIOLATION, "token")
+        return False
 
-    def _submit(self, text: str | bytes) -> dict[str, str]:
+    async def _submit(self, text: str | bytes) -> dict[str, str]:
         """Check a request against the state now, not the one on the page; return the answer."""
         request = access.parse_request(text)
         if request is None:
@@ -453,10 +430,21 @@ class PageServer:
         reason = access.find_refusal(request, self._feed.read_state())
         if reason is None and not self._feed.submit(request):
             reason = "nowhere" if request.kind == "point" else "busy"
+        if request.kind == "stop" and not await self._wait_for_stop():
+            reason = "unconfirmed"
         log.info("%s %s: %s", request.kind, request.value, reason or "done")
         if reason:
             return {"refused": reason, "kind": request.kind}
         return {"done": request.kind, "kind": request.kind}
+
+    async def _wait_for_stop(self) -> bool:
+        """Return whether the guard confirms the stop in time."""
+        until_s = time.monotonic() + CONFIRM_S
+        while not self._feed.confirms_stop():
+            if time.monotonic() > until_s:
+                return False
+            await asyncio.sleep(CONFIRM_POLL_S)
+        return True
 
 
 def _list_facts(state: PageState) -> tuple[object, ...]:
@@ -469,6 +457,7 @@ def _list_facts(state: PageState) -> tuple[object, ...]:
         state.alive,
         state.guiding,
         state.recording.on,
+        state.recording.failed,
         state.targets,
     )
 

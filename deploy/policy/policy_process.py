@@ -7,6 +7,7 @@ the request slot, which the guard reads; otherwise there is no such slot.
 from __future__ import annotations
 
 import json
+import math
 import time
 from dataclasses import dataclass
 
@@ -208,6 +209,15 @@ class PolicyAdviser:
             return None
         return u
 
+    def _build_request(self, status: AdviceStatus, u: np.ndarray, now_s: float) -> RequestedCommand:
+        """Return the command to ask for; without advice the last one must not go on."""
+        if status is AdviceStatus.VALID:
+            return RequestedCommand(now_s, u)
+        if status is AdviceStatus.REJECTED:
+            return RequestedCommand(now_s, np.full(len(u), np.nan))
+        # Too old for the guard from the beginning: withdrawn.
+        return RequestedCommand(-math.inf, u)
+
     def _publish(
         self,
         status: AdviceStatus,
@@ -231,8 +241,8 @@ class PolicyAdviser:
         )
         self._memory.advice.write(advice)
         # The request slot exists only where commands may be sent.
-        if self._memory.request is not None and status is AdviceStatus.VALID:
-            self._memory.request.write(RequestedCommand(now_s, u))
+        if self._memory.request is not None:
+            self._memory.request.write(self._build_request(status, u, now_s))
         text = {
             "topic": "advice",
             "t_s": now_s,

@@ -37,6 +37,7 @@ class RecordingControl:
         wanted: Whether a recording is to be running.
         next_folder: Folder of the next recording, where it was given one.
         since_s: When the recording began, monotonic.
+        failed: Whether the last recording has ended unasked.
     """
 
     def __init__(
@@ -48,7 +49,7 @@ class RecordingControl:
         # Set by the supervisor and by requests; `refresh` acts on it.
         self.wanted = False
         self.next_folder: Path | None = None
-        self.since_s = 0.0
+        self.since_s, self.failed = 0.0, False
 
     @property
     def recording(self) -> bool:
@@ -74,12 +75,12 @@ class RecordingControl:
                     child.code,
                 )
                 # Otherwise it would be started again and hide the fault.
-                self.wanted = False
+                self.wanted, self.failed = False, True
             self._child = child = None
         if child is None and self.wanted:
             folder = self._choose_folder()
             self._child, self._asked_to_stop = self._start(folder), False
-            self.since_s = time.monotonic()
+            self.since_s, self.failed = time.monotonic(), False
         elif child is not None and not self.wanted and not self._asked_to_stop:
             child.ask_to_stop()
             self._asked_to_stop = True
@@ -123,7 +124,7 @@ class RequestHandler:
         commands: bool,
     ) -> None:
         self._memory, self._recorder, self._selector = memory, recorder, selector
-        self._armed, self._commands = armed, commands
+        self._armed, self._armed_s, self._commands = armed, time.monotonic(), commands
 
     def refresh(self) -> None:
         """Carry out new requests, and publish the controls."""
@@ -136,7 +137,12 @@ class RequestHandler:
         self._recorder.refresh()
         recorder = self._recorder
         controls = OperatorControls(
-            time.monotonic(), self._armed, recorder.recording, recorder.since_s
+            t_s=time.monotonic(),
+            armed=self._armed,
+            armed_t_s=self._armed_s,
+            recording=recorder.recording,
+            recording_t_s=recorder.since_s,
+            recording_failed=recorder.failed,
         )
         self._memory.controls.write(controls)
 
@@ -152,4 +158,6 @@ class RequestHandler:
         else:
             # `commands` is a promise of the run's configuration that no request can break.
             self._armed = self._commands and request["kind"] == "start"
+            # When the person asked for it, not when it is carried out: a stop may lie between.
+            self._armed_s = float(request["asked_s"])
         log.info("requested: %s %s", request["kind"], request["value"])

@@ -56,7 +56,9 @@ class OperatorState:
         exclusive_selected: Whether the exclusive joint is selected at the machine.
         status_t_s: When the machine's last status came.
         oil_c: Temperature of the oil, degrees Celsius; NaN where not measured.
-        held_up_s: Delay of the last positions beyond the shortest seen, by the gateway's clock.
+        held_up_s: Largest delay of a message beyond the shortest seen, by the gateway's clock.
+        round_trip_s: From the gateway to here and back, as it measured on our commands; infinite
+            where it has not.
         bus_up: Whether the bus works.
         trusted: Whether messages arrive uncorrupted.
         alone: Whether nobody else sends valve commands.
@@ -88,6 +90,7 @@ class OperatorState:
     status_t_s: float
     oil_c: float
     held_up_s: float
+    round_trip_s: float
     bus_up: bool
     trusted: bool
     alone: bool
@@ -154,16 +157,31 @@ class OperatorControls:
     """Switches on the operator's side.
 
     Attributes:
-        t_s: When they were written.
+        t_s: When they were written; the guard latches when that is long ago.
         armed: Whether commands are to be sent at all.
+        armed_t_s: When a person asked for that. A later stop is stronger.
         recording: Whether a recording is running.
         recording_t_s: When it began.
+        recording_failed: Whether a recording has ended unasked.
     """
 
     t_s: float
     armed: bool
+    armed_t_s: float
     recording: bool
     recording_t_s: float
+    recording_failed: bool
+
+
+@dataclass(frozen=True)
+class StopRequest:
+    """The operator's stop. It reaches the bus process by itself, whatever the supervisor does.
+
+    Attributes:
+        t_s: When it was pressed.
+    """
+
+    t_s: float
 
 
 @dataclass(frozen=True)

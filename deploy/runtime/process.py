@@ -23,6 +23,8 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, Literal
 
+from deploy.runtime.detached_log import DetachedHandler
+
 log = logging.getLogger(__name__)
 
 ENTRY = "from deploy.runtime.process import enter_child; enter_child()"
@@ -108,7 +110,9 @@ def enter_child() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     asked: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, _: asked.append(number))
-    logging.basicConfig(level=logging.INFO, format=f"{name}: %(message)s")
+    writer = logging.StreamHandler()
+    writer.setFormatter(logging.Formatter(f"{name}: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[DetachedHandler([writer])])
     if realtime is not None:
         # before the imports: on a busy computer they would take ten times as long
         ask_for_priority(realtime)
@@ -133,10 +137,16 @@ def keep_in_memory() -> None:
         log.debug("memory is not locked: %s", os.strerror(ctypes.get_errno()))
 
 
-def ask_for_priority(priority: int) -> Literal["fifo", "ordinary"]:
-    """Ask for SCHED_FIFO; return the scheduling that was granted."""
+def ask_for_priority(priority: int, inherited: bool = True) -> Literal["fifo", "ordinary"]:
+    """Ask for SCHED_FIFO; return the scheduling that was granted.
+
+    Args:
+        priority: 1 to 99.
+        inherited: Whether processes that are started later get it too.
+    """
+    policy = os.SCHED_FIFO if inherited else os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+        os.sched_setscheduler(0, policy, os.sched_param(priority))
     except OSError as error:
         log.warning(
             "no real-time priority (%s): the loop may run late. Allow it, for example by RTPRIO and MEMLOCK limits for this user, "

@@ -27,7 +27,11 @@ PATIENCE_S = 3.0
 BUS_PRIORITY, POLICY_PRIORITY = 55, 50
 """Of SCHED_FIFO, 1 to 99. Chosen by hand: the bus before the policy, and both before twin (45) and
 commander (40)."""
-OPTIONAL = {"page": "nothing is shown any more", "camera": "nothing new is seen any more"}
+OPTIONAL = {
+    "page": "nothing is shown any more",
+    "terminal": "nothing is shown here any more",
+    "camera": "nothing new is seen any more",
+}
 """Processes without which the loop goes on, and the loss that the alarm names."""
 END_ORDER = {"policy": 0, "bus": 1, "log": 3}
 """Order in which processes are asked to end; 2 for others. The bus ends after the policy, so that

@@ -1,4 +1,8 @@
-"""The receiving side of the bus process: frames in, `OperatorState` and `GuardInput` out."""
+"""The receiving side of the bus process: frames in, `OperatorState` and `GuardInput` out.
+
+Pure: the caller brings frames and time. Every age counts from the stamp of a message, not from its
+arrival.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +14,13 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
+from deploy.bus.clock import GatewayClock
 from deploy.bus.description import (
     COUNTER,
     GATEWAY,
     LEVER_AXES,
     REMOTE,
+    STAMP,
     BusDescription,
     MessageLayout,
 )
@@ -32,11 +38,6 @@ STRANGER_S = 1.0
 periods of any cyclic sender."""
 FROM_PC = 2
 """Value of `FlowSource`."""
-STAMP_MODULUS_S = 65.536
-"""Time after which the gateway's clock wraps in the example DBC: 16 bits of milliseconds."""
-FORGET_S = 60.0
-"""Time after which the best transit time is taken anew. Chosen by hand: clocks that differ by 100
-ppm drift 6 ms in it, well below the limits on ages."""
 
 
 @dataclass
@@ -59,8 +60,13 @@ class BusReceiver:
         self.channels: dict[str, ProtectedChannel] = {}
         for layout in heard:
             if layout.data_id is not None:
-                self.channels[layout.name] = ProtectedChannel(layout.modulus)
+                self.channels[layout.name] = layout.open_channel()
         self._layouts = {layout.frame_id: layout for layout in heard}
+        # The clock is learned from the stamps that wrap last: they are the finest and the surest.
+        own = [layout.stamp_wrap_s for layout in heard if layout.sender == GATEWAY]
+        self._clock, self._longest_wrap_s = GatewayClock(), max(own, default=0.0)
+        # A gateway that does not measure it reports none.
+        self.round_trip_s = math.inf if described.has_signal("RoundTrip") else 0.0
         first_flow = f"Flow_{machine.joint_names[0]}"
         signals = ["DeadMan", "EStop", "ExclusiveSelected", first_flow]
         signals += [f"Position_{joint}" for joint in machine.joint_names]
@@ -85,7 +91,8 @@ class BusReceiver:
         self.estop = self.exclusive_selected = False
         self.oil_c, self.status_t_s = math.nan, -math.inf
         self.frames = self.refused = 0
-        self.held_up_s, self._transit = 0.0, _TransitTime()
+        # Delay of the newest message of each name.
+        self._delay_s: dict[str, float] = {}
         self._own: deque[bytes] = deque(maxlen=NUM_OWN_COMMANDS)
         self._stranger_s = -math.inf
 
@@ -113,19 +120,38 @@ class BusReceiver:
             # A refused frame still moves the channel towards "invalid".
             fault = channel.refuse(values) if channel else values
         else:
-            fault = channel.take(int(values[COUNTER])) if channel else None
+            stamp_s = values.get(STAMP, 0.0)
+            fault = channel.take(int(values[COUNTER]), stamp_s, now_s) if channel else None
         if fault is not None or isinstance(values, MessageFault):
             self.refused += 1
             return fault
-        self._use(layout, values, now_s)
+        sent_s = self._find_sent_s(layout, values, now_s)
+        self._delay_s[layout.name] = now_s - sent_s
+        self._use(values, sent_s)
         return None
 
-    def build_guard_input(self, now_s: float, bus_up: bool) -> GuardInput:
-        """Return the values that the guard decides by."""
+    @property
+    def stamp_s(self) -> float:
+        """Newest stamp of the gateway, to be put into commands."""
+        return self._clock.newest_s
+
+    @property
+    def held_up_s(self) -> float:
+        """Largest delay of a message beyond the shortest; 0 where none has come."""
+        return max(self._delay_s.values(), default=0.0)
+
+    def build_guard_input(self, now_s: float, bus_up: bool, controls_age_s: float) -> GuardInput:
+        """Return the values that the guard decides by.
+
+        Args:
+            now_s: Time of the cycle.
+            bus_up: Whether the bus works.
+            controls_age_s: Age of the operator's switches.
+        """
         return GuardInput(
             q=tuple(self.q.tolist()),
             # The oldest position counts: the guard needs all joints.
-            joints_age_s=now_s - float(self.q_t_s.min()) + self.held_up_s,
+            joints_age_s=now_s - float(self.q_t_s.min()),
             joints_plausible=self.plausible,
             trusted=self.trusted,
             # A remote that is off is as good as one that never came.
@@ -137,6 +163,8 @@ class BusReceiver:
             bus_up=bus_up,
             followed=self.followed,
             alone=self._is_alone(now_s),
+            controls_age_s=controls_age_s,
+            round_trip_s=self.round_trip_s,
         )
 
     def build_state(
@@ -154,7 +182,7 @@ class BusReceiver:
             t_s=now_s,
             q=self.q.copy(),
             # Infinite ages become 0, since a record has no infinity.
-            q_t_s=max(0.0, float(self.q_t_s.min()) - self.held_up_s),
+            q_t_s=max(0.0, float(self.q_t_s.min())),
             q_plausible=self.plausible,
             flow=self.flow,
             flow_sum=self.flow_sum,
@@ -170,6 +198,7 @@ class BusReceiver:
             status_t_s=max(0.0, self.status_t_s),
             oil_c=self.oil_c,
             held_up_s=self.held_up_s,
+            round_trip_s=self.round_trip_s,
             bus_up=bus_up,
             trusted=self.trusted,
             alone=self._is_alone(now_s),
@@ -196,54 +225,39 @@ class BusReceiver:
     def _is_alone(self, now_s: float) -> bool:
         return now_s - self._stranger_s > STRANGER_S
 
-    def _use(self, layout: MessageLayout, values: dict[str, float], now_s: float) -> None:
-        machine, stamp = self.machine, values.get("Stamp")
-        if stamp is not None:
-            self.held_up_s = self._transit.measure_delay_s(stamp, now_s)
+    def _find_sent_s(self, layout: MessageLayout, values: dict[str, float], now_s: float) -> float:
+        """Return when a message was sent; `-inf` where its stamp makes no sense."""
+        stamp_s, wrap_s = values.get(STAMP, 0.0), layout.stamp_wrap_s
+        if not wrap_s:
+            return now_s
+        if layout.sender == GATEWAY and wrap_s == self._longest_wrap_s:
+            self._clock.learn(stamp_s, wrap_s, now_s)
+        return self._clock.find_sent_s(stamp_s, wrap_s, now_s)
+
+    def _use(self, values: dict[str, float], sent_s: float) -> None:
+        machine = self.machine
         for j, joint in enumerate(machine.joint_names):
             position = values.get(f"Position_{joint}")
             if position is not None:
                 # A sensor without a validity signal is taken at its word.
                 self.q_valid[j] = values.get(f"Valid_{joint}", 1.0) == 1.0
                 # The filter is asked first, so that it also learns of positions called invalid.
-                if self.plausibility.accept(j, now_s, position) and self.q_valid[j]:
-                    self.q[j], self.q_t_s[j] = position, now_s
+                if self.plausibility.accept(j, sent_s, position) and self.q_valid[j]:
+                    self.q[j], self.q_t_s[j] = position, sent_s
         if f"Flow_{machine.joint_names[0]}" in values:
-            self.followed = values["FlowSource"] == FROM_PC
             self.flow = np.array([values[f"Flow_{joint}"] for joint in machine.joint_names])
             # Sums and counts, so that a reader can form the mean flow of any period.
             self.flow_sum, self.flow_number = self.flow_sum + self.flow, self.flow_number + 1
-            self.flow_t_s = now_s
+            self.flow_t_s = sent_s
+        if "FlowSource" in values:
+            self.followed = values["FlowSource"] == FROM_PC
+        if "RoundTrip" in values:
+            self.round_trip_s = values["RoundTrip"]
         if "DeadMan" in values:
             self.lever = np.array([values[f"Lever_{axis}"] for axis in LEVER_AXES])
             self.button_right, self.deadman = values["ButtonRight"] == 1.0, values["DeadMan"] == 1.0
-            self.remote_on, self.levers_t_s = values["RemoteOn"] == 1.0, now_s
+            self.remote_on, self.levers_t_s = values["RemoteOn"] == 1.0, sent_s
         if "EStop" in values:
             self.estop = values["EStop"] == 1.0
             self.exclusive_selected = values["ExclusiveSelected"] == 1.0
-            self.oil_c, self.status_t_s = values.get("OilTemperature", math.nan), now_s
-
-
-class _TransitTime:
-    """Delay of stamped messages beyond the shortest one seen, whatever the two clocks say."""
-
-    def __init__(self) -> None:
-        self._offset_s: float | None = None
-        self._best_s, self._recent_s, self._since_s = math.inf, math.inf, -math.inf
-
-    def measure_delay_s(self, stamp_s: float, now_s: float) -> float:
-        """Return the delay of a message with the gateway's `stamp_s` that came at `now_s`."""
-        # Transit time with an unknown constant: the two clocks share no origin.
-        raw_s = now_s - stamp_s
-        if self._offset_s is None:
-            self._offset_s = raw_s
-        # clocks differ by a constant and whole turns of the stamp
-        half_s = STAMP_MODULUS_S / 2
-        transit_s = (raw_s - self._offset_s + half_s) % STAMP_MODULUS_S - half_s
-        # The best of the last minute replaces the best ever, so that drift is forgotten.
-        if now_s - self._since_s > FORGET_S:
-            self._best_s = min(self._recent_s, transit_s)
-            self._recent_s, self._since_s = transit_s, now_s
-        self._recent_s = min(self._recent_s, transit_s)
-        self._best_s = min(self._best_s, transit_s)
-        return transit_s - self._best_s
+            self.oil_c, self.status_t_s = values.get("OilTemperature", math.nan), sent_s

@@ -16,6 +16,7 @@ from deploy.runtime.operator_state import (
     OperatorState,
     PolicyAdvice,
     RequestedCommand,
+    StopRequest,
 )
 from deploy.runtime.shared_memory import Pipe, RecordSlot, Slot
 
@@ -75,6 +76,7 @@ class LoopMemory:
         request: Commands to be sent; `None` where nothing ever is.
         target: The borehole.
         controls: From the operator's side.
+        stop: From the page, straight to the bus process.
         frame: Newest frame of the camera; `None` without one.
         holes: Boreholes that perception knows.
         bus_log: From the bus process to the log.
@@ -90,6 +92,7 @@ class LoopMemory:
     request: RecordSlot[RequestedCommand] | None
     target: Slot
     controls: RecordSlot[OperatorControls]
+    stop: RecordSlot[StopRequest]
     frame: Slot | None
     holes: Slot
     bus_log: Pipe
@@ -115,6 +118,7 @@ class LoopMemory:
             request=request,
             target=Slot("target", TARGET),
             controls=RecordSlot("controls", OperatorControls, num_joints),
+            stop=RecordSlot("stop", StopRequest, num_joints),
             frame=Slot("frame", build_frame_fields(frame_px)) if frame_px else None,
             holes=Slot("holes", HOLES),
             bus_log=Pipe("bus_log", LOG_BYTES),

@@ -7,34 +7,26 @@ itself.
 
 from __future__ import annotations
 
-import contextlib
 import json
 import logging
-import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-import numpy as np
-from rich.console import Console
-from rich.live import Live
-from rich.table import Table
-from rich.text import Text
-
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from deploy.guidance import LeverPositions, convert_to_positions, find_full_angles_rad
+from deploy.guidance import find_full_angles_rad
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.recorder.capture import CaptureConfig
+from deploy.runtime.detached_log import detach_logging
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
-from deploy.runtime.operator_state import LoopSnapshot
 from deploy.runtime.perception_process import CameraConfig
-from deploy.runtime.process import ChildProcess
+from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_priority
 from deploy.runtime.process_group import PATIENCE_S, BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import DetectedTarget, TargetSelector
@@ -45,12 +37,9 @@ PROCESSES, TIMING = "processes.json", "timing.json"
 """Files in the run folder: process ids, and how each process kept its time."""
 WATCH_S = 0.05
 """Between looks at requests and processes. Chosen by hand: quick for a person."""
-TERMINAL_HZ = 10
-"""Refresh rate of the terminal, as fast as a person can read it."""
-BAR_WIDTH = 10
-"""Characters of a lever bar from neutral to full."""
-LARGEST_AGE_S = 9.999
-"""Age above which the terminal shows no more digits."""
+SUPERVISOR_PRIORITY = 30
+"""Of SCHED_FIFO, below all that depend on it. The guard latches when the supervisor's switches are
+older than 0.2 s, so it must not wait for other work. Its children do not inherit it."""
 
 
 @spec
@@ -111,6 +100,12 @@ class DeploymentLoop(BusAndPolicySettings):
             LinkError: bus or policy process died.
         """
         self.check_machine(machine)
+        with detach_logging():
+            self._run(machine, session, companions)
+
+    def _run(
+        self, machine: Machine, session: Session, companions: Sequence[CompanionProcess]
+    ) -> None:
         frame_px = self.camera.num_px if self.camera else 0
         memory = LoopMemory.new(machine.num_joints, self.commands, frame_px)
         group = ProcessGroup(memory, self.realtime)
@@ -120,16 +115,19 @@ class DeploymentLoop(BusAndPolicySettings):
             for one in companions:
                 group.start(one.name, one.target, one.arguments, one.realtime)
             self._start(group, machine, session)
+            if self.realtime:
+                ask_for_priority(SUPERVISOR_PRIORITY, inherited=False)
             recorder.refresh()
             # Process ids are written before the loop runs, for tools that watch it from outside.
             write_json(session.folder / PROCESSES, group.pids | recorder.pids)
             selector = TargetSelector(self.target.build(), memory.target, memory.holes)
             handler = RequestHandler(memory, recorder, selector, self.armed, self.commands)
-            full_rad = find_full_angles_rad(self.guidance.levers or machine.levers)
-            self._watch(group, memory, full_rad, handler)
+            self._watch(group, handler)
         except KeyboardInterrupt:
             log.info("stopping")
         finally:
+            if self.realtime:
+                give_up_priority()
             # The order matters: the log is ended last, so that it records how the others ended.
             group.end()
             recorder.end(PATIENCE_S)
@@ -142,6 +140,10 @@ class DeploymentLoop(BusAndPolicySettings):
         if self.page is not None:
             config = self.build_page_config(self.page, machine, session)
             group.start("page", "deploy.page.loop_feed:run", (config,))
+        if self.show:
+            # A process of its own: a terminal that is not read blocks whoever writes to it.
+            full_rad = find_full_angles_rad(self.guidance.levers or machine.levers)
+            group.start("terminal", "deploy.runtime.terminal:run", (full_rad,))
         if self.camera is not None:
             group.start("camera", "deploy.runtime.perception_process:run", (self.camera,))
 
@@ -176,24 +178,14 @@ class DeploymentLoop(BusAndPolicySettings):
         recorder.wanted = self.record
         return recorder
 
-    def _watch(
-        self, group: ProcessGroup, memory: LoopMemory, full_rad: np.ndarray, handler: RequestHandler
-    ) -> None:
-        """Carry out requests, watch the processes and show the state, until it is time to stop."""
+    def _watch(self, group: ProcessGroup, handler: RequestHandler) -> None:
+        """Carry out requests and watch the processes, until it is time to stop."""
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
-        with contextlib.ExitStack() as stack:
-            live = None
-            if self.show:
-                # On stderr: stdout belongs to the command's result.
-                console = Console(stderr=True)
-                live = stack.enter_context(Live(console=console, refresh_per_second=TERMINAL_HZ))
-            # Times are monotonic: a clock that is set must not end a run.
-            while end_s is None or time.monotonic() < end_s:
-                handler.refresh()
-                group.check()
-                if live is not None:
-                    live.update(build_table(memory.read_snapshot(), full_rad))
-                time.sleep(WATCH_S)
+        # Times are monotonic: a clock that is set must not end a run.
+        while end_s is None or time.monotonic() < end_s:
+            handler.refresh()
+            group.check()
+            time.sleep(WATCH_S)
 
 
 @dataclass(frozen=True)
@@ -238,54 +230,3 @@ def _write_timing_report(memory: LoopMemory, session: Session) -> None:
     last = memory.read_snapshot()
     report = {"processes": reports, "log_dropped": last.log_dropped, "last": last.to_plain()}
     write_json(session.folder / TIMING, report)
-
-
-def build_table(snapshot: LoopSnapshot, full_rad: np.ndarray) -> Table:
-    """Return levers and safety as a table, for a desk without the operator's page.
-
-    Args:
-        snapshot: State and advice.
-        full_rad: Angles of the four axes at full deflection, `(4,)`.
-    """
-    # The terminal's table is a stand-in; see `deploy.page` for the real one.
-    grid = Table.grid(padding=(0, 2))
-    state, advice = snapshot.state, snapshot.advice
-    own = state.levers if state else None
-    proposed = None
-    if advice is not None:
-        proposed = convert_to_positions(advice.lever_rad, full_rad, advice.button_right)
-    for name in ("left_theta", "left_psi", "right_theta", "right_psi"):
-        grid.add_row(
-            name.replace("_", " "),
-            _draw_bar(getattr(proposed, name, 0.0), "green"),
-            _draw_bar(getattr(own, name, 0.0), "blue"),
-        )
-    grid.add_row("right button", _draw_button(proposed, "green"), _draw_button(own, "blue"))
-    reason = "no policy yet" if advice is None else advice.reason.value
-    safety = "bus process silent"
-    if state is not None and snapshot.alive:
-        safety = f"{state.guard.name.lower()}, {state.trip.value}"
-    grid.add_row("advice", reason, f"safety: {safety}")
-    if state is not None:
-        joints = "  ".join(f"{q:+.3f}" for q in state.q)
-        # An age of many digits would make the columns jump.
-        age_s = min(snapshot.t_s - state.q_t_s, LARGEST_AGE_S)
-        grid.add_row("joints", joints, f"{1e3 * age_s:.0f} ms old")
-    return grid
-
-
-def _draw_bar(part: float, color: str) -> Text:
-    """Draw a bar from the middle to `part` of full, in [-1, 1]."""
-    # NaN is a lever that is not known; it is drawn in neutral.
-    shown = max(-1.0, min(1.0, part)) if math.isfinite(part) else 0.0
-    filled = round(shown * BAR_WIDTH)
-    cells = [" "] * (2 * BAR_WIDTH + 1)
-    low, high = sorted((BAR_WIDTH, BAR_WIDTH + filled))
-    cells[low : high + 1] = ["█"] * (high - low + 1)
-    cells[BAR_WIDTH] = "│" if filled == 0 else "█"
-    return Text("".join(cells), style=color)
-
-
-def _draw_button(levers: LeverPositions | None, color: str) -> Text:
-    held = levers is not None and levers.button_right
-    return Text("■ held" if held else "□", style=color if held else "")

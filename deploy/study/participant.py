@@ -258,10 +258,12 @@ class _Taking:
             0,
             find_full_angles_rad(self._machine.levers),
         )
-        with wire.open([]) as bus:
+        with wire.open(remote.frame_ids) as bus:
             while not stop() and not any(task.done() for task in tasks):
                 # The time until the next message belongs to the event loop.
                 await asyncio.sleep(max(0.0, pace.next_s - time.monotonic()))
+                while (frame := bus.recv(0.0)) is not None:
+                    remote.hear(frame, time.monotonic())
                 pace.begin()
                 # Levers are moved once a control period, the remote sends more often.
                 if cycle % every == 0:

@@ -133,6 +133,10 @@ class StudyFeed:
         self._conductor.take({"do": "stop_trial"})
         return True
 
+    def confirms_stop(self) -> bool:
+        """See `PageFeed`; a trial is ended by the conductor, and nothing is ever sent in a study."""
+        return True
+
     def report_drawn(self, report: DrawReport) -> None:
         """See `PageFeed`."""
         self._feed.report_drawn(report)

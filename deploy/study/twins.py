@@ -42,7 +42,7 @@ BEGIN_S = 1000.0
 """Start of the simulated clock, s; large, so that no small number passes for a time."""
 BEFORE_S = 1.0
 """For which everything runs before a trial begins: the policy's history is full then."""
-NO_BUS = CanBus(interface="virtual", channel="none", bitrate=None, port=None)
+NO_BUS = CanBus(interface="virtual", channel="none", bitrate=None, port=None, hops=None)
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,))])
 
 
@@ -284,6 +284,7 @@ class _Desk:
         self._twin.cycle(self._now_s)
         for frame in self._air.frames:
             self._receiver.take(frame, self._now_s)
+            self._remote.hear(frame, self._now_s)
         self._air.frames.clear()
 
     def _advise(self) -> None:

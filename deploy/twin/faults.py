@@ -42,11 +42,12 @@ MACHINE_FAULTS = (
     "remote_off",
     "lever",
     "second_sender",
+    "second_remote",
     "flood",
     "silent",
 )
 """Faults of the machine: emergency stop, dead-man or remote let go, a lever moved, another node
-that sends commands, a babbling node, nothing sent at all."""
+that sends commands, another remote whose dead-man is held, a babbling node, nothing sent at all."""
 KNOWN = ("none", *FRAME_FAULTS, *SIGNAL_FAULTS, *MACHINE_FAULTS)
 FOREVER_S = 1e9
 """Length of a fault that stays until it is switched off."""

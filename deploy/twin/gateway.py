@@ -6,7 +6,8 @@
 
 Commands that stay away for `TIMEOUT_S`, whose counter stands still or whose CRC is wrong count as
 missing; the PC then begins again with idle frames. Zero flow at an emergency stop, and when the
-remote is lost.
+remote is lost. Commands and levers carry the newest stamp of this gateway's clock that their senders
+have heard: those that are too old are refused, wherever on the way they were held up.
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
-from deploy.bus.description import COUNTER, LEVER_AXES, BusDescription
-from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel
+from deploy.bus.description import COUNTER, LEVER_AXES, STAMP, BusDescription
+from deploy.bus.protection import ChannelTrust, MessageFault
 from deploy.guidance import AXES, LeverMap, find_full_angles_rad
 
 TIMEOUT_S = 0.07
@@ -26,6 +27,12 @@ TIMEOUT_S = 0.07
 ms that are promised."""
 REMOTE_S = 0.13
 """Age of the remote's last message from which it is lost: six of its periods, and a half."""
+ROUND_TRIP_S = 0.15
+"""Age of the stamp in a command above which it is refused: the 150 ms that are promised for delay."""
+ROUNDING_S = 1e-6
+"""Of differences of times."""
+LARGEST_ROUND_TRIP_S = 0.51
+"""Of the signal `RoundTrip` in the example DBC; stands for "not measured" too."""
 FORGET_S = 1.0
 """Silence of the PC after which its next command counts as heard anew. Chosen by hand."""
 IDLE_FRAMES = 3
@@ -57,6 +64,7 @@ class Gateway:
     Attributes:
         estop: Whether the emergency stop is pressed.
         heard_s: Since when the PC is heard.
+        round_trip_s: Age of the stamp in the newest command.
     """
 
     def __init__(self, description: BusDescription, machine: Machine) -> None:
@@ -65,13 +73,15 @@ class Gateway:
         self._remote = description.layouts[description.message_of("DeadMan")]
         self._channels = {}
         for layout in (self._command, self._remote):
-            self._channels[layout.name] = ProtectedChannel(layout.modulus)
+            self._channels[layout.name] = layout.open_channel()
+        self._most_s = {self._command.name: ROUND_TRIP_S, self._remote.name: REMOTE_S}
         self._map = LeverMap(machine.levers, machine)
         self._axis_full_rad = find_full_angles_rad(machine.levers)
         self._u, self._u_s, self._mode, self._idle = np.zeros(machine.num_joints), -np.inf, 0, 0
         self._lever, self._remote_s = np.zeros(len(AXES)), -np.inf
         self._button = self._deadman = self._on = False
         self.estop, self.heard_s = False, np.inf
+        self.round_trip_s, self._round_trip_t_s = np.inf, -np.inf
 
     def take(self, frame: CanFrame, now_s: float) -> None:
         """Take in a frame of PC or remote."""
@@ -82,10 +92,18 @@ class Gateway:
         if isinstance(values, MessageFault):
             channel.refuse(values)
             return
-        if (
-            channel.take(int(values[COUNTER])) is not None
-            or channel.trust is not ChannelTrust.VALID
-        ):
+        stamp_s = values.get(STAMP, 0.0)
+        age_s = 0.0
+        if layout.stamp_wrap_s:
+            # A stamp of this very moment must not seem to lie in the future, through rounding.
+            age_s = (now_s - stamp_s + ROUNDING_S) % layout.stamp_wrap_s
+        if layout is self._command:
+            self.round_trip_s, self._round_trip_t_s = age_s, now_s
+        if age_s > self._most_s[layout.name]:
+            channel.refuse(MessageFault.LATE)
+            return
+        fault = channel.take(int(values[COUNTER]), stamp_s, now_s)
+        if fault is not None or channel.trust is not ChannelTrust.VALID:
             return
         if layout is self._remote:
             self._lever = np.array([values[f"Lever_{axis}"] for axis in LEVER_AXES])
@@ -113,7 +131,6 @@ class Gateway:
             flow = self._map.command(self._lever * self._axis_full_rad, self._button)
             return flow, LEVERS, GatewayState.LEVERS
         if now_s - self._u_s > TIMEOUT_S or not self._trusts(self._command.name):
-            self._idle = 0
             return nothing, NOBODY, GatewayState.TIMEOUT
         if not self._deadman or self._mode != 1 or self._idle < IDLE_FRAMES:
             return nothing, NOBODY, GatewayState.IDLE
@@ -121,6 +138,11 @@ class Gateway:
         if moved[self._machine.is_exclusive].any() and moved.sum() > 1:
             return nothing, NOBODY, GatewayState.IDLE
         return self._u, PC, GatewayState.PC
+
+    def report_round_trip_s(self, now_s: float) -> float:
+        """Return the signal `RoundTrip`."""
+        known = now_s - self._round_trip_t_s <= FORGET_S
+        return min(LARGEST_ROUND_TRIP_S, self.round_trip_s) if known else LARGEST_ROUND_TRIP_S
 
     @property
     def exclusive_selected(self) -> bool:

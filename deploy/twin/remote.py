@@ -10,7 +10,9 @@ import numpy as np
 from brokk_rl.contracts.actuator import Follower
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanBus, CanFrame
-from deploy.bus.description import LEVER_AXES, BusDescription
+from deploy.bus.clock import GatewayClock
+from deploy.bus.description import LEVER_AXES, STAMP, BusDescription
+from deploy.bus.protection import MessageFault
 from deploy.guidance import AXES, LeverMap, find_full_angles_rad
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -39,7 +41,21 @@ class RadioRemote:
         self.levers: Sequence[float] = (0.0,) * len(AXES)
         self.button_right = self.deadman = False
         self.on = True
-        self._counter = 0
+        self._counter, self._clock = 0, GatewayClock()
+        self._heard = description.layouts[description.message_of("EStop")]
+
+    @property
+    def frame_ids(self) -> list[int]:
+        """Identifier of the message from which it takes the gateway's clock."""
+        return [self._heard.frame_id]
+
+    def hear(self, frame: CanFrame, now_s: float) -> None:
+        """Take the gateway's clock from its status; other frames are ignored."""
+        if frame.frame_id != self._heard.frame_id or not self._heard.stamp_wrap_s:
+            return
+        values = self._description.decode(self._heard, frame.data)
+        if not isinstance(values, MessageFault):
+            self._clock.learn(values[STAMP], self._heard.stamp_wrap_s, now_s)
 
     def build_frame(self, frozen: int | None = None) -> CanFrame:
         """Return the next message; `frozen` is a counter that stands still, a fault."""
@@ -47,6 +63,7 @@ class RadioRemote:
         for axis, value in zip(LEVER_AXES, self.levers, strict=True):
             values[f"Lever_{axis}"] = value
         values |= {"ButtonRight": self.button_right, "DeadMan": self.deadman, "RemoteOn": self.on}
+        values[STAMP] = self._clock.newest_s
         self._counter = self._counter + 1 if frozen is None else frozen
         return CanFrame(
             self._layout.frame_id,
@@ -90,9 +107,12 @@ def run_operator(
     own = LeverMap(machine.levers, machine)
     remote.deadman = True
     timer, cycle = CycleTimer(remote.period_s), 0
-    with wire.open([]) as bus:
+    with wire.open(remote.frame_ids) as bus:
         while not stop():
-            timer.wait()
+            while (left_s := timer.next_s - time.monotonic()) > 0:
+                frame = bus.recv(left_s)
+                if frame is not None:
+                    remote.hear(frame, time.monotonic())
             timer.begin()
             if cycle % cycles_a_period == 0:
                 displayed = _read_displayed_command(memory, levers)

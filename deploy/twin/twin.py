@@ -19,11 +19,12 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.signals import Command
 from brokk_rl.spec import spec
+from deploy.bus.c_header import generate_c_header
 from deploy.bus.can_bus import CanBus, CanFrame
-from deploy.bus.description import GATEWAY, BusDescription, generate_c_header
+from deploy.bus.description import GATEWAY, STAMP, BusDescription
 from deploy.runtime.process import CycleTimer, Stop, ask_for_priority
 from deploy.twin.faults import ActiveFaults, FaultPort
-from deploy.twin.gateway import NOBODY, PC, Gateway
+from deploy.twin.gateway import NOBODY, PC, REMOTE_S, ROUND_TRIP_S, TIMEOUT_S, Gateway
 from deploy.twin.remote import RadioRemote
 
 log = logging.getLogger(__name__)
@@ -102,7 +103,9 @@ class Twin:
         # The header describes the bus to the firmware of a real gateway; it must fit this very
         # run.
         session.folder.mkdir(parents=True, exist_ok=True)
-        write_text(session.folder / HEADER, generate_c_header(BusDescription(self.dbc, machine)))
+        description = BusDescription(self.dbc, machine)
+        header = generate_c_header(description, ROUND_TRIP_S, REMOTE_S, TIMEOUT_S)
+        write_text(session.folder / HEADER, header)
         with (
             plant.build(machine, 1, session) as link,
             self.wire.open() as bus,
@@ -156,6 +159,8 @@ class RunningTwin:
             Gateway(self._description, machine),
             RadioRemote(self._description),
         )
+        self._second, self._second_due_s = RadioRemote(self._description), -np.inf
+        self._second.deadman = True
         self._faults, self._timer = ActiveFaults(), CycleTimer(CYCLE_S)
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
@@ -216,8 +221,7 @@ class RunningTwin:
             self._link.send(Command(flow))
             self._q = np.asarray(self._link.read().q, dtype=float)
             self._oil_c = _read_oil_c(self._link)
-        # the gateway's clock: 16 bits of milliseconds
-        values |= self._measure_positions(now_s) | {"Stamp": int(1e3 * now_s) % 65536 / 1e3}
+        values |= self._measure_positions(now_s)
         for layout in self._description.sent_by(GATEWAY):
             self._send(layout.name, values, now_s)
         for frame in faults.due(now_s):
@@ -231,6 +235,12 @@ class RunningTwin:
                     self._description.encode(command.name, {}, self._counters.get("JointPos1", 0)),
                 )
             )
+        # A second remote: nobody else can tell which of the two is the operator's.
+        if faults.on("second_remote", "", now_s) and now_s >= self._second_due_s:
+            self._second_due_s = now_s + self._second.period_s - CYCLE_S / 2
+            frame = self._second.build_frame()
+            self._gateway.take(frame, now_s)
+            self._bus.send(frame)
         # Identifier of lowest priority: arbitration lets every other frame pass first.
         if faults.on("flood", "", now_s):
             for _ in range(FLOOD):
@@ -256,14 +266,17 @@ class RunningTwin:
             "EStop": gateway.estop,
             "ExclusiveSelected": gateway.exclusive_selected,
             "GatewayState": state.value,
+            "RoundTrip": gateway.report_round_trip_s(now_s),
             "OilTemperature": self._oil_c,
         }
         for name, u in zip(self._machine.joint_names, self._flow, strict=True):
             values[f"Flow_{name}"] = float(u)
         # A stop is reported at once: it must not wait for the message's cycle.
         if before.any() and not self._flow.any():
-            for signal in ("FlowSource", "EStop"):
-                self._send(self._description.message_of(signal), values, now_s, at_once=True)
+            names = ("EStop", "FlowSource", f"Flow_{self._machine.joint_names[0]}")
+            # In the order of the names, each once.
+            for name in dict.fromkeys(map(self._description.message_of, names)):
+                self._send(name, values, now_s, at_once=True)
         return self._flow, values
 
     def _play_remote(self, now_s: float) -> None:
@@ -317,8 +330,11 @@ class RunningTwin:
         # A frozen counter is a fault that only the end-to-end protection can see.
         if self._faults.on("freeze_counter", name, now_s):
             counter = FROZEN
-        data = self._description.encode(name, values, counter)
+        # All stamps of the bus are readings of the gateway's clock, which is that of this process.
+        data = self._description.encode(name, values | {STAMP: now_s}, counter)
         frame = CanFrame(layout.frame_id, data, layout.extended)
+        self._remote.hear(frame, now_s)
+        self._second.hear(frame, now_s)
         for one in self._faults.pass_on(layout, frame, now_s):
             self._bus.send(one)
 

@@ -19,25 +19,27 @@ from rich.progress import Progress
 from rich.table import Table
 
 from actuators.excite.schedule import Approach
-from brokk_rl import record
 from brokk_rl.contracts.actuator import ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
-from diagnosis import answer, effect_library
+from diagnosis import effect_library
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.detection import Penalties
-from exam import dataset, oracle, report, run_cases, score
+from exam import dataset, oracle, registration, report, run_cases
+from exam.answer_scoring import RUN_FILE, AnswerScoring
 from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family
 from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
-from exam.generate import CaseRecorder, HalfPlan
+from exam.dataset import CaseSet, end_on_interrupt
+from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
 from exam.metrics import compute_metrics
+from exam.progress import CaseProgress
 from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
 
-ORACLE_FILE = "oracle.json"
+ORACLE_FILE, EXAMINED_FILE = "oracle.json", "examined.json"
 
 
 @spec
@@ -45,9 +47,9 @@ class ExamSettings:
     """The step to do, and the cases.
 
     Attributes:
-        do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score`
-            the answers of one or several, run and score all `baselines`, `calibrate` prices by the
-            answers to development exams.
+        do: `make` cases into the run folder, `register` the present engine for them, `run` a
+            candidate on them, ask the `oracle`, `score` the answers of one or several, run and
+            score all `baselines`, `calibrate` prices by the answers to development exams.
         folder: The exam that all but `make` are about: the folder that `make` left.
         candidate: Who answers.
         baselines: Who answers for comparison, by name.
@@ -59,13 +61,17 @@ class ExamSettings:
         trials: Of `calibrate`: other prices that it tries.
         oracle: Fit of the simulator whose gap the oracle closes; that of the candidate.
         oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
-        ledger: File to which `score` appends its headlines; `null`: none.
+        ledger: File that grows by a line for each exam that is made, registered or opened, and for
+            each candidate that is scored.
         mix: Which cases there are.
         plants: Machines, written apart from the library.
         roughness: How much of a machine no tidy model has: a name of the family's, `mild` or
             `strong`.
+        known: How far candidates know the machine: `full`, or by its `joints` only, without
+            masses, geometry and measured tool point.
         reference: How the machine as it is believed to be is recorded.
         field: How the machine as it is is recorded.
+        withheld: How it is recorded for the examiner, who simulates the repair there.
         approach: How start poses are taken up.
         first_sealed_seed: Seeds (`session.seed`) from here on are for exams, smaller ones for
             development.
@@ -74,7 +80,7 @@ class ExamSettings:
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
     """
 
-    do: Literal["make", "run", "oracle", "baselines", "score", "calibrate"]
+    do: Literal["make", "register", "run", "oracle", "baselines", "score", "calibrate"]
     folder: str | None
     candidate: Candidate
     baselines: dict[str, Candidate]
@@ -82,15 +88,17 @@ class ExamSettings:
     answers: dict[str, str]
     oracle: ActuatorFit
     oracles: str | None
-    ledger: str | None
+    ledger: str
     prices: Penalties
     certainty: ProbabilityModel
     trials: int
     mix: CaseDistribution
     plants: PlantFamily
     roughness: str
+    known: Literal["full", "joints"]
     reference: HalfPlan
     field: HalfPlan
+    withheld: HalfPlan
     approach: Approach
     first_sealed_seed: int
     sealed: bool
@@ -108,6 +116,11 @@ class ExamSettings:
         for name in ("workers", "trials"):
             if getattr(self, name) < 1:
                 raise ConfigError(f"exam.{name}: expected 1 or more, got {getattr(self, name)}")
+        if self.do in ("make", "calibrate") and self.plants.is_held_out and not self.sealed:
+            raise ConfigError(
+                "exam_plants=held_out: this make is held out from development and calibration; only a sealed exam draws "
+                "from it (exam_protocol=sealed), development has exam_plants=valves"
+            )
         for name in self.mix.troubles:
             if name not in self.plants.effects:
                 raise ConfigError(
@@ -124,8 +137,8 @@ class Exam:
         machine: The machine of all cases.
         excitation: Excitations by name; `exam.reference` and `exam.field` give the file.
         exam: The step and the cases.
-        resume: Run folder of an interrupted `exam.do=run`, `oracle` or `baselines` to go on with;
-            the same as `session.out`.
+        resume: Run folder of an interrupted `exam.do=make`, `run`, `oracle`, `baselines` or `score` to
+            go on with; the same as `session.out`.
     """
 
     session: Session
@@ -138,13 +151,15 @@ class Exam:
         if self.resume is None:
             return
         if Path(self.resume).resolve() != self.session.folder.resolve() or self.exam.do not in (
+            "make",
             "run",
             "oracle",
             "baselines",
+            "score",
         ):
             raise ConfigError(
-                f"resume={self.resume}: exam.do=run, oracle or baselines goes on in its own folder; add session.out={self.resume} "
-                "and give exam.do as before"
+                f"resume={self.resume}: exam.do=make, run, oracle, baselines or score goes on in its own folder; add "
+                f"session.out={self.resume} and give exam.do as before"
             )
 
     def run(self) -> None:
@@ -160,60 +175,87 @@ class Exam:
                 f"session.seed={self.session.seed} with exam.sealed={str(settings.sealed).lower()}: seeds from "
                 f"{settings.first_sealed_seed} on are for exams and need exam.sealed=true, smaller ones are for development"
             )
-        salt = settings.salt or secrets.token_hex(16)
-        questions = self.questions(salt)
-        workshop = CaseRecorder(
-            self.machine, settings.plants, settings.roughness, self.excitation, settings.approach
+        salt = dataset.read_partial_salt(folder) or settings.salt or secrets.token_hex(16)
+        known = restrict_machine(self.machine, settings.known)
+        recorder = CaseRecorder(
+            self.machine,
+            settings.plants,
+            settings.roughness,
+            self.excitation,
+            settings.approach,
+            known,
         )
-        total = len(questions) * (len(settings.reference.programs) + len(settings.field.programs))
-        with Progress(transient=True) as progress:
-            task = progress.add_task(f"{len(questions)} cases", total=total)
-            labels = dataset.write_cases(
-                workshop,
-                questions,
-                settings.reference,
-                settings.field,
-                self.machine,
-                folder,
-                settings.workers,
-                lambda n: progress.advance(task, n),
-            )
+        halves: dict[Half, HalfPlan] = {
+            "reference": settings.reference,
+            "field": settings.field,
+            "withheld": settings.withheld,
+        }
+        cases = CaseSet(recorder, self.questions(salt), halves, self.machine, folder)
+        with CaseProgress("cases made", len(cases.questions)) as progress:
+            labels = dataset.write_cases(cases, salt, settings.workers, progress)
         facts = {
-            "schema": 1,
+            "schema": 2,
             "seed": self.session.seed,
             "sealed": is_exam,
+            "held_out": settings.plants.is_held_out,
+            "known": settings.known,
             "roughness": settings.roughness,
             "num_cases": len(labels),
         }
         found = dataset.seal_labels(folder, {**facts, "cases": labels}, salt)
-        write_json(folder / "exam.json", {**facts, "labels_sha256": found})
+        facts["labels_sha256"] = found
+        write_json(folder / "exam.json", facts)
+        registration.append_event(folder, "made", facts, settings.ledger)
         log.info(
-            "%d cases in %s, labels sealed: sha256 %s",
+            "%d cases in %s, labels sealed: sha256 %s; engine %s is registered",
             len(labels),
             folder / dataset.CASES_FOLDER,
             found,
+            registration.compute_engine_id()[:12],
         )
 
     def questions(self, salt: str) -> list[CaseDesign]:
         """Return the cases; those of a sealed exam depend on the secret salt too."""
-        entropy = [self.session.seed, *(salt.encode() if self.exam.sealed else b"")]
-        return self.exam.mix.questions(
-            self.machine, self.exam.plants.outside_faults, np.random.default_rng(entropy)
+        settings, mix = self.exam, self.exam.mix
+        entropy = [self.session.seed, *(salt.encode() if settings.sealed else b"")]
+        if settings.known == "joints":
+            known = restrict_machine(self.machine, "joints")
+            mix = mix.restrict([kind.name for kind in effect_library.load_effects(known)])
+        return mix.questions(
+            self.machine,
+            settings.plants.outside_faults,
+            np.random.default_rng(entropy),
+            settings.plants.outside_not_on,
         )
 
+    def _register(self) -> None:
+        """Commit to the present engine: a line in the registration of the exam and in the ledger."""
+        state = registration.read_state(self._folder)
+        registration.append_event(self._folder, "registered", self._facts, self.exam.ledger)
+        write_json(self.session.folder / "registered.json", {"engine": state.engine})
+        if state.is_opened:
+            log.warning(
+                "the labels of %s are open already: a score of this engine is marked so",
+                self._folder,
+            )
+        log.info("engine %s is registered for %s", state.engine[:12], self._folder)
+
     def _run(self) -> None:
-        """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case."""
+        """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case, and `run.json`."""
         settings = self.exam
         cases = self._cases()
-        with Progress(transient=True) as progress:
-            task = progress.add_task(f"{len(cases)} cases", total=len(cases))
+        state = registration.check_engine(self._folder, self._facts["sealed"])
+        facts = {**state.describe(), "labels_sha256": self._facts["labels_sha256"]}
+        write_json(self.session.folder / RUN_FILE, {**facts, "candidate": repr(settings.candidate)})
+        with CaseProgress("cases answered", len(cases)) as progress:
             failed = run_cases.answer_cases(
                 settings.candidate,
                 cases,
                 self.session.folder,
-                self.machine,
+                self._known,
                 settings.workers,
-                lambda: progress.advance(task),
+                progress,
+                state.engine,
             )
         if failed:
             log.warning(
@@ -236,9 +278,35 @@ class Exam:
     def _folder(self) -> Path:
         return Path(self.exam.folder or "")
 
+    @property
+    def _facts(self) -> dict[str, Any]:
+        """Facts of the exam in `exam.folder`.
+
+        Raises:
+            RecordingError: there is no exam.
+        """
+        path = self._folder / "exam.json"
+        try:
+            return json.loads(path.read_text())
+        except (OSError, ValueError) as error:
+            raise RecordingError(
+                f"exam.folder={self._folder}: expected exam.json, as exam.do=make writes it ({error})"
+            ) from error
+
+    @property
+    def _known(self) -> Machine:
+        """The machine as the candidates of the exam in `exam.folder` know it."""
+        return restrict_machine(self.machine, self._facts.get("known", "full"))
+
+    def _open_labels(self) -> list[dict[str, Any]]:
+        """Open the labels, and note that for later runs."""
+        cases = dataset.open_labels(self._folder)["cases"]
+        registration.note_opening(self._folder, self._facts, self.exam.ledger)
+        return cases
+
     def _oracle(self) -> None:
         """Open the labels; write `oracle.json`: shares of the gap that true effects close."""
-        cases = dataset.open_labels(self._folder)["cases"]
+        cases = self._open_labels()
         # only these have effects that a simulator could repair
         labels = [label for label in cases if label["kind"] in ("one", "several")]
         place, found = self.session.folder / ORACLE_FILE, {}
@@ -249,16 +317,17 @@ class Exam:
             oracle.close_labelled_gap,
             self._folder / dataset.CASES_FOLDER,
             self.exam.oracle,
-            self.machine,
+            self._known,
         )
-        with Progress(transient=True) as progress, ProcessPoolExecutor(self.exam.workers) as pool:
-            task = progress.add_task(
-                f"{len(labels)} cases", total=len(labels), completed=len(labels) - len(todo)
-            )
+        with (
+            CaseProgress("cases repaired", len(labels)) as progress,
+            ProcessPoolExecutor(self.exam.workers, initializer=end_on_interrupt) as pool,
+        ):
+            progress.skip(len(labels) - len(todo))
             for label, share in zip(todo, pool.map(job, todo), strict=True):
                 found[label["case"]] = share
                 write_json(place, found)
-                progress.advance(task)
+                progress.advance()
         shares = [share for share in found.values() if share is not None]
         log.info(
             "the true effects close %.2f of the gap (median of %d cases with one)",
@@ -279,18 +348,14 @@ class Exam:
                 name,
                 name,
             )
-        with Progress(transient=True) as progress:
-            for name, candidate in usable.items():
-                task = progress.add_task(name, total=len(cases))
-                folder = self.session.folder / name
+        state = registration.check_engine(self._folder, self._facts["sealed"])
+        for name, candidate in usable.items():
+            folder = self.session.folder / name
+            with CaseProgress(name, len(cases)) as progress:
                 run_cases.answer_cases(
-                    candidate,
-                    cases,
-                    folder,
-                    self.machine,
-                    settings.workers,
-                    partial(progress.advance, task),
+                    candidate, cases, folder, self._known, settings.workers, progress, state.engine
                 )
+            write_json(folder / RUN_FILE, {**state.describe(), "candidate": repr(candidate)})
         self._scored(settings.answers | {name: str(self.session.folder / name) for name in usable})
 
     def _calibrate(self) -> None:
@@ -335,6 +400,12 @@ class Exam:
             self.session.folder,
         )
 
+    def _read_oracle(self) -> dict[str, float | None]:
+        """Return the share that the true effects close by case; empty where nobody asked."""
+        if self.exam.oracles is None:
+            return {}
+        return json.loads((Path(self.exam.oracles) / ORACLE_FILE).read_text())
+
     def _of_machine(self) -> list[str]:
         shared = []
         for name, trouble in self.exam.mix.troubles.items():
@@ -346,58 +417,34 @@ class Exam:
         self._scored(self.exam.answers)
 
     def _scored(self, answers: Mapping[str, str]) -> None:
-        """Open the labels; write `marks.json`, report and ledger; print the table."""
-        labels = dataset.open_labels(self._folder)
-        facts = json.loads((self._folder / "exam.json").read_text())
-        tables = {}
-        for name, folder in answers.items():
-            tables[name] = self._table(Path(folder), labels["cases"])
-        write_json(self.session.folder / "marks.json", {"exam": facts, "candidates": tables})
-        report.write_report(self.session.folder, facts, tables)
-        if self.exam.ledger is not None:
-            for name, table in tables.items():
-                report.append_to_ledger(
-                    Path(self.exam.ledger), record.format_now(), facts, name, table
-                )
-        _show(tables)
-        log.info("report: %s", self.session.folder / report.REPORT_FILE)
-
-    def _table(self, folder: Path, labels: list[dict[str, Any]]) -> dict[str, Any]:
-        """Return the figures of the answers in `folder`."""
-        mix, marks = self.exam.mix, []
-        best = (
-            {}
-            if self.exam.oracles is None
-            else json.loads((Path(self.exam.oracles) / ORACLE_FILE).read_text())
+        """Open the labels; write marks, answers, labels, report and ledger; print the table."""
+        labels, facts = self._open_labels(), self._facts
+        folders = {name: Path(folder) for name, folder in answers.items()}
+        out = self.session.folder
+        marking = AnswerScoring(
+            exam=self._folder,
+            labels=labels,
+            machine=self._known,
+            fit=self.exam.oracle,
+            classes=self.exam.mix.classes,
+            of_machine=self._of_machine(),
+            oracle=self._read_oracle(),
         )
-        of_machine = self._of_machine()
-        begun = [label for label in labels if run_cases.is_begun(folder / label["case"])]
-        if len(begun) < len(labels):
-            log.warning(
-                "%s: %d of %d cases sat; the others are left out", folder, len(begun), len(labels)
-            )
-        for label in begun:
-            place = folder / label["case"]
-            said = (
-                answer.read_answer(place / answer.ANSWER_FILE)
-                if (place / answer.ANSWER_FILE).is_file()
-                else None
-            )
-            marks.append(
-                score.score_answer(
-                    label,
-                    said,
-                    mix.classes,
-                    of_machine,
-                    run_cases.read_seconds(place),
-                    best.get(label["case"]),
-                )
-            )
-        if all(mark.verdict == "failed" for mark in marks):
-            raise RecordingError(
-                f"exam.answers: {folder} holds no answer to any case of {self._folder}"
-            )
-        return compute_metrics(marks, len(labels) - len(begun))
+        examined = marking.examine(folders, out / EXAMINED_FILE, self.exam.workers)
+        tables = {}
+        for name, folder in folders.items():
+            tables[name] = marking.build_table(folder, examined.get(name, {}))
+        write_json(out / "marks.json", {"exam": facts, "candidates": tables})
+        report.write_report(out, facts, tables)
+        # what anybody needs to score them again stands beside the score
+        write_text(out / "labels.json", (self._folder / dataset.LABELS_FILE).read_text())
+        for name, folder in folders.items():
+            marking.publish(folder, out / f"answers_{name}.jsonl")
+            line = {**facts, **report.collect_headlines(name, tables[name])}
+            line |= {"engines": tables[name]["engines"], "warnings": tables[name]["warnings"]}
+            registration.append_event(self._folder, "scored", line, self.exam.ledger)
+        _show(tables)
+        log.info("report: %s", out / report.REPORT_FILE)
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:

@@ -215,6 +215,13 @@ class HydraulicPlants:
 
     roughness: dict[str, float]
 
+    is_held_out = False
+
+    @property
+    def outside_not_on(self) -> Mapping[str, tuple[str, ...]]:
+        """Return nothing: every joint shows every outside fault."""
+        return {}
+
     @property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects that its plants can have."""

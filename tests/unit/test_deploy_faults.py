@@ -45,6 +45,7 @@ STOPS: list[tuple[str, str, float]] = [
     ("delay", "JointPos1", LOST), ("delay", "JointPos2", LOST), ("delay", "LeverState", LOST), ("silent", "", LOST),
     ("jump", "", UNLIKELY), ("out_of_range", "", UNLIKELY), ("sign", "", UNLIKELY), ("invalid", "", AT_ONCE),
     ("estop", "", AT_ONCE), ("deadman_released", "", AT_ONCE), ("remote_off", "", AT_ONCE), ("second_sender", "", AT_ONCE),
+    ("second_remote", "", UNTRUSTED),
 ]  # fmt: skip
 """Faults that end a motion, and within which time."""
 HARMLESS = [
@@ -168,6 +169,7 @@ def test_a_policy_that_dies_is_slow_or_talks_nonsense_stops_the_machine(
         ({"wanted": (0.3, 0, 1.2, 0, 0)}, 0.07), ({"wanted": (0.3, 0.3, 0, 0, 0)}, 0.07),
     ):  # fmt: skip
         stage.get_going()
+        stage.go(0.4, lambda: 3 < stage.ms % 400 <= 20)  # a request has just been made
         for name, value in change.items():
             setattr(stage, name, value)
         assert stage.stops_within_s() <= limit_s
@@ -240,3 +242,88 @@ def test_a_dead_man_pressed_before_there_was_advice_has_to_be_pressed_again(
     stage.go(6.0, lambda: stage.moves)
     assert stage.moves == (again_s is not None)
     stage.close()
+
+
+BRIDGE: list[tuple[str, dict[str, Any], float]] = [
+    *((f"half {name}", {"half": name}, UNTRUSTED) for name in (*MESSAGES, "ValveCmd")),
+    *((f"late {name}", {"delay_s": {name: 0.2}}, LOST) for name in (*MESSAGES[:4], "ValveCmd")),
+    *((f"late {way}", {"delay_s": {way: 0.2}}, LOST) for way in ("to_pc", "to_gateway")),
+    *((f"copies of {name}", {"echo_s": {name: 0.26}}, 0.26 + UNTRUSTED) for name in (*MESSAGES, "ValveCmd")),
+    *((f"second remote, {k} ahead", {"second_remote": True, "remote_offset": k}, UNTRUSTED) for k in range(5)),
+    ("foreign commands", {"foreign": {"Command_q3": 0.5, "CommandMode": 1}}, UNTRUSTED),
+    ("growing delay", {"delay_s": {"to_pc": lambda since_s: 0.1 * since_s}}, 1.5 + 0.02),
+]  # fmt: skip
+"""What a bridge between gateway and PC can do, and the time within which the motion ends."""
+
+
+def build_bridge(stage: Stage, faults: dict[str, Any]) -> None:
+    stage.bridge.begun_ms = stage.ms
+    for name, value in faults.items():
+        setattr(stage.bridge, name, value)
+
+
+@pytest.mark.parametrize(("mode", "name", "faults", "limit_s"), against(BRIDGE, *COMMANDING))
+def test_what_a_bridge_does_ends_the_motion_in_time_and_for_good(
+    stages: dict[str, Stage], mode: str, name: str, faults: dict[str, Any], limit_s: float
+) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    build_bridge(stage, faults)
+    assert stage.stops_within_s(max(0.6, limit_s + 0.3)) <= limit_s + 0.011
+    state = stage.view.state
+    assert state is not None and state.guard.name == "LATCHED"
+
+
+@pytest.mark.parametrize(("mode", "name", "faults", "limit_s"), against(BRIDGE, "listen"))
+def test_a_bridge_makes_a_loop_that_listens_send_nothing(
+    stages: dict[str, Stage], mode: str, name: str, faults: dict[str, Any], limit_s: float
+) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    build_bridge(stage, faults)
+    stage.go(limit_s + 0.1)
+    assert not stage.air.sent
+    if any(f"{word} JointPos" in name for word in ("half", "late", "copies of")):
+        assert not stage.advised
+
+
+@pytest.mark.parametrize("mode", COMMANDING)
+@pytest.mark.parametrize("way", ["to_pc", "to_gateway"])
+def test_a_delay_that_was_always_there_is_measured_and_nothing_moves(
+    machine: Machine, tmp_path: Path, mode: Any, way: str
+) -> None:
+    stage = Stage(machine, mode, tmp_path)
+    stage.bridge.delay_s = {way: 0.2}
+    for _ in range(3):
+        stage.fault("none")
+        stage.go(1.2)
+        stage.fault("deadman_released")
+        stage.go(0.3, lambda: stage.moves)
+        assert not stage.moves
+    state = stage.view.state
+    assert state is not None and state.round_trip_s >= 0.2
+    assert state.trip.value == "way to the gateway and back unknown or too long"
+    stage.close()
+
+
+@pytest.mark.parametrize("mode", COMMANDING)
+def test_a_stop_needs_no_supervisor_and_a_supervisor_that_hangs_ends_the_motion(
+    stages: dict[str, Stage], mode: str
+) -> None:
+    stage = stages[mode]
+    stage.get_going()
+    stage.supervised = False
+    stage.go(0.05)
+    assert stage.moves
+    stage.stop()
+    assert stage.stops_within_s() <= 0.011
+    state, sent = stage.view.state, len(stage.air.sent)
+    assert state is not None and state.guard.name == "SILENT"
+    stage.supervised = True
+    stage.go(0.5)
+    assert not stage.moves and len(stage.air.sent) == sent, "it is still the arming of before"
+    stage.get_going()
+    stage.supervised = False
+    assert stage.stops_within_s() <= 0.2 + 0.011
+    state = stage.view.state
+    assert state is not None and state.guard.name == "LATCHED"

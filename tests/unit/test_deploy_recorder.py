@@ -49,6 +49,7 @@ def write(
         names = [
             "JointPos1",
             "JointPos2",
+            "JointPos3",
             *(("ValveFeedback", "MachineStatus") if k % 2 == 0 else ()),
         ]
         data = b""

@@ -286,7 +286,7 @@ def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Ma
     def late_s(residuals: Residuals) -> list[float]:
         shapes = [Response(ray.sizes, change) for change in residuals.response(ray)]
         return [
-            late.size("dead_time_s") * fit_sizes(z, [shape])[0]
+            late.size_on("dead_time_s", 0) * fit_sizes(z, [shape])[0]
             for z, shape in zip(residuals.z, shapes, strict=True)
         ]
 

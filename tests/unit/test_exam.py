@@ -17,22 +17,18 @@ import pytest
 from composed import option
 from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
+from small_exam import SMALL
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine
 from diagnosis import answer
 from diagnosis.answer import ANSWER_FILE
-from exam import dataset, run_cases
+from exam import dataset, registration, run_cases
 from exam.baselines import ConstantAnswer
 from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
+from exam.progress import CaseProgress
 from exam.residual_forest import ResidualForest
-
-SMALL = (
-    "mode=exam", "exam.mix.num_cases=2", "exam.mix.shares={none: 0.5, faint: 0, one: 0.5, several: 0, outside: 0}",
-    "exam.reference.programs=[[levels]]", "exam.reference.file_s=12", "exam.field.programs=[[levels],[levels]]",
-    "exam.field.file_s=8",
-)  # fmt: skip
 
 
 def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDesign]:
@@ -177,10 +173,21 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
     assert (marks / "exam.html").stat().st_size > 10_000 and (
         marks / "confusion_none.png"
     ).is_file()
-    (line,) = [json.loads(text) for text in ledger.read_text().splitlines()]
-    assert (
-        line["candidate"] == "none"
-        and line["labels_sha256"] == (exam / dataset.HASH_FILE).read_text().split()[0]
+    opened, line = [json.loads(text) for text in ledger.read_text().splitlines()]
+    assert opened["event"] == "opened" and line["event"] == "scored"
+    assert line["candidate"] == "none" and line["num_cases"] == 2 and line["seed"] == 0
+    assert line["labels_sha256"] == (exam / dataset.HASH_FILE).read_text().split()[0]
+    assert line["engine"] == registration.compute_engine_id() and line["engines"] == [
+        line["engine"]
+    ]
+    # labels and answers are published beside the score
+    assert (marks / "labels.json").read_bytes() == (exam / dataset.LABELS_FILE).read_bytes()
+    said = [json.loads(text) for text in (marks / "answers_none.jsonl").read_text().splitlines()]
+    assert [one["answer"]["verdict"] for one in said] == ["none", "none"]
+    # whoever says "none" repairs nothing, by the examiner's own simulation
+    assert all(
+        one["before"] == one["after"]
+        for one in json.loads((marks / "examined.json").read_text())["none"].values()
     )
 
 
@@ -192,12 +199,17 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
     answers.mkdir()
     assert (
         run_cases.answer_cases(
-            Recorder(ValueError("ran away")), [first], answers, machine, 1, lambda: None
+            Recorder(ValueError("ran away")), [first], answers, machine, 1, CaseProgress("", 1)
         )
         == 1
     )
     run_cases.answer_cases(
-        ConstantAnswer(effect=None, probability=0.5), [second], answers, machine, 1, lambda: None
+        ConstantAnswer(effect=None, probability=0.5),
+        [second],
+        answers,
+        machine,
+        1,
+        CaseProgress("", 1),
     )
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
     for expected, missed in (({"value": 2, "of": 2}, 1), ({"value": 1, "of": 2}, 0)):
@@ -272,7 +284,7 @@ def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_
 def test_a_forest_learns_from_development_cases_only_and_answers(
     exam: Path, machine: Machine, tmp_path: Path
 ) -> None:
-    trees = ResidualForest(exam=str(exam), trees=20, least=0.3, seed=0)
+    trees = ResidualForest(exam=str(exam), trees=20, seed=0)
     trees.answer(exam / dataset.CASES_FOLDER / "0000", tmp_path / "out", machine)
     found = answer.read_answer(tmp_path / "out" / ANSWER_FILE)
     assert all(0 <= one.probability <= 1 for one in found.ranking) and found.verdict in (
@@ -311,10 +323,10 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     (case / "field" / "00.parquet").touch()
     dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
     first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
-    assert run_cases.answer_cases(first, [case], answers, machine, 1, lambda: None) == 1
+    assert run_cases.answer_cases(first, [case], answers, machine, 1, CaseProgress("", 1)) == 1
     assert run_cases.read_seconds(answers / "0000") is None
-    assert run_cases.answer_cases(second, [case], answers, machine, 1, lambda: None) == 0
-    assert run_cases.answer_cases(third, [case], answers, machine, 1, lambda: None) == 0
+    assert run_cases.answer_cases(second, [case], answers, machine, 1, CaseProgress("", 1)) == 0
+    assert run_cases.answer_cases(third, [case], answers, machine, 1, CaseProgress("", 1)) == 0
     given, content = second.given[0]
     assert (
         content == ["field", "field/00.parquet"]

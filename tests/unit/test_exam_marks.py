@@ -220,11 +220,11 @@ def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay(
         for name, ray in (("lag", form), ("creep", other))
     }
     errors = JointErrors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)
-    assert set(baselines.select_forward(errors, baselines.score_bic)) == {"lag"}
-    assert next(iter(baselines.select_forward(errors, baselines.score_held_out))) == "lag"
+    assert set(baselines.select_forward(errors, baselines.score_bic, 0.0)) == {"lag"}
+    assert next(iter(baselines.select_forward(errors, baselines.score_held_out, 0.0))) == "lag"
     assert (
         baselines.select_forward(
-            JointErrors(generator.standard_normal(600), shapes, fold), baselines.score_bic
+            JointErrors(generator.standard_normal(600), shapes, fold), baselines.score_bic, 0.0
         )
         == {}
     )

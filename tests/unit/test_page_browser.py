@@ -16,10 +16,11 @@ from PIL import Image
 
 from brokk_rl.signals import Frame
 from deploy.guard.guard import GuardState, GuardTrip
-from deploy.page.protocol import OperatorRequest, SourceAge
+from deploy.page.protocol import OperatorRequest, RecordingStatus, SourceAge
 
 SIZE = {"width": 1280, "height": 800}
 TRAVEL = 95.0
+FAILED = RecordingStatus(on=False, seconds=0.0, dropped=0, failed=True)
 GREEN, BLUE = np.array([0, 117, 43]), np.array([10, 75, 209])
 
 
@@ -237,13 +238,28 @@ def test_safety_and_connection_are_told_apart_in_words(
     latched = change_state(SHOWN, guard=GuardState.LATCHED, trip=GuardTrip.CHANNEL_INVALID)
     feed.now = replace(latched, commands=True)
     page.wait_for_selector("#safety.bad")
-    assert page.locator("#safety").inner_text() == "LATCHED – messages corrupted"
+    assert (
+        page.locator("#safety").inner_text() == "LATCHED – messages corrupted or from two senders"
+    )
     feed.now = change_state(SHOWN, estop=True, trip=GuardTrip.ESTOP)
     until(page, "document.getElementById('safety').textContent.includes('EMERGENCY STOP')")
     page.wait_for_selector("#deadman.careful")
     feed.now = replace(SHOWN, alive=False)
     page.wait_for_selector("#connection.bad")
     assert page.locator("#left.stale").count() == 1
+
+
+def test_a_recording_that_has_failed_is_an_alarm_and_a_stop_that_is_not_confirmed_is_said(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
+    feed.now, feed.confirms = replace(SHOWN, recording=FAILED), False
+    page = opened(port)
+    alarm = page.locator("#recording")
+    eventually(lambda: alarm.inner_text() == "RECORDING HAS FAILED")
+    assert "bad" in alarm.get_attribute("class")
+    page.keyboard.press("Escape")
+    told = page.locator("#answer")
+    eventually(lambda: told.inner_text().startswith("STOP NOT CONFIRMED"))
 
 
 def test_german(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
@@ -384,12 +400,18 @@ def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
     ] == pytest.approx([0.25, 0.6], abs=0.01)
 
 
-@pytest.mark.parametrize("size", [(1280, 800), (1920, 1080), (800, 1280), (390, 844)], ids=str)
+SIZES = [(640, 400), (800, 600), (1100, 700), (1280, 800), (1920, 1080), (768, 1024), (390, 844)]
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
 @pytest.mark.parametrize("language", ["en", "de"])
 def test_nothing_overlaps_and_stop_stays_in_sight(
     feed: Scripted, port: int, opened: Callable[..., Any], size: tuple[int, int], language: str
 ) -> None:
-    feed.now = replace(SHOWN, streams=(*SHOWN.streams, SourceAge("camera", 0.0, 1e6)))
+    streams = (*SHOWN.streams, SourceAge("camera", 0.0, 1e6))
+    failed = replace(SHOWN, commands=True, streams=streams, recording=FAILED)
+    # the longest words that the header has to hold
+    feed.now = change_state(failed, guard=GuardState.LATCHED, trip=GuardTrip.ROUND_TRIP)
     page = opened(port, query=f"?lang={language}")
     page.set_viewport_size({"width": size[0], "height": size[1]})
     until(page, "!document.getElementById('camera').hidden")
@@ -397,12 +419,19 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
     assert stop["x"] >= 0 and stop["x"] + stop["width"] <= size[0]
     assert stop["y"] >= 0 and stop["y"] + stop["height"] <= size[1]
     cut = page.evaluate(
-        """() => [...document.querySelectorAll("button, #advice, #boreholes")].filter(node =>
+        """() => [...document.querySelectorAll("button, #advice, #boreholes, header, header > *")].filter(node =>
         node.scrollHeight > node.clientHeight + 1 || node.scrollWidth > node.clientWidth + 1)
         .map(node => node.id + node.textContent)"""
     )
     assert cut == []
-    # the buttons lie above the rest of an upright screen, which scrolls under them
+    assert page.evaluate("document.documentElement.scrollWidth") <= size[0]
+    # the rest of a narrow screen scrolls above the buttons
+    apart_from_buttons = page.evaluate(
+        """() => { const work = document.getElementById("work").getBoundingClientRect();
+        const stop = document.getElementById("actions").getBoundingClientRect();
+        return work.height === 0 || work.bottom <= stop.top + 1; }"""
+    )
+    assert apart_from_buttons
     boxes = [page.locator(name).bounding_box() for name in ("#view", "aside", "#levers")]
     for number, one in enumerate(boxes):
         for other in boxes[number + 1 :]:

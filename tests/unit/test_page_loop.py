@@ -207,6 +207,50 @@ def test_start_arms_and_stop_disarms(memory: LoopMemory, feed: LoopFeed, tmp_pat
     assert not controls(memory).armed, "the last word counts"
 
 
+def test_a_stop_goes_straight_to_the_bus_process_and_is_confirmed_by_the_guard(
+    memory: LoopMemory, feed: LoopFeed
+) -> None:
+    say(memory, guard=GuardState.ACTIVE)
+    assert memory.stop.read() is None and not feed.confirms_stop()
+    begun_s = time.monotonic()
+    assert feed.submit(OperatorRequest("stop", ""))
+    asked = memory.stop.read()
+    assert asked is not None and begun_s <= asked.t_s <= time.monotonic()
+    assert not feed.confirms_stop(), "it was active before the stop"
+    say(memory, guard=GuardState.LATCHED)
+    assert not feed.confirms_stop(), "latched still sends"
+    say(memory, guard=GuardState.SILENT, t_s=asked.t_s)
+    assert not feed.confirms_stop(), "decided before"
+    say(memory, guard=GuardState.SILENT)
+    assert feed.confirms_stop()
+
+
+def test_a_start_that_was_asked_for_before_a_stop_does_not_undo_it(
+    memory: LoopMemory, feed: LoopFeed, tmp_path: Path
+) -> None:
+    supervisor, _ = wanted(memory, tmp_path)
+    feed.submit(OperatorRequest("start", ""))
+    supervisor.refresh()
+    feed.submit(OperatorRequest("stop", ""))
+    asked = memory.stop.read()  # the supervisor hangs, and still says "armed"
+    assert asked is not None and controls(memory).armed_t_s < asked.t_s
+    feed.submit(OperatorRequest("start", ""))
+    supervisor.refresh()
+    assert controls(memory).armed and controls(memory).armed_t_s > asked.t_s
+
+
+def test_a_loop_that_sends_nothing_has_nothing_to_confirm(tmp_path: Path) -> None:
+    memory = LoopMemory.new(MACHINE.num_joints, commands=False)
+    session = Session(out=str(tmp_path), seed=1, device="cpu")
+    guidance = option("guidance", "machine")
+    config = PageProcessConfig(
+        option("page", "local"), MACHINE, guidance, session, 0.15, 0.15, 600.0
+    )
+    feed = LoopFeed(config, memory)
+    assert feed.submit(OperatorRequest("stop", "")) and feed.confirms_stop()
+    memory.close()
+
+
 def test_nothing_is_armed_where_nothing_is_ever_sent(
     memory: LoopMemory, feed: LoopFeed, tmp_path: Path
 ) -> None:
@@ -251,6 +295,10 @@ def test_a_log_that_died_is_not_started_again_in_secret(
     supervisor.refresh()
     supervisor.refresh()
     assert len(started) == 1 and not feed.read_state().recording.on
+    assert feed.read_state().recording.failed, "an alarm, and not as if nobody wanted one"
+    feed.submit(OperatorRequest("record", "on"))
+    supervisor.refresh()
+    assert feed.read_state().recording.on and not feed.read_state().recording.failed
 
 
 def test_other_lever_patterns_have_their_own_full_angles(

@@ -21,11 +21,12 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.signals import Frame
 from deploy.page import access, frame_codec
 from deploy.page.clock import PageClock
+from deploy.page.connections import ConnectionBudget, SendWindow
 from deploy.page.demo import DemoMachine
 from deploy.page.files import load_files
 from deploy.page.protocol import OperatorRequest, SourceAge
 from deploy.page.scene import plan_approach
-from deploy.page.server import SendWindow, build_link
+from deploy.page.server import build_link
 
 MINE = access.list_own_hosts("127.0.0.1", 8170, ())
 
@@ -309,3 +310,18 @@ def test_both_languages_say_everything() -> None:
 
     said = {one.value for one in (*GuardTrip, *AdviceStatus)} - {"valid"}
     assert said - {key for key in said if f'"{key}":' in german or f" {key}:" in german} == set()
+
+
+def test_places_are_kept_apart_and_the_mute_and_the_oldest_give_way() -> None:
+    budget = ConnectionBudget[str](clients=1)
+    assert budget.admit_watcher("a", 0.0) == (True, None)
+    assert budget.admit_watcher("b", 0.5) == (True, None)
+    assert budget.admit_watcher("c", 1.9) == (False, None), "nobody has been mute for two seconds"
+    budget.note_heard("a", 1.9)
+    assert budget.admit_watcher("c", 2.5) == (True, "b")
+    budget.note_heard("b", 2.6)
+    assert budget.num_watchers == 2
+    budget.release("a")
+    assert budget.admit_watcher("d", 2.5) == (True, None)
+    assert [budget.admit_unproven(str(number)) for number in range(9)] == [None] * 8 + ["0"]
+    assert [budget.admit_operator(name) for name in "xyz"] == [None, None, "x"]

@@ -13,8 +13,8 @@ from browser import TOKEN, Scripted, served
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
+from deploy.page.connections import UNPROVEN, WATCHING
 from deploy.page.protocol import PageState
-from deploy.page.server import CONNECTIONS
 
 
 @pytest.fixture
@@ -126,7 +126,56 @@ def test_connections_that_come_together_do_not_exceed_the_limit(feed: Scripted) 
             return socket.close_reason or ""
 
     with served(feed, clients=2) as port:
-        assert asyncio.run(count(port)) == 12 - 2 * CONNECTIONS
+        assert asyncio.run(count(port)) == 12 - 2 * WATCHING
+
+
+def test_two_dozen_mute_sockets_lock_nobody_out(feed: Scripted) -> None:
+    async def run(port: int) -> list[Any]:
+        own, ours = f"http://localhost:{port}", json.dumps({"token": TOKEN})
+        mute = []
+        for path in ("/control", "/state", "/frames"):
+            for _ in range(24):
+                address = f"ws://localhost:{port}{path}"
+                mute.append(await connect(address, origin=own, proxy=None))  # type: ignore[arg-type]
+        await asyncio.sleep(2.1)
+        control = await connect(f"ws://localhost:{port}/control", origin=own, proxy=None)  # type: ignore[arg-type]
+        answers = []
+        for text in (ours, '{"kind": "stop", "value": ""}'):
+            await control.send(text)
+            answers.append(json.loads(await asyncio.wait_for(control.recv(), 1.0)))
+        async with connect(f"ws://localhost:{port}/state", proxy=None) as state:
+            answers.append("number" in json.loads(await asyncio.wait_for(state.recv(), 1.0)))
+        await asyncio.gather(control.close(), *(one.close() for one in mute))
+        return answers
+
+    with served(feed) as port:
+        assert asyncio.run(run(port)) == [{"ready": True}, {"done": "stop", "kind": "stop"}, True]
+    assert [one.kind for one in feed.requests] == ["stop"]
+
+
+def test_a_page_that_has_not_shown_its_token_is_not_thrown_out_by_few_others(port: int) -> None:
+    async def run() -> dict[str, bool]:
+        own = f"http://localhost:{port}"
+        sockets = []
+        for _ in range(UNPROVEN):
+            address = f"ws://localhost:{port}/control"
+            sockets.append(await connect(address, origin=own, proxy=None))  # type: ignore[arg-type]
+        await sockets[0].send(json.dumps({"token": TOKEN}))
+        answer = json.loads(await asyncio.wait_for(sockets[0].recv(), 1.0))
+        await asyncio.gather(*(one.close() for one in sockets))
+        return answer
+
+    assert asyncio.run(run()) == {"ready": True}
+
+
+def test_a_stop_is_done_when_the_guard_says_so(feed: Scripted, port: int) -> None:
+    feed.confirms = False
+    said = [json.dumps({"token": TOKEN}), '{"kind": "stop", "value": ""}']
+    begun_s = time.monotonic()
+    assert talk(port, "/control", said)[1] == {"refused": "unconfirmed", "kind": "stop"}
+    assert time.monotonic() - begun_s >= 0.3
+    feed.confirms = True
+    assert talk(port, "/control", said)[1] == {"done": "stop", "kind": "stop"}
 
 
 def test_a_page_that_says_nonsense_is_closed(port: int) -> None:

@@ -86,7 +86,8 @@ function drawSafety(shown, lost, known) {
   } else put($("safety"), say("nothing from the bus"), "bad");
   const minutes = `${Math.floor(recording.seconds / 60)}:${String(Math.floor(recording.seconds % 60)).padStart(2, "0")}`;
   const gaps = recording.dropped ? `, ${recording.dropped} ${say("gaps")}` : "";
-  put($("recording"), recording.on ? `${say("recording")} ${minutes}${gaps}` : say("not recording"), recording.dropped ? "bad" : recording.on ? "good" : "idle");
+  if (recording.failed && !recording.on) put($("recording"), say("recording failed"), "bad");
+  else put($("recording"), recording.on ? `${say("recording")} ${minutes}${gaps}` : say("not recording"), recording.dropped ? "bad" : recording.on ? "good" : "idle");
 }
 
 function drawLevers(shown, sure) {

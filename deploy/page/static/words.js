@@ -12,9 +12,11 @@ const DE = {
   "refused token": "Kein Zugriff: Seite über den Link mit Schlüssel öffnen", "refused deadman": "Abgelehnt: Totmann halten",
   "refused target": "Abgelehnt: dieses Bohrloch gibt es nicht mehr", "refused busy": "Abgelehnt: die Steuerung nimmt es nicht an",
   "refused nowhere": "Abgelehnt: dort ist keine Fläche gemessen", "boreholes seen": "Loch wählen, antippen", "no borehole seen": "Bohrloch antippen", "refused malformed": "Abgelehnt: nicht verstanden", "refused lost": "Keine Verbindung zur Steuerung",
+  "refused unconfirmed": "STOPP NICHT BESTÄTIGT: Not-Halt drücken", "recording failed": "AUFNAHME ABGEBROCHEN",
   nothing: "alles in Ordnung", "bus down": "Bus gestört", "time stood still": "Zeit stand still", "emergency stop": "NOT-HALT",
   "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen",
-  "joint positions not plausible": "Gelenkstellungen unglaubwürdig", "messages corrupted": "Nachrichten verfälscht",
+  "joint positions not plausible": "Gelenkstellungen unglaubwürdig", "messages corrupted or from two senders": "Nachrichten verfälscht oder von zwei Sendern",
+  "operator's switches missing": "Bedienseite der Steuerung still", "way to the gateway and back unknown or too long": "Weg zum Steuergerät unbekannt oder zu lang",
   "somebody else sends commands": "Ein anderer sendet Befehle", "operator moves a lever": "Bediener bewegt Hebel", "no fresh command": "Kein frischer Befehl",
   "command is no number, or beyond full": "Befehl ungültig", "exclusive joint together with others": "Gelenk darf nur allein fahren", "not armed": "nicht scharf", "the gateway does not follow": "Steuergerät folgt nicht",
   "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
@@ -32,6 +34,7 @@ const EN = {
   "refused token": "No access: open the page by the link with the key", "refused deadman": "Refused: hold the dead-man",
   "refused target": "Refused: that borehole is gone", "refused busy": "Refused: the loop does not take it", "refused malformed": "Refused: not understood",
   "refused nowhere": "Refused: no face is measured there", "boreholes seen": "Choose or touch a borehole", "no borehole seen": "Touch the borehole",
+  "refused unconfirmed": "STOP NOT CONFIRMED: press the emergency stop", "recording failed": "RECORDING HAS FAILED",
   "refused lost": "No connection to the loop", nothing: "all is well", "emergency stop": "EMERGENCY STOP",
 };
 

@@ -1,0 +1,250 @@
+"""Injected faults on the way between gateway and PC: python benchmarks/deploy/injections.py <json> [trials].
+
+Twin, gateway, bus process and policy as they are, on a clock of their own (`tests/stage.py`); a
+bridge between them delays, copies and corrupts messages, and strangers send. Each trial begins at
+another phase of all cycles. Times count until the valves get nothing, for good; "moves" says that
+they still move at the end of the time watched.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+
+import numpy as np  # noqa: E402
+from composed import option  # noqa: E402
+from stage import Stage  # noqa: E402
+
+from deploy.guard.guard import GuardState  # noqa: E402
+
+LATCHED = GuardState.LATCHED
+WATCHED_S = 4.0
+MESSAGES = ("JointPos1", "JointPos2", "LeverState", "MachineStatus", "ValveFeedback", "ValveCmd")
+
+
+def start_second_remote(stage: Stage, trial: int) -> None:
+    """A second remote holds the dead-man while the real one releases it."""
+    stage.bridge.second_remote, stage.bridge.remote_offset = True, trial % 4
+    stage.fault("deadman_released")
+
+
+def start_second_remote_alone(stage: Stage, trial: int) -> None:
+    """A second remote begins to send, both hold the dead-man."""
+    stage.bridge.second_remote, stage.bridge.remote_offset = True, trial % 16
+
+
+def copy_levers(stage: Stage, trial: int) -> None:
+    """A repeater's late copies of `LeverState`; then the real remote releases the dead-man."""
+    late_s = (0.24, 0.26, 0.28, 0.30, 0.56, 0.58, 0.60, 0.62)[trial % 8]
+    stage.bridge.echo_s = {"LeverState": late_s}
+    stage.go(late_s + 0.2)
+    stage.fault("deadman_released")
+
+
+def copy_commands(stage: Stage, trial: int) -> None:
+    """A repeater's late copies of `ValveCmd` at the gateway; then the PC stands still."""
+    stage.bridge.echo_s = {"ValveCmd": (0.24, 0.26, 0.28, 0.30)[trial % 4]}
+    stage.go(0.6)
+    stage.pause(1.0)
+
+
+def send_foreign_commands(stage: Stage, trial: int) -> None:
+    """A foreign node sends `ValveCmd` beside the PC."""
+    stage.bridge.foreign = {"Command_q3": 0.5, "CommandMode": 1}
+
+
+def stop_beside_hung_supervisor(stage: Stage, trial: int) -> None:
+    """The page's STOP while the supervisor hangs."""
+    stage.supervised = False
+    if hasattr(stage.memory, "stop"):
+        stage.stop()
+
+
+def hang_supervisor(stage: Stage, trial: int) -> None:
+    """The supervisor hangs; nobody presses anything."""
+    stage.supervised = False
+
+
+def corrupt_half(message: str) -> Callable[[Stage, int], None]:
+    def inject(stage: Stage, trial: int) -> None:
+        stage.bridge.half = message
+
+    inject.__doc__ = f"Every second `{message}` is corrupt."
+    return inject
+
+
+def delay(message: str) -> Callable[[Stage, int], None]:
+    def inject(stage: Stage, trial: int) -> None:
+        stage.bridge.delay_s = {message: 0.2}
+
+    inject.__doc__ = f"`{message}` comes 0.2 s late from now on."
+    return inject
+
+
+def answer(value: float) -> Callable[[Stage, int], None]:
+    def inject(stage: Stage, trial: int) -> None:
+        bundle = stage.adviser._bundle
+        bundle.command = lambda observation: np.full((1, 5), value)
+
+    inject.__doc__ = f"The policy answers {value:g}."
+    return inject
+
+
+SHORT: dict[str, list[Callable[[Stage, int], None]]] = {
+    "collect": [
+        start_second_remote,
+        start_second_remote_alone,
+        copy_levers,
+        copy_commands,
+        send_foreign_commands,
+        stop_beside_hung_supervisor,
+        hang_supervisor,
+        *(corrupt_half(name) for name in MESSAGES),
+        *(delay(name) for name in MESSAGES if name != "ValveFeedback"),
+    ],
+    "auto": [answer(float("nan")), answer(1e30)],
+}
+
+
+def measure_stop(stage: Stage, inject: Callable[[Stage, int], None], trial: int) -> float | None:
+    """Return the time until the valves get nothing for good; `None`: they still move."""
+    stage.get_going()
+    stage.go(0.013 * (trial % 11))  # another phase of cycles and requests
+    original = stage.adviser._bundle.command if stage.adviser else None
+    inject(stage, trial)
+    begun_ms = stage.ms
+    stage.go(WATCHED_S)
+    if stage.adviser:
+        stage.adviser._bundle.command = original
+    return None if stage.stopped_ms is None else max(0, stage.stopped_ms - begun_ms) / 1e3
+
+
+def measure_constant_delay(stage: Stage) -> dict[str, object]:
+    """0.5 s of delay to the PC for 150 s, then a new press: does the machine move?"""
+    stage.get_going()
+    stage.bridge.delay_s = {"to_pc": 0.5}
+    stage.go(150.0)
+    stage.fault("deadman_released")
+    stage.go(1.0)
+    stage.fault("none")
+    stage.go(2.0)
+    state = stage.view.state
+    return {"moves_again": stage.moves, "guard": state.guard.name, "trip": state.trip.value}
+
+
+def measure_start_delay(folder: Path) -> dict[str, object]:
+    """0.3 s of delay from the first message on: does the machine move?"""
+    stage = Stage(option("machine", "brokk170"), "collect", folder)
+    stage.bridge.delay_s = {"to_pc": 0.3}
+    moved = False
+    for _ in range(4):
+        stage.fault("none")
+        stage.go(1.5)
+        stage.fault("deadman_released")
+        stage.go(1.0)
+        moved = moved or stage.moves
+    stage.fault("none")
+    stage.go(2.0)
+    state = stage.view.state
+    return {"moves": moved or stage.moves, "guard": state.guard.name, "trip": state.trip.value}
+
+
+def measure_drift(stage: Stage) -> dict[str, object]:
+    """A delay to the PC that grows by 1 ms a second: how large is it when the machine stops?"""
+    stage.get_going()
+    stage.bridge.begun_ms = stage.ms
+    stage.bridge.delay_s = {"to_pc": lambda since_s: 1e-3 * since_s}
+    begun_ms = stage.ms
+    for _ in range(100):
+        # To and fro, so that no joint comes to its end.
+        stage.wanted = tuple(-u for u in stage.wanted)
+        stage.go(4.0, lambda: stage.memory.state.peek("guard") == LATCHED.value)
+        if stage.memory.state.peek("guard") == LATCHED.value:
+            break
+    seconds = (stage.ms - begun_ms) / 1e3
+    return {"delay_ms": round(seconds, 1), "stopped": not stage.moves}
+
+
+def measure_random_corruption(stage: Stage, trials: int) -> dict[str, object]:
+    """Wrong bits in 5 % of all messages: mean time until the guard latches."""
+    chance, found = np.random.default_rng(1), []
+    for _ in range(trials):
+        stage.get_going()
+        carry = stage.bridge._arrive
+
+        def arrive(frame, to_gateway, carry=carry):
+            if not to_gateway and chance.random() < 0.05:
+                frame = type(frame)(frame.frame_id, bytes([frame.data[0] ^ 1, *frame.data[1:]]))
+            carry(frame, to_gateway)
+
+        stage.bridge._arrive = arrive
+        begun_ms = stage.ms
+        stage.go(20.0, lambda: not stage.moves)
+        found.append((stage.ms - begun_ms) / 1e3)
+        del stage.bridge._arrive
+    return {"mean_s": round(float(np.mean(found)), 2), "worst_s": max(found)}
+
+
+def measure_reversals(stage: Stage) -> dict[str, object]:
+    """+-1 at 20 Hz on one joint for 1.7 s: reversals of the command sent."""
+    stage.get_going()
+    bundle, signs = stage.adviser._bundle, [1.0]
+    original = bundle.command
+
+    def command(observation):
+        signs[0] = -signs[0]
+        return np.array([[signs[0], 0, 0, 0, 0]])
+
+    bundle.command = command
+    sent: list[float] = []
+
+    def note() -> bool:
+        sent.append(float(stage.memory.state.read().sent[0]))
+        return False
+
+    stage.go(1.7, note)
+    bundle.command = original
+    directions = np.sign([one for one in sent if one])
+    return {"reversals": int((directions[1:] != directions[:-1]).sum())}
+
+
+def main(path: Path, trials: int) -> None:
+    table: dict[str, object] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        machine = option("machine", "brokk170")
+        for mode, injections in SHORT.items():
+            stage = Stage(machine, mode, Path(folder))  # type: ignore[arg-type]
+            for inject in injections:
+                found = [measure_stop(stage, inject, trial) for trial in range(trials)]
+                stopped = sorted(1e3 * one for one in found if one is not None)
+                row: dict[str, object] = {"trials": trials, "moves": found.count(None)}
+                if stopped:
+                    row |= {
+                        "median_ms": round(stopped[len(stopped) // 2]),
+                        "worst_ms": round(stopped[-1]),
+                    }
+                table[f"{mode}: {inject.__doc__}"] = row
+                sys.stdout.write(f"{mode}: {inject.__doc__} {row}\n")
+            stage.close()
+        stage = Stage(machine, "collect", Path(folder))
+        for measure in (measure_constant_delay, measure_drift):
+            table[str(measure.__doc__)] = measure(stage)
+        table[str(measure_start_delay.__doc__)] = measure_start_delay(Path(folder))
+        table[str(measure_random_corruption.__doc__)] = measure_random_corruption(stage, 10)
+        stage.close()
+        stage = Stage(machine, "auto", Path(folder))
+        table[str(measure_reversals.__doc__)] = measure_reversals(stage)
+        stage.close()
+    path.write_text(json.dumps(table, indent=2) + "\n")
+    for key, row in table.items():
+        sys.stdout.write(f"{key}: {row}\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 60)

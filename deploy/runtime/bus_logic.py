@@ -1,0 +1,184 @@
+"""Logic of the bus process: frames and requests in, frames and state out.
+
+Pure: no clock, no bus, no shared memory; `deploy.runtime.bus_process` brings all of it.
+
+* A message that ends a motion acts when it arrives, not in the next cycle.
+* A command that stops motion goes out at once, others with the cycle time of the DBC.
+* When sending ends, by the operator's stop or by its switches, zero goes out a few times before the
+  silence. When the process ends, zero goes out once more.
+* The operator's stop is stronger than any arming before it, whoever still says "armed".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from brokk_rl.machine import Machine
+from deploy.bus.can_bus import CanFrame
+from deploy.bus.description import STAMP, BusDescription
+from deploy.bus.protection import MessageFault
+from deploy.guard.guard import CommandRequest, Guard, GuardDecision, GuardState
+from deploy.guard.limits import GuardLimits
+from deploy.runtime.operator_state import (
+    OperatorControls,
+    OperatorState,
+    RequestedCommand,
+    StopRequest,
+)
+from deploy.runtime.receiver import BusReceiver
+
+CYCLE_S = 0.01
+"""Half the cycle time of valve commands in the example DBC (20 ms)."""
+LARGEST_OVERRUNS = 4095
+"""Of the 12-bit signal `Overruns`."""
+LAST_ZEROS = 5
+"""Zero commands before silence: 100 ms of the example bus, longer than the 70 ms after which the
+gateway misses commands. One of them would do; the others are for a bus that loses some."""
+IDLE, COMMAND = 0, 1
+"""Values of `CommandMode`."""
+HEARTBEAT = "PcHeartbeat"
+"""Message with the state of this computer; optional in a DBC."""
+
+
+@dataclass(frozen=True)
+class BusInputs:
+    """Newest records of the other processes; `None` where nothing has come.
+
+    Attributes:
+        controls: Switches on the operator's side.
+        stop: The operator's stop.
+        request: Command to be sent.
+    """
+
+    controls: OperatorControls | None
+    stop: StopRequest | None
+    request: RequestedCommand | None
+
+
+class BusLogic:
+    """See the module.
+
+    Args:
+        description: The bus.
+        machine: The machine.
+        limits: Of the guard.
+        commands: Whether anything is ever sent.
+
+    Attributes:
+        receiver: Known values of the machine.
+        decision: Of the guard, in the last cycle; `None` before the first.
+    """
+
+    def __init__(
+        self, description: BusDescription, machine: Machine, limits: GuardLimits, commands: bool
+    ) -> None:
+        self._description, self._machine, self._commands = description, machine, commands
+        self.receiver = BusReceiver(description, machine, limits)
+        self._guard = Guard(limits, self.receiver.bounds)
+        self.decision: GuardDecision | None = None
+        self._zeros_left = 0
+        self._controls_age_s = math.inf
+        # Counters and due times are kept by message name, since each has its own cycle.
+        self._counters: dict[str, int] = {}
+        self._due_s: dict[str, float] = {}
+
+    def take(self, frame: CanFrame, now_s: float) -> tuple[MessageFault | None, bool]:
+        """Take in a frame; return its fault, if any, and whether to decide at once."""
+        fault = self.receiver.take(frame, now_s)
+        # Only while commanding: otherwise there is no motion to end, and the cycle keeps its time.
+        if self.decision is None or self.decision.state is not GuardState.ACTIVE:
+            return fault, False
+        seen = self.receiver.build_guard_input(now_s, True, self._controls_age_s)
+        return fault, self._guard.stops(seen)
+
+    def decide(
+        self, now_s: float, bus_up: bool, inputs: BusInputs, num_missed: int
+    ) -> list[CanFrame]:
+        """Let the guard decide; return the frames to send now.
+
+        Args:
+            now_s: Monotonic time.
+            bus_up: Whether the bus works.
+            inputs: Newest records of the other processes.
+            num_missed: Cycles missed so far.
+        """
+        controls, requested = inputs.controls, inputs.request
+        self._controls_age_s = math.inf if controls is None else now_s - controls.t_s
+        seen = self.receiver.build_guard_input(now_s, bus_up, self._controls_age_s)
+        request = None
+        if requested is not None:
+            request = CommandRequest(tuple(requested.u.tolist()), now_s - requested.t_s)
+        before = self.decision
+        armed = self._commands and is_armed(controls, inputs.stop)
+        self.decision = self._guard.decide(now_s, armed, seen, request)
+        if not self._commands:
+            return []
+        if self.decision.sends:
+            self._zeros_left = LAST_ZEROS
+        elif self._zeros_left == 0:
+            return []
+        stops = before is not None and any(before.u) and not any(self.decision.u)
+        silenced = before is not None and before.sends and not self.decision.sends
+        return self._build_frames(now_s, at_once=stops or silenced, num_missed=num_missed)
+
+    def build_state(self, now_s: float, bus_up: bool, num_missed: int) -> OperatorState:
+        """Return the state to publish; call `decide` first."""
+        assert self.decision is not None
+        return self.receiver.build_state(now_s, bus_up, self.decision, num_missed)
+
+    def end(self, now_s: float, num_missed: int) -> list[CanFrame]:
+        """Return the last frames: zero, where anything was being sent."""
+        if self.decision is None or not self.decision.sends:
+            return []
+        # To the guard the bus is going down. That is the strictest input: no request overrides it.
+        closing = self.receiver.build_guard_input(now_s, False, self._controls_age_s)
+        self.decision = self._guard.decide(now_s, True, closing, None)
+        return self._build_frames(now_s, at_once=True, num_missed=num_missed)
+
+    def _build_frames(self, now_s: float, at_once: bool, num_missed: int) -> list[CanFrame]:
+        """Return the guard's decision as a frame, and the heartbeat, where they are due.
+
+        This is the one place from which valves are commanded.
+        """
+        assert self.decision is not None
+        values: dict[str, float] = {STAMP: self.receiver.stamp_s}
+        for joint, u in zip(self._machine.joint_names, self.decision.u, strict=True):
+            values[f"Command_{joint}"] = u
+        values["CommandMode"] = COMMAND if self.decision.state is GuardState.ACTIVE else IDLE
+        frames = []
+        command = self._build_frame(self._description.command.name, values, now_s, at_once)
+        if command is not None:
+            frames.append(command)
+            self._zeros_left -= not self.decision.sends
+            # Remembered before it is sent: the bus may deliver it back before `send` returns.
+            self.receiver.note_own_command(command.data)
+        # The gateway expects a heartbeat only where its DBC has one.
+        if HEARTBEAT in self._description.layouts:
+            overruns = min(LARGEST_OVERRUNS, num_missed)
+            state = {"PcState": self.decision.state.value, "Overruns": overruns}
+            heartbeat = self._build_frame(HEARTBEAT, state, now_s, at_once=False)
+            frames += [] if heartbeat is None else [heartbeat]
+        return frames
+
+    def _build_frame(
+        self, name: str, values: Mapping[str, float], now_s: float, at_once: bool
+    ) -> CanFrame | None:
+        """Return the next frame of a message, `None` where it is not due."""
+        layout = self._description.layouts[name]
+        due_s, period_s = self._due_s.get(name, now_s), layout.period_s
+        # half a cycle early is on time: the next chance would be half a cycle late
+        if now_s < due_s - CYCLE_S / 2 and not at_once:
+            return None
+        self._due_s[name] = max(due_s, now_s - period_s) + period_s
+        counter = self._counters[name] = self._counters.get(name, -1) + 1
+        data = self._description.encode(name, values, counter)
+        return CanFrame(layout.frame_id, data, layout.extended)
+
+
+def is_armed(controls: OperatorControls | None, stop: StopRequest | None) -> bool:
+    """Return whether commands are to be sent: armed, and later than the operator's last stop."""
+    if controls is None or not controls.armed:
+        return False
+    return stop is None or controls.armed_t_s > stop.t_s

@@ -1,0 +1,235 @@
+"""The examiner's own view of a repair: `effects.yaml` is simulated on recordings that were withheld.
+
+The examiner fits a simulator to the reference, puts the effects of an answer around it, and runs it
+freely through recordings of the changed machine that no candidate got. The floor is the error of
+the same simulator on the same machine without what the case is about, under the same commands.
+Nothing of the diagnosis is used but the names of its files.
+Axes: `W` windows, `K` steps, `J` joints.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from actuators.effects.composition import ActuatorWithEffects, MeasuredActuatorModel
+from brokk_rl import open_loop, record, registry
+from brokk_rl.contracts.actuator import Actuator, ActuatorFit
+from brokk_rl.errors import BrokkError, RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.open_loop import FreeRunWindows
+from brokk_rl.record import Recording
+from diagnosis import effect_library
+from diagnosis.answer import ANSWER_FILE, Answer, read_answer
+from diagnosis.case import estimate_running_s
+from diagnosis.pipeline import EFFECTS_FILE
+from exam.dataset import CASES_FOLDER, WITHHELD_FOLDER
+from exam.generate import UNCHANGED_FOLDER
+
+HORIZON_S = 5.0
+"""Length of the free runs, s: as `closed` of an answer is defined."""
+STRIDE_S = 2.5
+"""Distance between two of them, s: they overlap by half."""
+MIN_GAP_RATIO = 1.05
+"""Error over floor from which there is a gap to close. Chosen by hand; not searched."""
+NUM_DRAWS = 200
+"""Bootstrap draws over windows."""
+MAX_DIFFERENCE = 0.2
+"""Difference between the share that an answer states and the examiner's from which, if both lie
+outside of the other's interval, they disagree. Chosen by hand: twice the width of usual intervals."""
+
+
+@dataclass(frozen=True)
+class Examination:
+    """The examiner's errors of one answer on the withheld part.
+
+    Attributes:
+        before: Error of the simulator without effects, over all joints.
+        after: The same with the effects of the answer.
+        floor: The same without effects, on the unchanged machine.
+        closed: Share of the gap that the effects close; `None` where there is none.
+        ci95: Its interval.
+        said: Share that the answer states, `None` without one.
+        differs: Whether answer and examiner disagree.
+    """
+
+    before: float
+    after: float
+    floor: float
+    closed: float | None
+    ci95: tuple[float, float] | None
+    said: float | None
+    differs: bool
+
+
+class ExaminerSimulator:
+    """A simulator of one case, and the windows that it is held against.
+
+    Args:
+        exam: Folder of the exam.
+        case: Name of the case.
+        fit: Fit of the simulator.
+        machine: The machine as the candidates know it.
+
+    Raises:
+        RecordingError: there are no withheld recordings, or the simulator cannot be fitted.
+    """
+
+    def __init__(self, exam: Path, case: str, fit: ActuatorFit, machine: Machine) -> None:
+        self._machine = machine
+        place, hidden = exam / CASES_FOLDER / case, exam / WITHHELD_FOLDER / case
+        reference = record.read_recordings(str(place / "reference" / "*.parquet"), machine)
+        field = record.read_recordings(str(place / "field" / "*.parquet"), machine)
+        withheld = record.read_recordings(str(hidden / "*.parquet"), machine)
+        unchanged = record.read_recordings(str(hidden / UNCHANGED_FOLDER / "*.parquet"), machine)
+        with tempfile.TemporaryDirectory(prefix="brokk") as scratch:
+            self._actuator = fit.fit(machine, reference, [], Path(scratch), 0, torch.device("cpu"))
+        # of the field an answer knows how long the machine had run; the withheld part goes on
+        running = estimate_running_s([*field, *withheld])[len(field) :]
+        self._cut, self._running_s = cut_with_times(withheld, running, machine)
+        self._unchanged, _ = cut_with_times(unchanged, running, machine)
+        self._before = self._squares(self._actuator, self._cut)
+        self._floor = self._squares(self._actuator, self._unchanged)
+
+    def examine(self, effects: Mapping[str, Any], said: Answer | None) -> Examination:
+        """Return the errors with these effects, specs by name, beside what the answer says."""
+        after = self._before
+        if effects:
+            repaired = TimedActuator(self._actuator, effects, self._running_s)
+            after = self._squares(repaired, self._cut)
+        draws = np.random.default_rng(0).multinomial(
+            len(after), np.full(len(after), 1.0 / len(after)), NUM_DRAWS
+        )
+        weights = np.concatenate([np.ones((1, len(after))), draws]) / len(after)
+        errors = [np.sqrt(weights @ squares) for squares in (self._before, after, self._floor)]
+        closed, interval = compute_closed(*errors)
+        stated = said.gap.closed if said and said.gap else None
+        differs = False
+        if closed is not None and interval is not None and stated is not None:
+            apart = abs(closed - stated.mean) > MAX_DIFFERENCE
+            low, high = stated.ci95
+            differs = apart and not (
+                interval[0] <= stated.mean <= interval[1] or low <= closed <= high
+            )
+        return Examination(
+            before=float(errors[0][0]),
+            after=float(errors[1][0]),
+            floor=float(errors[2][0]),
+            closed=closed,
+            ci95=interval,
+            said=None if stated is None else stated.mean,
+            differs=differs,
+        )
+
+    def _squares(self, actuator: Actuator, cut: FreeRunWindows) -> np.ndarray:
+        """Return the mean square error of each window over all joints, `(W,)`.
+
+        Joints count by their travel where rad and m meet.
+        """
+        paths = open_loop.roll_out(actuator, self._machine, cut, torch.device("cpu"))
+        units = {joint.unit for joint in self._machine.joints}
+        size = self._machine.upper - self._machine.lower if len(units) > 1 else 1.0
+        return np.square((paths - cut.measured) / size).mean((1, 2))
+
+
+def compute_closed(
+    before: np.ndarray, after: np.ndarray, floor: np.ndarray
+) -> tuple[float | None, tuple[float, float] | None]:
+    """Return the closed share of a gap and its interval from errors of draws, the first as it is."""
+    if before[0] < MIN_GAP_RATIO * floor[0]:
+        return None, None
+    # in a draw the gap may vanish
+    gap = np.maximum(before - floor, (1.0 - 1.0 / MIN_GAP_RATIO) * before)
+    share = (before - after) / gap
+    low, high = np.quantile(share[1:], [0.025, 0.975])
+    return float(share[0]), (float(low), float(high))
+
+
+def cut_with_times(
+    recordings: Sequence[Recording], running_s: Sequence[float], machine: Machine
+) -> tuple[FreeRunWindows, np.ndarray]:
+    """Return windows of recordings, and how long the machine had run at the first sample of each."""
+    cuts, times = [], []
+    for recording, begun_s in zip(recordings, running_s, strict=True):
+        cut = open_loop.cut_windows([recording], machine, HORIZON_S, STRIDE_S)
+        cuts.append(cut)
+        times.append(begun_s + STRIDE_S * np.arange(len(cut.q)))
+    return open_loop.join_windows(cuts), np.concatenate(times)
+
+
+@dataclass(frozen=True)
+class TimedActuator:
+    """An actuator with effects, on a machine that has run for a while at the start of each window.
+
+    Attributes:
+        actuator: The actuator.
+        effects: Specs of the effects by name, the first nearest to the machine.
+        running_s: Running time of each environment, `(W,)`.
+    """
+
+    actuator: Actuator
+    effects: Mapping[str, Any]
+    running_s: np.ndarray
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> MeasuredActuatorModel:
+        """Return a model for as many environments as there are running times."""
+        around = ActuatorWithEffects(actuator=self.actuator, effects=dict(self.effects))
+        model = around.build(machine, num_envs, device)
+        for name, effect in self.effects.items():
+            running = getattr(effect, "running", None)
+            if running is not None:
+                wrapped: Any = model.effects[name]
+                times = torch.as_tensor(self.running_s, dtype=torch.float32, device=device)
+                wrapped.parameters[running].copy_(times[:, None])
+        return model
+
+
+def read_effects(path: Path, machine: Machine) -> dict[str, Any]:
+    """Return the specs of an `effects.yaml` by name; a file is not trusted with targets of its own.
+
+    Raises:
+        RecordingError: it is missing, no YAML, or names something that is no effect.
+    """
+    try:
+        nodes = yaml.safe_load(registry.rename_targets(path.read_text())) or {}
+        known = {kind.name: kind.target for kind in effect_library.load_effects(machine)}
+        found = {}
+        for name, node in nodes.items():
+            target, fields = known[name], dict(node)
+            if fields.pop("_target_") != f"{target.__module__}.{target.__name__}":
+                raise ValueError(f"'{name}' has another target than the library's")
+            found[name] = target(**fields)
+    except (OSError, KeyError, ValueError, TypeError, AttributeError, yaml.YAMLError) as error:
+        raise RecordingError(f"{path}: no effects of the library ({error})") from error
+    return found
+
+
+def examine_case(
+    exam: Path, fit: ActuatorFit, machine: Machine, case: str, answers: Sequence[Path]
+) -> list[dict[str, Any]]:
+    """Return the examination of each answer to a case, as plain JSON data.
+
+    `error` holds the reason where an answer could not be simulated; it then closes nothing.
+    """
+    simulator = ExaminerSimulator(exam, case, fit, machine)
+    found = []
+    for place in answers:
+        error, effects = None, {}
+        said = read_answer(place / ANSWER_FILE) if (place / ANSWER_FILE).is_file() else None
+        try:
+            names_effects = said is not None and said.verdict == "effects"
+            # a baseline writes no file: it repairs nothing
+            if names_effects and (place / EFFECTS_FILE).is_file():
+                effects = read_effects(place / EFFECTS_FILE, machine)
+            result = simulator.examine(effects, said)
+        except BrokkError as failure:
+            error, result = str(failure), simulator.examine({}, said)
+        found.append({**vars(result), "error": error})
+    return found

@@ -1,0 +1,249 @@
+"""Arms of the held-out make: `N` runs side by side behind a `Link`, and their plant family."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Self
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Command, JointState
+from brokk_rl.spec import spec
+from exam.case_distribution import PlantRun
+from exam.held_out.causes import CAUSES, OutsideCauses
+from exam.held_out.hydraulics import OPEN, STEP_S, Linkage, PilotedSpools, SensingHydraulics
+from exam.held_out.parameters import CHANGES, ArmParameters, change_machine, draw_machine
+from exam.held_out.readings import TRACKER_SPREAD, RunChance, SteppedEncoders
+from exam.plants.electronics import CommandBus
+from exam.plants.linkage import Arm
+
+SPOOL_STEP = 1e-5
+"""Movement of a spool in a step, of full stroke, that counts as one."""
+VISCOSITY_RATIO = 6.0
+"""Viscosity of cold over that of warm oil: ISO VG 46 at 10 and 50 degrees Celsius, ISO 3448."""
+
+
+class SensingArm:
+    """A `Link` to simulated machines of the held-out make.
+
+    Args:
+        machine: Geometry, masses, limits.
+        parameters: Of each run's machine.
+        kinds: Cause outside the library of each run, or `None`.
+        seeds: Chance of each run.
+        elapsed_s: How long each machine has run before.
+        tracked: Whether the tool of each run is measured.
+        steps: Control periods of the longest run.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        parameters: Sequence[ArmParameters],
+        kinds: Sequence[str | None],
+        seeds: Sequence[int],
+        elapsed_s: np.ndarray,
+        tracked: Sequence[bool],
+        steps: int,
+    ) -> None:
+        self._machine = machine
+        n = self._n = {name: np.stack([one[name] for one in parameters]) for name in parameters[0]}
+        self._chance = [
+            RunChance(seed, one, steps) for seed, one in zip(seeds, parameters, strict=True)
+        ]
+        self._lost = np.stack([one.lost for one in self._chance], 1)
+        self._queue = np.stack([one.queue for one in self._chance], 1)
+        self._noise = np.stack([one.noise for one in self._chance], 1)
+        self._settling = np.stack([one.settling for one in self._chance], 1)
+        luck = np.stack([one.luck for one in self._chance], 1)
+        phase = np.array([one.phase for one in self._chance])
+        self._causes = OutsideCauses(machine, list(kinds), n["severity"], phase, luck)
+        bus = {
+            "transport_s": n["transport_s"] + n["wait_s"],
+            "jitter_s": 0.5 * n["queue_s"],  # mean delay of the effect, whose delays are uniform
+            "loss": n["loss"],
+        }
+        self._bus = CommandBus(bus, machine.period_s)
+        self._spools = PilotedSpools(n)
+        self._hydraulics = SensingHydraulics(
+            n, machine, self._causes.back_flow, self._causes.pump_lag
+        )
+        self._linkage = Linkage(n, machine, self._causes.mounting_rad)
+        self._weight, self._encoders = Arm(machine, n), SteppedEncoders(n)
+        self._q = np.tile(machine.home, (len(parameters), 1))
+        self._link, self._trace = self._q.copy(), [self._q.copy()]
+        self._is_open = np.zeros(self._q.shape, dtype=bool)
+        self._motions = np.zeros(self._q.shape, dtype=int)
+        self._k, self._tracked = 0, np.array(tracked)
+        self._elapsed_s = np.asarray(elapsed_s, dtype=float)
+        self._half_play = 0.5 * (n["play_rad"] + n["added_play_rad"])
+        self._num_kept = (
+            1 + round(machine.period_s / STEP_S) * 12
+        )  # stamps are never later than that
+        self._hydraulics.hold(self._weight.load(self._link))
+
+    @property
+    def q(self) -> np.ndarray:
+        """True positions of the links, `(N, J)`."""
+        return self._link
+
+    def read(self) -> JointState:
+        """Return the present readings of the encoders."""
+        shown = self._encoders.read(self._stamped(), self._noise[self._k])
+        return JointState(self._k * self._machine.period_s, self._causes.show(self._k, shown))
+
+    def extra(self) -> Mapping[str, np.ndarray]:
+        """Return the measured tool, NaN in runs without a tracker; empty where none has one."""
+        if not self._tracked.any():
+            return {}
+        tip_m, pitch_rad = self._weight.tool(self._link)
+        seen = np.concatenate([tip_m, pitch_rad[:, None]], 1)
+        noise = np.stack([chance.tool[self._k] for chance in self._chance])
+        seen = np.where(self._tracked[:, None], seen + noise * TRACKER_SPREAD, np.nan)
+        return dict(zip(("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad"), seen.T, strict=True))
+
+    def send(self, command: Command) -> Command:
+        """Move on by one control period with these commands, `(N, J)`."""
+        machine, causes, hydraulics = self._machine, self._causes, self._hydraulics
+        t_s, k = self._k * machine.period_s, self._k
+        run_s = self._elapsed_s + t_s
+        u = causes.drive(np.asarray(command.u, dtype=float), run_s)
+        # below its loss a frame is lost: 0 or 1 says which
+        self._bus.send(
+            u, t_s, np.where(self._lost[k], -1.0, 1.0)[:, None], self._queue[k][:, None], 0.0 * u
+        )
+        oil, load = self._oil(run_s), self._weight.load(self._link)
+        lever = self._linkage.compute_lever(self._q)
+        stroke = self._linkage.compute_stroke(self._q)
+        sticking = causes.stick(np.zeros_like(self._is_open))
+        for i in range(round(machine.period_s / STEP_S)):
+            before = self._spools.spool
+            area = self._spools.step(self._bus.at(t_s + i * STEP_S), sticking, hydraulics.drop)
+            sticking = causes.stick(np.abs(self._spools.spool - before) > SPOOL_STEP)
+            is_open = np.abs(area) > OPEN
+            self._motions += is_open & ~self._is_open
+            self._is_open = is_open
+            leak = causes.leak(is_open)
+            y = hydraulics.step(area, lever, stroke, load, self._springs() * oil**2, leak)
+            speed = causes.move_others(y * machine.max_speed)
+            moved = self._q + STEP_S * speed
+            self._q = np.clip(moved, causes.lower, causes.upper)
+            hydraulics.stop(self._q != moved)
+            self._link = np.clip(self._link, self._q - self._half_play, self._q + self._half_play)
+            self._trace.append(self._link)
+        del self._trace[: -self._num_kept]
+        self._k += 1
+        return command
+
+    def _springs(self) -> np.ndarray:
+        """Return the factor on the compensators' drops: each motion has its own rest."""
+        n, drawn = self._n, self._motions % len(self._settling)
+        rest = np.take_along_axis(self._settling, drawn[None], 0)[0]
+        return n["spring"] * (1.0 + n["settling"] * rest) ** 2
+
+    def _oil(self, run_s: np.ndarray) -> np.ndarray:
+        """Return the factor on all flows by the oil's viscosity, `(N, J)`.
+
+        The temperature rises with one time constant, and the logarithm of the viscosity falls with
+        it (Reynolds' law), so the flow rises early and then
+        slowly.
+        """
+        n, run_s = self._n, run_s[:, None]
+        own = 1.0 + n["warm_change"] * _compute_warming(run_s / 900.0)  # s: the nuisance's tank
+        return own * (1.0 + n["oil_change"] * _compute_warming(run_s / n["oil_s"]))
+
+    def _stamped(self) -> np.ndarray:
+        """Return the positions of the moments that the readings are stamped for, `(N, J)`."""
+        late = self._n["late_s"]
+        if not late.any():
+            return self._link
+        steps = np.minimum(late / STEP_S, len(self._trace) - 1.0)
+        trace = np.stack(self._trace)
+        place = len(trace) - 1 - np.round(steps).astype(int)
+        return np.take_along_axis(trace, place[None], 0)[0]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        pass
+
+
+def _compute_warming(times: np.ndarray) -> np.ndarray:
+    """Return how much of the change of viscosity is over after so many time constants, 0 to 1."""
+    left = np.exp(-times)
+    return (VISCOSITY_RATIO - VISCOSITY_RATIO**left) / (VISCOSITY_RATIO - 1.0)
+
+
+@spec
+class HeldOutPlants:
+    """Arms with a load-sensing pump, for sealed exams only.
+
+    Attributes:
+        roughness: By name, size of the nuisances.
+        sealed: Whether the exam is sealed; otherwise nothing can be drawn.
+        outside_not_on: Joints on which nothing of an outside cause would be seen.
+    """
+
+    roughness: dict[str, float]
+    sealed: bool
+    outside_not_on: dict[str, tuple[str, ...]]
+
+    is_held_out = True
+
+    def check(self) -> None:
+        for name in self.outside_not_on:
+            if name not in CAUSES:
+                raise ConfigError(
+                    f"exam.plants.outside_not_on: no cause '{name}'; {list_choices(name, CAUSES)}"
+                )
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that its plants can have."""
+        return tuple(CHANGES)
+
+    @property
+    def outside_faults(self) -> tuple[str, ...]:
+        """Names of the causes outside the library that its plants can have."""
+        return CAUSES
+
+    def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
+        """Return the make of each run: all are of one."""
+        return ["sensing"] * len(runs)
+
+    def build(self, machine: Machine, runs: Sequence[PlantRun], run_s: float) -> SensingArm:
+        """Return runs side by side.
+
+        Raises:
+            ConfigError: the exam is not sealed, or an effect, cause or roughness is unknown.
+        """
+        if not self.sealed:
+            raise ConfigError(
+                "exam_plants=held_out: this make is held out from development and calibration; only a "
+                "sealed exam draws from it (exam_protocol=sealed), development has exam_plants=valves"
+            )
+        parameters, kinds = [], []
+        for run in runs:
+            if run.roughness not in self.roughness:
+                raise ConfigError(
+                    f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
+                    f"{list_choices(run.roughness, self.roughness)}"
+                )
+            numbers = draw_machine(machine, run.seed, self.roughness[run.roughness])
+            numbers = change_machine(numbers, run.faults)
+            if run.outside_fault is not None:
+                numbers["severity"] = run.outside_fault.severity
+            parameters.append(numbers)
+            kinds.append(run.outside_fault.kind if run.outside_fault else None)
+        return SensingArm(
+            machine,
+            parameters,
+            kinds,
+            [run.chance for run in runs],
+            np.array([run.elapsed_s for run in runs]),
+            [run.tracked for run in runs],
+            round(run_s / machine.period_s),
+        )

@@ -1,0 +1,149 @@
+"""Causes outside the library that only the held-out make has.
+
+No effect of the library describes them: they depend on time at rest, on the sign of the command
+before, on other joints' motion, or on the pose without the weight. Each has a severity by joint: 1
+for a plain one, 0 for none.
+
+silted_spool     a spool that rests silts up; it sticks until the pilot force has grown, then lets go
+ajar_check       after a motion the load-holding valve stays ajar for seconds: the joint sinks on
+supply_voltage   commands are scaled by a supply voltage that falls and recovers with its charger
+moved_stop       a stop that moved into the travel
+back_flow        a missing load check and a pump that wakes slowly: a start under load first goes the
+                 wrong way
+stale_readings   the encoder repeats its reading for some tenths of a second, then jumps
+coarse_driver    the valve's driver knows a few currents only
+levelling        a levelling cylinder takes up part of the next joint's motion
+moved_mounting   a cylinder mounted elsewhere: speed varies with the pose
+reversal_pause   after a reversal the valve stays closed for some tenths of a second
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from exam.held_out.hydraulics import STEP_S
+
+CAUSES = (
+    "silted_spool", "ajar_check", "supply_voltage", "moved_stop", "back_flow", "stale_readings", "coarse_driver",
+    "levelling", "moved_mounting", "reversal_pause",
+)  # fmt: skip
+
+# Sizes at severity 1, chosen by hand so that each shows plainly in the motion.
+SILT_STROKE = 0.8
+SILT_S = 1.0
+AJAR_SPEED, AJAR_S = 0.12, 2.0
+VOLTAGE_LOSS, CHARGER_S, CHARGER_SHARE = 0.25, 24.0, 0.5
+STOP_TRAVEL = 0.4
+BACK_FLOW, WAKING = 2.0, 0.3
+STALE_EVERY_S, STALE_S = 2.5, 0.6
+DRIVER_LEVELS = 3.0
+LEVELLING_SHARE = 0.3
+MOUNTING_RAD = 1.1
+PAUSE_S = 0.7
+
+
+class OutsideCauses:
+    """The causes of several runs side by side.
+
+    Args:
+        machine: Limits, period, full speeds.
+        kinds: Cause of each run, or `None`, `(N,)`.
+        severity: `(N, J)`.
+        phase: Uniform random number of each run, `(N,)`: when its charger begins.
+        luck: Uniform random numbers, `(T, N)`, one a control period.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        kinds: list[str | None],
+        severity: np.ndarray,
+        phase: np.ndarray,
+        luck: np.ndarray,
+    ) -> None:
+        self._period_s, self._luck, self._phase = machine.period_s, luck, phase
+        self._of: dict[str, np.ndarray] = {}
+        for kind in CAUSES:
+            if kind in kinds:
+                has = np.array([other == kind for other in kinds])
+                self._of[kind] = severity * has[:, None]
+        none = np.zeros_like(severity)
+        travel = machine.upper - machine.lower
+        cut = STOP_TRAVEL * travel * self._of.get("moved_stop", none)
+        # the stop that is farther from home: the machine must reach its home
+        is_upper = machine.upper - machine.home >= machine.home - machine.lower
+        upper = np.where(is_upper, np.maximum(machine.upper - cut, machine.home), machine.upper)
+        lower = np.where(is_upper, machine.lower, np.minimum(machine.lower + cut, machine.home))
+        self.lower, self.upper = (
+            np.broadcast_to(lower, none.shape),
+            np.broadcast_to(upper, none.shape),
+        )
+        self.mounting_rad = MOUNTING_RAD * self._of.get("moved_mounting", none)
+        self.back_flow = BACK_FLOW * self._of.get("back_flow", none)
+        self.pump_lag = 1.0 + WAKING * self._of.get("back_flow", none).max(1, keepdims=True)
+        self._rest_s, self._since_s = none.copy(), none + 1e3
+        self._direction, self._pause_s = none.copy(), none.copy()
+        self._stale_s, self._held = none[:, 0].copy(), none.copy()
+        self._is_held = none.astype(bool)
+        # a joint is levelled by the next one, the last by the one before
+        self._master = np.minimum(np.arange(machine.num_joints) + 1, machine.num_joints - 1)
+        self._master[-1] = max(machine.num_joints - 2, 0)
+        self._full_speed = machine.max_speed
+
+    def drive(self, u: np.ndarray, t_s: np.ndarray) -> np.ndarray:
+        """Return the commands that the drivers give at the running times `t_s`, `(N,)`."""
+        if (size := self._of.get("supply_voltage")) is not None:
+            part = np.mod(t_s / CHARGER_S + self._phase, 1.0)
+            low = (part < CHARGER_SHARE)[:, None]
+            u = u * (1.0 - VOLTAGE_LOSS * size.max(1, keepdims=True) * low)
+        if (size := self._of.get("coarse_driver")) is not None:
+            levels = DRIVER_LEVELS / np.maximum(size, 1e-3)
+            u = np.where(size > 0, np.round(u * levels) / levels, u)
+        if (size := self._of.get("reversal_pause")) is not None:
+            heads = np.sign(u) * (np.abs(u) > 0.05)
+            turned = (heads * self._direction < 0) & (size > 0)
+            self._pause_s = np.where(turned, PAUSE_S * size, self._pause_s - self._period_s)
+            self._direction = np.where(heads != 0, heads, self._direction)
+            u = np.where(self._pause_s > 0, 0.0, u)
+        return u
+
+    def stick(self, moved: np.ndarray) -> np.ndarray:
+        """Return the further friction of the spools, of full stroke, `(N, J)`.
+
+        Args:
+            moved: Whether each spool moved in the last step.
+        """
+        size = self._of.get("silted_spool")
+        if size is None:
+            return np.zeros_like(moved, dtype=float)
+        self._rest_s = np.where(moved, 0.0, self._rest_s + STEP_S)
+        return SILT_STROKE * size * (1.0 - np.exp(-self._rest_s / SILT_S))
+
+    def leak(self, is_open: np.ndarray) -> np.ndarray:
+        """Return the further leak of the closed valves, of full speed, `(N, J)`."""
+        size = self._of.get("ajar_check")
+        if size is None:
+            return np.zeros_like(is_open, dtype=float)
+        self._since_s = np.where(is_open, 0.0, self._since_s + STEP_S)
+        return AJAR_SPEED * size * np.exp(-self._since_s / AJAR_S) * ~is_open
+
+    def move_others(self, speed: np.ndarray) -> np.ndarray:
+        """Return the speeds, rad/s or m/s, with what other joints add, `(N, J)`."""
+        size = self._of.get("levelling")
+        if size is None:
+            return speed
+        return speed - LEVELLING_SHARE * size * speed[:, self._master]
+
+    def show(self, k: int, reading: np.ndarray) -> np.ndarray:
+        """Return the readings of period `k` as they are sent, `(N, J)`."""
+        size = self._of.get("stale_readings")
+        if size is None:
+            return reading
+        begins = (self._luck[k] < self._period_s / STALE_EVERY_S) & (self._stale_s <= 0)
+        length_s = STALE_S * size.max(1)
+        self._stale_s = np.where(begins, length_s, self._stale_s - self._period_s)
+        stale = (self._stale_s > 0)[:, None] & (size > 0)
+        self._held = np.where(stale & self._is_held, self._held, reading)
+        self._is_held = stale
+        return np.where(stale, self._held, reading)

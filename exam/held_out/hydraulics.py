@@ -1,0 +1,291 @@
+"""Hydraulics of the held-out make, from commands at the valve block to joint speeds.
+
+Per joint, with a step of `STEP_S`:
+
+    pilot       a chamber fills through an orifice: p' = sign(d) sqrt(|d|) / T with d = u - p
+    spool       dry friction about the pilot, pushed back by the flow force: x = p / (1 + f a drop)
+    metering    notches, then the land: area a(x) beyond the overlap
+    inlet       q = a sqrt(min(set, supply - inlet pressure) / nominal), `set` by the compensator
+    outlet      regulated: q = r a sqrt(p / (p + p0))
+    chambers    p' = stiffness / volume (flow in - flow out), volumes with the stroke
+    linkage     the cylinder is a side of a triangle, so its lever arm changes with the pose
+    joint       force of both chambers, load, dry friction larger at rest, viscous friction
+    pump        follows the highest inlet pressure plus a margin, with a lag; limited in flow and
+                in power, so that the heaviest joint is starved first
+
+Pressures and speed of a step are solved together (linearly implicit Euler); dry friction bounds the
+momentum, so it stops a joint and never drives it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from exam.held_out.parameters import ArmParameters, compute_notch_area
+
+STEP_S = 0.0025
+"""Time step, s: a twentieth of a control period; the first mode of a joint lasts 50 of them."""
+FORCE_RATIO = 1.6
+"""Cylinder force at relief pressure over the machine's yield force; as a relief valve is set."""
+FIRST_MODE_HZ = 6.0
+"""First mode on closed cylinders that the machine's stiffness was estimated for, Hz."""
+NOMINAL_DROP = 0.06
+"""Drop over the metering edge that its compensator keeps: 15 of 250 bar."""
+MARGIN = 0.11
+"""Pressure of the pump above the highest load: 27 of 250 bar, above the compensators' drop."""
+STANDBY = 0.08
+"""Pressure of the idle pump: 20 of 250 bar."""
+LINE_SOFTNESS = 0.05
+"""Pump flow that the line stores per relief pressure, s. Chosen by hand; not searched."""
+OUTLET_PRESSURE = 0.02
+"""Pressure at which the outlet regulator begins to regulate: 5 of 250 bar."""
+OPEN = 1e-4
+"""Area from which a valve counts as open."""
+STILL = 0.004
+"""Speed, of full speed, below which a joint rests. Chosen by hand; not searched."""
+STRIBECK = 0.02
+"""Speed, of full speed, over which friction falls from that at rest to that in motion."""
+TYPICAL_HOLDING = 0.25
+"""Pressure that holds two fifths of the yield force: there a leak has its nominal speed."""
+EPSILON = 1e-4
+"""Drop below which an orifice is laminar, so that its slope is finite."""
+
+
+def compute_orifice(drop: np.ndarray, nominal: float | np.ndarray) -> np.ndarray:
+    """Return flow over area, 1 at the nominal drop: the root of the drop, linear close to 0."""
+    return drop / np.sqrt((np.abs(drop) + EPSILON) * nominal)
+
+
+class Linkage:
+    """Lever arms and strokes of cylinders that are a side of a triangle.
+
+    Args:
+        numbers: `linkage_rad`, `linkage_swing_rad`, `(N, J)`.
+        machine: Limits.
+        added_rad: Further turn of the triangle to either end, by a moved mounting, `(N, J)`.
+    """
+
+    def __init__(self, numbers: ArmParameters, machine: Machine, added_rad: np.ndarray) -> None:
+        self._middle = 0.5 * (machine.lower + machine.upper)
+        self._half = 0.5 * (machine.upper - machine.lower)
+        self._at_rad = numbers["linkage_rad"]
+        self._swing_rad = numbers["linkage_swing_rad"] + added_rad
+
+    def compute_lever(self, q: np.ndarray) -> np.ndarray:
+        """Return the lever arm at `q` over that in the middle of the travel, `(N, J)`."""
+        share = (q - self._middle) / self._half
+        angle = self._at_rad + self._swing_rad * share
+        return _compute_arm(angle) / _compute_arm(self._at_rad)
+
+    def compute_stroke(self, q: np.ndarray) -> np.ndarray:
+        """Return the stroke of the cylinder, 0 to 1, `(N, J)`."""
+        return np.clip(0.5 + 0.5 * (q - self._middle) / self._half, 0.0, 1.0)
+
+
+SIDE_RATIO = 0.3
+"""Short over long side of the triangle; chosen by hand: cylinders of booms have 0.2 to 0.4."""
+
+
+def _compute_arm(angle: np.ndarray) -> np.ndarray:
+    """Return the lever arm over the short side: `sin(angle)` over the third side's length."""
+    return np.sin(angle) / np.sqrt(1.0 + SIDE_RATIO**2 - 2.0 * SIDE_RATIO * np.cos(angle))
+
+
+class PilotedSpools:
+    """Pilot pressures and spools of all joints.
+
+    Args:
+        numbers: The machine's, `(N, J)`.
+    """
+
+    def __init__(self, numbers: ArmParameters) -> None:
+        self._n = numbers
+        shape = numbers["notch"].shape
+        self.pilot, self.spool = np.zeros(shape), np.zeros(shape)
+        # of an orifice that fills a chamber in 2 T the mean delay is two thirds of T
+        self._fill_s = 1.5 * (numbers["fill_s"] + numbers["added_fill_s"])
+        self._slope = np.where(
+            numbers["stroke_s"] > 0, 1.0 / np.maximum(numbers["stroke_s"], 1e-6), np.inf
+        )
+
+    def step(self, u: np.ndarray, sticking: np.ndarray, drop: np.ndarray) -> np.ndarray:
+        """Return the signed metering areas after a step, `(N, J)`.
+
+        Args:
+            u: Commands in force.
+            sticking: Further friction of the spools, of full stroke.
+            drop: Drop over each metering edge, over the nominal one.
+        """
+        n, behind = self._n, u - self.pilot
+        share = np.minimum(STEP_S / (self._fill_s * np.sqrt(np.abs(behind) + 1e-3)), 1.0)
+        reach = STEP_S * self._slope
+        self.pilot = self.pilot + np.clip(share * behind, -reach, reach)
+        band = n["spool_band"] + sticking
+        away = self.pilot - self.spool
+        # a spool that lets go comes to rest within its own friction band
+        moves = np.abs(away) > band
+        rest = self.pilot - np.sign(away) * n["spool_band"]
+        self.spool = np.where(moves, rest, self.spool)
+        stroke = self.spool / (1.0 + n["flow_force"] * np.abs(self.spool) * drop)
+        stroke = np.clip(stroke, -n["stop"], n["stop"])
+        overlap = np.where(stroke > 0, n["overlap_extend"], n["overlap_retract"])
+        beyond = np.maximum(np.abs(stroke) - overlap, 0.0) / (1.0 - overlap)
+        edge = np.where(stroke > 0, n["area_extend"], n["area_retract"])
+        return np.sign(stroke) * edge * compute_notch_area(beyond, n["notch"])
+
+
+class SensingHydraulics:
+    """Chambers, joints and pump.
+
+    Args:
+        numbers: The machine's, `(N, J)`.
+        machine: Full speeds, yield forces, stiffness.
+        back_flow: Share of an oil flow from the cylinder back to the pump that the check valves let
+            pass, `(N, J)`.
+        pump_lag: Factor on the time constant of the pump, `(N, 1)`.
+    """
+
+    def __init__(
+        self, numbers: ArmParameters, machine: Machine, back_flow: np.ndarray, pump_lag: np.ndarray
+    ) -> None:
+        self._n, self._back_flow, self._pump_lag = numbers, back_flow, pump_lag
+        shape = numbers["notch"].shape
+        self.speed = np.zeros(shape)
+        self._bore, self._rod = np.zeros(shape), np.zeros(shape)
+        self._supply = np.full((shape[0], 1), STANDBY)
+        force, inertia = [], []
+        for body in machine.bodies:
+            force.append(FORCE_RATIO * body.yield_force.value)
+            inertia.append(body.stiffness.value / (2.0 * np.pi * FIRST_MODE_HZ) ** 2)
+        self._push = np.array(force) / (np.array(inertia) * machine.max_speed)  # 1/s
+        period_s = np.hypot(1.0 / numbers["mode_hz"], numbers["soft_s"])
+        omega = 2.0 * np.pi / period_s
+        self._stiffness = omega**2 / self._push / (1.0 + numbers["rod_area"])  # 1/s
+        soft = 2.0 * numbers["soft_damping"] * omega / self._push
+        is_soft = numbers["soft_s"] > 0
+        self._viscous = np.where(is_soft, np.minimum(soft, numbers["viscous"]), numbers["viscous"])
+        # a soft joint rings: dry friction of full size would end that after one swing
+        self._coulomb = numbers["coulomb"] * np.where(is_soft, 0.4, 1.0)
+        self._sink = 0.4 * numbers["sink"] / machine.max_speed
+
+    def hold(self, load: np.ndarray) -> None:
+        """Let resting cylinders bear their load, over the yield force, `(N, J)`."""
+        area, force = self._n["rod_area"], load / FORCE_RATIO
+        self._bore = np.maximum(-force, 0.0) + 0.1
+        self._rod = (self._bore + force) / area
+
+    @property
+    def drop(self) -> np.ndarray:
+        """Drop over the metering edges if they open now, over the nominal one, `(N, J)`."""
+        head = self._supply - np.minimum(self._bore, self._rod)
+        return np.clip(head / NOMINAL_DROP, 0.0, 1.0)
+
+    def step(
+        self,
+        area: np.ndarray,
+        lever: np.ndarray,
+        stroke: np.ndarray,
+        load: np.ndarray,
+        spring: np.ndarray,
+        leak: np.ndarray,
+    ) -> np.ndarray:
+        """Return the speeds after a step, of full speed, `(N, J)`.
+
+        Args:
+            area: Signed metering areas.
+            lever: Lever arms over those in the middle of the travel.
+            stroke: Strokes, 0 to 1.
+            load: Weight in the positive direction over the yield force.
+            spring: Factor on the drops that the compensators keep.
+            leak: Further leak of the closed valves, as a speed under two fifths of the yield force.
+        """
+        n, dt, extends = self._n, STEP_S, area > 0
+        opened, ratio, force = np.abs(area), n["rod_area"], load / FORCE_RATIO
+        p_in, p_out = (
+            np.where(extends, self._bore, self._rod),
+            np.where(extends, self._rod, self._bore),
+        )
+        is_open = opened > OPEN
+        # a loose compensator lets the drop change with the load that its inlet feels
+        usual = np.where(extends, 0.12 * ratio, 0.12)
+        felt = FORCE_RATIO * n["loose"] * (usual - p_in)
+        relaxed = spring * (1.0 - n["droop"] * p_in) * np.clip(1.0 + felt, 0.05, 2.0)
+        head = self._supply - p_in
+        drop = np.minimum(NOMINAL_DROP * relaxed, head)
+        side = np.where(extends, 1.0, ratio)  # both edges give the same speed
+        inlet = side * opened * compute_orifice(drop, NOMINAL_DROP)
+        inlet = np.where(inlet < 0, self._back_flow * inlet, inlet)
+        throttled = head < NOMINAL_DROP * relaxed
+        slope_in = np.where(
+            throttled & ((head > 0) | (self._back_flow > 0)),
+            side * opened * 0.5 / np.sqrt(NOMINAL_DROP * (np.abs(head) + EPSILON)),
+            0.0,
+        )
+        # the outlet regulator: with the same loose spring it passes more under more pressure
+        passed = (
+            n["outlet"] * np.where(extends, ratio, 1.0) * opened * np.sqrt(np.maximum(spring, 0.0))
+        )
+        passed = passed * np.sqrt(
+            np.clip(1.0 + FORCE_RATIO * n["loose"] * (p_out - 0.12), 0.05, 2.0)
+        )
+        regulated = np.sqrt(np.maximum(p_out, 0.0) / (np.maximum(p_out, 0.0) + OUTLET_PRESSURE))
+        outlet = passed * regulated
+        slope_out = (
+            passed
+            * 0.5
+            * OUTLET_PRESSURE
+            / ((np.maximum(p_out, 0.0) + OUTLET_PRESSURE) ** 1.5 * np.sqrt(np.maximum(p_out, 1e-3)))
+        )
+        bled = np.where(is_open, n["bleed"] * np.sqrt(np.maximum(p_in, 0.0)), 0.0)
+        inlet = inlet - bled
+        sink = self._sink + leak
+        lost_bore = sink * np.sqrt(np.maximum(self._bore, 0.0) / TYPICAL_HOLDING)
+        lost_rod = ratio * sink * np.sqrt(ratio * np.maximum(self._rod, 0.0) / TYPICAL_HOLDING)
+        to_bore = np.where(extends, inlet, -outlet) - lost_bore
+        to_rod = np.where(extends, -outlet, inlet) - lost_rod
+        slope_bore = np.where(extends, slope_in, slope_out)
+        slope_rod = np.where(extends, slope_out, slope_in)
+        # volumes: a tenth of the stroke is dead; the rod side is smaller by its area
+        k_bore = dt * self._stiffness * 0.6 / (0.1 + stroke)
+        k_rod = dt * self._stiffness * 0.6 / (ratio * (1.1 - stroke))
+        k_bore = k_bore / (1.0 + k_bore * slope_bore)
+        k_rod = k_rod / (1.0 + k_rod * slope_rod)
+        bore = self._bore + k_bore * to_bore
+        rod = self._rod + k_rod * to_rod
+        drive = dt * self._push
+        springs = drive * lever**2 * (k_bore + ratio**2 * k_rod)
+        momentum = self.speed + drive * (lever * (bore - ratio * rod) + force)
+        rubbing = drive * self._compute_friction(force)
+        speed = np.sign(momentum) * np.maximum(np.abs(momentum) - rubbing, 0.0)
+        self.speed = speed / (1.0 + springs + drive * self._viscous)
+        self._bore = np.clip(bore - k_bore * lever * self.speed, 0.0, 1.0)
+        self._rod = np.clip(rod + k_rod * ratio * lever * self.speed, 0.0, 1.0)
+        self._follow_load(np.where(is_open, p_in, 0.0), inlet + bled, slope_in)
+        return self.speed
+
+    def _compute_friction(self, force: np.ndarray) -> np.ndarray:
+        """Return dry friction, over the cylinder's force: larger at rest, and under load."""
+        n = self._n
+        moving = self._coulomb + n["pin"] * np.abs(force)
+        extra = self._coulomb * (n["static"] - 1.0) + n["breakaway"]
+        # a seized pin lets go at once; usual friction falls with the speed
+        still = np.abs(self.speed)
+        return moving + np.where(
+            n["breakaway"] > 0, extra * (still < STILL), extra * np.exp(-((still / STRIBECK) ** 2))
+        )
+
+    def _follow_load(self, sensed: np.ndarray, flow: np.ndarray, slope: np.ndarray) -> None:
+        """Move the pump's pressure on by a step."""
+        n, dt = self._n, STEP_S
+        lag_s, power = n["pump_s"][:, :1] * self._pump_lag, n["power"][:, :1]
+        wanted = np.clip(sensed.max(1, keepdims=True) + MARGIN, STANDBY, 1.0)
+        rise = (wanted - self._supply) * (1.0 - np.exp(-dt / lag_s))
+        asked = (n["demand"] * flow).sum(1, keepdims=True)
+        spare = np.minimum(1.0, power / np.maximum(self._supply, 0.05)) - asked
+        softness = LINE_SOFTNESS + dt * (n["demand"] * slope).sum(1, keepdims=True)
+        self._supply = np.clip(self._supply + np.minimum(rise, dt * spare / softness), 0.0, 1.0)
+
+    def stop(self, where: np.ndarray) -> None:
+        """Take the speed from joints at their stops, `(N, J)` bool."""
+        self.speed = np.where(where, 0.0, self.speed)

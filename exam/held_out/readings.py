@@ -1,0 +1,83 @@
+"""Chance and sensors of the held-out make: bursts of lost frames, a queue, encoders."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from exam.held_out.parameters import ArmParameters
+
+BURST_FRAMES = 1.8
+"""Mean length of a burst of lost frames; chosen by hand, as of a fading radio link."""
+NUM_MOTIONS = 4096
+"""Motions of a run for which the rest of a compensator is drawn; then they repeat."""
+TRACKER_SPREAD = (0.0015, 0.0015, 0.0015, 0.001)
+"""Standard deviation of the measured tool point, m, and of its pitch, rad; chosen by hand."""
+QUANTISER_BAND = 0.6
+"""Steps that a position must leave its reading by before that changes: 0.5 without hysteresis."""
+
+
+class RunChance:
+    """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours.
+
+    Attributes:
+        lost: Whether the frame of each period is lost, `(T,)`.
+        queue: Delay of each frame over the mean delay of the queue, `(T,)`.
+        noise: Noise of the encoders over its standard deviation, `(T, J)`.
+        luck: Uniform numbers, `(T,)`.
+        tool: Normal numbers of the tracker, `(T, 4)`.
+        settling: Where compensators come to rest, normal, `(M, J)`.
+        phase: Uniform.
+    """
+
+    def __init__(self, seed: int, one: ArmParameters, steps: int) -> None:
+        generator = np.random.default_rng([seed, 7])
+        count = len(one["loss"])
+        self.lost = draw_bursts(generator.random(steps + 1), float(one["loss"].max()))
+        # waiting times of a queue are exponential; a frame older than three means is dropped
+        self.queue = np.minimum(generator.exponential(1.0, steps + 1), 3.0)
+        shape = (steps + 1, count)
+        # of a Laplace distribution the variance is twice the squared scale
+        self.noise = generator.laplace(0.0, np.sqrt(0.5), shape).astype(np.float32)
+        self.luck = generator.random(steps + 1)
+        self.tool = generator.standard_normal((steps + 1, 4)).astype(np.float32)
+        self.settling = generator.standard_normal((NUM_MOTIONS, count)).astype(np.float32)
+        self.phase = float(generator.random())
+
+
+def draw_bursts(luck: np.ndarray, share: float) -> np.ndarray:
+    """Return which frames a two-state channel loses, `(T,)` bool: `share` of them in the long run.
+
+    A burst ends with the chance `1 / BURST_FRAMES` a frame (Gilbert 1960).
+    """
+    ends = 1.0 / BURST_FRAMES
+    begins = min(ends * share / max(1.0 - share, 1e-9), 1.0)
+    lost, is_bad = np.zeros(len(luck), dtype=bool), False
+    for k, chance in enumerate(luck.tolist()):
+        is_bad = chance >= ends if is_bad else chance < begins
+        lost[k] = is_bad
+    return lost
+
+
+class SteppedEncoders:
+    """Positions as they are logged.
+
+    Args:
+        numbers: The machine's, `(N, J)`.
+    """
+
+    def __init__(self, numbers: ArmParameters) -> None:
+        self._n = numbers
+        self._sigma = np.hypot(numbers["noise_rad"], numbers["sigma_rad"])
+        self._step = np.maximum(numbers["step_rad"], 1e-9)
+        self._count: np.ndarray | None = None
+
+    def read(self, q: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        """Return the readings at positions `q` with unit noise, both `(N, J)`."""
+        n = self._n
+        shown = n["scale"] * q + n["bias_rad"] + self._sigma * noise
+        nearest = np.round(shown / self._step)
+        if self._count is None:
+            self._count = nearest
+        keeps = np.abs(shown / self._step - self._count) < QUANTISER_BAND
+        self._count = np.where(keeps, self._count, nearest)
+        return np.where(n["step_rad"] > 0, self._count * self._step, shown)

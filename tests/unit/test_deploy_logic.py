@@ -1,0 +1,339 @@
+"""Logic of the bus process: what is sent and when, from the guard's decisions to the last zero."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from desk import DBC
+from sender import BUS, LIMITS, MACHINE, Sender
+
+from brokk_rl.registry import resolve_package_path
+from deploy.bus.can_bus import CanFrame
+from deploy.bus.description import BusDescription
+from deploy.bus.protection import MessageFault
+from deploy.guard.guard import GuardState, GuardTrip
+from deploy.runtime.bus_logic import LAST_ZEROS, BusInputs, BusLogic, is_armed
+from deploy.runtime.operator_state import OperatorControls, RequestedCommand, StopRequest
+
+U = np.array([0.2, 0.0, -0.2, 0.0, 0.1])
+
+
+def build_controls(t_s: float, armed: bool = True, armed_t_s: float = 0.0) -> OperatorControls:
+    return OperatorControls(t_s, armed, armed_t_s, False, 0.0, False)
+
+
+class Loop:
+    """Logic, gateway and remote on one clock; requests, switches and stop as they are set."""
+
+    def __init__(self, commands: bool = True, bus: BusDescription = BUS) -> None:
+        self.sender = Sender(bus)
+        self.bus = bus
+        self.logic = BusLogic(bus, MACHINE, LIMITS, commands)
+        self.sender.receiver = self.logic.receiver
+        self.armed, self.armed_s, self.stop_s = True, 0.0, None
+        self.u: np.ndarray | None = U
+        self.request_age_s, self.controls_age_s = 0.0, 0.0
+        self.bus_up, self.missed = True, 3
+        self.sent: list[tuple[float, str, dict[str, float]]] = []
+
+    @property
+    def now_s(self) -> float:
+        return self.sender.now_s
+
+    def cycle(self, dt_s: float = 0.01, *left_out: str) -> list[CanFrame]:
+        """Let 10 ms go by, with all messages, and decide."""
+        self.sender.go(dt_s, *left_out)
+        return self.decide()
+
+    def decide(self) -> list[CanFrame]:
+        now_s, stop_s = self.now_s, self.stop_s
+        inputs = BusInputs(
+            controls=build_controls(now_s - self.controls_age_s, self.armed, self.armed_s),
+            stop=None if stop_s is None else StopRequest(stop_s),
+            request=None
+            if self.u is None
+            else RequestedCommand(now_s - self.request_age_s, self.u),
+        )
+        frames = self.logic.decide(now_s, self.bus_up, inputs, self.missed)
+        self.note(frames)
+        return frames
+
+    def note(self, frames: list[CanFrame]) -> None:
+        for frame in frames:
+            layout = self.bus.by_id[frame.frame_id]
+            values = self.bus.decode(layout, frame.data)
+            assert isinstance(values, dict)
+            self.sent.append((self.now_s, layout.name, values))
+
+    def go(self, seconds: float, *left_out: str) -> None:
+        for _ in range(round(seconds * 100)):
+            self.cycle(0.01, *left_out)
+
+    def commands(self) -> list[tuple[float, dict[str, float]]]:
+        return [(t_s, values) for t_s, name, values in self.sent if name == "ValveCmd"]
+
+    def get_active(self) -> Loop:
+        self.sender.values["DeadMan"] = 0
+        self.go(0.3)
+        self.sender.values["DeadMan"] = 1
+        self.go(0.3)
+        assert self.state is GuardState.ACTIVE
+        self.sent.clear()
+        return self
+
+    @property
+    def state(self) -> GuardState:
+        assert self.logic.decision is not None
+        return self.logic.decision.state
+
+    @property
+    def trip(self) -> GuardTrip:
+        assert self.logic.decision is not None
+        return self.logic.decision.trip
+
+
+@pytest.fixture
+def loop() -> Loop:
+    return Loop().get_active()
+
+
+def values_of(u: np.ndarray) -> dict[str, Any]:
+    return {f"Command_q{j + 1}": pytest.approx(value, abs=2.1e-3) for j, value in enumerate(u)}
+
+
+def test_commands_go_out_with_their_cycle_time_counted_and_stamped(loop: Loop) -> None:
+    loop.go(0.4)
+    commands = loop.commands()
+    assert np.diff([t_s for t_s, _ in commands]) == pytest.approx(0.02)
+    counters = [values["Counter"] for _, values in commands]
+    assert all((after - before) % 16 == 1 for before, after in itertools.pairwise(counters))
+    for t_s, values in commands:
+        assert values["CommandMode"] == 1 and values.items() >= values_of(U).items()
+        assert (t_s + 40.0 - values["Stamp"]) % 1.024 <= 0.017
+    beats = [(t_s, values) for t_s, name, values in loop.sent if name == "PcHeartbeat"]
+    assert np.diff([t_s for t_s, _ in beats]) == pytest.approx(0.1)
+    assert all(values["PcState"] == 3 and values["Overruns"] == 3 for _, values in beats)
+    assert len(commands) == 20 and len(beats) == 4
+
+
+def test_a_late_cycle_keeps_the_phase_and_sends_no_burst(loop: Loop) -> None:
+    loop.sender.go(0.09)
+    frames = loop.decide()
+    assert len([one for one in frames if one.frame_id == BUS.command.frame_id]) == 1
+    loop.sent.clear()
+    loop.go(0.2)
+    times = [t_s for t_s, _ in loop.commands()]
+    # one command is made up for, half a cycle later; the others keep their phase
+    assert np.diff(times)[1:] == pytest.approx(0.02) and len(times) <= 11
+
+
+def test_many_missed_cycles_fit_into_the_heartbeat(loop: Loop) -> None:
+    loop.missed = 10_000
+    loop.go(0.1)
+    assert loop.sent[-1][2].get("Overruns", 4095) == 4095
+    assert any(name == "PcHeartbeat" for _, name, _ in loop.sent)
+
+
+def test_zero_goes_out_at_once_and_does_not_wait_for_its_turn(loop: Loop) -> None:
+    loop.cycle()
+    if loop.sent and loop.sent[-1][0] != loop.now_s:
+        loop.cycle()
+    assert loop.sent[-1][0] == loop.now_s, "a command has just gone out"
+    loop.sent.clear()
+    loop.u = np.full(5, np.nan)
+    loop.cycle()
+    (at_s, values), *_ = loop.commands()
+    assert at_s == loop.now_s and values.items() >= values_of(np.zeros(5)).items()
+    assert values["CommandMode"] == 0 and loop.trip is GuardTrip.REQUEST_INVALID
+    assert loop.cycle() == [], "once; then with the cycle time, which keeps its phase"
+
+
+@pytest.mark.parametrize(
+    ("message", "changes"),
+    [
+        ("LeverState", {"DeadMan": 0}),
+        ("LeverState", {"Lever_right_theta": -0.3}),
+        ("LeverState", {"RemoteOn": 0}),
+        ("MachineStatus", {"EStop": 1}),
+        ("JointPos2", {"Valid_q4": 0}),
+    ],
+)
+def test_a_message_that_ends_a_motion_asks_for_a_decision_at_once(
+    loop: Loop, message: str, changes: dict[str, float]
+) -> None:
+    loop.sender.now_s += 0.003
+    assert loop.logic.take(loop.sender.build(message), loop.now_s) == (None, False)
+    loop.sender.now_s += 0.001
+    assert loop.logic.take(loop.sender.build(message, **changes), loop.now_s) == (None, True)
+    assert any(loop.decide()) and not any(loop.logic.decision.u)  # type: ignore[union-attr]
+
+
+def test_where_nothing_moves_no_message_needs_haste() -> None:
+    for loop in (Loop(), Loop(commands=False)):
+        frame = loop.sender.build("MachineStatus", EStop=1)
+        assert loop.logic.take(frame, loop.now_s) == (None, False)
+        loop.go(0.5)
+        frame = loop.sender.build("MachineStatus", EStop=1)
+        assert loop.logic.take(frame, loop.now_s) == (None, False)
+
+
+def test_the_fault_of_a_message_is_told(loop: Loop) -> None:
+    frame = loop.sender.build("JointPos1")
+    wrong = CanFrame(frame.frame_id, frame.data[:-1])
+    assert loop.logic.take(wrong, loop.now_s) == (MessageFault.LENGTH, False)
+    assert loop.logic.take(wrong, loop.now_s) == (MessageFault.LENGTH, True), "trust is lost"
+
+
+def test_switches_that_grow_old_latch_and_have_to_be_left_by_hand(loop: Loop) -> None:
+    loop.controls_age_s = 0.19
+    loop.go(0.05)
+    assert loop.state is GuardState.ACTIVE
+    loop.controls_age_s = 0.21
+    loop.cycle()
+    assert loop.state is GuardState.LATCHED and loop.trip is GuardTrip.CONTROLS_STALE
+    loop.controls_age_s = 0.0
+    loop.go(0.3)
+    assert loop.state is GuardState.LATCHED
+    loop.get_active()
+
+
+def test_disarming_sends_zero_a_few_times_and_then_nothing(loop: Loop) -> None:
+    loop.cycle()
+    loop.armed = False
+    loop.sent.clear()
+    loop.cycle()
+    assert loop.commands()[0][0] == loop.now_s, "the first at once"
+    loop.go(1.0)
+    zeros = loop.commands()
+    assert len(zeros) == LAST_ZEROS == 5 and loop.state is GuardState.SILENT
+    for _, values in zeros:
+        assert values["CommandMode"] == 0 and values.items() >= values_of(np.zeros(5)).items()
+    assert zeros[-1][0] - zeros[0][0] <= 0.1 + 1e-9
+    loop.sent.clear()
+    loop.go(0.3)
+    assert loop.sent == []
+
+
+def test_a_stop_is_stronger_than_any_arming_before_it_and_no_stronger_than_one_after_it(
+    loop: Loop,
+) -> None:
+    loop.armed_s = loop.now_s - 1.0
+    loop.stop_s = loop.now_s
+    loop.cycle()
+    assert loop.state is GuardState.SILENT and not any(loop.logic.decision.u)  # type: ignore[union-attr]
+    loop.go(0.5)
+    assert loop.state is GuardState.SILENT
+    loop.armed_s = loop.now_s
+    loop.cycle()
+    assert loop.state is GuardState.LATCHED
+    loop.get_active()
+
+
+@pytest.mark.parametrize(
+    ("controls", "stop", "armed"),
+    [
+        (None, None, False),
+        (None, StopRequest(1.0), False),
+        (build_controls(9.0, False, 5.0), None, False),
+        (build_controls(9.0, True, 5.0), None, True),
+        (build_controls(9.0, True, 5.0), StopRequest(4.9), True),
+        (build_controls(9.0, True, 5.0), StopRequest(5.0), False),
+        (build_controls(9.0, True, 5.0), StopRequest(5.1), False),
+        (build_controls(9.0, False, 5.0), StopRequest(4.9), False),
+    ],
+)
+def test_who_is_armed(
+    controls: OperatorControls | None, stop: StopRequest | None, armed: bool
+) -> None:
+    assert is_armed(controls, stop) is armed
+
+
+def test_without_switches_nothing_is_ever_sent() -> None:
+    loop = Loop()
+    loop.sender.go(0.3)
+    inputs = BusInputs(None, None, RequestedCommand(loop.now_s, U))
+    assert loop.logic.decide(loop.now_s, True, inputs, 0) == []
+    assert loop.state is GuardState.SILENT and loop.logic.end(loop.now_s, 0) == []
+
+
+def test_a_loop_that_never_commands_sends_nothing_whatever_it_is_asked() -> None:
+    loop = Loop(commands=False)
+    loop.sender.values["DeadMan"] = 0
+    loop.go(0.3)
+    loop.sender.values["DeadMan"] = 1
+    loop.go(0.5)
+    assert loop.sent == [] and loop.state is GuardState.SILENT
+    assert loop.trip is GuardTrip.NOT_ARMED and loop.logic.end(loop.now_s, 0) == []
+
+
+def test_at_the_end_zero_goes_out_once_more_at_once(loop: Loop) -> None:
+    loop.cycle()
+    loop.cycle()
+    loop.sent.clear()
+    frames = loop.logic.end(loop.now_s + 0.001, 9)
+    loop.note(frames)
+    (_, values), *_ = loop.commands()
+    assert values["CommandMode"] == 0 and values.items() >= values_of(np.zeros(5)).items()
+    assert loop.trip is GuardTrip.BUS_DOWN and loop.state is GuardState.LATCHED
+    assert Loop().logic.end(1000.0, 0) == [], "nothing was ever sent"
+
+
+def test_requests_reach_the_guard_with_their_age(loop: Loop) -> None:
+    loop.request_age_s = 0.149
+    loop.go(0.05)
+    assert loop.state is GuardState.ACTIVE
+    loop.request_age_s = 0.151
+    loop.cycle()
+    assert loop.trip is GuardTrip.REQUEST_STALE
+    loop.request_age_s = 0.0
+    loop.get_active()
+    loop.u = None
+    loop.cycle()
+    assert loop.trip is GuardTrip.REQUEST_STALE
+    loop.u, loop.request_age_s = U, 0.0
+    loop.get_active()
+    loop.request_age_s = math.inf  # withdrawn
+    loop.cycle()
+    assert loop.trip is GuardTrip.REQUEST_STALE
+
+
+def test_a_bus_that_is_down_is_told_to_the_guard_and_to_the_others(loop: Loop) -> None:
+    loop.bus_up = False
+    loop.cycle()
+    assert loop.trip is GuardTrip.BUS_DOWN
+    state = loop.logic.build_state(loop.now_s, False, 11)
+    assert not state.bus_up and state.guard is GuardState.LATCHED and state.missed == 11
+    assert loop.logic.build_state(loop.now_s, True, 11).bus_up
+
+
+def test_own_commands_that_come_back_are_known(loop: Loop) -> None:
+    for _ in range(10):
+        for frame in loop.cycle():
+            assert loop.logic.take(frame, loop.now_s) == (None, False)
+    assert (
+        loop.state is GuardState.ACTIVE
+        and loop.logic.receiver.build_guard_input(loop.now_s, True, 0.0).alone
+    )
+
+
+def test_a_way_that_is_too_long_or_unknown_is_no_way(loop: Loop) -> None:
+    loop.sender.values["RoundTrip"] = 0.148
+    loop.go(0.1)
+    assert loop.state is GuardState.ACTIVE
+    loop.sender.values["RoundTrip"] = 0.152
+    loop.go(0.03)
+    assert loop.state is GuardState.LATCHED and loop.trip is GuardTrip.ROUND_TRIP
+
+
+def test_a_bus_without_a_heartbeat_gets_none(tmp_path: Any) -> None:
+    text = resolve_package_path(DBC).read_text()
+    text = text.replace("PcHeartbeat", "OtherName")
+    path = tmp_path / "other.dbc"
+    path.write_text(text)
+    loop = Loop(bus=BusDescription(str(path), MACHINE)).get_active()
+    loop.go(0.3)
+    assert {name for _, name, _ in loop.sent} == {"ValveCmd"}

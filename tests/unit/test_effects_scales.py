@@ -1,0 +1,177 @@
+"""Sizes of effects follow from the machine's own joints, and option files of before keep their meaning."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import names, option
+
+from actuators.effects.load import Creep, LoadDependence
+from actuators.effects.speed import Backlash
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.scales import choose_horizon_s, measure_time_scale
+from diagnosis import effect_library
+
+CPU = torch.device("cpu")
+MACHINES = names("machine")
+# A typical size of an effect is small against the joint that has it, and not nothing.
+SMALL, LARGE = 1e-4, 0.15
+
+
+def stretched(machine: Machine, joint: int, by: float) -> Machine:
+    """Returns the machine with one joint of another travel and speed."""
+    joints = list(machine.joints)
+    one = joints[joint]
+    joints[joint] = replace(
+        one,
+        lower=replace(one.lower, value=by * one.lower.value),
+        upper=replace(one.upper, value=by * one.upper.value),
+        max_speed=replace(one.max_speed, value=by * one.max_speed.value),
+        home=by * one.home,
+    )
+    return replace(machine, joints=tuple(joints))
+
+
+def typical(machine: Machine, name: str, number: str) -> np.ndarray:
+    (kind,) = effect_library.load_effects(machine, [name])
+    return kind.typical(number)
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_the_library_is_drawn_on_every_machine_with_sizes_that_fit_its_joints(name: str) -> None:
+    machine, library = option("machine", name), replace(option("effect", "library"), share=1.0)
+    model = library.wrap(option("actuator", "ideal").build(machine, 500, CPU), machine, 500, CPU)
+    drawn = {key: value.abs().amax(0).numpy() for key, value in model.parameters.items()}
+    travel, speed = machine.upper - machine.lower, machine.max_speed
+    for key in ("backlash.gap_rad", "quantisation.step_rad", "sensor_noise.sigma_rad"):
+        assert (drawn[key] > SMALL * travel).all() and (drawn[key] < 0.01 * travel).all(), key
+    assert (drawn["encoder_bias.bias_rad"] < 0.001 * travel).all()
+    moved = drawn["creep.sink_rad_s"] + drawn["creep.drift_rad_s"]
+    assert (moved < 0.02 * speed).all() and (moved > 0.004 * speed).all()
+    for key in ("lag.time_constant_s", "dead_time.dead_time_s", "delay_jitter.jitter_s"):
+        assert (drawn[key] > 0.2 * machine.period_s).all(), key
+        assert (drawn[key] < 4.0 * max(machine.period_s, machine.dead_time_s)).all(), key
+    history = History(
+        q=torch.as_tensor(machine.home, dtype=torch.float32).expand(500, machine.num_history, -1),
+        u=torch.ones(500, machine.num_history, machine.num_joints),
+    )
+    with torch.no_grad():
+        assert torch.isfinite(model.step(history)).all()
+
+
+@pytest.mark.parametrize("name", MACHINES)
+def test_a_diagnosis_has_creep_and_a_pose_term_on_every_machine(name: str) -> None:
+    machine = option("machine", name)
+    kinds = {kind.name: kind for kind in effect_library.load_effects(machine)}
+    own = {"sink_rad_s"} if machine.has_bodies else {"drift_rad_s"}
+    assert set(kinds["creep"].fitted) == own
+    own = {"sensitivity"} if machine.has_bodies else {"pose_cos", "pose_sin"}
+    assert set(kinds["load_dependence"].fitted) == own
+    for kind in kinds.values():
+        for number in kind.fitted:
+            low, high = kind.limits(number)
+            assert (low <= kind.typical(number)).all() and (kind.typical(number) <= high).all()
+
+
+def test_the_reference_keeps_its_sizes(machine: Machine) -> None:
+    """Exact for times; within the spread of its joints about their median for angles and speeds."""
+    assert measure_time_scale(machine) == 1.0 and choose_horizon_s(machine) == 5.0
+    assert typical(machine, "lag", "time_constant_s") == pytest.approx([0.12] * 5)
+    gaps = typical(machine, "backlash", "gap_rad")
+    assert np.median(gaps) == pytest.approx(0.01)
+    assert gaps == pytest.approx(0.01 * (machine.upper - machine.lower) / 2.7)
+    assert np.median(typical(machine, "creep", "sink_rad_s")) == pytest.approx(0.004)
+    assert typical(machine, "link_length", "extra_m") == pytest.approx([0.01] * 5, rel=1e-3)
+
+
+def test_sizes_grow_with_the_joint_that_they_are_on_and_no_other(machine: Machine) -> None:
+    half = stretched(machine, 2, 0.5)
+    for name, number in (("backlash", "gap_rad"), ("creep", "sink_rad_s")):
+        ratio = typical(half, name, number) / typical(machine, name, number)
+        assert ratio == pytest.approx([1.0, 1.0, 0.5, 1.0, 1.0])
+    assert typical(half, "dead_band", "extend") == pytest.approx([0.06] * 5)
+
+
+def test_times_follow_the_longer_of_control_period_and_dead_time(machine: Machine) -> None:
+    quick = replace(machine, period_s=0.01, dead_time_s=0.055)
+    assert measure_time_scale(quick) == pytest.approx(0.2)
+    assert typical(quick, "rate_limit", "stroke_s") == pytest.approx([0.08] * 5)
+    assert choose_horizon_s(quick) == pytest.approx(1.0)
+    assert choose_horizon_s(replace(machine, dead_time_s=0.6)) == 5.0, "no free run is longer"
+
+
+def test_a_backlash_is_no_longer_a_fifth_of_a_short_cylinder() -> None:
+    small = option("machine", "mini_excavator")
+    boom, *_, swing = typical(small, "backlash", "gap_rad")
+    assert boom == pytest.approx(0.01 / 2.7 * 0.0534) and swing == pytest.approx(0.01 / 2.7 * 2.38)
+
+
+@pytest.mark.parametrize("value", [0.01, (0.005, 0.01), {"q3": 0.02, "other": (0.0, 0.01)}])
+def test_numbers_of_before_are_rad_and_metres_as_they_were(value: Any, machine: Machine) -> None:
+    half = stretched(machine, 2, 0.5)
+    for one in (machine, half):
+        model = Backlash(joints="all", gap_rad=value).wrap(
+            option("actuator", "ideal").build(one, 2000, CPU), one, 2000, CPU
+        )
+        table = value if isinstance(value, dict) else {"q3": value, "other": value}
+        for j, name in enumerate(one.joint_names):
+            ends = table.get(name, table["other"])
+            low, high = ends if isinstance(ends, tuple) else (ends, ends)
+            got = model.parameters["gap_rad"][:, j]
+            assert got.min().item() == pytest.approx(low, abs=1e-4)
+            assert got.max().item() == pytest.approx(high, abs=1e-4)
+
+
+def test_a_range_over_the_typical_size_is_mirrored_about_the_neutral_value(
+    machine: Machine,
+) -> None:
+    spec = replace(option("effect", "saturation"), level=(0.0, 2.0, "typical"))
+    model = spec.wrap(option("actuator", "ideal").build(machine, 2000, CPU), machine, 2000, CPU)
+    level = model.parameters["level"]
+    assert level.min().item() == pytest.approx(0.5, abs=0.01), "two typical sizes below 1"
+    assert level.max().item() == pytest.approx(1.0, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "spec", [Creep(joints="all", sink_rad_s=0.002), LoadDependence(joints="all", sensitivity=0.5)]
+)
+def test_a_weight_on_a_machine_without_masses_is_still_refused(spec: Any) -> None:
+    small = option("machine", "mini_excavator")
+    with pytest.raises(ConfigError, match=r"known by its joints only.*add joints\[\].body"):
+        spec.wrap(option("actuator", "ideal").build(small, 1, CPU), small, 1, CPU)
+
+
+def test_a_pose_on_a_machine_with_masses_is_refused(machine: Machine) -> None:
+    spec = LoadDependence(joints="all", sensitivity=0.0, pose_sin=0.2)
+    with pytest.raises(ConfigError, match=r"has known masses.*give sensitivity"):
+        spec.wrap(option("actuator", "ideal").build(machine, 1, CPU), machine, 1, CPU)
+
+
+def test_the_pose_term_is_a_line_over_a_cylinder_and_a_harmonic_of_an_angle() -> None:
+    """A joint that extends bears the weight; sqrt(1 - 0.19) is 0.9."""
+    small = option("machine", "mini_excavator")
+    at = torch.tensor(
+        np.stack([small.lower, (small.lower + small.upper) / 2, small.upper]), dtype=torch.float32
+    )
+    history = History(
+        q=at[:, None].repeat(1, small.num_history, 1),
+        u=torch.full((3, small.num_history, 4), -1.0),  # in the sense of the weight: faster
+    )
+    full = torch.as_tensor(small.max_speed * small.period_s, dtype=torch.float32)
+    history.q[0] += 2.0 * full  # an effect never moves a joint through a stop
+    build = option("actuator", "ideal").build
+    spec = LoadDependence(joints="all", sensitivity=0.0, pose_sin=0.19)
+    with torch.no_grad():
+        moved = spec.wrap(build(small, 3, CPU), small, 3, CPU).step(history) - history.q[:, -1]
+    speed = (moved / -full).numpy()
+    assert speed[1] == pytest.approx([1.0] * 4, abs=1e-4), "nothing in mid-travel"
+    assert speed[2, :3] == pytest.approx([0.9] * 3, abs=1e-3), "a cylinder at its end"
+    sine = np.sin(1.19)  # half of the swing's travel of 2.38 rad
+    assert speed[2, 3] == pytest.approx(np.sqrt(1.0 - 0.19 * sine), abs=1e-3)
+    assert (speed[0, :3] > 1.08).all()

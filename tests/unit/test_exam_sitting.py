@@ -1,0 +1,295 @@
+"""What surrounds a sitting: registration, interruption, the examiner's own simulation, noise-aware baselines."""
+
+from __future__ import annotations
+
+import json
+import os
+import stat
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import option
+from small_exam import SMALL
+
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.machine import Machine
+from diagnosis.answer import Answer, Estimate, Gap, Where
+from diagnosis.responses import Response
+from exam import baselines, dataset, examiner, registration, run_cases
+from exam.examiner import ExaminerSimulator, compute_closed, read_effects
+from exam.generate import UNCHANGED_FOLDER, restrict_machine
+from exam.oracle import JointErrors
+from exam.progress import CaseProgress
+
+
+def test_the_engine_is_its_source_its_weights_and_its_calibration(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    files = registration._list_engine_files()
+    for name in (
+        "diagnosis/search.py", "conf:certainty/default", "conf:prices/default", "conf:fit/valve", "conf:effect/lag",
+        "conf:mode/diagnose", "brokk_rl/open_loop.py",
+    ):  # fmt: skip
+        assert name in files, name
+    assert not any(name.startswith(("exam/", "deploy/", "conf:mode/exam")) for name in files)
+    before = registration.compute_engine_id()
+    assert before == registration.compute_engine_id() and len(before) == 64
+    for name in ("diagnosis/search.py", "conf:certainty/default"):
+        changed = tmp_path / "changed"
+        changed.write_bytes(files[name].read_bytes() + b"\n")
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                registration, "_list_engine_files", lambda n=name, c=changed: {**files, n: c}
+            )
+            assert registration.compute_engine_id() != before
+
+
+def test_a_sealed_exam_refuses_an_engine_that_was_not_registered(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    ledger = str(tmp_path / "kept" / "ledger.jsonl")
+    facts = {"seed": 1000, "num_cases": 3, "labels_sha256": "abc"}
+    with pytest.raises(ConfigError, match="no engine registered"):
+        registration.check_engine(tmp_path, is_sealed=True)
+    registration.append_event(tmp_path, "made", facts, ledger)
+    mine = registration.compute_engine_id()
+    assert registration.check_engine(tmp_path, is_sealed=True).describe() == {
+        "engine": mine, "registered": True, "after_opening": False
+    }  # fmt: skip
+    monkeypatch.setattr(registration, "compute_engine_id", lambda: "other" * 12)
+    with pytest.raises(ConfigError, match=r"commit to this engine first, exam.do=register"):
+        registration.check_engine(tmp_path, is_sealed=True)
+    # a development exam may be sat by any engine, and the answers are marked
+    state = registration.check_engine(tmp_path, is_sealed=False)
+    assert not state.describe()["registered"]
+    registration.note_opening(tmp_path, facts, ledger)
+    registration.note_opening(tmp_path, facts, ledger)
+    registration.append_event(tmp_path, "registered", facts, ledger)
+    late = registration.check_engine(tmp_path, is_sealed=True)
+    (tmp_path / "run.json").write_text(json.dumps(late.describe()))
+    assert registration.list_warnings(tmp_path / "run.json", ["a", "b"]) == [
+        "2 engines gave these answers",
+        "the labels were open before these answers were given",
+    ]
+    lines = [json.loads(text) for text in Path(ledger).read_text().splitlines()]
+    assert [line["event"] for line in lines] == ["made", "opened", "registered"]
+    assert lines[0]["engine"] == mine and {"when", "commit", "versions", *facts} <= set(lines[0])
+
+
+def test_a_sealed_exam_is_registered_where_it_is_made_and_run_says_so(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    exam, answers = tmp_path / "exam", tmp_path / "answers"
+    ledger = f"exam.ledger={tmp_path / 'ledger.jsonl'}"
+    sealed = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234", ledger)
+    made = brokk(*SMALL, *sealed, f"session.out={exam}")
+    assert made.code == 0, made.err
+    facts = json.loads((exam / "exam.json").read_text())
+    assert facts["sealed"] and facts["held_out"] and facts["num_cases"] == 2
+    withheld = sorted((exam / dataset.WITHHELD_FOLDER).rglob("*.parquet"))
+    assert {path.parent.name for path in withheld} == {"0000", "0001", UNCHANGED_FOLDER}
+    about = ("mode=exam", f"exam.folder={exam}", ledger, "exam_candidate=always_none")
+    registered = (exam / registration.REGISTRATION_FILE).read_text()
+    line = json.loads(registered)
+    other = json.dumps(line | {"engine": "0" * 64}) + "\n"
+    (exam / registration.REGISTRATION_FILE).write_text(other)
+    refused = brokk(*about, "exam.do=run", f"session.out={answers}")
+    assert refused.code != 0 and "exam.do=register" in refused.err and not answers.exists()
+    assert brokk(*about, "exam.do=register", f"session.out={tmp_path / 'again'}").code == 0
+    done = brokk(*about, "exam.do=run", f"session.out={answers}")
+    assert done.code == 0, done.err
+    assert json.loads((answers / "run.json").read_text())["registered"]
+    note = json.loads((answers / "0000" / "sitting.json").read_text())
+    assert note["engine"] == line["engine"]
+
+
+def test_a_make_that_was_interrupted_goes_on_and_gives_the_same_cases(
+    brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    whole, part = tmp_path / "whole", tmp_path / "part"
+    assert brokk(*SMALL, f"session.out={whole}").code == 0
+    monkeypatch.setattr(dataset, "BLOCK_CASES", 1)
+    write = dataset.CaseSet.write
+
+    def fail_on_second(self: Any, numbers: list[int]) -> Any:
+        if numbers == [1]:
+            raise RecordingError("interrupted")
+        return write(self, numbers)
+
+    fail_on_second.__name__ = "write"  # another process finds a method by its name
+    with monkeypatch.context() as patch:
+        patch.setattr(dataset.CaseSet, "write", fail_on_second)
+        assert brokk(*SMALL, f"session.out={part}").code != 0
+    partial = part / dataset.PARTIAL_FILE
+    assert stat.S_IMODE(os.stat(partial).st_mode) == 0o600
+    assert [json.loads(line).get("case") for line in partial.read_text().splitlines()][1:] == [
+        "0000"
+    ]
+    assert not (part / dataset.LABELS_FILE).exists()
+    again = brokk(*SMALL, f"session.out={part}", f"resume={part}")
+    assert again.code == 0, again.err
+    labels = [
+        json.loads((folder / dataset.LABELS_FILE).read_text())["cases"] for folder in (whole, part)
+    ]
+    assert labels[0] == labels[1] and not partial.exists()
+    for path in sorted((whole / "cases").rglob("*.parquet")):
+        assert path.read_bytes() == (part / path.relative_to(whole)).read_bytes()
+
+
+def test_an_exam_of_arms_known_by_their_joints_asks_nothing_that_needs_masses(
+    brokk: Callable[..., Any], machine: Machine, tmp_path: Path
+) -> None:
+    exam = tmp_path / "exam"
+    many = (
+        "exam.mix.num_cases=4",
+        "exam.mix.shares={none: 0, faint: 0, one: 1, several: 0, outside: 0}",
+    )
+    done = brokk(*SMALL, *many, "exam.known=joints", f"session.out={exam}")
+    assert done.code == 0, done.err
+    known = restrict_machine(machine, "joints")
+    assert not known.has_bodies and known.name == "brokk170_joints"
+    labels = dataset.open_labels(exam)
+    named = {one["effect"] for label in labels["cases"] for one in label["effects"]}
+    assert labels["known"] == "joints" and not any(label["tracked"] for label in labels["cases"])
+    assert named and not named & {"encoder_bias", "encoder_scale", "link_length", "base_tilt"}
+    # the files are those of the machine that a candidate knows
+    ExaminerSimulator(exam, "0000", option("fit", "valve"), known)
+    with pytest.raises(RecordingError):
+        ExaminerSimulator(exam, "0000", option("fit", "valve"), machine)
+    # a program gets the machine as an option file
+    text = json.dumps(run_cases.describe_spec(known))
+    assert '"_target_": "brokk_rl.machine.Machine"' in text and '"body": null' in text
+
+
+@pytest.fixture(scope="module")
+def slow_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An exam of one case: all joints at 0.6 of their speed, withheld recordings of 40 s."""
+    from hydra import compose, initialize_config_module
+    from hydra.utils import instantiate
+
+    out = tmp_path_factory.mktemp("examined") / "exam"
+    gain = (
+        "{flow_gain: {_target_: exam.case_distribution.EffectDistribution, numbers: {gain: [1.0, 0.6]}, "
+        "joints: all, needs_tool: false, only_one: false, mirrored: false, not_on: [], shape: {}}}"
+    )
+    words = [
+        "mode=exam", "exam.mix.num_cases=1", "exam.mix.shares={none: 0, faint: 0, one: 1, several: 0, outside: 0}",
+        "exam.mix.sizes=[1.0,1.0]", "~exam.mix.troubles", f"+exam.mix.troubles={gain}",
+        "exam.reference.programs=[[levels],[levels]]",
+        "exam.reference.file_s=60", "exam.field.programs=[[levels]]", "exam.field.file_s=20", "exam.withheld.programs=[[levels]]",
+        "exam.withheld.file_s=40", f"exam.ledger={out.parent / 'ledger.jsonl'}", f"session.out={out}",
+    ]  # fmt: skip
+    with initialize_config_module("conf", version_base="1.3"):
+        mode = instantiate(compose("config", words), _convert_="all")
+    out.mkdir()
+    mode.run()
+    return out
+
+
+def say(closed: float | None) -> Answer:
+    """An answer that states how far it closes the gap."""
+    estimate = None if closed is None else Estimate(closed, (closed - 0.02, closed + 0.02))
+    return Answer(
+        verdict="effects",
+        selected=(),
+        ranking=(),
+        where=Where({}, (), None),
+        gap=Gap(0.03, 0.01, 0.008, estimate),
+        next_experiment=None,
+    )
+
+
+def test_the_examiner_believes_its_own_simulation(
+    slow_case: Path, machine: Machine, tmp_path: Path
+) -> None:
+    simulator = ExaminerSimulator(slow_case, "0000", option("fit", "valve"), machine)
+    path = tmp_path / "effects.yaml"
+
+    def write(gain: float) -> dict[str, Any]:
+        path.write_text(
+            "# @package effect\nflow_gain:\n  _target_: actuators.effects.speed.FlowGain\n"
+            f"  joints: all\n  gain: {gain}\n"
+        )
+        return read_effects(path, machine)
+
+    nothing = simulator.examine({}, None)
+    right, half, wrong = (simulator.examine(write(gain), say(0.95)) for gain in (0.6, 0.8, 1.4))
+    assert nothing.after == nothing.before and nothing.closed == 0.0
+    assert nothing.before > 1.5 * nothing.floor, "a joint at 0.6 of its speed is seen"
+    assert right.closed is not None and right.closed > 0.8 and not right.differs
+    assert half.closed is not None and 0.2 < half.closed < 0.8 and half.differs
+    assert wrong.closed is not None and wrong.closed < 0.0 and wrong.differs
+    assert not simulator.examine(write(0.8), say(None)).differs
+
+
+def test_an_effects_file_brings_no_targets_of_its_own(machine: Machine, tmp_path: Path) -> None:
+    path = tmp_path / "effects.yaml"
+    for text in (
+        "lag: {_target_: os.system, command: ls}\n",
+        "made_up: {_target_: actuators.effects.speed.Lag, joints: all, time_constant_s: 0.1}\n",
+        "lag: {_target_: actuators.effects.speed.Lag, joints: all}\n",
+        "[1, 2]\n",
+    ):
+        path.write_text(text)
+        with pytest.raises(RecordingError, match="no effects of the library"):
+            read_effects(path, machine)
+    path.write_text("# @package effect\n# none: no gap\n")
+    assert read_effects(path, machine) == {}
+
+
+def test_the_closed_share_is_that_worked_by_hand() -> None:
+    before, after, floor = np.array([3.0, 3.0, 5.0]), np.array([2.0, 1.0, 2.0]), np.ones(3)
+    share, interval = compute_closed(before, after, floor)
+    assert share == pytest.approx(0.5)  # (3 - 2) / (3 - 1)
+    assert interval == pytest.approx((0.75 + 0.025 * 0.25, 1.0 - 0.025 * 0.25))  # of 1 and 0.75
+    assert compute_closed(1.04 * floor, floor, floor) == (None, None)
+    assert examiner.MAX_DIFFERENCE == 0.2
+
+
+def test_forward_selection_takes_nothing_that_a_repeat_of_the_reference_shows_too() -> None:
+    generator, fold = np.random.default_rng(1), np.arange(600) // 100 % 2
+    ray, sizes = generator.standard_normal(600), np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    shapes = {"lag": [Response(sizes, np.outer(sizes, ray))]}
+
+    def build(strength: float) -> JointErrors:
+        return JointErrors(strength * ray + generator.standard_normal(600), shapes, fold)
+
+    for score in (baselines.score_held_out, baselines.score_bic):
+        # repeats differ by half as much as the field: a fixed threshold would name that
+        field, repeats = build(0.5), [build(0.45), build(-0.6)]
+        assert set(baselines.select_forward(field, score, 0.0)) == {"lag"}
+        least = baselines.learn_threshold(repeats, score)
+        assert least > 0 and not baselines.select_forward(field, score, least)
+        assert set(baselines.select_forward(build(1.5), score, least)) == {"lag"}
+    assert baselines.learn_threshold([], baselines.score_bic) == 0.0
+
+
+def test_progress_tells_the_time_left_by_the_items_of_this_run() -> None:
+    progress = CaseProgress("cases", 10)
+    progress.skip(4)
+    assert progress.describe(100.0) == "4 of 10"
+    progress.advance()
+    progress.advance()
+    # two in 240 s: 120 s each, four are left
+    assert progress.describe(240.0) == "6 of 10, about 8 min left"
+
+
+def test_an_interrupted_program_leaves_no_note_and_sits_again(
+    machine: Machine, tmp_path: Path
+) -> None:
+    case, answers = tmp_path / "case", tmp_path / "answers"
+    case.mkdir()
+    (case / "a").touch()
+    command = run_cases.CommandCandidate(
+        command=("sh", "-c", "kill -INT $$ #{case}{out}"), limit_s=10.0, threads=1
+    )
+    with pytest.raises(KeyboardInterrupt):
+        run_cases.answer_cases(command, [case], answers, machine, 1, CaseProgress("", 1))
+    assert not run_cases.is_begun(answers / "case")
+    failing = replace(command, command=("sh", "-c", "exit 3 #{case}{out}"))
+    run_cases.answer_cases(failing, [case], answers, machine, 1, CaseProgress("", 1))
+    assert run_cases.is_begun(answers / "case")
