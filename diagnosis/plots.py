@@ -76,7 +76,7 @@ def draw_speed_curves(curves: Mapping[str, Any], machine: Machine) -> Figure:
         machine: The machine.
     """
     figure, axes = make_joint_panels(machine, "xy")
-    strokes = np.array(curves["knots"])
+    strokes, fastest = np.array(curves["knots"]), [1.0]
     for axis, name in zip(axes, machine.joint_names, strict=False):
         axis.set_title(name, loc="left", fontsize=9)
         axis.grid(alpha=0.3)
@@ -94,11 +94,10 @@ def draw_speed_curves(curves: Mapping[str, Any], machine: Machine) -> Figure:
                 axis.fill_between(at, low, high, color=colour, alpha=0.2, lw=0, zorder=2)
                 label = who if sign > 0 else None
                 axis.plot(at, sign * np.array(one["speed"]), color=colour, lw=1.8, label=label)
-        top = 1.15 * max(1.0, *(max(found[w][s]["speed"]) for w in WHO for s in SIDES))
-        axis.set_ylim(-top, top)
-        axis.set_title(
-            f"{name}: {_describe_curve_change(found['difference'])}", loc="left", fontsize=8
-        )
+        fastest += [max(found[who][side]["speed"]) for who in WHO for side in SIDES]
+        told = _describe_curve_change(found["difference"])
+        axis.set_title(f"{name}\n{told}", loc="left", fontsize=8)
+    axes[0].set_ylim(-1.1 * max(fastest), 1.1 * max(fastest))  # shared by all panels
     figure.supxlabel("stroke of the valve, of full command", fontsize=10)
     figure.supylabel("speed, of the joint's full speed", fontsize=10)
     add_legend(figure, axes[0])

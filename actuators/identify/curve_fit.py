@@ -155,8 +155,11 @@ def _fit_curve(
     # The fit of the sample itself is the curve: its own small step is taken off.
     away = np.stack(drawn) - drawn[0]
     information = normal.sum(0)[: len(curve), : len(curve)] / noise
+    # A valve moves its joint one way: what a command that was never held leaves open is no speed.
+    draws_of_both = start + away
+    draws_of_both[:, : len(curve)] = np.maximum(draws_of_both[:, : len(curve)], 0.0)
     points = _list_points(data, j, dynamics)
-    return FittedCurve(curve, dynamics, start + away, information, points)
+    return FittedCurve(np.maximum(curve, 0.0), dynamics, draws_of_both, information, points)
 
 
 def _list_points(data: SpeedData, j: int, dynamics: np.ndarray) -> np.ndarray:
