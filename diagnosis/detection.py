@@ -19,6 +19,7 @@ from diagnosis import (
     refine,
     residual_model,
     sensors,
+    shown_effects,
     timing,
 )
 from diagnosis.baseline import Baseline
@@ -42,6 +43,7 @@ from diagnosis.search import (
     bind_shared_sizes,
     choose_set,
 )
+from diagnosis.speed_curves import SpeedCurves
 
 log = logging.getLogger(__name__)
 
@@ -165,6 +167,7 @@ class EffectSearch:
         kinds: The library.
         penalties: Penalties of effects.
         tell: Receives the name and the progress of each step.
+        curves: Speed curves of machine and simulator, which may show a set at once.
     """
 
     case: GapCase
@@ -172,6 +175,7 @@ class EffectSearch:
     kinds: Sequence[EffectType]
     penalties: Penalties
     tell: ProgressCallback
+    curves: SpeedCurves | None = None
 
     def run(self) -> DetectionResult:
         """Return the chosen set, its fit and the remaining residuals."""
@@ -183,16 +187,24 @@ class EffectSearch:
         on_tool = geometry.find_geometry_errors(
             self.case, self.kinds, penalties.joint, penalties.name
         )
-        residuals = _adjust_residuals(
+        residuals = sensors.adjust_residuals(
             self.base.field.residuals, self.case, [*on_sensors, *on_tool.found]
         )
         effects = self._simulate_effects(residuals)
         price = self._build_price(effects)
         search = self._choose(effects, price, np.ones(self.case.machine.num_joints))
-        if search.fitted and nonadditive_refit.is_needed(
+        self.tell("what the speed curves show", 0.71)
+        shown = []
+        if self.curves is not None:
+            proposed = shown_effects.propose_effects(self.curves, self.kinds, self.case.machine)
+            parts = (effects.rays, effects.shapes, search.fitted, price)
+            shown = shown_effects.fit_shown_effects(residuals, proposed, *parts)
+        if shown:
+            search = self._refit_beside(search, shown, price)
+        elif search.fitted and nonadditive_refit.is_needed(
             residuals, search.fitted, _sum_scores(search.tables, search.chosen)
         ):
-            search = self._refit_beside(search, search.fitted, price)
+            search = self._refit_beside(search, [search.fitted], price)
         self.tell("frames", 0.8)
         error = residuals.compute_error(search.fitted.after if search.fitted else residuals.base)
         late, search = self._detect_late_frames(search, error)
@@ -316,12 +328,12 @@ class EffectSearch:
         return tables
 
     def _refit_beside(
-        self, search: SearchState, fitted: FittedSet, price: PenaltyFunction
+        self, search: SearchState, known: Sequence[FittedSet], price: PenaltyFunction
     ) -> SearchState:
-        """Continue from a set whose responses do not add up: simulate all effects beside it, fit sizes together."""
+        """Continue from sets whose responses do not add up: simulate all effects beside the first, fit sizes together."""
         effects, residuals = search.effects, search.effects.residuals
-        tried, scatter = [fitted], np.ones(self.case.machine.num_joints)
-        wide = nonadditive_refit.simulate_beside(residuals, effects.rays, fitted)
+        tried, scatter = list(known), np.ones(self.case.machine.num_joints)
+        wide = nonadditive_refit.simulate_beside(residuals, effects.rays, known[0])
         for turn in range(MAX_REFITS):
             self.tell("simulating around what was found", 0.72 + 0.04 * turn)
             before, search = search, self._choose(effects, price, scatter, wide)
@@ -475,26 +487,3 @@ def _rewhiten_effects(effects: CandidateEffects, noisy: Residuals) -> CandidateE
 def _sum_scores(tables: Sequence[SubsetTable], chosen: EffectSet) -> float:
     scored = zip(tables, chosen.subsets, strict=True)
     return sum(table.score(subset).total for table, subset in scored)
-
-
-def _adjust_residuals(
-    residuals: Residuals, case: GapCase, found: Sequence[DetectedEffect]
-) -> Residuals:
-    """Return the residuals with encoder errors in the simulator, and with the added noise of sensors."""
-    of_sensors = [one for one in found if one.kind.target.side == "measurement"]
-    steady = [(one.kind, one.values()) for one in of_sensors if _is_steady(one.kind)]
-    simulator = residuals.simulator
-    simulator = replace(simulator, fixed=[*simulator.fixed, *steady])
-    residuals = replace(residuals, simulator=simulator)
-    rough = [one.joints for one in of_sensors if not _is_steady(one.kind)]
-    if not rough:
-        return residuals
-    assert residuals.noise is not None, "noise is known by now"
-    excess = sensors.measure_excess_scatter(case.field, case.reference, case.machine)
-    reading = (excess * np.any(rough, 0)).tolist()
-    pairs = zip(residuals.noise, reading, strict=True)
-    return replace(residuals, noise=[replace(one, reading=more) for one, more in pairs])
-
-
-def _is_steady(kind: EffectType) -> bool:
-    return kind.target.smooth and not kind.target.stochastic

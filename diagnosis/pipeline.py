@@ -10,11 +10,20 @@ from typing import Any
 import numpy as np
 import yaml
 
-from brokk_rl.contracts.actuator import Excitation
+from brokk_rl.contracts.actuator import CurveFit, Excitation
 from brokk_rl.errors import StorageError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.session import write_text
-from diagnosis import calibration, decision, detection, gates, next_experiment, sanity, verdict
+from diagnosis import (
+    calibration,
+    decision,
+    detection,
+    gates,
+    next_experiment,
+    sanity,
+    speed_curves,
+    verdict,
+)
 from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, Where
 from diagnosis.attribution import MIN_RESTORED, EffectAttribution, EffectPart
 from diagnosis.baseline import Baseline
@@ -22,16 +31,19 @@ from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate, serialize_estimate
 from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
-from diagnosis.effect_library import DetectedEffect, EffectType
+from diagnosis.effect_library import DetectedEffect, EffectSimulator, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
 from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
+from diagnosis.speed_curves import SpeedCurves
 from diagnosis.stages import Survey, examine_gap
 from diagnosis.verdict import Judgement
 
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
+CURVE_SEED = 0
+"""Of the bootstrap of the speed curves: they do not change the draws of what follows."""
 DECIDED_BY = {
     frozenset(
         {"flow_gain", "encoder_scale"}
@@ -55,6 +67,7 @@ class DiagnosisPipeline:
         calibration: Calibration of the probabilities.
         thresholds: When a stretch of a recording is worth telling.
         excitations: Experiments that could follow, by name.
+        curve_fit: Reads the speed curves of machine and simulator.
         generator: Draws bootstraps, permutations and excitations.
     """
 
@@ -65,6 +78,7 @@ class DiagnosisPipeline:
     calibration: ProbabilityModel
     thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
+    curve_fit: CurveFit
     generator: np.random.Generator
 
     def run(self, tell: ProgressCallback) -> Outcome:
@@ -76,15 +90,33 @@ class DiagnosisPipeline:
         told = verdict.judge_case(self.case, self.base, remarks, self._known())
         if failed := gates.list_failures(told):
             return self._cannot_tell(failed, told)
-        search = detection.EffectSearch(self.case, self.base, self.kinds, self.penalties, tell)
-        return self._outcome(search.run(), told)
+        tell("speed curves", 0.31)
+        curves = speed_curves.measure_curves(
+            self.base.field,
+            [self.base.field.with_base(one.base) for one in self._list_left_out()],
+            self.case.machine,
+            self.curve_fit,
+            np.random.default_rng(CURVE_SEED),
+        )
+        search = detection.EffectSearch(
+            self.case, self.base, self.kinds, self.penalties, tell, curves
+        )
+        return self._outcome(search.run(), told, curves)
+
+    def _list_left_out(self) -> list[EffectSimulator]:
+        """Return the simulators that were fitted without a part of the reference."""
+        if self.base.is_flexible:
+            return []
+        return [one.residuals.simulator for one in self.base.left_out]
 
     def _known(self) -> GapClosure:
         """Return the errors of the simulator as it was."""
         machine, paths = self.case.machine, self.base.field.residuals.base
         return GapClosure(self.base, machine, paths, None, self.generator)
 
-    def _outcome(self, result: DetectionResult, told: Sequence[Gate]) -> Outcome:
+    def _outcome(
+        self, result: DetectionResult, told: Sequence[Gate], curves: SpeedCurves
+    ) -> Outcome:
         weighed = decision.record_weights(result, self.penalties)
         result = decision.drop_unlikely_effects(result, self.penalties, self.calibration)
         field, machine = self.base.field, self.case.machine
@@ -122,6 +154,7 @@ class DiagnosisPipeline:
             reason=self._reason(seen, selected, remainder),
             more=survey.more()
             | self._more(result, weighed, foretold)
+            | {"curves": speed_curves.serialize_curves(curves)}
             | {"unknown_remainder": remainder, "reference_error": reach.measure_reference()}
             | self._unseen(result, seen.fitted),
         )

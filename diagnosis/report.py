@@ -197,6 +197,13 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
     answer, more = outcome.answer, outcome.answer.more
     text, tone = write_headline(answer)
     page = Report(f"Missing effects in the simulator of {machine.name}", text, tone)
+    if curves := more.get("curves"):
+        page.add_picture(
+            plots.draw_speed_curves(curves, machine),
+            "Speed over command, positive and negative side. Black: the machine; red: the simulator "
+            "under the same commands, fitted in the same way. Bands: 95 % by a bootstrap over blocks "
+            "of 30 s. Titles: what changes the red curve into the black one.",
+        )
     if figure := plots.draw_gap_bars(answer):
         page.add_picture(
             figure,

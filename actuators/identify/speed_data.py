@@ -9,6 +9,7 @@ Axes: `T` time, `J` joints, `K` knots, `M` features of the pose, `I` increments,
 play.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,6 +40,8 @@ FIRST_DEMAND = 0.55
 searched."""
 SIGMA_OVER_MEDIAN = 1.4826
 """Standard deviation over the median absolute deviation of a normal distribution: 1 / 0.6745."""
+STILL = 1e-10
+"""Mean square of the increments of a joint that never moves, rad² or m²."""
 OUTLIER = 4.0
 """Typical errors beyond which an increment counts with its size instead of its square. Chosen by
 hand; not searched."""
@@ -54,7 +57,13 @@ class StaticFit:
 
 
 class SpeedData:
-    """Recordings as increments, and the model on them."""
+    """Recordings as increments, and the model on them.
+
+    Attributes:
+        way: Increments, `(J, I)`.
+        known: Increments that count, `(I,)` bool.
+        scale: Mean square of the increments, `(J,)`.
+    """
 
     def __init__(
         self, recordings: Sequence[Recording], machine: Machine, knots: np.ndarray
@@ -63,7 +72,9 @@ class SpeedData:
         self._period_s = machine.period_s
         # what came before the recording is not known
         self._skip = max(1, round((machine.num_history + 1.0 / machine.period_s) / WIDTH))
-        used = [r for r in recordings if r.num_samples > WIDTH * (self._skip + 4)]
+        least = WIDTH * (self._skip + 4)
+        self._places = [n for n, r in enumerate(recordings) if r.num_samples > least]
+        used = [recordings[n] for n in self._places]
         if not used:
             raise RecordingError(
                 f"too little data: none of the {len(self.recordings)} recordings lasts long enough to fit to"
@@ -77,14 +88,63 @@ class SpeedData:
         way = [self._increments(np.diff(part, axis=0, append=part[-1:])) for part in q]
         self.way = np.concatenate(way).T  # (J, I)
         self._free = np.concatenate([self._at_stop(part) for part in q]).T
-        self.scale = np.maximum(np.mean(self.way**2, 1), 1e-12)
-        if (still := np.flatnonzero(self.scale < 1e-10)).size:
-            names = ", ".join(machine.joint_names[j] for j in still)
-            raise RecordingError(
-                f"too little data: {names} never moves in the {len(used)} recordings to fit to"
-            )
-        self._noise = 1e-3 * self.scale  # a first guess of the squared error, for the priors
+        self.known = np.ones(self.way.shape[1], dtype=bool)
         self._bend = _build_bend_penalty(knots)
+        self._measure_scale()
+
+    def _measure_scale(self) -> None:
+        self.scale = np.maximum(np.mean(self.way**2, 1), 1e-12)
+        self._noise = 1e-3 * self.scale  # a first guess of the squared error, for the priors
+
+    @property
+    def moves(self) -> np.ndarray:
+        """Joints that move at all, `(J,)` bool."""
+        return self.scale >= STILL
+
+    @property
+    def weights(self) -> np.ndarray:
+        """1 for increments away from both stops, else 0, `(J, I)`."""
+        return self._free
+
+    @property
+    def num_increments(self) -> list[int]:
+        """Number of increments of each used recording."""
+        return [len(self._increments(u)) for u in self._u]
+
+    def strokes(self, j: int, dynamics: np.ndarray) -> np.ndarray:
+        """Return the mean stroke of the valve of joint `j` over each increment, `(I,)`."""
+        parts = [self._increments(self._spool(n, j, dynamics)) for n in range(len(self._u))]
+        return np.concatenate(parts) / WIDTH
+
+    def pull(self, noise: float, size: int) -> np.ndarray:
+        """Return the prior of the curve as a normal matrix, `(size, size)`, zero beyond the curve."""
+        found = np.zeros((size, size))
+        count = len(self._bend)
+        found[:count, :count] = noise / STIFFNESS**2 * self._bend
+        return found
+
+    def check_motion(self) -> None:
+        """Raise `RecordingError` where a joint never moves: nothing can be fitted to it."""
+        if (still := np.flatnonzero(~self.moves)).size:
+            names = ", ".join(self.machine.joint_names[j] for j in still)
+            raise RecordingError(
+                f"too little data: {names} never moves in the {len(self._u)} recordings to fit to"
+            )
+
+    def replace_motion(self, steps: Sequence[np.ndarray]) -> "SpeedData":
+        """Return the same commands and poses with another motion.
+
+        Args:
+            steps: Motion from each sample to the next of each recording, `(T, J)`; increments with
+                NaN count nothing.
+        """
+        other = copy.copy(self)
+        used = [steps[n] for n in self._places]
+        way = np.concatenate([self._increments(part) for part in used]).T
+        other.known = np.isfinite(way).all(0)
+        other.way, other._free = np.where(other.known, way, 0.0), self._free * other.known
+        other._measure_scale()
+        return other
 
     def features(
         self, j: int, dynamics: np.ndarray, known: Sequence[np.ndarray] | None = None

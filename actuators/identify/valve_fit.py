@@ -68,6 +68,7 @@ class ValveFit:
         """
         del seed, device  # deterministic, numpy
         data = SpeedData([*train, *validation], machine, np.array(self.actuator.knots))
+        data.check_motion()
         dynamics = np.zeros((machine.num_joints, 4))
         with Progress(transient=True) as progress:
             rounds = [(turn, j) for turn in range(2) for j in range(machine.num_joints)]
@@ -75,8 +76,13 @@ class ValveFit:
             for turn, j in progress.track(rounds, description=f"{self.name}: dead times and lags"):
                 if turn and known is None:
                     known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
-                dynamics[j] = self._dynamics(
-                    data, j, known[j] if known else None, dynamics[j] if turn else None
+                dynamics[j] = fit_dynamics(
+                    data,
+                    j,
+                    known[j] if known else None,
+                    dynamics[j] if turn else None,
+                    self.longest_lag_s,
+                    self.iterations,
                 )
         fitted = self._spec(data, dynamics)
         # through JSON, which makes lists of tuples as YAML wants them
@@ -107,56 +113,9 @@ class ValveFit:
         dynamics = np.array(by_joint)
         assert isinstance(fitted.demand, dict), "a fitted actuator has numbers by joint"
         demand = np.array([fitted.demand[name] for name in machine.joint_names])
-        return self._spec(
-            SpeedData(recordings, machine, np.array(self.actuator.knots)), dynamics, demand
-        )
-
-    def _dynamics(
-        self, data: SpeedData, j: int, known: Sequence[np.ndarray] | None, start: np.ndarray | None
-    ) -> np.ndarray:
-        """Return the dead time, play, spool lag and speed lag that explain joint `j` best.
-
-        Args:
-            data: The recordings.
-            j: The joint.
-            known: Factor on the speed, from pose and pump, of each recording; `None` while they are
-                not known.
-            start: Where the search begins; `None`: at the best dead time.
-        """
-        machine = data.machine
-        most = np.array(
-            [
-                (machine.num_history - 2) * machine.period_s,
-                PLAYS[-1],
-                self.longest_lag_s,
-                self.longest_lag_s,
-            ]
-        )
-
-        def left(x: np.ndarray) -> np.ndarray:
-            features = data.features(j, x, known)
-            return (data.way[j] - features @ data.curve(features, data.way[j])) / np.sqrt(
-                data.scale[j]
-            )
-
-        if start is None:
-            delays = np.arange(0.0, most[0] + 1e-9, machine.period_s)
-            losses = []
-            for delay in delays:
-                losses.append(float(np.square(left(np.array([delay, 0.01, 0.04, 0.0]))).sum()))
-            start = np.array([delays[int(np.argmin(losses))], 0.02, 0.03, 0.02])
-        inside = np.clip(start, 1e-6, most - 1e-6)
-        step = np.array([0.1, 0.3, 0.3, 0.3])  # of `x_scale`: above the grain of the samples
-        return least_squares(
-            left,
-            inside,
-            bounds=(np.zeros(4), most),
-            x_scale=np.array([0.02, 0.02, 0.02, 0.02]),
-            diff_step=0.02 * step / np.maximum(inside, 1e-3) * 0.5,
-            loss="soft_l1",
-            f_scale=0.05,
-            max_nfev=self.iterations,
-        ).x
+        data = SpeedData(recordings, machine, np.array(self.actuator.knots))
+        data.check_motion()
+        return self._spec(data, dynamics, demand)
 
     def _spec(
         self, data: SpeedData, dynamics: np.ndarray, demand: np.ndarray | None = None
@@ -188,3 +147,50 @@ class ValveFit:
             pose_extend=rows(found.pose[:, 0]),
             pose_retract=rows(found.pose[:, 1]),
         )
+
+
+def fit_dynamics(
+    data: SpeedData,
+    j: int,
+    known: Sequence[np.ndarray] | None,
+    start: np.ndarray | None,
+    longest_lag_s: float,
+    iterations: int,
+) -> np.ndarray:
+    """Return the dead time, play, spool lag and speed lag that explain joint `j` best, `(4,)`.
+
+    Args:
+        data: The recordings.
+        j: The joint.
+        known: Factor on the speed, from pose and pump, of each recording; `None` while they are
+            not known.
+        start: Where the search begins; `None`: at the best dead time.
+        longest_lag_s: Upper bound of each lag.
+        iterations: Steps of the search.
+    """
+    machine = data.machine
+    longest_s = (machine.num_history - 2) * machine.period_s
+    most = np.array([longest_s, PLAYS[-1], longest_lag_s, longest_lag_s])
+
+    def left(x: np.ndarray) -> np.ndarray:
+        features, way = data.features(j, x, known)[data.known], data.way[j][data.known]
+        return (way - features @ data.curve(features, way)) / np.sqrt(data.scale[j])
+
+    if start is None:
+        delays = np.arange(0.0, most[0] + 1e-9, machine.period_s)
+        losses = []
+        for delay in delays:
+            losses.append(float(np.square(left(np.array([delay, 0.01, 0.04, 0.0]))).sum()))
+        start = np.array([delays[int(np.argmin(losses))], 0.02, 0.03, 0.02])
+    inside = np.clip(start, 1e-6, most - 1e-6)
+    step = np.array([0.1, 0.3, 0.3, 0.3])  # of `x_scale`: above the grain of the samples
+    return least_squares(
+        left,
+        inside,
+        bounds=(np.zeros(4), most),
+        x_scale=np.array([0.02, 0.02, 0.02, 0.02]),
+        diff_step=0.02 * step / np.maximum(inside, 1e-3) * 0.5,
+        loss="soft_l1",
+        f_scale=0.05,
+        max_nfev=iterations,
+    ).x

@@ -163,6 +163,55 @@ class ActuatorFit(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class FittedCurve:
+    """Speed over the stroke of the valve of one joint, with its bootstrap.
+
+    Attributes:
+        curve: Speed at each knot but 0, positive side first, over the machine's full speed, `(C,)`.
+        dynamics: Dead time (s), play (of full command), lag of the valve and lag of the speed (s).
+        draws: Bootstrap of both, `(1 + B, C + 4)`; the first row is the fit itself.
+        information: Information of the recordings on the curve, `(C, C)`.
+        points: Stroke and speed of single increments, `(I, 2)`.
+    """
+
+    curve: np.ndarray
+    dynamics: np.ndarray
+    draws: np.ndarray
+    information: np.ndarray
+    points: np.ndarray
+
+
+class CurveFit(Protocol):
+    """A spec in `conf/curve_fit`: reads speed curves off motions under the same commands."""
+
+    knots: tuple[float, ...]
+    """Strokes at which the curves are given, rising from 0 to 1."""
+
+    def fit_curves(
+        self,
+        machine: Machine,
+        recordings: Sequence[Recording],
+        motions: Sequence[Sequence[np.ndarray]],
+        further: Sequence[Sequence[np.ndarray]],
+        generator: np.random.Generator,
+    ) -> list[list[FittedCurve]]:
+        """Return the curves of each joint, those of `motions` first; empty for a joint at rest.
+
+        Args:
+            machine: The machine.
+            recordings: Commands and poses.
+            motions: Each: motion from every sample to the next, by recording `(T, J)`, rad or m;
+                NaN where it is not known.
+            further: More motions, fitted with the dynamics, pose and pump of the last of `motions`.
+            generator: Draws the blocks of the bootstrap, the same for all.
+
+        Raises:
+            RecordingError: no recording is long enough.
+        """
+        ...
+
+
 class Effect(Protocol):
     """A spec in `conf/effect`: wraps an actuator model; the result is one again."""
 

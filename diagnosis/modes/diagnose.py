@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from brokk_rl.contracts.actuator import Actuator, ActuatorFit, Excitation
+from brokk_rl.contracts.actuator import Actuator, ActuatorFit, CurveFit, Excitation
 from brokk_rl.errors import ConfigError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
@@ -69,6 +69,7 @@ class Diagnose:
         fit: Fit of the simulator to `reference/`; without a reference, the flexible model that gives
             the floor.
         actuator: The simulator that `diagnosis.field` is held against.
+        curve_fit: Reads the speed curves of machine and simulator.
         thresholds: When a stretch of a recording is worth telling.
         excitation: Experiments that could follow, by name.
         diagnosis: Recordings to diagnose.
@@ -78,6 +79,7 @@ class Diagnose:
     machine: Machine
     fit: ActuatorFit
     actuator: Actuator | None
+    curve_fit: CurveFit
     thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
     diagnosis: DiagnosisSubject
@@ -101,7 +103,15 @@ class Diagnose:
             generator = self.session.generator("diagnosis")
             prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
             work = DiagnosisPipeline(
-                given, base, kinds, prices, certainty, self.thresholds, self.excitation, generator
+                given,
+                base,
+                kinds,
+                prices,
+                certainty,
+                self.thresholds,
+                self.excitation,
+                self.curve_fit,
+                generator,
             )
             outcome = work.run(
                 lambda doing, done: progress.update(task, description=doing, completed=done)

@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 from composed import option
+from desk import DBC
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import ConfigError
+from deploy.bus.description import BusDescription
 from deploy.guard.guard import (
     CommandRequest,
     Guard,
@@ -289,6 +291,72 @@ def test_nothing_moves_further_out_at_a_stop_but_everything_back() -> None:
     assert hand.decide(u=(0.05, 0.0, -0.05), q=q).u == STILL
     assert hand.decide(u=(-0.05, 0.0, 0.05), q=q).u == (-0.05, 0.0, 0.05)
     assert hand.decide(u=(0.05, 0.0, -0.05), q=(0.899, 0.0, 0.101)).u == (0.05, 0.0, -0.05)
+
+
+WAY = [
+    ({"controls_age_s": LIMITS.controls_s + 0.001}, GuardTrip.CONTROLS_STALE),
+    ({"controls_age_s": math.nan}, GuardTrip.CONTROLS_STALE),
+    ({"round_trip_s": LIMITS.round_trip_s + 0.001}, GuardTrip.ROUND_TRIP),
+    ({"round_trip_s": math.inf}, GuardTrip.ROUND_TRIP),
+    ({"round_trip_s": math.nan}, GuardTrip.ROUND_TRIP),
+]
+
+
+@pytest.mark.parametrize(("change", "trip"), WAY, ids=str)
+def test_old_switches_and_an_unknown_way_latch_but_matter_only_where_something_is_sent(
+    change: dict[str, Any], trip: GuardTrip
+) -> None:
+    hand = Hand()
+    hand.decide(armed=False)
+    assert hand.decide(armed=False, **change).trip is GuardTrip.NOT_ARMED
+    hand.decide(RELEASED)
+    assert hand.decide(RELEASED, **change).state is GuardState.LATCHED
+    hand.active()
+    hand.decide(u=(0.1, 0.0, 0.1))
+    decision = hand.decide(u=(0.1, 0.0, 0.1), **change)
+    assert (decision.state, decision.u, decision.trip) == (GuardState.LATCHED, STILL, trip)
+    assert hand.decide(u=(0.1, 0.0, 0.1)).cause is trip
+    assert hand.decide(estop=True, **change).trip is GuardTrip.ESTOP, "what is worse is said"
+
+
+def test_switches_and_way_at_their_limits_will_do() -> None:
+    hand = Hand().active()
+    seen = {"controls_age_s": LIMITS.controls_s, "round_trip_s": LIMITS.round_trip_s}
+    assert hand.decide(u=(0.1, 0.0, 0.1), **seen).u == pytest.approx((0.1, 0.0, 0.1))
+
+
+def test_a_joint_changes_its_direction_so_often_in_a_second_and_no_more() -> None:
+    hand = Hand().active()
+    sent = []
+    for number in range(20):
+        value = 0.05 if number % 2 == 0 else -0.05
+        sent.append(hand.decide(u=(value, 0.0, 0.05), dt=0.05).u)
+    # three changes, of which the first is forgotten a second later
+    assert [u[0] for u in sent[:4]] == [0.05, -0.05, 0.05, -0.05]
+    assert {u[0] for u in sent[4:]} == {0.0, -0.05} and all(u[2] == 0.05 for u in sent)
+    assert hand.decide(u=(0.0, 0.0, 0.05), dt=0.06).u[0] == 0.0
+    # the first change was 1.01 s ago, the second 0.99 s and then 1.01 s
+    assert hand.decide(u=(0.05, 0.0, 0.05), dt=0.05).u[0] == 0.05
+    assert hand.decide(u=(-0.05, 0.0, 0.05), dt=0.03).u[0] == 0.0
+    assert hand.decide(u=(-0.05, 0.0, 0.05), dt=0.02).u[0] == -0.05
+
+
+def test_a_direction_is_remembered_through_zero_and_the_first_is_no_change() -> None:
+    hand = Hand().active()
+    for value in (0.05, 0.0, -0.05, 0.0, 0.05, 0.0, -0.05):
+        assert hand.decide(u=(value, 0.0, 0.0), dt=0.02).u[0] == value
+    assert hand.decide(u=(0.05, 0.0, 0.0), dt=0.02).u[0] == 0.0
+    assert hand.decide(u=(-0.05, 0.0, 0.0), dt=0.02).u[0] == -0.05
+
+
+def test_numbers_of_the_states_mean_what_the_description_says() -> None:
+    bus = BusDescription(DBC, option("machine", "brokk170"))
+    choices = bus._messages["PcHeartbeat"].get_signal_by_name("PcState").choices
+    assert choices is not None
+    assert {one.value: one.name.lower() for one in GuardState} == {
+        number: str(name) for number, name in choices.items()
+    }
+    assert [one.sends for one in GuardState] == [False, True, True, True]
 
 
 def test_the_exclusive_joint_moves_alone() -> None:

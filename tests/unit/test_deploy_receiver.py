@@ -269,6 +269,16 @@ def test_a_bus_without_stamps_counts_ages_from_arrival(tmp_path: Any) -> None:
     assert sender.state().flow_t_s == sender.now_s and sender.receiver.stamp_s == 0.0
 
 
+def test_a_message_without_protection_is_taken_as_it_comes(tmp_path: Any) -> None:
+    sender = Sender(_build_bus(tmp_path, '"E2EDataId" BO_ 2365592835 '))
+    sender.go(0.3)
+    assert "ValveFeedback" not in sender.receiver.channels
+    assert sender.state().flow_number == 15 and sender.seen().trusted
+    short = replace(sender.build("ValveFeedback"), data=b"")
+    assert sender.receiver.take(short, sender.now_s) is MessageFault.LENGTH
+    assert sender.state().refused == 1 and sender.seen().trusted
+
+
 def test_channels_that_are_not_needed_cost_no_trust(sender: Sender, tmp_path: Any) -> None:
     bus = _build_bus(tmp_path, " SG_ OilTemperature ")
     other = Sender(bus)

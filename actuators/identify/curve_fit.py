@@ -1,0 +1,169 @@
+"""Speed curves of a machine's joints from several motions under the same commands, with a bootstrap.
+
+The model is that of `actuators.identify.speed_data`: dead time, play, lags, a speed curve on each side,
+pose and pump. The bootstrap draws blocks of the recordings, the same for all motions, so that the
+difference of two curves scatters less than each.
+
+Axes: `J` joints, `I` increments, `C` numbers of a curve (both sides), `B` draws, `P` blocks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from actuators.identify.speed_data import WIDTH, SpeedData
+from actuators.identify.valve_fit import fit_dynamics
+from brokk_rl.contracts.actuator import FittedCurve
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.spec import spec
+
+# Chosen by hand; not searched.
+NUM_DRAWS = 200
+"""Bootstrap draws; the ends of a 95 % interval vary by 5 % of its width."""
+BLOCK_S = 30.0
+"""Length of the blocks that are drawn, s: the speed of a machine wanders over some seconds."""
+TIME_STEP, PLAY_STEP = 0.02, 0.02
+"""Finite differences of times, s, and of the play, of full command."""
+PLAY, NUM_DYNAMICS = 1, 4
+"""Place of the play among the numbers of the dynamics, and how many these are."""
+
+
+@spec
+class ValveCurveFit:
+    """Fits the speed curves of the valve model.
+
+    Attributes:
+        knots: Strokes at which the curves are given, rising from 0 to 1.
+        longest_lag_s: Upper bound of each lag.
+        sweeps: Turns of curve, pose and pump.
+        iterations: Steps of each of the two searches for dead time, play and lags.
+    """
+
+    knots: tuple[float, ...]
+    longest_lag_s: float
+    sweeps: int
+    iterations: int
+
+    def check(self) -> None:
+        if self.knots[0] != 0.0 or self.knots[-1] != 1.0 or (np.diff(self.knots) <= 0).any():
+            raise ConfigError(
+                f"curve_fit.knots: expected strokes that rise from 0 to 1, got {list(self.knots)}"
+            )
+        if self.longest_lag_s <= 0 or min(self.sweeps, self.iterations) < 1:
+            raise ConfigError(
+                "curve_fit: longest_lag_s must be above 0, sweeps and iterations 1 or more"
+            )
+
+    def fit_curves(
+        self,
+        machine: Machine,
+        recordings: Sequence[Recording],
+        motions: Sequence[Sequence[np.ndarray]],
+        further: Sequence[Sequence[np.ndarray]],
+        generator: np.random.Generator,
+    ) -> list[list[FittedCurve]]:
+        """See `brokk_rl.contracts.actuator.CurveFit`."""
+        data = SpeedData(recordings, machine, np.array(self.knots))
+        every = [data.replace_motion(motion) for motion in [*motions, *further]]
+        blocks = _number_blocks(data, machine)
+        draws = _draw_blocks(blocks, generator)
+        moving = np.all([one.moves for one in every[: len(motions)]], 0)
+        fits = [self._fit_dynamics(one, moving) for one in every[: len(motions)]]
+        # Further motions are those of the last simulator with a part left out: only curves differ.
+        fits += [fits[-1]] * len(further)
+        found: list[list[FittedCurve]] = []
+        for j in range(machine.num_joints):
+            found.append([])
+            if moving[j]:
+                for one, (dynamics, factors) in zip(every, fits, strict=True):
+                    found[j].append(_fit_curve(one, j, dynamics[j], factors[j], blocks, draws))
+        return found
+
+    def _fit_dynamics(
+        self, data: SpeedData, moving: np.ndarray
+    ) -> tuple[np.ndarray, list[list[np.ndarray]]]:
+        """Return the dynamics of all joints, `(J, 4)`, and the factors of pose and pump."""
+        limits = (self.longest_lag_s, self.iterations)
+        dynamics = np.zeros((data.machine.num_joints, NUM_DYNAMICS))
+        for j in np.flatnonzero(moving).tolist():
+            dynamics[j] = fit_dynamics(data, j, None, None, *limits)
+        factors = data.factors(data.statics(dynamics, self.sweeps), dynamics)
+        for j in np.flatnonzero(moving).tolist():
+            dynamics[j] = fit_dynamics(data, j, factors[j], dynamics[j], *limits)
+        return dynamics, factors
+
+
+def _number_blocks(data: SpeedData, machine: Machine) -> np.ndarray:
+    """Return the number of the block of each increment, `(I,)`."""
+    size = max(1, round(BLOCK_S / (WIDTH * machine.period_s)))
+    found, first = [], 0
+    for count in data.num_increments:
+        found.append(first + np.arange(count) // size)
+        first = int(found[-1][-1]) + 1 if count else first
+    return np.concatenate(found)
+
+
+def _draw_blocks(blocks: np.ndarray, generator: np.random.Generator) -> np.ndarray:
+    """Return how often each block is drawn, `(1 + B, P)`; the first row is the sample itself."""
+    count = int(blocks.max()) + 1
+    drawn = generator.multinomial(count, np.full(count, 1.0 / count), NUM_DRAWS)
+    return np.concatenate([np.ones((1, count)), drawn])
+
+
+def _fit_curve(
+    data: SpeedData,
+    j: int,
+    dynamics: np.ndarray,
+    factors: Sequence[np.ndarray],
+    blocks: np.ndarray,
+    draws: np.ndarray,
+) -> FittedCurve:
+    """Return the curve of joint `j`, drawn together with its dynamics, which are linearised."""
+    features = data.features(j, dynamics, factors)
+    way, weight = data.way[j], data.weights[j]
+    curve = data.curve(features, way, free=weight)
+    columns = [features]
+    for k in range(NUM_DYNAMICS):
+        step = PLAY_STEP if k == PLAY else TIME_STEP
+        moved = dynamics.copy()
+        moved[k] += step
+        later = data.features(j, moved, factors) @ curve
+        columns.append(((later - features @ curve) / step)[:, None])
+    slopes = np.hstack(columns)
+    left = way - features @ curve
+    noise = float(np.average(left**2, weights=np.maximum(weight, 1e-9)))
+    count, size = draws.shape[1], slopes.shape[1]
+    normal, right = np.zeros((count, size, size)), np.zeros((count, size))
+    for block in range(count):
+        rows = blocks == block
+        weighted = slopes[rows] * weight[rows, None]
+        normal[block] = weighted.T @ slopes[rows]
+        right[block] = weighted.T @ left[rows]
+    pull = data.pull(noise, size)
+    start = np.concatenate([curve, dynamics])
+    # The pull acts on the curve itself, not on its change.
+    held = pull @ np.concatenate([curve, np.zeros(NUM_DYNAMICS)])
+    drawn = []
+    for row in draws:
+        drawn.append(
+            np.linalg.solve(np.tensordot(row, normal, 1) + pull, np.tensordot(row, right, 1) - held)
+        )
+    # The fit of the sample itself is the curve: its own small step is taken off.
+    away = np.stack(drawn) - drawn[0]
+    information = normal.sum(0)[: len(curve), : len(curve)] / noise
+    # A valve moves its joint one way: what a command that was never held leaves open is no speed.
+    draws_of_both = start + away
+    draws_of_both[:, : len(curve)] = np.maximum(draws_of_both[:, : len(curve)], 0.0)
+    points = _list_points(data, j, dynamics)
+    return FittedCurve(np.maximum(curve, 0.0), dynamics, draws_of_both, information, points)
+
+
+def _list_points(data: SpeedData, j: int, dynamics: np.ndarray) -> np.ndarray:
+    """Return stroke and speed over the machine's full speed of each increment that counts, `(I, 2)`."""
+    full = data.machine.max_speed[j] * data.machine.period_s * WIDTH
+    counts = data.weights[j] > 0
+    return np.stack([data.strokes(j, dynamics)[counts], data.way[j][counts] / full], 1)

@@ -1,0 +1,118 @@
+"""The set of effects that speed curves show, from which a search begins.
+
+Responses that do not add up hide what a curve shows plainly: a dead band of half the command changes
+the responses to all other effects, so that a search from nothing ends elsewhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from brokk_rl.machine import Machine
+from diagnosis.effect_library import EffectType
+from diagnosis.nonadditive_refit import combine_best
+from diagnosis.refine import FittedSet, fit_set, list_subsets
+from diagnosis.residuals import ParameterRay, Residuals
+from diagnosis.responses import Response
+from diagnosis.search import PenaltyFunction
+from diagnosis.speed_curves import ADDED, CURVE_NUMBERS, MIN_SCORE, CurveDifference, SpeedCurves
+
+EffectNumbers = Mapping[str, Mapping[str, float]]
+"""Numbers of effects, by effect and number."""
+
+
+def fit_shown_effects(
+    residuals: Residuals,
+    proposed: Sequence[EffectNumbers],
+    rays: Mapping[str, Sequence[ParameterRay]],
+    shapes: Sequence[Mapping[str, Sequence[Response]]],
+    found: FittedSet | None,
+    price: PenaltyFunction,
+) -> list[FittedSet]:
+    """Return sets to continue from, the best first; none where the search already found the best.
+
+    Args:
+        residuals: Residuals of the simulator.
+        proposed: Effects that the curves show, by joint.
+        rays: Rays of each effect.
+        shapes: Responses of each joint to each effect; others are not tried there.
+        found: The set that the search found from nothing.
+        price: Penalty of a subset on a joint.
+    """
+    subsets, start = [], []
+    for mine, responses in zip(proposed, shapes, strict=True):
+        sizes = {}
+        for name, numbers in mine.items():
+            if name in responses:
+                sizes[name] = compute_sizes(rays[name], numbers)
+        subsets.append(frozenset(sizes))
+        start.append(sizes)
+    if not any(subsets):
+        return []
+    shown = fit_set(residuals, subsets, rays, start)
+    tried = [shown, *([found] if found else [])]
+    best = combine_best(residuals, rays, tried, price)
+    known = list_subsets(found) if found else (frozenset(),) * len(subsets)
+    return [best, *tried] if best and list_subsets(best) != known else []
+
+
+def compute_sizes(rays: Sequence[ParameterRay], numbers: Mapping[str, float]) -> np.ndarray:
+    """Return the size along each ray of an effect with these numbers, `(R,)`.
+
+    A ray of all numbers at once takes the mean of their sizes.
+    """
+    found = []
+    for ray in rays:
+        names = [ray.name] if ray.name else [n for n in ray.kind.fitted if n in numbers]
+        sizes = []
+        for name in names:
+            none = ray.kind.numbers[name].none or 0.0
+            sizes.append((numbers[name] - none) / ray.kind.size(name))
+        found.append(float(np.mean(sizes)))
+    return np.array(found)
+
+
+def propose_effects(
+    curves: SpeedCurves, kinds: Sequence[EffectType], machine: Machine
+) -> list[EffectNumbers]:
+    """Return the effects of the library that the curves show, with their numbers, by joint and name.
+
+    Gains that do not differ between the sides are one of both. The play of a valve has no effect of
+    its own in the library.
+    """
+    known = {kind.name for kind in kinds}
+    found: list[EffectNumbers] = []
+    for name in machine.joint_names:
+        one = curves.joints.get(name)
+        proposed = _read_effects(one) if one else {}
+        found.append({effect: numbers for effect, numbers in proposed.items() if effect in known})
+    return found
+
+
+def _read_effects(one: CurveDifference) -> EffectNumbers:
+    """Return the numbers of the effects that a difference shows, by effect."""
+    names: list[str] = [*CURVE_NUMBERS, *ADDED]
+    value = dict(zip(names, one.values.tolist(), strict=True))
+    error = dict(zip(names, one.deviation.tolist(), strict=True))
+    found: dict[str, Mapping[str, float]] = {}
+    bands = {side: max(0.0, value[f"dead_band_{side}"]) for side in ("extend", "retract")}
+    if max(bands.values()) > 0.0:
+        found["dead_band"] = bands
+    if value["saturation"] < 1.0:
+        found["saturation"] = {"level": value["saturation"]}
+    gains = {name: value[name] for name in ("extend_gain", "retract_gain")}
+    if any(gain != 1.0 for gain in gains.values()):
+        apart = abs(gains["extend_gain"] - gains["retract_gain"])
+        if apart < MIN_SCORE * np.hypot(error["extend_gain"], error["retract_gain"]):
+            found["flow_gain"] = {"gain": float(np.mean(list(gains.values())))}
+        else:
+            found["asymmetry"] = gains
+    for effect, name, number in (
+        ("dead_time", "dead_time_s", "dead_time_s"),
+        ("lag", "lag_s", "time_constant_s"),
+    ):
+        if value[name] > MIN_SCORE * error[name]:
+            found[effect] = {number: value[name]}
+    return found

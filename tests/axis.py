@@ -1,0 +1,73 @@
+"""A single servo axis and recordings of it, for tests of what is read off recordings."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+
+from actuators.effects.composition import ActuatorWithEffects
+from actuators.models.lag import FirstOrderLag
+from brokk_rl.contracts.actuator import Effect
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+CPU = torch.device("cpu")
+PLANT = FirstOrderLag(
+    dead_time_s=0.31,
+    dead_band_extend=0.07,
+    dead_band_retract=0.1,
+    gain=0.9,
+    time_constant_s=0.08,
+    spread={},
+)
+
+
+def make_axis(machine: Machine) -> Machine:
+    """A single servo axis, known by nothing but its limits."""
+    joint = dataclasses.replace(machine.joints[2], body=None)
+    return dataclasses.replace(
+        machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=()
+    )
+
+
+def driven(
+    machine: Machine, effects: dict[str, Effect], count: int, seconds: float, seed: int
+) -> list[Recording]:
+    """Returns recordings of the plant with effects under levels and rests, its speed wandering by a percent or two."""
+    random, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
+    model = ActuatorWithEffects(actuator=PLANT, effects=effects).build(machine, count, CPU)
+    shape = (count, machine.num_history, machine.num_joints)
+    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
+    history.reset(
+        torch.ones(count, dtype=torch.bool),
+        torch.as_tensor(machine.home, dtype=torch.float32).expand(count, -1),
+    )
+    level, left, wander = np.zeros(shape[::2]), np.zeros(shape[::2]), np.zeros(shape[::2])
+    commands, positions, margin = [], [], 0.2 * (machine.upper - machine.lower)
+    for _ in range(steps):
+        q = history.q[:, -1].numpy()
+        fresh = random.uniform(-0.9, 0.9, level.shape) * (random.random(level.shape) > 0.2)
+        level = np.where(left <= 0, fresh, level)
+        left = np.where(left <= 0, random.uniform(0.4, 2.5, level.shape), left) - machine.period_s
+        level = np.where((q > machine.upper - margin) & (level > 0), -0.6, level)
+        level = np.where((q < machine.lower + margin) & (level < 0), 0.6, level)
+        commands.append(level)
+        positions.append(q + 2e-4 * random.standard_normal(q.shape))
+        history.push_u(torch.as_tensor(level, dtype=torch.float32))
+        wander = 0.99 * wander + 0.003 * random.standard_normal(wander.shape)
+        before = history.q[:, -1].clone()
+        history.push_q(
+            before
+            + (model.step(history) - before) * torch.as_tensor(1.0 + wander, dtype=torch.float32)
+        )
+    u, q = (np.stack(rows, 1).astype(np.float32) for rows in (commands, positions))
+    return [
+        Recording(
+            machine=machine.name, joints=machine.joint_names, units=("rad",) * machine.num_joints, rate_hz=20.0,
+            t_s=np.arange(steps) * 0.05, u=u[n], q=q[n], metadata={"run": f"{seed}.{n}"},
+        )
+        for n in range(count)
+    ]  # fmt: skip
