@@ -37,8 +37,13 @@ from brokk_rl import distributed, extensions, gpu_pool, registry
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.session import read_earlier_job, remove_empty_folders
 from brokk_rl.sweep import SweepFolder
+from brokk_rl.task_choice import choose_task
 
 log = logging.getLogger(__name__)
+
+
+CHECKED_FIRST = ("machine", "sim", "task", "rl", "evaluation")
+"""Nodes whose specs are checked before the mode is imported, and torch with it."""
 
 
 class FailedJob(BaseException):
@@ -116,7 +121,9 @@ def run_job(cfg: DictConfig) -> float | None:
 def _run(cfg: DictConfig) -> float | None:
     """Instantiate the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
-    cfg = _drop_consumed_groups(_rename_targets(cfg))
+    cfg = _rename_targets(cfg)
+    _check_values(cfg)
+    cfg = _drop_consumed_groups(choose_task(cfg))
     if "session" not in cfg:
         distributed.check_together(get_class(str(cfg._target_)), sweep)
         return instantiate(cfg, _convert_="all").run()
@@ -142,6 +149,14 @@ def _run(cfg: DictConfig) -> float | None:
             # into which a job has written stays.
             remove_empty_folders([folder, *folder.parents])
         raise
+
+
+def _check_values(cfg: DictConfig) -> None:
+    """Build the specs that need no torch, so that their bad values are refused within a second."""
+    for name in CHECKED_FIRST:
+        node = OmegaConf.select(cfg, name, throw_on_missing=False)
+        if isinstance(node, DictConfig) and "_target_" in node and not OmegaConf.missing_keys(node):
+            instantiate(node, _convert_="all")
 
 
 def _is_first_process() -> bool:

@@ -10,11 +10,12 @@ configuration: a policy carries no hidden statistics.
 
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from brokk_rl.bounds import require_number
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -33,6 +34,15 @@ class TargetScaling:
     target_mean_m: tuple[float, float, float]
     target_std_m: tuple[float, float, float]
     pitch_rad: tuple[float, float] | None
+
+    def check(self) -> None:
+        for index, std_m in enumerate(self.target_std_m):
+            require_number(f"task.scaling.target_std_m[{index}]", std_m, above=0)
+        for index, mean_m in enumerate(self.target_mean_m):
+            require_number(f"task.scaling.target_mean_m[{index}]", mean_m)
+        if self.pitch_rad is not None:
+            require_number("task.scaling.pitch_rad: mean", self.pitch_rad[0])
+            require_number("task.scaling.pitch_rad: standard deviation", self.pitch_rad[1], above=0)
 
 
 def compute_size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
@@ -87,13 +97,16 @@ class ObservationEncoder:
             proposed: Proposals so far, oldest first, shape `(N, H, J)`; left out where no person
                 stands between.
         """
+        # the width is fixed and the batch is not: a length read here would be a constant of the
+        # exported graph
+        num = self.shape[0] * self.shape[1]
         target = (target_in_base_m - self._target_mean_m) / self._target_std_m
-        joints = ((q - self._q_mean) / self._q_std).reshape(len(q), -1)
-        parts = (target, joints, u.reshape(len(u), -1))
+        joints = ((q - self._q_mean) / self._q_std).reshape(-1, num)
+        parts = (target, joints, u.reshape(-1, num))
         if self.has_pitch:
             parts = (*parts, ((pitch_rad - self._pitch_mean_rad) / self._pitch_std_rad)[:, None])
         if self.has_proposals:
-            parts = (*parts, proposed.reshape(len(proposed), -1))
+            parts = (*parts, proposed.reshape(-1, num))
         return self._concat(parts, 1)
 
     def decode(self, vector: Any) -> tuple[Any, Any, Any]:
@@ -136,3 +149,23 @@ class ObservationEncoder:
             "q": {"mean": ((lower + upper) / 2).tolist(), "std": ((upper - lower) / 4).tolist()},
             "u": {"mean": 0.0, "std": 1.0},
         } | pitch
+
+
+def restore_encoder(machine: Machine, observation: Mapping[str, Any]) -> ObservationEncoder:
+    """Return the numpy encoder that `observation` of a policy's contract describes.
+
+    Args:
+        machine: The machine of the policy.
+        observation: `ObservationEncoder.describe`, as it stands in `policy.json`.
+
+    Raises:
+        KeyError: A part of the description is missing.
+    """
+    pitch = observation.get("pitch")
+    scaling = TargetScaling(
+        target_mean_m=observation["target"]["mean_m"],
+        target_std_m=observation["target"]["std_m"],
+        pitch_rad=(pitch["mean_rad"], pitch["std_rad"]) if pitch else None,
+    )
+    proposals = any("proposals" in part for part in observation["order"])
+    return ObservationEncoder(machine, scaling, with_proposals=proposals)

@@ -1,8 +1,10 @@
 """Specs: the typed, frozen data that every config node becomes."""
 
+import math
 import types
 import typing
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, TypeVar, Union, dataclass_transform
 
 from brokk_rl.errors import ConfigError
@@ -15,9 +17,9 @@ def spec(cls: type[T]) -> type[T]:
     """Turn `cls` into a spec: a frozen, keyword-only dataclass that checks its field types.
 
     A YAML list becomes a tuple. An integer given for a float becomes a float, and a whole number
-    such as 48e6 given for an integer becomes an integer. Any other mismatch raises a `ConfigError`
-    that names the field, the expected type and the value. A spec may define `check(self)` for
-    rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
+    such as 48e6 given for an integer becomes an integer. NaN and any other mismatch raise a
+    `ConfigError` that names the field, the expected type and the value. A spec may define
+    `check(self)` for rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
     defaults here.
     """
     cls.__post_init__ = _post_init  # type: ignore[attr-defined]
@@ -30,6 +32,32 @@ def name_spec(value: object) -> str:
     A class attribute `label` keeps the name in files when the class is renamed.
     """
     return getattr(value, "label", type(value).__name__.lower())
+
+
+def restore_spec(kind: type[T], values: Mapping[str, Any]) -> T:
+    """Return the spec `kind` with plain values, as `dataclasses.asdict` gives them.
+
+    The classes come from the annotations of `kind`, never from the values: a file of somebody else
+    can choose numbers, but no code.
+
+    Raises:
+        ConfigError: A field is unknown, missing, or of another type.
+    """
+    hints = typing.get_type_hints(kind)
+    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    if names != values.keys():
+        odd = ", ".join(sorted(names ^ values.keys()))
+        raise ConfigError(f"{kind.__name__}: unknown or missing fields: {odd}")
+    return kind(**{name: restore_value(hints[name], value) for name, value in values.items()})
+
+
+def restore_value(hint: Any, value: Any) -> Any:
+    """Return a plain value as the annotation `hint` has it; see `restore_spec`."""
+    if isinstance(value, Mapping):
+        for kind in (hint, *typing.get_args(hint)):
+            if isinstance(kind, type) and is_dataclass(kind):
+                return restore_spec(kind, value)
+    return value
 
 
 def _post_init(self: Any) -> None:
@@ -76,6 +104,8 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
         return float(value)
     if plain is int and isinstance(value, float) and value.is_integer():
         return int(value)
+    if plain is float and isinstance(value, float) and math.isnan(value):
+        raise ConfigError(f"{where}: expected a number, got nan")
     protocol = getattr(plain, "_is_protocol", False)
     wrong_bool = isinstance(value, bool) and plain in (int, float)
     if not protocol and (wrong_bool or not isinstance(value, plain)):

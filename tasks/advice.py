@@ -8,61 +8,21 @@ times of machine and person are one.
 
 import torch
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from tasks.settings import AdviceConfig, take_middle
 
 MIN_LAG_PERIODS = 1e-6
 """Floor of the hand's lag, in control periods: no lag would divide by zero."""
 ROUNDING = 5e-7
 """Tolerance, in control periods, by which a delay of whole periods counts as whole."""
 
-Expected = float | tuple[float, float]
-"""A number, or the range [low, high] in which it lies."""
-
-
-@spec
-class AdviceConfig:
-    """Habits of the person for whom proposals are made; the middle of a range counts.
-
-    Attributes:
-        delay_s: Reaction delay, from the display to the hand.
-        lag_s: Time constant of the hand.
-        dead_zone: Deflection below which a lever commands nothing: an effective proposal is
-            proposed larger.
-        joints_at_once: Levers that the person can move at the same time, of a range the fewest: no
-            more are proposed. `null`: all.
-        hold_s: Time for which a lever once proposed is proposed again before a larger request takes
-            its place.
-        settle_s: Time for which the hand is followed after its last proposal; several times the
-            lag.
-    """
-
-    delay_s: Expected
-    lag_s: Expected
-    dead_zone: Expected
-    joints_at_once: int | tuple[int, int] | None
-    hold_s: float
-    settle_s: float
-
-    def check(self) -> None:
-        for name in ("delay_s", "lag_s", "dead_zone"):
-            if _take_middle(getattr(self, name)) < 0:
-                raise ConfigError(
-                    f"task.advice.{name}: expected 0 or more, got {getattr(self, name)}"
-                )
-
-    def build(self, machine: Machine, device: torch.device) -> "LeverAdviser":
-        """Return the adviser for `machine` on `device`."""
-        return LeverAdviser(self, machine, device)
-
 
 class LeverAdviser:
     """Proposals under `AdviceConfig`; stateless, so that it can stand inside a policy."""
 
     def __init__(self, advice: AdviceConfig, machine: Machine, device: torch.device) -> None:
-        self._dead_zone = _take_middle(advice.dead_zone)
+        self._dead_zone = take_middle(advice.dead_zone)
         self._exclusive = torch.as_tensor(machine.is_exclusive, device=device)
         most = advice.joints_at_once
         self._most = (
@@ -117,9 +77,9 @@ def _predict_levers(advice: AdviceConfig, machine: Machine) -> torch.Tensor:
     Columns: `H` proposals, oldest first, and the present position of the hand.
     """
     num, period_s = machine.num_history, machine.period_s
-    delay = _take_middle(advice.delay_s) / period_s
-    lag = max(_take_middle(advice.lag_s) / period_s, MIN_LAG_PERIODS)
-    steps = round((_take_middle(advice.delay_s) + advice.settle_s) / period_s) + 1
+    delay = take_middle(advice.delay_s) / period_s
+    lag = max(take_middle(advice.lag_s) / period_s, MIN_LAG_PERIODS)
+    steps = round((take_middle(advice.delay_s) + advice.settle_s) / period_s) + 1
     whole = int(delay + ROUNDING)
     part = max(0.0, delay - whole)
     stay = float(torch.exp(torch.tensor(-1.0 / lag)))
@@ -135,7 +95,3 @@ def _predict_levers(advice: AdviceConfig, machine: Machine) -> torch.Tensor:
         rows.append(target + (hand - target) * lag * (1.0 - stay))  # the mean over the period
         hand = target + (hand - target) * stay
     return torch.stack(rows)
-
-
-def _take_middle(value: Expected) -> float:
-    return sum(value) / 2 if isinstance(value, tuple) else value

@@ -18,57 +18,13 @@ import torch
 
 from brokk_rl.kinematics import Kinematics, ToolPose, multiply_small_matrices
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from tasks.settings import ClassicalConfig
 
 REACH_DAMPING = 0.05
 """Damping of the exclusive joints' step towards the working range, m² per (rad or m)². Chosen by
 hand: bounds the step where a joint hardly changes the reach."""
 MIN_RADIUS_M = 1e-3
 """Floor of horizontal distances by which the controller divides."""
-
-
-@spec
-class ClassicalConfig:
-    """Resolved-rate control of the tool with dead-time compensation.
-
-    Attributes:
-        in_flight_samples: Past commands that have not yet fully acted: dead time and lag, in
-            control periods (may be fractional).
-        dead_band: Command below which the static valve map gives no motion.
-        gain_1_s: Speed of approach per distance left.
-        top_speed_m_s: Bound on the speed of the tool point.
-        top_rate_rad_s: Bound on the rate of its pitch.
-        straight: Whether the slowest joint slows all of them alike, so that the tool goes
-            straight; otherwise each goes as fast as it can.
-        damping: Damping of the least squares, in the same unit as the Jacobian times joint speed
-            (m/s at full command).
-        rest: Share of full speed below which a joint is left alone.
-        creep: Smallest share of full speed that is commanded at all, large enough to be beyond the
-            dead band of every valve.
-        hover_m: Height above the target at which the tool waits until it is aligned.
-        funnel_m: Lateral error at which the descent begins and at which it is free, (outer, inner).
-        margin_rad: Distance to a joint limit within which the joint is no longer driven towards it.
-        brake_s: Time in which a joint at full speed would cover the distance before that margin
-            over which it is slowed down.
-    """
-
-    in_flight_samples: float
-    dead_band: float
-    gain_1_s: float
-    top_speed_m_s: float
-    top_rate_rad_s: float
-    straight: bool
-    damping: float
-    rest: float
-    creep: float
-    hover_m: float
-    funnel_m: tuple[float, float]
-    margin_rad: float
-    brake_s: float
-
-    def build(self, machine: Machine, device: torch.device) -> "ClassicalController":
-        """Return the controller for `machine` on `device`."""
-        return ClassicalController(self, machine, device)
 
 
 @dataclass

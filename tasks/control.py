@@ -7,15 +7,14 @@ classical controller's guidance, the residual, and proposals for a person.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 
-from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder, TargetScaling
-from brokk_rl.spec import spec
-from tasks.advice import AdviceConfig
-from tasks.classical import ClassicalConfig, ControllerGuidance
+from tasks.advice import LeverAdviser
+from tasks.classical import ClassicalController, ControllerGuidance
+from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
 
 ERROR_SCALES_M = (0.1, 0.02)
 """Distances at which the saturated copies of position errors resolve: approach and insertion.
@@ -24,85 +23,6 @@ PITCH_SCALE_RAD = 0.1
 """The same for the pitch error. Chosen by hand."""
 REACH_CENTER_M = 2.0
 """Subtracted from the reach; about the middle of the paper's range, 1.7 to 2.4 m."""
-
-
-@spec
-class PhaseSwitch:
-    """Rule for the positioning phase, in which only the exclusive joints move (paper, III-B).
-
-    Attributes:
-        rule: `planar`: while the reach, with the target turned into the arm's plane, is out of
-            range and the tool is not low. It does not depend on the direction of q1, and always
-            lets the episode proceed. `text`: the same with the distance in space, as the paper's
-            text says. `equation`: while that distance is out of range or the tool is above the
-            height, as the paper's equation 1 says.
-        reach_m: The good working range (nearest, farthest).
-        height_m: Height of the tool below which the exclusive joints rest, to keep it off the
-            ground.
-    """
-
-    rule: Literal["planar", "text", "equation"]
-    reach_m: tuple[float, float]
-    height_m: float
-
-    def reach(self, guidance: ControllerGuidance) -> torch.Tensor:
-        """Return the distance by which the rule decides, `(N,)`."""
-        return guidance.reach_m if self.rule == "planar" else guidance.reach_3d_m
-
-    def positioning(self, guidance: ControllerGuidance) -> torch.Tensor:
-        """Return which environments are positioning, `(N,)` bool."""
-        near, far = self.reach_m
-        reach = self.reach(guidance)
-        out_of_range = (reach < near) | (reach > far)
-        is_high = guidance.tip_z_m >= self.height_m
-        return out_of_range | is_high if self.rule == "equation" else out_of_range & is_high
-
-
-@spec
-class ActionMapping:
-    """Map from the policy's output to valve commands.
-
-    Attributes:
-        kind: `direct`: the output is the command. `residual`: it is added to the classical
-            controller's command.
-        scale: Factor on the output.
-        mask: Keep exclusive and other joints apart, as the machine does; only an ablation switches
-            it off.
-        limits: Slow joints down before their ends, as far as the commands in flight let them be
-            foreseen.
-    """
-
-    kind: Literal["direct", "residual"]
-    scale: float
-    mask: bool
-    limits: bool
-
-    def command(
-        self,
-        output: torch.Tensor,
-        base: torch.Tensor,
-        lowest: torch.Tensor,
-        highest: torch.Tensor,
-        positioning: torch.Tensor,
-        exclusive: torch.Tensor,
-    ) -> torch.Tensor:
-        """Return valve commands in [-1, 1], `(N, J)`.
-
-        Args:
-            output: Output of the network, `(N, J)`.
-            base: Command of the classical controller, `(N, J)`.
-            lowest: Least commands that do not drive joints into their ends, `(N, J)`
-                (`ControllerGuidance.lowest`).
-            highest: Largest such commands, `(N, J)`.
-            positioning: Whether only the exclusive joints move, `(N,)` bool.
-            exclusive: Which joints are exclusive, `(J,)` bool.
-        """
-        u = self.scale * output + (base if self.kind == "residual" else 0.0)
-        if self.limits:
-            u = torch.maximum(torch.minimum(u, highest), lowest)
-        if self.mask:
-            u = torch.where(mask_exclusive_joints(exclusive, positioning), u, 0.0)
-        return u.clamp(-1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -154,8 +74,8 @@ class ToolPoseControl:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
         self.switch, self.action, self.memory = switch, action, memory
-        self.controller = classical.build(machine, device)
-        self.adviser = advice.build(machine, device) if advice else None
+        self.controller = ClassicalController(classical, machine, device)
+        self.adviser = LeverAdviser(advice, machine, device) if advice else None
         self.encoder = ObservationEncoder(
             machine, scaling, to_constant, torch.cat, with_proposals=self.adviser is not None
         )

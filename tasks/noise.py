@@ -12,13 +12,16 @@ import math
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 
+from brokk_rl.bounds import require_number
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+
+if TYPE_CHECKING:
+    import torch
 
 ROOT = Path(__file__).parents[1]
 """Folder of the benchmark's files in a checkout; an installed package has none."""
@@ -57,6 +60,10 @@ class ObservationNoise:
     filter: Literal["none", "mean"]
     q_scale: float
     u_scale: float
+
+    def check(self) -> None:
+        for name in ("target_sample_m", "target_bias_m", "target_relative", "q_scale", "u_scale"):
+            require_number(f"task.noise.{name}", getattr(self, name), least=0)
 
     def bias_m(self, target_m: torch.Tensor) -> torch.Tensor | float:
         """Return the longest constant error of targets, `(N, 3)` in the base frame."""
@@ -102,12 +109,10 @@ class MeasuredNoise:
     target_relative = 0.0
 
     def check(self) -> None:
-        smallest = min(self.calibration_m, self.unmeasured_bias_m, self.unmeasured_sample_m)
-        if smallest < 0 or not 0 <= self.frame_share <= 1:
-            raise ConfigError(
-                "noise: expected calibration_m and unmeasured_… of 0 or more, "
-                "frame_share from 0 to 1"
-            )
+        sizes = ("calibration_m", "unmeasured_bias_m", "unmeasured_sample_m", "q_scale", "u_scale")
+        for name in sizes:
+            require_number(f"task.noise.{name}", getattr(self, name), least=0)
+        require_number("task.noise.frame_share", self.frame_share, least=0, most=1)
         self._laws()
 
     def bias_m(self, target_m: torch.Tensor) -> torch.Tensor | float:

@@ -21,11 +21,10 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
-from tasks.advice import AdviceConfig
-from tasks.classical import ClassicalConfig
-from tasks.control import ActionMapping, DeployedPolicy, PhaseSwitch, ToolPoseControl
+from tasks.control import DeployedPolicy, ToolPoseControl
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardTerm, ToolState
+from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
 """Endings of an episode; where several hold in one step, the first of them counts."""
@@ -61,6 +60,10 @@ class ToolPoseGoal(Protocol):
         self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
     ) -> dict[str, torch.Tensor]:
         """Return `success`, `paper_success` (bool) and `closeness`, each `(N,)`."""
+        ...
+
+    def describe_success(self) -> dict[str, float]:
+        """Return the bounds of the strict criterion by name, with units, for `policy.json`."""
         ...
 
 
@@ -299,6 +302,9 @@ class ToolPoseProcess:
         description |= {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
         if options.advice:
             description["advice"] = asdict(options.advice)
+        success = self.goal.describe_success()
+        description["masked"] = options.action.mask
+        description["stop"] = {"joint_margin": options.limit_margin, "success": success}
         return description
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:

@@ -5,13 +5,18 @@ names functions of its own there as `package.module:function`. The six terms of 
 1 carry the symbol of their term in the docstring.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from pkgutil import resolve_name
+from typing import TYPE_CHECKING
 
-import torch
-
+from brokk_rl.bounds import require_number
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass
@@ -80,6 +85,7 @@ class RewardTerm:
     weight: float
 
     def check(self) -> None:
+        require_number(f"weight of the reward term '{self.function}'", self.weight)
         try:
             found = resolve_name(self.function)
         except (ImportError, AttributeError, ValueError) as error:
@@ -172,10 +178,10 @@ def peak_contact(state: ToolState) -> torch.Tensor:
     An episode pays for its hardest blow, not for the time it leans on the rim: a penalty of every
     step in contact teaches a beginner to stay away from the hole.
     """
-    peak_n = torch.maximum(state.peak_force_n, state.contact_force_n)
+    peak_n = state.peak_force_n.maximum(state.contact_force_n)
     return (peak_n.clamp(max=10_000.0) - state.peak_force_n.clamp(max=10_000.0)) / 1000.0
 
 
 def duration(state: ToolState) -> torch.Tensor:
     """One in each step."""
-    return torch.ones_like(state.reach_m)
+    return state.reach_m.new_ones(state.reach_m.shape)

@@ -5,6 +5,8 @@ the target into reach, the other joints reach the wanted pose within their limit
 the kinematics when a task is built, so that resets only pick rows.
 """
 
+import logging
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,12 +14,21 @@ import torch
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
 from tasks.classical import REACH_DAMPING, ClassicalController
+from tasks.settings import ArmStarts
 
-BATCH_FACTOR, MIN_BATCH, MAX_BATCHES = 4, 256, 64
-"""Candidates per batch for each start asked for, least batch, and batches until `draw_starts` gives
-up. Chosen by hand."""
+log = logging.getLogger(__name__)
+
+BATCH_FACTOR, MIN_BATCH = 4, 256
+"""Candidates per batch for each start asked for, and least batch. Chosen by hand."""
+CHUNK = 4096
+"""Candidates that are checked at once: what is found is known after each. Chosen by hand: less
+than a second on one core."""
+MIN_CANDIDATES, MIN_SHARE = 16384, 1 / 256
+"""Candidates after which `draw_starts` gives up, where no larger share of them can be done. Chosen
+by hand: the default tasks accept about one in four."""
+REPORT_S = 5.0
+"""Seconds between two lines about the progress. Chosen by hand."""
 
 REACH_STEPS, REACH_MAX_STEP = 40, 0.1
 """Damped Newton steps of the exclusive joints towards the working range, and their largest step
@@ -28,24 +39,6 @@ longer than an episode of `borehole_insertion`."""
 POSE_TOLERANCE_M, POSE_TOLERANCE_RAD = 0.01, 0.03
 """Errors up to which a pose counts as reached. Chosen by hand: the clearance of the hole, and a
 fraction of the tolerance of `goal_pose`."""
-
-
-@spec
-class ArmStarts:
-    """Ranges of the arm at the start of an episode.
-
-    Attributes:
-        margin_rad: Distance from joint limits.
-        floor_m: Height above the ground that no joint behind the second and no tool point starts
-            below.
-        clearance_m: Height above the object that the tool point does not start below.
-        nearest_m: Horizontal distance from the slew axis that the tool point does not start within.
-    """
-
-    margin_rad: float
-    floor_m: float
-    clearance_m: float
-    nearest_m: float
 
 
 @dataclass
@@ -91,10 +84,13 @@ def draw_starts(
         controller: Gives kinematics and reach.
         reach_m: Good working range.
         depth_m: How far below `target_m` the tool must get.
-        task_name: Name of the task, for the message when too few are found.
+        task_name: Name of the task, for messages.
 
     Returns:
         `q`, `scene`, `target_m`, `target_pitch_rad`.
+
+    Raises:
+        ConfigError: Nearly none of the drawn starts can be done.
     """
     generator = torch.Generator().manual_seed(seed)
     batch = max(BATCH_FACTOR * count, MIN_BATCH)
@@ -102,8 +98,9 @@ def draw_starts(
     def uniform(bounds: tuple[float, float]) -> torch.Tensor:
         return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
 
-    drawn = []
-    for _ in range(MAX_BATCHES):
+    drawn: list[dict[str, torch.Tensor]] = []
+    tally = _DrawTally(task_name, count)
+    while tally.done < count:
         targets = draw(uniform)
         q, free = draw_arms(arms, machine, controller, targets.object_z_m, generator)
         rows = {
@@ -112,15 +109,87 @@ def draw_starts(
             "target_m": targets.target_m,
             "target_pitch_rad": targets.pitch_rad,
         }
-        rows = {name: value[free] for name, value in rows.items()}
-        deep = rows["target_m"] - torch.tensor([0.0, 0.0, depth_m])
-        done = check_reachable(
-            controller, machine, rows["q"], deep, rows["target_pitch_rad"], reach_m, arms.margin_rad
+        for first in range(0, batch, CHUNK):
+            inside = free[first : first + CHUNK]
+            part = {name: value[first : first + CHUNK][inside] for name, value in rows.items()}
+            deep = part["target_m"] - torch.tensor([0.0, 0.0, depth_m])
+            in_range, reached = try_targets(
+                controller,
+                machine,
+                part["q"],
+                deep,
+                part["target_pitch_rad"],
+                reach_m,
+                arms.margin_rad,
+            )
+            drawn.append({name: value[in_range & reached] for name, value in part.items()})
+            tally.add(inside, in_range, reached)
+            if tally.done >= count:
+                break
+    return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
+
+
+class _DrawTally:
+    """Counts of a draw: reports progress, and ends a draw of which nearly nothing can be done."""
+
+    def __init__(self, task_name: str, count: int) -> None:
+        self._task_name, self._count = task_name, count
+        self._candidates = self._free = self._in_range = self.done = 0
+        self._begun_s = self._reported_s = time.monotonic()
+
+    def add(self, free: torch.Tensor, in_range: torch.Tensor, reached: torch.Tensor) -> None:
+        """Count a chunk.
+
+        Args:
+            free: Which arms begin in the open, `(M,)` bool.
+            in_range: Of these, whose target can be brought into the working range.
+            reached: Of these, whose tool gets there with the wanted pitch.
+
+        Raises:
+            ConfigError: Nearly none of the candidates can be done; the message says why.
+        """
+        self._candidates += len(free)
+        self._free += int(free.sum())
+        self._in_range += int(in_range.sum())
+        self.done += int((in_range & reached).sum())
+        if self.done >= self._count:
+            return
+        if self._candidates >= MIN_CANDIDATES and self.done < MIN_SHARE * self._candidates:
+            raise ConfigError(self._explain())
+        now_s = time.monotonic()
+        if now_s - self._reported_s >= REPORT_S:
+            self._reported_s = now_s
+            log.info(
+                "%s: %d of %d starts drawn in %.0f s; %.1f %% of the candidates can be done",
+                self._task_name,
+                self.done,
+                self._count,
+                now_s - self._begun_s,
+                100 * self.done / self._candidates,
+            )
+
+    def _explain(self) -> str:
+        """Return the message for a draw that is given up."""
+        closed = 1 - self._free / self._candidates
+        outside = 1 - self._in_range / max(1, self._free)
+        unreached = 1 - self.done / max(1, self._in_range)
+        reasons = [f"{closed:.1%} of the arms do not begin in the open (task.arms, joint limits)"]
+        if self._free:
+            reasons.append(
+                f"of the others {outside:.1%} of the targets cannot be brought into the working "
+                "range (task.switch.reach_m)"
+            )
+        if self._in_range:
+            reasons.append(
+                f"of the rest {unreached:.1%} cannot be reached with the wanted pitch within the "
+                "joint limits"
+            )
+        return (
+            f"{self._task_name}: nearly no start can be done: {self.done} of "
+            f"{self._candidates} candidates, expected 1 in {round(1 / MIN_SHARE)} at least. "
+            f"{'; '.join(reasons)}. Change the ranges of the target or of the arms in the task, or "
+            "the joint limits of the machine."
         )
-        drawn.append({name: value[done] for name, value in rows.items()})
-        if sum(len(found["q"]) for found in drawn) >= count:
-            break
-    return join_starts(count, drawn, task_name)
 
 
 def draw_arms(
@@ -148,7 +217,7 @@ def draw_arms(
     return q, free
 
 
-def check_reachable(
+def try_targets(
     controller: ClassicalController,
     machine: Machine,
     q: torch.Tensor,
@@ -156,11 +225,15 @@ def check_reachable(
     pitch_rad: torch.Tensor,
     reach_m: tuple[float, float],
     margin_rad: float,
-) -> torch.Tensor:
-    """Return from which `q`, `(M, J)`, the target pose can be reached under the masks, `(M,)` bool.
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Try to reach target poses from `q`, `(M, J)`, under the masks.
 
     First the exclusive joints move until the reach lies well inside the good working range, then
     the others by damped least squares.
+
+    Returns:
+        Whether the target came into the working range, `(M,)` bool, and whether the tool ended at
+        the wanted pose, `(M,)` bool.
     """
     exclusive = torch.as_tensor(machine.is_exclusive)
     lower = torch.as_tensor(machine.lower, dtype=torch.float32) + margin_rad
@@ -186,24 +259,4 @@ def check_reachable(
         q = (q + POSE_STEP_S * share * controller.speed).clamp(lower, upper)
     pose = controller.kinematics.pose(q)
     near = (target_m - pose.tip_in_base_m).norm(dim=1) < POSE_TOLERANCE_M
-    return good & near & ((pitch_rad - pose.pitch_rad).abs() < POSE_TOLERANCE_RAD)
-
-
-def join_starts(
-    count: int, drawn: list[dict[str, torch.Tensor]], task_name: str
-) -> dict[str, torch.Tensor]:
-    """Join batches of accepted starts and cuts them to `count`.
-
-    Raises:
-        ConfigError: If too few were accepted.
-    """
-    joined = {}
-    for key in drawn[0]:
-        joined[key] = torch.cat([batch[key] for batch in drawn])
-    found = len(joined["q"])
-    if found < count:
-        raise ConfigError(
-            f"{task_name}: only {found} of {count} starts were reachable; "
-            "widen the joint limits or narrow the ranges of the task"
-        )
-    return {key: value[:count] for key, value in joined.items()}
+    return good, near & ((pitch_rad - pose.pitch_rad).abs() < POSE_TOLERANCE_RAD)

@@ -134,7 +134,9 @@ class DeployableTask(Protocol):
         """Return `size`, order, scale and filters of the `policy` group, as plain JSON data.
 
         It becomes `observation` in `policy.json`; the machine's computer builds the same vector
-        with `brokk_rl.observation`.
+        with `brokk_rl.observation`. Two entries stand elsewhere in that file: `stop`, when an
+        episode ends, and `masked`, `False` where commands may move exclusive and other joints at
+        once.
         """
         ...
 
@@ -157,7 +159,12 @@ def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
 
 
 class Task(Protocol):
-    """A spec in `conf/task`: builds a task process."""
+    """A spec in `conf/task`: builds a task process.
+
+    A class attribute `behaviour` names the fields that a policy has learned with, such as
+    `("memory", "noise.filter")`. Checkpoints and policies carry them, and a policy is evaluated and
+    exported with its own (`brokk_rl.task_description`). Without it only the task's name is known.
+    """
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""

@@ -22,7 +22,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.execution import capture_graph
 from brokk_rl.rl.logger import TrainingLogger
-from brokk_rl.rl.runner import TrainingConfig, TrainingRunner
+from brokk_rl.rl.runner import TrainingRunner
+from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, read_versions, write_json

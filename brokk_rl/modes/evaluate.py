@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Collection
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -12,13 +14,15 @@ from rich.table import Table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
-from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
+from brokk_rl.rl.policy import TrainedPolicy
+from brokk_rl.rl.settings import Evaluation
+from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.video import render_video
 from brokk_rl.spec import name_spec, spec
+from brokk_rl.task_description import describe_task
 
 log = logging.getLogger(__name__)
 
@@ -29,31 +33,6 @@ class PolicySpec(Protocol):
     def build(self, loop: ControlLoop, seed: int) -> Policy:
         """Return the policy for the control loop."""
         ...
-
-
-@spec
-class Evaluation:
-    """Number of episodes, their seed, and how many to record and show.
-
-    Attributes:
-        episodes: Number of episodes, one from each start.
-        seed: Seed of starts and noise; the same for every policy and run, so that results can be
-            compared.
-        num_recorded: Episodes recorded, of which the video shows one.
-        video: Whether to render a video.
-    """
-
-    episodes: int
-    seed: int
-    num_recorded: int
-    video: bool
-
-    def check(self) -> None:
-        if not 1 <= self.num_recorded <= self.episodes:
-            raise ConfigError(
-                "evaluation: expected 1 <= num_recorded <= episodes, "
-                f"got {self.num_recorded} and {self.episodes}"
-            )
 
 
 @spec
@@ -71,6 +50,8 @@ class Evaluate:
         policy: The policy in question.
         rivals: Policies beside it, by name.
         evaluation: How to evaluate.
+        asked: Keys of the task that were given on the command line; a trained policy acts by its
+            own task, and what contradicts it is refused.
     """
 
     session: Session
@@ -83,6 +64,7 @@ class Evaluate:
     policy: PolicySpec
     rivals: dict[str, PolicySpec]
     evaluation: Evaluation
+    asked: tuple[str, ...]
 
     def run(self) -> float:
         """Evaluate; return the strict success of the policy."""
@@ -95,7 +77,7 @@ class Evaluate:
             follower=self.follower,
         )
         policies = {name_spec(self.policy): self.policy} | self.rivals
-        results, _ = evaluate_policies(config, self.evaluation, self.session, policies)
+        results = evaluate_policies(config, self.evaluation, self.session, policies, self.asked)
         return float(results["success_strict"]["mean"])
 
 
@@ -104,10 +86,12 @@ def evaluate_policies(
     evaluation: Evaluation,
     session: Session,
     policies: dict[str, PolicySpec],
-) -> tuple[dict[str, Any], torch.Tensor]:
+    asked: Collection[str] = (),
+) -> dict[str, Any]:
     """Evaluate policies from the same starts with the same noise.
 
-    Writes `evaluation.json` and `insertion.mp4`.
+    Each trained policy acts by its own task, under the conditions of `config.task`; the others
+    share the task of the first policy. Writes `evaluation.json` and `insertion.mp4`.
 
     Args:
         config: The control loop.
@@ -115,19 +99,33 @@ def evaluate_policies(
         session: Where to write, and on which device.
         policies: By name; the first is the one in question and stands at the top of
             `evaluation.json`.
+        asked: Keys of the configuration that the caller gave; see
+            `brokk_rl.task_description.apply_behaviour`.
 
     Returns:
-        The content of `evaluation.json`, and observation vectors `(B, O)` of the first policy.
+        The content of `evaluation.json`.
+
+    Raises:
+        ConfigError: The caller asked for something that a policy does not have.
     """
     device = session.torch_device()
-    torch.manual_seed(evaluation.seed)  # effects and followers draw from it, too
-    loop = config.build(device, evaluation.episodes, evaluation.episodes, evaluation.seed)
-    loop.capture()
-    starts = {key: value.clone() for key, value in loop.starts.items()}
-    fresh = loop.state_dict()
+    tasks = _choose_tasks(config, policies, asked)
+    descriptions = {name: describe_task(task) for name, task in tasks.items()}
+    loops: dict[str, tuple[ControlLoop, dict[str, Any]]] = {}
+    starts: Starts | None = None
     evaluated: dict[str, PolicyEvaluation] = {}
     for name, policy in policies.items():
         log.info("evaluating %s over %d episodes", name, evaluation.episodes)
+        key = descriptions[name].fingerprint()
+        if key not in loops:
+            # effects and followers draw from it, too
+            torch.manual_seed(evaluation.seed)
+            num, own = evaluation.episodes, replace(config, task=tasks[name])
+            loop = own.build(device, num, num, evaluation.seed, starts)
+            loop.capture()
+            loops[key] = loop, loop.state_dict()
+        loop, fresh = loops[key]
+        starts = starts or {key: value.clone() for key, value in loop.starts.items()}
         loop.load_state_dict(fresh)  # every policy meets the same machines and persons
         evaluated[name] = evaluate_policy(
             loop, policy.build(loop, session.seed), starts, evaluation.seed, evaluation.num_recorded
@@ -140,6 +138,8 @@ def evaluate_policies(
         "actuator": name_spec(config.actuator),
         "follower": name_spec(config.follower),
         "policy": first,
+        "task": descriptions[first].to_json(),
+        "tasks": {name: found.fingerprint() for name, found in descriptions.items()},
         "policies": table,
     }
     write_json(session.folder / "evaluation.json", results)
@@ -149,7 +149,22 @@ def evaluate_policies(
         shown = next((episode for episode in recorded if episode.success), recorded[0])
         path = render_video(config.machine, shown, session.folder / "insertion.mp4")
         log.info("video of one episode: %s", path)
-    return results, evaluated[first].observations
+    return results
+
+
+def _choose_tasks(
+    config: ControlLoopConfig, policies: dict[str, PolicySpec], asked: Collection[str]
+) -> dict[str, Task]:
+    """Return the task of each policy: its own, or that of the first one."""
+    tasks: dict[str, Task] = {}
+    shared = config.task
+    for name, policy in policies.items():
+        if isinstance(policy, TrainedPolicy):
+            tasks[name] = policy.choose_task(config.task, config.machine, asked)
+        else:
+            tasks[name] = shared
+        shared = next(iter(tasks.values()))
+    return tasks
 
 
 def _print_table(table: dict[str, dict[str, Any]]) -> None:

@@ -15,7 +15,7 @@ from brokk_rl.contracts.task import Task, supports_classical_control, supports_d
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
+from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves
@@ -26,7 +26,8 @@ from brokk_rl.rl.policy import (
     load_initial_weights,
     write_bundle,
 )
-from brokk_rl.rl.runner import TrainingConfig, TrainingRunner, list_checkpoints
+from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
+from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.tracking import NoTracking, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session
@@ -119,7 +120,7 @@ class Train:
             "device": str(device),
             "follower": read_follower(self.session.folder),
         }
-        return self._finish(config, loop, runner.alg.get_policy(), facts)
+        return self._finish(config, runner, facts)
 
     def _open_logger(self, loop: ControlLoop, group: TrainingGroup) -> TrainingLogger:
         """Return the logger of this process; only the first of several writes."""
@@ -137,11 +138,15 @@ class Train:
         )
 
     def _finish(
-        self, config: ControlLoopConfig, loop: ControlLoop, actor: Any, facts: dict[str, Any]
+        self, config: ControlLoopConfig, runner: TrainingRunner, facts: dict[str, Any]
     ) -> float:
         """Write bundle and curves, evaluate, export; return the strict success."""
-        folder = self.session.folder
-        contract = write_bundle(folder, actor, self.rl, loop, facts)
+        folder, loop, actor = self.session.folder, runner.env, runner.alg.get_policy()
+        network = self.rl.describe_network()
+        contract = write_bundle(
+            folder, actor, network, loop.task, loop.description, self.machine, facts
+        )
+        answers = runner.record_answers()
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
         policies: dict[str, PolicySpec] = {"trained": TrainedPolicy(folder=str(folder))}
         if supports_classical_control(loop.task):
@@ -152,10 +157,10 @@ class Train:
                 type(self.task).__name__,
             )
         policies["untrained"] = UntrainedPolicy(training=self.rl)
-        results, observations = evaluate_policies(config, self.evaluation, self.session, policies)
+        results = evaluate_policies(config, self.evaluation, self.session, policies)
         task = self.task.build(self.machine, 1, torch.device("cpu"))
         if supports_deployment(task):
-            export_onnx(folder, actor, task, contract, observations)
+            export_onnx(folder, actor, task, self.machine, contract, answers)
         else:
             log.warning(NOT_DEPLOYABLE.format(task=type(self.task).__name__))
         log.info("run folder: %s", folder)

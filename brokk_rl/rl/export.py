@@ -1,8 +1,7 @@
-"""Export of a policy to ONNX, and proof that the file answers like the network."""
+"""Export of a policy to ONNX, and proof that the file answers as the training run recorded."""
 
 from __future__ import annotations
 
-import copy
 import io
 import json
 import logging
@@ -19,20 +18,18 @@ from rsl_rl.models import MLPModel
 
 from brokk_rl.contracts.task import DeployableTask
 from brokk_rl.errors import CheckpointError
-from brokk_rl.rl.policy import CONTRACT, ONNX
+from brokk_rl.machine import Machine
+from brokk_rl.observation import ObservationEncoder, restore_encoder
+from brokk_rl.rl.policy import CONTRACT, GOLDEN, ONNX, TOLERANCE, PlainActor
 from brokk_rl.session import write_json
 
-TOLERANCE = 1e-3
-"""Largest difference of a command (of 2 full strokes) between torch and onnxruntime over recorded
-observations. Chosen by hand: far above the rounding of float32, far below what a valve resolves."""
 MAX_EDGE_SHARE = 0.005
 """Share of observations that may differ by more: at the edge of a mask or of the dead band the last
 bit of a float decides between two commands. Chosen by hand."""
 OPSET = 18
 """ONNX operator set; chosen by hand, onnxruntime on the machine reads it."""
-GOLDEN, NUM_GOLDEN = "golden.json", 16
-"""Observations and the network's own commands: whoever runs the file elsewhere compares with them
-first."""
+NUM_GOLDEN = 16
+"""Answers in `golden.json`: whoever runs the file elsewhere compares with them first."""
 NOT_DEPLOYABLE = (
     "the task ({task}) cannot be deployed, so there is no policy.onnx: it has no methods "
     "`describe` "
@@ -41,28 +38,13 @@ NOT_DEPLOYABLE = (
 )
 
 
-class _OnnxActor(torch.nn.Module):
-    """A copy of an actor on the CPU that takes a dictionary of groups: ONNX knows no TensorDict."""
-
-    def __init__(self, actor: MLPModel) -> None:
-        super().__init__()
-        assert actor.distribution is not None
-        self.groups = list(actor.obs_groups)
-        self.normalizer = copy.deepcopy(actor.obs_normalizer).cpu()
-        self.mlp = copy.deepcopy(actor.mlp).cpu()
-        self.output = actor.distribution.as_deterministic_output_module()
-
-    def forward(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        latent = torch.cat([groups[name] for name in self.groups], dim=-1)
-        return self.output(self.mlp(self.normalizer(latent)))
-
-
 def export_onnx(
     folder: Path,
     actor: MLPModel,
     task: DeployableTask,
+    machine: Machine,
     contract: dict[str, Any],
-    observations: torch.Tensor,
+    answers: tuple[torch.Tensor, torch.Tensor],
 ) -> float:
     """Write `policy.onnx`, with the contract as metadata, and `golden.json`.
 
@@ -70,21 +52,21 @@ def export_onnx(
         folder: Where to; the contract there is completed by the parity figures.
         actor: The network.
         task: The policy's task, built on the CPU: constants of a GPU would travel with the file.
+        machine: The machine.
         contract: Contract that `write_bundle` returned.
-        observations: Recorded observation vectors, `(B, O)`, over which file and network are
-            compared.
+        answers: Observation vectors, `(B, O)`, and the commands, `(B, J)`, that the network gave
+            for them in the run that trained it (`ControlLoop.record_answers`).
 
     Returns:
-        The largest difference of a command between onnxruntime and torch.
+        The largest difference of a command between onnxruntime and the recorded ones.
 
     Raises:
-        CheckpointError: File and network differ; the file is removed.
+        CheckpointError: The file answers otherwise than the run did; it is removed.
     """
-    module = task.deployable(_OnnxActor(actor).eval()).eval()
+    module = task.deployable(PlainActor(actor).cpu().eval()).eval()
     part = folder / f".{ONNX}.part"
-    _write_onnx(module, observations[:1].cpu(), part)
-    with torch.no_grad():
-        expected = module(observations.cpu()).numpy()
+    observations, expected = answers[0].float(), answers[1].numpy()
+    _write_onnx(module, observations[:1], part)
     metadata = {}
     for key, value in contract.items():
         if key != "network":
@@ -94,24 +76,24 @@ def export_onnx(
     onnx.save(model, part)
 
     session = onnxruntime.InferenceSession(part.read_bytes(), providers=["CPUExecutionProvider"])
-    inputs = {"observation": observations.cpu().numpy().astype(np.float32)}
-    difference = np.abs(session.run(None, inputs)[0] - expected).max(1)
+    found = session.run(None, {"observation": observations.numpy()})[0]
+    difference = np.abs(found - expected).max(1)
     off = difference > TOLERANCE  # rows at an edge are counted, not compared
-    if off.mean() > MAX_EDGE_SHARE:
+    if not off.sum() <= max(1, MAX_EDGE_SHARE * len(off)):
         part.unlink()
-        raise CheckpointError(
-            f"the exported policy differs from the network in {off.mean():.1%} of {len(off)} "
-            f"observations (largest {difference.max():.3g}); nothing was written. This is a bug of "
-            "the exporter or of a custom network layer."
-        )
+        raise CheckpointError(_explain_difference(module, observations, expected, difference))
     part.replace(folder / ONNX)
     largest = float(difference[~off].max())
     golden = np.flatnonzero(~off)[:: max(1, len(off) // NUM_GOLDEN)][:NUM_GOLDEN]
-    answers = {
-        "observation": observations[golden].cpu().numpy().astype(float).tolist(),
+    vectors = observations[golden].numpy()
+    recorded = {
+        "observation": vectors.astype(float).tolist(),
         "command": expected[golden].astype(float).tolist(),
     }
-    write_json(folder / GOLDEN, answers)
+    if contract["observation"]:
+        encoder = restore_encoder(machine, contract["observation"])
+        recorded["inputs"] = _decode_inputs(encoder, vectors)
+    write_json(folder / GOLDEN, recorded)
     parity = {
         "observations": len(off),
         "largest_difference": largest,
@@ -120,6 +102,39 @@ def export_onnx(
     }
     write_json(folder / CONTRACT, contract | {"parity": parity})
     return largest
+
+
+def _explain_difference(
+    module: torch.nn.Module,
+    observations: torch.Tensor,
+    expected: np.ndarray,
+    difference: np.ndarray,
+) -> str:
+    """Return the message for a file that does not answer as the training run did."""
+    with torch.no_grad():
+        in_torch = np.abs(module(observations).numpy() - expected).max(1) > TOLERANCE
+    cause = (
+        "The task or the network built here is not the one of the run"
+        if in_torch.any()
+        else "This is a bug of the exporter or of a custom network layer"
+    )
+    share = (difference > TOLERANCE).mean()
+    return (
+        f"the exported policy differs from the answers that its training recorded in {share:.1%} "
+        f"of {len(difference)} observations (largest {difference.max():.3g}); nothing was written. "
+        f"{cause}."
+    )
+
+
+def _decode_inputs(encoder: ObservationEncoder, vectors: np.ndarray) -> dict[str, Any]:
+    """Return target, history, pitch and proposals of observation vectors in their units."""
+    target_m, q, u = encoder.decode(vectors)
+    inputs = {"target_in_base_m": target_m, "q": q, "u": u}
+    if encoder.has_pitch:
+        inputs["pitch_rad"] = encoder.decode_pitch(vectors)
+    if encoder.has_proposals:
+        inputs["proposals"] = encoder.decode_proposals(vectors)
+    return {name: np.asarray(value, float).tolist() for name, value in inputs.items()}
 
 
 def _write_onnx(module: torch.nn.Module, example: torch.Tensor, path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import copy
 import io
 import logging
 import os
@@ -14,11 +13,12 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.errors import CheckpointError, ConfigError, StorageError
+from brokk_rl.errors import CheckpointError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
-from brokk_rl.spec import spec
+from brokk_rl.task_description import TaskDescription
 
 log = logging.getLogger(__name__)
 
@@ -27,95 +27,9 @@ ITERATIONS_PER_ROUND = 10
 agree on it."""
 
 
-SETTLED_PART = 0.9
-"""Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
-`TrainingConfig.settling`."""
-
-
-@spec
-class TrainingBudget:
-    """When training ends: with the first of these that is spent; `null` for no bound.
-
-    Attributes:
-        max_env_steps: Control steps over all environments.
-        max_seconds: Seconds of training, those before a resume included.
-    """
-
-    max_env_steps: int | None
-    max_seconds: float | None
-
-    def check(self) -> None:
-        if self.max_env_steps is None and self.max_seconds is None:
-            raise ConfigError(
-                "rl.budget: give max_env_steps, max_seconds or both; "
-                "training without an end is not possible"
-            )
-
-    def share_spent(self, env_steps: int, seconds: float) -> float:
-        """Return the spent share of the budget, 1 or more when all of it is spent."""
-        return max(
-            env_steps / (self.max_env_steps or float("inf")),
-            seconds / (self.max_seconds or float("inf")),
-        )
-
-
-@spec
-class TrainingConfig:
-    """Numbers of a training with rsl-rl's PPO.
-
-    Attributes:
-        num_envs: Environments, of each process where several train together; `null` for the number
-            of the simulator's configuration.
-        num_starts: Number of valid starts from which resets draw.
-        budget: When training ends.
-        save_interval: Iterations between checkpoints; a killed run loses no more. As often several
-            processes prove that they agree.
-        keep_checkpoints: Newest checkpoints kept.
-        settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
-            learn fast, small ones keep it.
-        max_fault_rate: Share of control steps that may end in a diverged or overflowing world
-            before the run stops with an error.
-        fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
-            compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
-            less than half of a control step of few worlds, far more.
-        random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at
-            once.
-        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`,
-            `num_steps_per_env`, …), handed on as it is.
-    """
-
-    num_envs: int | None
-    num_starts: int
-    budget: TrainingBudget
-    save_interval: int
-    keep_checkpoints: int
-    settling: float
-    max_fault_rate: float
-    fuse: bool
-    random_episode_lengths: bool
-    runner: dict[str, Any]
-
-    def check(self) -> None:
-        if not 0.0 <= self.settling <= 1.0:
-            raise ConfigError(
-                f"rl.settling: expected a part of the budget, 0 to 1, got {self.settling}"
-            )
-
-    def divergence(self, share_spent: float) -> float | None:
-        """Return the `desired_kl` of updates when this share of the budget is spent."""
-        desired = self.runner["algorithm"].get("desired_kl")
-        if desired is None or share_spent <= 1.0 - self.settling:
-            return desired
-        return desired * (
-            1.0 - SETTLED_PART * min(1.0, (share_spent - 1.0 + self.settling) / self.settling)
-        )
-
-    def runner_config(self) -> dict[str, Any]:
-        """Return a copy for rsl-rl, which writes into it, without keys whose value is `null`."""
-        return _drop_nulls(copy.deepcopy(self.runner)) | {
-            "save_interval": 10**9,
-            "check_for_nan": False,
-        }
+NUM_ANSWERS = 256
+"""Observations at most, of as many environments, that a checkpoint holds with the network's own
+commands. Chosen by hand: many phases of an episode, and 150 kB."""
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -259,6 +173,9 @@ class TrainingRunner(OnPolicyRunner):
             "others": parts[1:],
             "book": self._book.state_dict(),
             "fingerprint": self.env.machine.fingerprint(),
+            "task": self.env.description.to_json(),
+            "network": self.training.describe_network(),
+            "answers": self.record_answers(),
         }
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
         part = path.with_suffix(".part")
@@ -279,6 +196,13 @@ class TrainingRunner(OnPolicyRunner):
         for old in list_checkpoints(self.folder)[: -self.training.keep_checkpoints]:
             old.unlink()
 
+    def record_answers(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return observations of running episodes and the network's own commands for them.
+
+        An export is compared with them; see `ControlLoop.record_answers`.
+        """
+        return self.env.record_answers(self.alg.get_policy(), NUM_ANSWERS)
+
     def save(self, path: str, infos: dict | None = None) -> None:
         """Do nothing: rsl-rl would save amid an iteration; `checkpoint` follows every `learn`."""
 
@@ -297,6 +221,7 @@ class TrainingRunner(OnPolicyRunner):
         """
         content = read_checkpoint(Path(path), self.device)
         self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
+        self._check_task(content, path)
         try:
             self.alg.load(content, None, strict=True)
             own = [content, *content.get("others", [])][self.group.rank.index :][:1]
@@ -315,6 +240,26 @@ class TrainingRunner(OnPolicyRunner):
                 "Resume with the run's own resolved.yaml."
             ) from error
         return {}
+
+    def _check_task(self, content: dict[str, Any], path: str) -> None:
+        """Refuse a checkpoint of a training for another task; the message names what differs."""
+        if "task" not in content:
+            log.warning("%s does not say which task it trains; assumed: the one given", path)
+            return
+        own, here = TaskDescription.from_json(content["task"], path), self.env.description
+        differences = own.compare(here)
+        if own.name != here.name:
+            differences = {"": (own.name, here.name)}
+        if differences:
+            values = []
+            for key, (there, given) in differences.items():
+                name = f"task.{key}" if key else "task"
+                values.append(f"{name} is {there} there, {given} here")
+            raise CheckpointError(
+                f"{path} belongs to a training for another task: {'; '.join(values)}. Resume with "
+                "the run's own resolved.yaml: brokk --config-dir <run> --config-name resolved "
+                "resume=<run> session.out=<run>"
+            )
 
 
 @contextlib.contextmanager
@@ -379,13 +324,3 @@ def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str)
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
-
-
-def _drop_nulls(value: Any) -> Any:
-    if isinstance(value, dict):
-        kept = {}
-        for key, item in value.items():
-            if item is not None:
-                kept[key] = _drop_nulls(item)
-        return kept
-    return value

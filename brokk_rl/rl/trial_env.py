@@ -18,6 +18,7 @@ from brokk_rl.record import Recording
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
+from brokk_rl.task_description import describe_task
 
 Rows = list[np.ndarray]
 
@@ -66,7 +67,13 @@ class SimulatedTrials:
         for key, value in task.starts(1, 0).items():
             starts[key] = value[:1].expand(num, *value.shape[1:]).clone()
         loop = ControlLoop(
-            machine, world, model, levers, task, starts | _make_starts(machine, trials)
+            machine,
+            world,
+            model,
+            levers,
+            task,
+            starts | _make_starts(machine, trials),
+            describe_task(self.task),
         )
         if task.max_episode_steps * machine.period_s < trials.limit_s:
             raise ConfigError(

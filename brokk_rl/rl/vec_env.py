@@ -8,7 +8,7 @@ world allows it (Warp on a GPU) the whole step is captured once in a CUDA graph 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -29,6 +29,7 @@ from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
+from brokk_rl.task_description import TaskDescription, describe_task
 
 Starts = dict[str, torch.Tensor]
 
@@ -54,7 +55,12 @@ class ControlLoopConfig:
     follower: Follower
 
     def build(
-        self, device: torch.device, num_envs: int | None, pool: int, seed: int
+        self,
+        device: torch.device,
+        num_envs: int | None,
+        pool: int,
+        seed: int,
+        starts: Starts | None = None,
     ) -> ControlLoop:
         """Return the control loop on `device`.
 
@@ -64,6 +70,7 @@ class ControlLoopConfig:
                 configuration.
             pool: Number of valid starts from which resets draw.
             seed: Seed of the starts.
+            starts: Starts of another control loop, in the place of drawn ones.
         """
         world = self.sim.build(self.machine, device, num_envs)
         num = world.num_worlds
@@ -74,9 +81,12 @@ class ControlLoopConfig:
         process = self.task.build(self.machine, num, device)
         # with all threads, four processes on a computer of 64 cores had no starts after three
         # minutes; with one each, after seconds
-        with limit_to_one_thread("cpu"):
-            starts = {key: value.to(device) for key, value in process.starts(pool, seed).items()}
-        return ControlLoop(self.machine, world, model, follower, process, starts)
+        if starts is None:
+            with limit_to_one_thread("cpu"):
+                drawn = process.starts(pool, seed)
+            starts = {key: value.to(device) for key, value in drawn.items()}
+        description = describe_task(self.task)
+        return ControlLoop(self.machine, world, model, follower, process, starts, description)
 
 
 class ControlLoop(VecEnv):
@@ -89,6 +99,7 @@ class ControlLoop(VecEnv):
         follower: Turns the proposed command into the command given.
         task: Task process.
         starts: Valid starts from which resets draw, each entry `(pool, …)`.
+        description: Description of the task, for checkpoints and policies made here.
     """
 
     def __init__(
@@ -99,8 +110,10 @@ class ControlLoop(VecEnv):
         follower: FollowerModel,
         task: TaskProcess,
         starts: Starts,
+        description: TaskDescription,
     ) -> None:
         self.machine, self.world, self.task = machine, world, task
+        self.description = description
         self.actuator, self.follower = actuator, follower
         self.num_envs = world.num_worlds
         self.device: torch.device = world.device
@@ -223,6 +236,27 @@ class ControlLoop(VecEnv):
             else:
                 self._advance()
             return self.get_observations(), self.reward, self.done, {"time_outs": self.timed_out}
+
+    def record_answers(
+        self, act: Callable[[TensorDict], torch.Tensor], count: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return present observations, `(B, O)`, and the commands proposed for them, `(B, J)`.
+
+        Nothing changes by it: neither an episode nor a random generator.
+
+        Args:
+            act: Returns the deterministic action for observation groups.
+            count: Number of environments at most.
+        """
+        with self._always_alike():
+            parts = (self.task.state, self.task.episode)
+            kept = [{name: value.clone() for name, value in part.items()} for part in parts]
+            groups = self.get_observations()
+            command = self.task.command(act(groups)).clone()
+            for part, values in zip(parts, kept, strict=True):
+                for name, value in values.items():
+                    part[name].copy_(value)
+        return groups["policy"][:count].cpu(), command[:count].cpu()
 
     def statistics(self) -> dict[str, float]:
         """Return figures of the episodes that finished since the last call: means, endings, number.

@@ -1,20 +1,21 @@
 """Simulator specs of `conf/sim`: MuJoCo C on CPU threads, MuJoCo Warp on a GPU, or by device.
 
-The worlds are imported where they are built: `mujoco_warp` alone takes seconds to import.
+Worlds and torch are imported where they are needed: `mujoco_warp` alone takes seconds to import,
+and a bad number is refused before.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import torch
-
-from brokk_rl.contracts.world import World
 from brokk_rl.errors import ConfigError, DeviceError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
 if TYPE_CHECKING:
+    import torch
+
+    from brokk_rl.contracts.world import World
     from brokk_rl.sim.native_world import NativeWorld
     from brokk_rl.sim.warp_world import WarpWorld
 
@@ -48,14 +49,16 @@ class NativeSimulator:
         Raises:
             DeviceError: `device` is not the CPU.
         """
-        if torch.device(device).type != "cpu":
+        if not _is_cpu(device):
             raise DeviceError(
                 f"sim=native runs on the CPU, but device '{device}' was asked for; "
                 "choose sim=warp, or the CPU"
             )
         from brokk_rl.sim.native_world import NativeWorld
 
-        return NativeWorld(machine, num_worlds or self.num_worlds, self.substeps, self.num_threads)
+        return NativeWorld(
+            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads
+        )
 
 
 @spec
@@ -112,6 +115,8 @@ class WarpSimulator:
         Raises:
             DeviceError: A GPU was asked for and there is none.
         """
+        import torch
+
         device = torch.device(device)
         if device.type == "cuda" and not torch.cuda.is_available():
             raise DeviceError(
@@ -125,7 +130,7 @@ class WarpSimulator:
         return WarpWorld(
             machine,
             device,
-            num_worlds=num_worlds or self.num_worlds,
+            num_worlds=_choose(num_worlds, self.num_worlds),
             substeps=self.substeps,
             num_contacts=self.num_contacts,
             num_constraints=self.num_constraints,
@@ -152,5 +157,14 @@ class AutoSimulator:
         self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
     ) -> World:
         """Return the worlds on `device`; `num_worlds` overrides the configured number."""
-        chosen = self.native if torch.device(device).type == "cpu" else self.warp
+        chosen = self.native if _is_cpu(device) else self.warp
         return chosen.build(machine, device, num_worlds)
+
+
+def _is_cpu(device: torch.device | str) -> bool:
+    return str(device).partition(":")[0] == "cpu"
+
+
+def _choose(given: int | None, configured: int) -> int:
+    """Return the number of worlds that was given, else the configured one."""
+    return configured if given is None else given

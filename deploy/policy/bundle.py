@@ -9,19 +9,24 @@ here.
 from __future__ import annotations
 
 import json
+import logging
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnxruntime
 
-from brokk_rl.errors import CheckpointError
+from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, TargetScaling
+from brokk_rl.observation import restore_encoder
 from brokk_rl.registry import resolve_package_path
+from brokk_rl.task_description import TaskDescription
+
+log = logging.getLogger(__name__)
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
-SCHEMA = 1
+SCHEMAS = (1, 2)
+"""Versions of the contract that are read; the first does not describe the policy's task."""
 ERRORS_ONLY = 3
 """Severity of onnxruntime's log."""
 ROUNDING = 1e-6
@@ -40,6 +45,7 @@ class PolicyBundle:
     Attributes:
         encoder: The training's own observation code, with the bundle's scaling.
         contract: Contents of `policy.json`.
+        task: Description of the task that the policy was trained in; `None` in old files.
 
     Raises:
         CheckpointError: see the module; the message names the difference.
@@ -49,23 +55,14 @@ class PolicyBundle:
         place = resolve_package_path(folder)
         self.contract = _read(place / CONTRACT, folder)
         _check_contract(self.contract, machine, folder)
+        self.task = _read_task(self.contract, folder)
         observation = self.contract["observation"]
         if observation is None:
             raise CheckpointError(
                 f"{folder}: the policy's task cannot be deployed, so there is no {ONNX}; see "
                 "brokk_rl.contracts.task.DeployableTask"
             )
-        pitch = observation.get("pitch")
-        scaling = TargetScaling(
-            target_mean_m=observation["target"]["mean_m"],
-            target_std_m=observation["target"]["std_m"],
-            pitch_rad=(pitch["mean_rad"], pitch["std_rad"]) if pitch else None,
-        )
-        self.encoder = ObservationEncoder(
-            machine,
-            scaling,
-            with_proposals=any("proposals" in part for part in observation["order"]),
-        )
+        self.encoder = restore_encoder(machine, observation)
         expected = self.encoder.describe()
         for key, value in expected.items():
             if key != "size" and _is_different(value, observation.get(key)):
@@ -81,6 +78,23 @@ class PolicyBundle:
                 f"in {ONNX}; history or joints differ"
             )
         self._check_golden(_read(place / GOLDEN, folder), folder)
+
+    def check_pitch(self, pitch_rad: float | None) -> None:
+        """Refuse a wanted pitch that the policy does not ask for, and none where it asks for one.
+
+        Raises:
+            ConfigError: `pitch_rad` contradicts the policy's task.
+        """
+        if self.encoder.has_pitch and pitch_rad is None:
+            raise ConfigError(
+                "deploy.pitch_rad: the policy asks for the wanted pitch of the tool, got null; "
+                "give deploy.pitch_rad=<rad>, 1.57 for straight down"
+            )
+        if pitch_rad is not None and not self.encoder.has_pitch:
+            raise ConfigError(
+                f"deploy.pitch_rad={pitch_rad} was asked for, but the policy's task fixes the pitch; "
+                "leave it out, or give a policy that asks for one"
+            )
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         """Return masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
@@ -100,10 +114,25 @@ class PolicyBundle:
                 )
 
 
+def _read_task(contract: dict[str, Any], folder: str) -> TaskDescription | None:
+    """Return the description of the policy's task; say what is assumed where there is none."""
+    if "task" in contract:
+        return TaskDescription.from_json(contract["task"], folder)
+    log.warning(
+        "%s: %s does not say which task the policy was trained in; assumed: %s holds all of it, as "
+        "its golden answers show",
+        folder,
+        CONTRACT,
+        ONNX,
+    )
+    return None
+
+
 def _check_contract(contract: dict[str, Any], machine: Machine, folder: str) -> None:
-    if contract.get("schema") != SCHEMA:
+    if contract.get("schema") not in SCHEMAS:
         raise CheckpointError(
-            f"{folder}: the contract has schema {contract.get('schema')}, expected {SCHEMA}"
+            f"{folder}: the contract has schema {contract.get('schema')}, expected one of "
+            f"{', '.join(map(str, SCHEMAS))}"
         )
     machine.check_fingerprint(contract.get("fingerprint", {}), f"the policy in {folder}")
     facts = {
@@ -177,8 +206,12 @@ def _open_session(
         raise CheckpointError(
             f"policy {folder}: {ONNX} is damaged or truncated ({str(error).splitlines()[0]})"
         ) from error
-    said = session.get_modelmeta().custom_metadata_map.get("brokk.fingerprint")
-    if said is None or json.loads(said) != contract["fingerprint"]:
+    metadata = session.get_modelmeta().custom_metadata_map
+    said = {}
+    for key in ("fingerprint", "task"):
+        text = metadata.get(f"brokk.{key}")
+        said[key] = None if text is None else json.loads(text)
+    if said != {"fingerprint": contract["fingerprint"], "task": contract.get("task")}:
         raise CheckpointError(
             f"policy {folder}: {CONTRACT} and {ONNX} do not belong together; export it again (mode=export)"
         )

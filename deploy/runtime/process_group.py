@@ -131,7 +131,11 @@ class BusAndPolicySettings:
             machine: The machine.
             target_s: Age of the borehole from which there is no advice.
             pitch_rad: Wanted pitch of the tool, for policies that ask for one.
+
+        Raises:
+            ConfigError: The pitch contradicts the policy's task.
         """
+        PolicyBundle(self.policy, machine).check_pitch(pitch_rad)
         bus = BusProcessConfig(self.wire, self.dbc, machine, self.limits)
         policy = PolicyProcessConfig(
             machine, self.policy, self.guidance, self.limits.joints_s, target_s, pitch_rad

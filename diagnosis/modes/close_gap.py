@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +18,10 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import Evaluation, PolicySpec, evaluate_policies
+from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.modes.train import Train
 from brokk_rl.rl.policy import CONTRACT, TrainedPolicy
-from brokk_rl.rl.runner import TrainingConfig
+from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.tracking import Tracking
 from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session, write_json
@@ -69,6 +70,8 @@ class CloseGap:
         tracking: Where figures of the training go beside the run folder.
         evaluation: How to evaluate.
         resume: Run folder of an interrupted run to go on with; the same as `session.out`.
+        asked: Keys of the task that were given on the command line; policies act by the tasks that
+            they were trained in, and what contradicts these is refused.
     """
 
     session: Session
@@ -88,6 +91,7 @@ class CloseGap:
     tracking: Tracking
     evaluation: Evaluation
     resume: str | None
+    asked: tuple[str, ...]
 
     def check(self) -> None:
         if not self.found:
@@ -141,11 +145,16 @@ class CloseGap:
         _show(found, folder)
         return float(found["achieved"]["mean"])
 
+    @cached_property
+    def _own_task(self) -> Task:
+        """Task of the policy as it was, in which it is retrained too."""
+        return self.policy.choose_task(self.task, self.machine, self.asked)
+
     def _plants(self) -> dict[str, ControlLoopConfig]:
         known = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
-            task=self.task,
+            task=self._own_task,
             actuator=self.actuator,
             effects=self.effect,
             follower=self.follower,
@@ -171,7 +180,7 @@ class CloseGap:
         plant = self._training_plant()
         log.info("retraining with %s", ", ".join(self.found))
         Train(
-            session=replace(self.session, out=str(place)), machine=self.machine, sim=self.sim, task=self.task,
+            session=replace(self.session, out=str(place)), machine=self.machine, sim=self.sim, task=plant.task,
             actuator=plant.actuator, effect=plant.effects, follower=self.follower, rl=self.rl, tracking=self.tracking,
             evaluation=self.evaluation, start_from=self.policy.folder if self.warm else None,
             resume=str(place) if self.resume else None,
@@ -188,8 +197,8 @@ class CloseGap:
         place.mkdir(exist_ok=True)
         log.info("on the %s", retraining.PLANT_NAMES[name])
         return evaluate_policies(
-            plant, self.evaluation, replace(self.session, out=str(place)), policies
-        )[0]
+            plant, self.evaluation, replace(self.session, out=str(place)), policies, self.asked
+        )
 
 
 def _describe_plant(plant: ControlLoopConfig) -> str:

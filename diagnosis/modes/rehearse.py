@@ -23,9 +23,8 @@ from brokk_rl.contracts.actuator import Effect
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError, list_choices
-from brokk_rl.modes.evaluate import Evaluation
 from brokk_rl.report import Cell, Report, Tone
-from brokk_rl.rl.runner import TrainingConfig
+from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.session import RESOLVED, Session, read_record, write_text
 from brokk_rl.spec import spec
 from diagnosis import answer, plots, report, retraining

@@ -1,24 +1,24 @@
-"""Inserting the chisel into a vertical borehole in a concrete block (the paper's task)."""
+"""Inserting the chisel into a vertical borehole in a concrete block (the paper's task).
 
-import math
+The specs here need no torch, so that a bad value is refused before torch is loaded.
+"""
 
-import torch
+from __future__ import annotations
 
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, ClassVar
+
+from brokk_rl.bounds import require_number, require_range
 from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
-from brokk_rl.sim import scene
 from brokk_rl.spec import spec
-from tasks.advice import AdviceConfig
-from tasks.classical import ClassicalConfig
-from tasks.control import ActionMapping, PhaseSwitch
 from tasks.noise import MeasuredNoise, ObservationNoise
-from tasks.process import ToolPoseOptions, ToolPoseProcess
 from tasks.reward import RewardTerm
-from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
+from tasks.settings import ActionMapping, AdviceConfig, ArmStarts, ClassicalConfig, PhaseSwitch
 
-DOWN_RAD = math.pi / 2
-"""Pitch of a tool that points straight down, rad (the paper's 1.57)."""
+if TYPE_CHECKING:
+    import torch
 
 
 @spec
@@ -41,6 +41,13 @@ class BoreholeRanges:
     block_scale: tuple[float, float]
     radius_m: float
 
+    def check(self) -> None:
+        for name in ("bearing_rad", "rim_z_m", "yaw_rad"):
+            require_range(f"task.hole.{name}", getattr(self, name))
+        for name in ("distance_m", "block_scale"):
+            require_range(f"task.hole.{name}", getattr(self, name), least=0)
+        require_number("task.hole.radius_m", self.radius_m, above=0)
+
 
 @spec
 class InsertionCriteria:
@@ -61,6 +68,13 @@ class InsertionCriteria:
     slack_m: float
     paper_alignment: float
     paper_height_m: float
+
+    def check(self) -> None:
+        for name in ("strict_depth_m", "chisel_radius_m"):
+            require_number(f"task.success.{name}", getattr(self, name), above=0)
+        for name in ("slack_m", "paper_height_m"):
+            require_number(f"task.success.{name}", getattr(self, name))
+        require_number("task.success.paper_alignment", self.paper_alignment, above=0, most=1)
 
 
 @spec
@@ -104,99 +118,26 @@ class BoreholeInsertion:
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
 
+    behaviour: ClassVar[tuple[str, ...]] = (
+        "depth_m",
+        "memory",
+        "advice",
+        "noise.filter",
+        "switch",
+        "action",
+        "scaling",
+        "classical",
+    )
+    """Fields that a policy has learned with; see `brokk_rl.task_description`."""
+
+    def check(self) -> None:
+        require_number("task.episode_s", self.episode_s, above=0)
+        require_number("task.memory", self.memory, least=1)
+        for name in ("limit_margin", "depth_m"):
+            require_number(f"task.{name}", getattr(self, name))
+
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""
-        return ToolPoseProcess(
-            InsertionGoal(self, machine), ToolPoseOptions.of(self), machine, num_envs, device
-        )
-
-
-class InsertionGoal:
-    """Starts and criteria of the borehole task; fulfils `tasks.process.ToolPoseGoal`."""
-
-    def __init__(self, task: BoreholeInsertion, machine: Machine) -> None:
-        self._task = task
-        self._machine = machine
-
-    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """Draw valid starts; see `tasks.process.ToolPoseGoal`."""
-        task, hole = self._task, self._task.hole
-
-        def draw(uniform: Uniform) -> CandidateTargets:
-            distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
-            rim = torch.stack(
-                (distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)), 1
-            )
-            columns = {
-                "hole_x_m": rim[:, 0],
-                "hole_y_m": rim[:, 1],
-                "rim_z_m": rim[:, 2],
-                "yaw_rad": bearing + uniform(hole.yaw_rad),
-                "block_scale": uniform(hole.block_scale),
-                "hole_radius_m": torch.full_like(distance, hole.radius_m),
-            }
-            return CandidateTargets(
-                target_m=rim,
-                pitch_rad=torch.full_like(distance, DOWN_RAD),
-                scene=torch.stack([columns[name] for name in scene.COLUMNS], 1),
-                object_z_m=rim[:, 2],
-            )
-
-        controller = task.classical.build(self._machine, torch.device("cpu"))
-        return draw_starts(
-            count,
-            seed,
-            draw,
-            task.arms,
-            self._machine,
-            controller,
-            task.switch.reach_m,
-            task.depth_m,
-            "borehole_insertion",
-        )
-
-    def judge(
-        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
-    ) -> dict[str, torch.Tensor]:
-        """Judge tool poses; see `tasks.process.ToolPoseGoal`."""
-        rules, rim = self._task.success, start["target_m"]
-        lateral = (tip_m - rim)[:, :2].norm(dim=1)
-        below = rim[:, 2] - tip_m[:, 2]
-        clearance = self._task.hole.radius_m - rules.chisel_radius_m + rules.slack_m
-        inside = lateral <= clearance
-        target = rim.clone()
-        target[:, 2] -= self._task.depth_m
-        distance = (target - tip_m).norm(dim=1)
-        turn = (start["target_pitch_rad"] - pitch_rad).abs()
-        aligned = (1 / (1 + distance) >= rules.paper_alignment) & (
-            1 / (1 + turn) >= rules.paper_alignment
-        )
-        return {
-            "success": inside & (below >= rules.strict_depth_m),
-            "paper_success": aligned & (below >= rules.paper_height_m),
-            "closeness": _measure_closeness(
-                distance, lateral, turn, below * inside, rules.strict_depth_m
-            ),
-        }
-
-
-def _measure_closeness(
-    distance_m: torch.Tensor,
-    lateral_m: torch.Tensor,
-    turn_rad: torch.Tensor,
-    inside_m: torch.Tensor,
-    depth_m: float,
-) -> torch.Tensor:
-    """Return the closeness of an insertion, 0 to 1.
-
-    Sum of distance at three scales, alignment at three, and depth inside the hole.
-    """
-    approach = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.1)) / 3
-    aligned = sum(1 / (1 + lateral_m / scale) for scale in (0.1, 0.03, 0.01)) / 3
-    upright = 1 / (1 + turn_rad / 0.2)
-    return (
-        0.3 * approach
-        + 0.3 * aligned * approach
-        + 0.1 * upright
-        + 0.3 * (inside_m / depth_m).clamp(0.0, 1.0)
-    )
+        # by name: importing it loads torch
+        make = resolve_name("tasks.borehole_insertion.goal:make_process")
+        return make(self, machine, num_envs, device)

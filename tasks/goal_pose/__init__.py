@@ -1,24 +1,25 @@
-"""Moving the tool to a pose in the open: a point and a pitch (the paper's outlook)."""
+"""Moving the tool to a pose in the open: a point and a pitch (the paper's outlook).
 
-import torch
+The specs here need no torch, so that a bad value is refused before torch is loaded.
+"""
 
+from __future__ import annotations
+
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, ClassVar
+
+from brokk_rl.bounds import require_number, require_range
 from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
-from brokk_rl.sim import scene
 from brokk_rl.spec import spec
-from tasks.advice import AdviceConfig
-from tasks.classical import ClassicalConfig
-from tasks.control import ActionMapping, PhaseSwitch
 from tasks.noise import ObservationNoise
-from tasks.process import ToolPoseOptions, ToolPoseProcess
 from tasks.reward import RewardTerm
-from tasks.starts import ArmStarts, CandidateTargets, Uniform, draw_starts
+from tasks.settings import ActionMapping, AdviceConfig, ArmStarts, ClassicalConfig, PhaseSwitch
 
-BLOCK_AWAY_M = -20.0
-"""Where the block stands along x: behind the machine and out of its reach, so that nothing but the
-ground is in the way."""
+if TYPE_CHECKING:
+    import torch
 
 
 @spec
@@ -38,12 +39,9 @@ class PoseRanges:
     pitch_rad: tuple[float, float]
 
     def check(self) -> None:
-        for name in ("distance_m", "bearing_rad", "height_m", "pitch_rad"):
-            low, high = getattr(self, name)
-            if low > high:
-                raise ConfigError(
-                    f"task.pose.{name}: expected (lowest, highest), got [{low}, {high}]"
-                )
+        for name in ("bearing_rad", "height_m", "pitch_rad"):
+            require_range(f"task.pose.{name}", getattr(self, name))
+        require_range("task.pose.distance_m", self.distance_m, least=0)
 
 
 @spec
@@ -59,6 +57,11 @@ class PoseCriteria:
     strict_distance_m: float
     strict_pitch_rad: float
     paper_alignment: float
+
+    def check(self) -> None:
+        for name in ("strict_distance_m", "strict_pitch_rad"):
+            require_number(f"task.tolerance.{name}", getattr(self, name), above=0)
+        require_number("task.tolerance.paper_alignment", self.paper_alignment, above=0, most=1)
 
 
 @spec
@@ -99,7 +102,21 @@ class GoalPose:
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
 
+    behaviour: ClassVar[tuple[str, ...]] = (
+        "memory",
+        "advice",
+        "noise.filter",
+        "switch",
+        "action",
+        "scaling",
+        "classical",
+    )
+    """Fields that a policy has learned with; see `brokk_rl.task_description`."""
+
     def check(self) -> None:
+        require_number("task.episode_s", self.episode_s, above=0)
+        require_number("task.memory", self.memory, least=1)
+        require_number("task.limit_margin", self.limit_margin)
         if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:
             raise ConfigError(
                 "task.scaling.pitch_rad: the wanted pitch differs between episodes, so the "
@@ -109,72 +126,6 @@ class GoalPose:
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""
-        return ToolPoseProcess(
-            ReachingGoal(self, machine),
-            ToolPoseOptions.of(self, depth_m=0.0),
-            machine,
-            num_envs,
-            device,
-        )
-
-
-class ReachingGoal:
-    """Starts and criteria of the pose task; fulfils `tasks.process.ToolPoseGoal`."""
-
-    def __init__(self, task: GoalPose, machine: Machine) -> None:
-        self._task = task
-        self._machine = machine
-
-    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """Draw valid starts; see `tasks.process.ToolPoseGoal`."""
-        task, pose = self._task, self._task.pose
-
-        def draw(uniform: Uniform) -> CandidateTargets:
-            distance, bearing = uniform(pose.distance_m), uniform(pose.bearing_rad)
-            place = scene.make_nominal_scenes(len(distance))
-            place[:, scene.COLUMNS.index("hole_x_m")] = BLOCK_AWAY_M
-            return CandidateTargets(
-                target_m=torch.stack(
-                    (distance * bearing.cos(), distance * bearing.sin(), uniform(pose.height_m)), 1
-                ),
-                pitch_rad=uniform(pose.pitch_rad),
-                scene=place,
-                object_z_m=torch.zeros_like(distance),
-            )
-
-        controller = task.classical.build(self._machine, torch.device("cpu"))
-        return draw_starts(
-            count,
-            seed,
-            draw,
-            task.arms,
-            self._machine,
-            controller,
-            task.switch.reach_m,
-            0.0,
-            "goal_pose",
-        )
-
-    def judge(
-        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
-    ) -> dict[str, torch.Tensor]:
-        """Judge tool poses; see `tasks.process.ToolPoseGoal`."""
-        rules = self._task.tolerance
-        distance = (start["target_m"] - tip_m).norm(dim=1)
-        turn = (start["target_pitch_rad"] - pitch_rad).abs()
-        return {
-            "success": (distance <= rules.strict_distance_m) & (turn <= rules.strict_pitch_rad),
-            "paper_success": (1 / (1 + distance) >= rules.paper_alignment)
-            & (1 / (1 + turn) >= rules.paper_alignment),
-            "closeness": _measure_closeness(distance, turn),
-        }
-
-
-def _measure_closeness(distance_m: torch.Tensor, turn_rad: torch.Tensor) -> torch.Tensor:
-    """Return the closeness of a pose, 0 to 1.
-
-    Sum of distance at three scales, pitch at three, and both together.
-    """
-    near = torch.stack([1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)
-    turned = torch.stack([1 / (1 + turn_rad / scale) for scale in (1.0, 0.3, 0.05)]).mean(0)
-    return 0.5 * near + 0.2 * turned + 0.3 * near * turned
+        # by name: importing it loads torch
+        make = resolve_name("tasks.goal_pose.goal:make_process")
+        return make(self, machine, num_envs, device)

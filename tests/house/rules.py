@@ -19,6 +19,7 @@ FLOORS = (
     ("brokk_rl.__main__", 5),
     ("brokk_rl.extensions", 5),
     ("brokk_rl.sweep", 5),
+    ("brokk_rl.task_choice", 5),
     ("conf", 5),
     *((f"{package}.modes", MODE) for package in ("brokk_rl", *ROOMS, *EXTENSIONS)),
     *((package, 3) for package in (*ROOMS, *EXTENSIONS)),
@@ -31,8 +32,8 @@ FLOORS = (
 """Floor of each package, the first that fits: roof, modes, rooms and diagnosis, sim and rl,
 bedrock, and ground for the rest."""
 DOORS = {
-    "hydra": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep"),
-    "omegaconf": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep"),
+    "hydra": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep", "brokk_rl.task_choice"),
+    "omegaconf": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep", "brokk_rl.task_choice"),
     "mujoco": ("brokk_rl.sim",),
     "mujoco_warp": ("brokk_rl.sim",),
     "warp": ("brokk_rl.sim",),

@@ -18,7 +18,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.observation import ObservationEncoder
 from brokk_rl.rl.vec_env import ControlLoop
-from tasks.advice import AdviceConfig
+from tasks.advice import LeverAdviser
+from tasks.settings import AdviceConfig
 
 CPU = torch.device("cpu")
 
@@ -67,7 +68,10 @@ def test_what_is_coming_is_what_a_person_gives_when_nothing_more_is_proposed(
     numbers: dict[str, float], machine: Machine
 ) -> None:
     """Held against the simulated person, who moves q1, q3, q4 and q5."""
-    adviser, model = advice(**numbers).build(machine, CPU), person(**numbers).build(machine, 1, CPU)
+    adviser, model = (
+        LeverAdviser(advice(**numbers), machine, CPU),
+        person(**numbers).build(machine, 1, CPU),
+    )
     given = torch.zeros(1, 5)
     proposed = (
         torch.rand(13, 1, 5, generator=torch.Generator().manual_seed(2)) * 2 - 1
@@ -88,7 +92,9 @@ def test_what_is_coming_is_what_a_person_gives_when_nothing_more_is_proposed(
 
 def test_a_proposal_makes_up_for_the_lever_s_dead_zone(machine: Machine) -> None:
     wanted = torch.tensor([[0.5, 0.0, -0.1, 1.0, 0.02]])
-    shown = advice(dead_zone=0.05).build(machine, CPU).proposal(wanted, torch.zeros(1, 13, 5))
+    shown = LeverAdviser(advice(dead_zone=0.05), machine, CPU).proposal(
+        wanted, torch.zeros(1, 13, 5)
+    )
     given = person(dead_zone=0.05, delay_s=0.0, lag_s=0.0).build(machine, 1, CPU).step(shown)
     torch.testing.assert_close(given, wanted)
 
@@ -96,7 +102,7 @@ def test_a_proposal_makes_up_for_the_lever_s_dead_zone(machine: Machine) -> None
 def test_no_more_levers_are_proposed_than_a_person_has_hands_for_and_each_for_a_while(
     machine: Machine,
 ) -> None:
-    adviser = advice(joints_at_once=(2, 4), hold_s=0.15).build(machine, CPU)
+    adviser = LeverAdviser(advice(joints_at_once=(2, 4), hold_s=0.15), machine, CPU)
     proposed = torch.zeros(1, 13, 5)
     moved = []
     for step in range(8):
@@ -115,7 +121,7 @@ def test_no_more_levers_are_proposed_than_a_person_has_hands_for_and_each_for_a_
 
 
 def test_proposals_keep_the_masks(machine: Machine) -> None:
-    adviser = advice(joints_at_once=1).build(machine, CPU)
+    adviser = LeverAdviser(advice(joints_at_once=1), machine, CPU)
     generator = torch.Generator().manual_seed(0)
     proposed, exclusive = torch.zeros(8, 13, 5), torch.as_tensor(machine.is_exclusive)
     for _ in range(40):
@@ -205,5 +211,8 @@ def test_a_contract_says_what_the_policy_knows_of_the_person(machine: Machine) -
 
 
 def test_a_delay_below_zero_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"task\.advice\.delay_s: expected 0 or more, got -0\.1"):
+    with pytest.raises(
+        ConfigError,
+        match=r"task\.advice\.delay_s: expected a finite number of 0 or more, got -0\.1",
+    ):
         advice(delay_s=-0.1)

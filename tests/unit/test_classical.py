@@ -20,7 +20,7 @@ RANGE_M = (1.7, 2.4)
 
 def controller(machine: Machine, **changes: Any) -> ClassicalController:
     config = replace(option("task", "borehole_insertion").classical, **changes)
-    return config.build(machine, CPU)
+    return ClassicalController(config, machine, CPU)
 
 
 def arms(machine: Machine, count: int, seed: int = 0) -> torch.Tensor:

@@ -127,17 +127,26 @@ def test_training_that_begins_with_a_policy_has_its_network_and_its_own_explorat
     old = runner.alg.actor
     with torch.no_grad():
         spread(old).fill_(-3.0)  # as one that has settled
-    write_bundle(tmp_path / "old", old, training, runner.env, {})
+    env = runner.env
+    network = training.describe_network()
+    write_bundle(tmp_path / "old", old, network, env.task, env.description, machine, {})
     config = training.runner_config()
     loop = plant(machine).build(CPU, 16, 64, 0)
-    actor = make_actor(config["actor"], config["obs_groups"], loop)
+    actor = make_actor(
+        config["actor"], config["obs_groups"], loop.get_observations(), loop.num_actions
+    )
     load_initial_weights(actor, str(tmp_path / "old"), machine)
     groups = loop.get_observations()
     np.testing.assert_array_equal(actor(groups).detach(), old(groups).detach())
     shipped = option("rl", "ppo").runner["actor"]["distribution_cfg"]["init_std"]
     torch.testing.assert_close(spread(actor).exp(), torch.full((5,), shipped))
 
-    other = make_actor(config["actor"] | {"hidden_dims": [8]}, config["obs_groups"], loop)
+    other = make_actor(
+        config["actor"] | {"hidden_dims": [8]},
+        config["obs_groups"],
+        loop.get_observations(),
+        loop.num_actions,
+    )
     with pytest.raises(CheckpointError, match="start_from"):
         load_initial_weights(other, str(tmp_path / "old"), machine)
 

@@ -19,9 +19,10 @@ from actuators.person import HumanFollower
 from brokk_rl.checks import check_follower
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import Evaluation, evaluate_policies
+from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.train import read_follower
 from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.settings import Evaluation
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import RESOLVED, Session
 
@@ -417,7 +418,7 @@ def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_p
         session = Session(out=str(tmp_path / name), seed=0, device="cpu")
         session.folder.mkdir()
         torch.manual_seed(len(name))
-        results, _ = evaluate_policies(
+        results = evaluate_policies(
             plant, how, session, {"first": ClassicalPolicy(), "second": ClassicalPolicy()}
         )
         assert (

@@ -15,7 +15,8 @@ import training as runs
 from brokk_rl.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import find_checkpoint
-from brokk_rl.rl.runner import TrainingBudget, list_checkpoints, read_checkpoint
+from brokk_rl.rl.runner import list_checkpoints, read_checkpoint
+from brokk_rl.rl.settings import TrainingBudget
 
 ITERATION = 16 * runs.STEPS
 """Control steps of one iteration."""
@@ -283,5 +284,5 @@ def test_the_divergence_of_updates_falls_to_a_tenth_while_the_policy_settles() -
         [0.01, 0.01, 0.0055, 0.001, 0.001]
     )
     assert runs.small(max_env_steps=100, settling=0.0).divergence(1.0) == 0.01
-    with pytest.raises(ConfigError, match=r"rl\.settling: expected a part of the budget"):
+    with pytest.raises(ConfigError, match=r"rl\.settling: expected a finite number from 0 to 1"):
         runs.small(max_env_steps=100, settling=1.5)

@@ -160,7 +160,13 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
     assert "success_paper" not in report
 
     with pytest.raises(ConfigError, match=r"mode=export: the task .HoldStill. cannot be deployed"):
-        Export(**parts, checkpoint=str(tmp_path), num_checked=4).run()
+        Export(
+            session=parts["session"],
+            machine=machine,
+            task=HoldStill(),
+            checkpoint=str(tmp_path),
+            asked=(),
+        ).run()
 
 
 def test_the_classical_policy_of_a_task_without_one_is_refused(machine: Machine) -> None:

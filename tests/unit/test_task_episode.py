@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from typing import Any
 
@@ -14,8 +15,10 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
+from tasks import starts
+from tasks.classical import ClassicalController
 from tasks.process import REASONS
-from tasks.starts import check_reachable, join_starts
+from tasks.starts import try_targets
 
 CPU = torch.device("cpu")
 TASKS = ("borehole_insertion", "goal_pose")
@@ -88,20 +91,73 @@ def test_poses_have_many_pitches_and_no_block_near(machine: Machine) -> None:
     assert ((start["scene"][:, :2] - start["target_m"][:, :2]).norm(dim=1) > 15.0).all()
 
 
-def test_too_few_reachable_starts_are_an_error_that_says_what_to_change() -> None:
+@pytest.mark.parametrize(
+    ("distance_m", "reason"),
+    [
+        ((9.0, 10.0), "100.0% of the targets cannot be brought into the working range"),
+        ((4.0, 4.1), "100.0% cannot be reached with the wanted pitch"),
+    ],
+)
+def test_a_draw_of_which_nothing_can_be_done_ends_with_the_reason(
+    distance_m: tuple[float, float], reason: str, machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(starts, "MIN_CANDIDATES", 1024)
+    task = option("task", "borehole_insertion")
+    task = replace(task, hole=replace(task.hole, distance_m=distance_m))
     with pytest.raises(
-        ConfigError, match="goal_pose: only 2 of 3 starts were reachable; widen the joint limits"
-    ):
-        join_starts(3, [{"q": torch.zeros(2, 5)}, {"q": torch.zeros(0, 5)}], "goal_pose")
+        ConfigError, match="borehole_insertion: nearly no start can be done"
+    ) as told:
+        task.build(machine, 1, CPU)
+    assert reason in str(told.value) and "0 of 1024 candidates" in str(told.value)
+
+
+def test_a_draw_of_which_little_can_be_done_goes_on(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tried on a chunk in which one candidate in 200 can be done, then one in 300."""
+    monkeypatch.setattr(starts, "MIN_CANDIDATES", 1000)
+    free = torch.ones(6000, dtype=torch.bool)
+    tally = starts._DrawTally("a task", 10_000)
+    done = torch.arange(6000) % 200 == 0
+    tally.add(free, done, done)
+    done = torch.arange(6000) % 10_000 == 0
+    with pytest.raises(ConfigError, match=r"a task: .* 31 of 12000 candidates"):
+        tally.add(free, done, done)
+
+
+def test_a_long_draw_tells_how_far_it_is(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = iter([0.0, 4.0, 6.0, 7.0, 12.0])
+    monkeypatch.setattr(starts.time, "monotonic", lambda: next(clock))
+    tally = starts._DrawTally("a task", 1000)
+    some = torch.arange(200) % 2 == 0
+    with caplog.at_level(logging.INFO):
+        for _ in range(4):
+            tally.add(torch.ones(200, dtype=torch.bool), some, some)
+    assert [record.getMessage() for record in caplog.records] == [
+        "a task: 200 of 1000 starts drawn in 6 s; 50.0 % of the candidates can be done",
+        "a task: 400 of 1000 starts drawn in 12 s; 50.0 % of the candidates can be done",
+    ]
+
+
+def test_a_draw_checked_in_parts_is_the_draw_checked_at_once(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process = option("task", "borehole_insertion").build(machine, 1, CPU)
+    whole = process.starts(100, 2)
+    monkeypatch.setattr(starts, "CHUNK", 64)
+    parts = process.starts(100, 2)
+    assert all(torch.equal(parts[name], value) for name, value in whole.items())
 
 
 def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
     task = option("task", "goal_pose")
-    controller = task.classical.build(machine, CPU)
-    found = check_reachable(
+    controller = ClassicalController(task.classical, machine, CPU)
+    found = try_targets(
         controller, machine, torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), (1.7, 2.4), 0.1
     )
-    assert found.shape == (0,)
+    assert [part.shape for part in found] == [(0,), (0,)]
 
 
 def test_a_pitch_that_varies_must_be_told_to_the_policy() -> None:

@@ -11,7 +11,8 @@ import torch
 from composed import option
 
 from brokk_rl.machine import Machine, mask_exclusive_joints
-from tasks.control import ActionMapping, PhaseSwitch
+from tasks.classical import ClassicalController
+from tasks.settings import ActionMapping, PhaseSwitch
 
 
 def switch(rule: str) -> PhaseSwitch:
@@ -149,7 +150,7 @@ def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
 
 def guided(machine: Machine, q: torch.Tensor, target_m: torch.Tensor) -> Any:
     task = option("task", "borehole_insertion")
-    controller = task.classical.build(machine, torch.device("cpu"))
+    controller = ClassicalController(task.classical, machine, torch.device("cpu"))
     history = q[:, None].repeat(1, machine.num_history, 1)
     return controller.guide(
         history, torch.zeros_like(history), target_m, torch.full((len(q),), 1.57), (1.7, 2.4)

@@ -1,0 +1,185 @@
+"""Specs of training and evaluation.
+
+This module needs no torch, so that a bad value is refused before torch is loaded.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+from brokk_rl.bounds import require_number, require_range
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
+
+SETTLED_PART = 0.9
+"""Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
+`TrainingConfig.settling`."""
+RUNNER_BOUNDS: dict[str, dict[str, Any]] = {
+    "num_steps_per_env": {"least": 1, "whole": True},
+    "algorithm.num_learning_epochs": {"least": 1, "whole": True},
+    "algorithm.num_mini_batches": {"least": 1, "whole": True},
+    "algorithm.clip_param": {"above": 0},
+    "algorithm.gamma": {"above": 0, "most": 1},
+    "algorithm.lam": {"least": 0, "most": 1},
+    "algorithm.value_loss_coef": {"least": 0},
+    "algorithm.entropy_coef": {"least": 0},
+    "algorithm.learning_rate": {"above": 0},
+    "algorithm.max_grad_norm": {"above": 0},
+    "algorithm.desired_kl": {"above": 0},
+    "actor.distribution_cfg.init_std": {"above": 0},
+}
+"""Bounds of rsl-rl's numbers, which it does not check itself: outside of them it divides by zero,
+climbs instead of descends, or trains nothing."""
+
+
+@spec
+class TrainingBudget:
+    """When training ends: with the first of these that is spent; `null` for no bound.
+
+    Attributes:
+        max_env_steps: Control steps over all environments.
+        max_seconds: Seconds of training, those before a resume included.
+    """
+
+    max_env_steps: int | None
+    max_seconds: float | None
+
+    def check(self) -> None:
+        if self.max_env_steps is None and self.max_seconds is None:
+            raise ConfigError(
+                "rl.budget: give max_env_steps, max_seconds or both; "
+                "training without an end is not possible"
+            )
+        if self.max_env_steps is not None:
+            require_number("rl.budget.max_env_steps", self.max_env_steps, least=1)
+        if self.max_seconds is not None:
+            require_number("rl.budget.max_seconds", self.max_seconds, above=0)
+
+    def share_spent(self, env_steps: int, seconds: float) -> float:
+        """Return the spent share of the budget, 1 or more when all of it is spent."""
+        return max(
+            env_steps / (self.max_env_steps or float("inf")),
+            seconds / (self.max_seconds or float("inf")),
+        )
+
+
+@spec
+class TrainingConfig:
+    """Numbers of a training with rsl-rl's PPO.
+
+    Attributes:
+        num_envs: Environments, of each process where several train together; `null` for the number
+            of the simulator's configuration.
+        num_starts: Number of valid starts from which resets draw.
+        budget: When training ends.
+        save_interval: Iterations between checkpoints; a killed run loses no more. As often several
+            processes prove that they agree.
+        keep_checkpoints: Newest checkpoints kept.
+        settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
+            learn fast, small ones keep it.
+        max_fault_rate: Share of control steps that may end in a diverged or overflowing world
+            before the run stops with an error.
+        fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
+            compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
+            less than half of a control step of few worlds, far more.
+        random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at
+            once.
+        runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`,
+            `num_steps_per_env`, …), handed on as it is.
+    """
+
+    num_envs: int | None
+    num_starts: int
+    budget: TrainingBudget
+    save_interval: int
+    keep_checkpoints: int
+    settling: float
+    max_fault_rate: float
+    fuse: bool
+    random_episode_lengths: bool
+    runner: dict[str, Any]
+
+    def check(self) -> None:
+        counts = ("num_starts", "save_interval", "keep_checkpoints")
+        for name in counts if self.num_envs is None else ("num_envs", *counts):
+            require_number(f"rl.{name}", getattr(self, name), least=1)
+        for name in ("settling", "max_fault_rate"):
+            require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
+        self._check_runner()
+
+    def _check_runner(self) -> None:
+        """Refuse numbers that rsl-rl would take without a word."""
+        for path, bounds in RUNNER_BOUNDS.items():
+            value: Any = self.runner
+            for part in path.split("."):
+                value = value.get(part) if isinstance(value, dict) else None
+            if value is not None:  # rsl-rl has a default of its own
+                require_number(f"rl.runner.{path}", value, **bounds)
+        for name in ("actor", "critic"):
+            network = self.runner.get(name, {})
+            for width in network.get("hidden_dims", ()):
+                require_number(f"rl.runner.{name}.hidden_dims", width, least=1, whole=True)
+            if spread := (network.get("distribution_cfg") or {}).get("std_range"):
+                require_range(f"rl.runner.{name}.distribution_cfg.std_range", tuple(spread), 0)
+
+    def divergence(self, share_spent: float) -> float | None:
+        """Return the `desired_kl` of updates when this share of the budget is spent."""
+        desired = self.runner["algorithm"].get("desired_kl")
+        if desired is None or share_spent <= 1.0 - self.settling:
+            return desired
+        return desired * (
+            1.0 - SETTLED_PART * min(1.0, (share_spent - 1.0 + self.settling) / self.settling)
+        )
+
+    def describe_network(self) -> dict[str, Any]:
+        """Return configuration and observation groups of the actor, as plain JSON data."""
+        config = self.runner_config()
+        return {
+            "actor": config["actor"],
+            "obs_groups": {"actor": list(config["obs_groups"]["actor"])},
+        }
+
+    def runner_config(self) -> dict[str, Any]:
+        """Return a copy for rsl-rl, which writes into it, without keys whose value is `null`."""
+        return _drop_nulls(copy.deepcopy(self.runner)) | {
+            "save_interval": 10**9,
+            "check_for_nan": False,
+        }
+
+
+@spec
+class Evaluation:
+    """Number of episodes, their seed, and how many to record and show.
+
+    Attributes:
+        episodes: Number of episodes, one from each start.
+        seed: Seed of starts and noise; the same for every policy and run, so that results can be
+            compared.
+        num_recorded: Episodes recorded, of which the video shows one.
+        video: Whether to render a video.
+    """
+
+    episodes: int
+    seed: int
+    num_recorded: int
+    video: bool
+
+    def check(self) -> None:
+        require_number("evaluation.episodes", self.episodes, least=1)
+        require_number("evaluation.seed", self.seed, least=0)
+        if not 1 <= self.num_recorded <= self.episodes:
+            raise ConfigError(
+                "evaluation: expected 1 <= num_recorded <= episodes, "
+                f"got {self.num_recorded} and {self.episodes}"
+            )
+
+
+def _drop_nulls(value: Any) -> Any:
+    if isinstance(value, dict):
+        kept = {}
+        for key, item in value.items():
+            if item is not None:
+                kept[key] = _drop_nulls(item)
+        return kept
+    return value

@@ -1,0 +1,99 @@
+"""Numbers that no training can use are refused by name before torch is loaded."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+BAD = {
+    ("rl.num_envs=0",): "rl.num_envs: expected a finite number of 1 or more, got 0",
+    ("rl.num_envs=-4",): "rl.num_envs",
+    ("rl.num_starts=0",): "rl.num_starts: expected a finite number of 1 or more, got 0",
+    ("rl.save_interval=0",): "rl.save_interval",
+    ("rl.keep_checkpoints=0",): "rl.keep_checkpoints",
+    ("rl.settling=2",): "rl.settling",
+    ("rl.max_fault_rate=-0.1",): "rl.max_fault_rate",
+    ("rl.budget.max_seconds=-1",): "rl.budget.max_seconds: expected a finite number above 0",
+    ("rl.budget.max_env_steps=0",): "rl.budget.max_env_steps",
+    ("rl.budget.max_seconds=nan",): "TrainingBudget.max_seconds",
+    (
+        "rl.runner.algorithm.learning_rate=-1e-3",
+    ): "rl.runner.algorithm.learning_rate: expected a finite number above 0, got -0.001",
+    ("rl.runner.algorithm.learning_rate=0",): "rl.runner.algorithm.learning_rate",
+    ("rl.runner.algorithm.learning_rate=nan",): "rl.runner.algorithm.learning_rate",
+    ("rl.runner.algorithm.learning_rate=fast",): "rl.runner.algorithm.learning_rate",
+    ("rl.runner.algorithm.gamma=1.5",): "rl.runner.algorithm.gamma",
+    ("rl.runner.algorithm.num_mini_batches=0",): "rl.runner.algorithm.num_mini_batches",
+    ("rl.runner.num_steps_per_env=0",): "rl.runner.num_steps_per_env",
+    ("rl.runner.actor.hidden_dims=[64,0]",): "rl.runner.actor.hidden_dims",
+    ("rl.runner.actor.distribution_cfg.init_std=-1",): "distribution_cfg.init_std",
+    ("rl.runner.actor.distribution_cfg.std_range=[1.0,0.1]",): "distribution_cfg.std_range",
+    ("evaluation.episodes=-5",): "evaluation.episodes: expected a finite number of 1 or more",
+    ("evaluation.episodes=0",): "evaluation.episodes",
+    ("evaluation.seed=-1",): "evaluation.seed",
+    ("task.episode_s=-5",): "task.episode_s: expected a finite number above 0, got -5.0",
+    ("task.episode_s=nan",): "BoreholeInsertion.episode_s: expected a number, got nan",
+    ("task.episode_s=inf",): "task.episode_s",
+    ("task.memory=0",): "task.memory",
+    ("task.action.scale=0",): "task.action.scale",
+    ("task.hole.distance_m=[3.5,2.3]",): "task.hole.distance_m: expected (lowest, highest)",
+    ("task.hole.radius_m=-0.05",): "task.hole.radius_m",
+    ("task.noise.target_sample_m=-0.01",): "task.noise.target_sample_m",
+    ("task.switch.reach_m=[2.4,1.7]",): "task.switch.reach_m",
+    ("task.scaling.target_std_m=[0.5,0.0,0.1]",): "task.scaling.target_std_m[1]",
+    ("task.classical.damping=0",): "task.classical.damping",
+    ("task.reward.progress.weight=nan",): "RewardTerm.weight: expected a number, got nan",
+    ("task.reward.success.weight=inf",): "weight of the reward term 'tasks.reward:success'",
+    ("task=goal_pose", "task.episode_s=0"): "task.episode_s",
+    ("task=goal_pose", "task.tolerance.strict_distance_m=0"): "task.tolerance.strict_distance_m",
+    ("sim=native", "sim.num_worlds=0"): "sim: expected num_worlds",
+    ("mode=evaluate", "evaluation.episodes=-5"): "evaluation.episodes",
+    ("mode=evaluate", "task.episode_s=-5"): "task.episode_s",
+    ("mode=bench", "rl.num_starts=0"): "rl.num_starts",
+}
+"""Words of a command, and what its message must say."""
+PROGRAM = """
+import contextlib, io, json, sys
+from brokk_rl import cli
+found = []
+for words in json.loads(sys.stdin.read()):
+    sys.argv = ["brokk", *words]
+    told = io.StringIO()
+    with contextlib.redirect_stderr(told):
+        code = cli.main()
+    found.append([code, told.getvalue(), "torch" in sys.modules])
+print(json.dumps(found))
+"""
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], list]:
+    """All commands in one process that has not imported torch."""
+    folder = tmp_path_factory.mktemp("values")
+    root = str(Path(__file__).parents[2])
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM],
+        input=json.dumps(list(BAD)),
+        capture_output=True,
+        text=True,
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": root},
+    )
+    assert done.returncode == 0, done.stderr
+    assert not list(folder.iterdir()), "a refused command leaves nothing behind"
+    return dict(zip(BAD, json.loads(done.stdout.splitlines()[-1]), strict=True))
+
+
+@pytest.mark.parametrize("words", BAD, ids=" ".join)
+def test_a_bad_number_is_refused_by_name_before_torch_is_loaded(
+    words: tuple[str, ...], outcomes: dict[tuple[str, ...], list]
+) -> None:
+    code, told, torch_loaded = outcomes[words]
+    assert code == 2 and "Traceback" not in told
+    assert BAD[words] in " ".join(told.split())
+    assert not torch_loaded

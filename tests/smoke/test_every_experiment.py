@@ -1,0 +1,121 @@
+"""Every experiment and every job of every ablation: trained for a moment, evaluated, exported, and the answers are the same.
+
+`make test` takes the other task, the experiment that trains a task of its own, and of each ablation that changes the behaviour
+of the task the last job. The others change the plant, the noise or the reward, and are marked slow.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import hydra
+import numpy as np
+import onnxruntime
+import pytest
+import yaml
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.utils import instantiate
+
+from brokk_rl import cli, registry
+from brokk_rl.task_description import describe_task
+from tasks.borehole_insertion import BoreholeInsertion
+
+SHORT = (
+    "session.device=cpu", "sim=native", "evaluation.episodes=2", "evaluation.num_recorded=1", "evaluation.video=false",
+    "task.episode_s=1.0",
+)  # fmt: skip
+TRAINED = (
+    "mode=train", "rl.num_envs=8", "rl.num_starts=16", "rl.runner.num_steps_per_env=8",
+    "rl.budget.max_seconds=null", "rl.budget.max_env_steps=128",
+)  # fmt: skip
+"""Two iterations of 8 environments."""
+
+
+def read_options(group: str) -> dict[str, dict[str, Any]]:
+    """Returns the content of each option's file: composing all of them takes longer than a test."""
+    return {
+        one.name: yaml.safe_load(one.path.read_text())
+        for one in registry.list_options()
+        if one.group == group
+    }
+
+
+def changes_behaviour(key: str) -> bool:
+    """Says whether a swept key belongs to the task's behaviour, or brings a part of it."""
+    fields = tuple(f"task.{name}" for name in BoreholeInsertion.behaviour)
+    return key.startswith("follower.") or key.startswith(fields)
+
+
+def list_cases() -> list[Any]:
+    """Returns words of trainings, and words that an evaluation can take too; most are slow."""
+    cases = [pytest.param(("task=goal_pose",), (), id="task=goal_pose")]
+    for name, content in read_options("experiment").items():
+        if "stages" not in content:
+            cases.append(pytest.param((f"experiment={name}",), (), id=f"experiment={name}"))
+            continue
+        for stage in content["stages"].values():
+            if stage["command"][0] == "mode=train":  # a story: its training, without its recordings
+                words = tuple(word for word in stage["command"][1:] if "{folder}" not in word)
+                marks = [pytest.mark.slow]
+                cases.append(pytest.param(words, (), id=f"experiment={name}", marks=marks))
+    for name, content in read_options("ablation").items():
+        params = content["hydra"]["sweeper"]["params"]
+        swept = [key for key in params if key != "session.seed"]
+        parsed = OverridesParser.create().parse_overrides([f"{key}={params[key]}" for key in swept])
+        jobs = BasicSweeper.split_arguments(parsed, None)[0]
+        for job in jobs:
+            words = (f"ablation={name}", *job)
+            quick = job is jobs[-1] and any(map(changes_behaviour, swept))
+            marks = [] if quick else [pytest.mark.slow]
+            cases.append(pytest.param(words, words, id=" ".join(words), marks=marks))
+    return cases
+
+
+def describe_words(words: tuple[str, ...]) -> str:
+    """Returns the fingerprint of the task that is trained with these words."""
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        cfg = hydra.compose("config", overrides=["mode=train", "session.out=x", *words])
+    return describe_task(instantiate(cfg.task, _convert_="all")).fingerprint()
+
+
+def command(*arguments: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sys.argv", ["brokk", *arguments])
+        assert cli.main() == 0
+
+
+def read(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+@pytest.mark.parametrize(("words", "shared"), list_cases())
+def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
+    words: tuple[str, ...], shared: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    # an ablation is a sweep; its jobs are single commands here
+    single = ("hydra.mode=RUN",) if any(word.startswith("ablation=") for word in words) else ()
+    command(*words, *TRAINED, *SHORT, *single, "session.out=run")
+    made = read(tmp_path / "run" / "policy.json")
+    assert made["task"]["fingerprint"] == describe_words(words)
+
+    command("mode=evaluate", "policy.folder=run", *shared, *SHORT, *single, "session.out=seen")
+    found = read(tmp_path / "seen" / "evaluation.json")
+    assert found["task"] == made["task"]
+    if shared:  # on the same plant the figures are those of the training
+        assert (
+            found["policies"]["trained"]
+            == read(tmp_path / "run" / "evaluation.json")["policies"]["trained"]
+        )
+
+    command("mode=export", "checkpoint=run", "session.out=export")
+    exported = read(tmp_path / "export" / "policy.json")
+    assert exported["task"] == made["task"] and exported["parity"]["largest_difference"] < 1e-3
+    golden = read(tmp_path / "run" / "golden.json")
+    assert read(tmp_path / "export" / "golden.json") == golden
+    session = onnxruntime.InferenceSession(str(tmp_path / "export" / "policy.onnx"))
+    answers = session.run(None, {"observation": np.array(golden["observation"], np.float32)})[0]
+    assert np.abs(answers - np.array(golden["command"])).max() < 1e-3
