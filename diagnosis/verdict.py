@@ -72,8 +72,8 @@ def judge_findings(
 ) -> Judgement:
     """Return the verdict on what the search found.
 
-    Effects on motion that fail their gates are not named. Effects that sensors, frames or tool points
-    show have been judged by their own statistic.
+    Effects on motion that fail their gates are not named, nor are late frames whose mean delay adds to
+    the error. Effects that sensors, frames or tool points show have been judged by their own statistic.
 
     Args:
         result: The findings.
@@ -96,6 +96,16 @@ def judge_findings(
             empty = EffectSet((frozenset(),) * len(result.chosen.subsets), 0.0)
             result, fitted = replace(result, chosen=empty, fitted=None), None
             reach = _build_reach(result, None, base, case.machine, generator)
+    late = [one for one in found if _acts_on_arrival(one)]
+    if fitted is None and late:
+        gate = gates.judge_late_frames(reach, [one.kind.name for one in late])
+        told.append(gate)
+        if not gate.passed:
+            failed = "; ".join(filter(None, (failed, gate.text)))
+            found = [one for one in found if not _acts_on_arrival(one)]
+            residuals = replace(result.residuals, mean=None)
+            result = replace(result, detected=found, residuals=residuals)
+            reach = _build_reach(result, None, base, case.machine, generator)
     if fitted is not None or found:
         return Judgement("effects", result, fitted, found, reach, tuple(told), failed)
     if not failed:
@@ -103,6 +113,11 @@ def judge_findings(
         failed = gates.list_failures(told)
     verdict: Verdict = "unknown" if failed else "none"
     return Judgement(verdict, result, None, [], reach, tuple(told), failed)
+
+
+def _acts_on_arrival(one: DetectedEffect) -> bool:
+    """Return whether a detected effect delays commands by chance; see `timing`."""
+    return one.kind.target.side == "command" and one.kind.target.stochastic
 
 
 def _build_reach(
