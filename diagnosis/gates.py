@@ -17,7 +17,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Ranked
 from diagnosis.bootstrap import summarise_draws
-from diagnosis.closure import Gate
+from diagnosis.closure import Estimate, Gate
 from diagnosis.gap import GapClosure, combine_joints
 from diagnosis.motion_floor import LeftOutErrors
 from diagnosis.rivals import Rival

@@ -42,11 +42,11 @@ def fit_shown_effects(
         price: Penalty of a subset on a joint.
     """
     subsets, start = [], []
-    for mine, responses in zip(proposed, shapes, strict=True):
+    for joint, (mine, responses) in enumerate(zip(proposed, shapes, strict=True)):
         sizes = {}
         for name, numbers in mine.items():
             if name in responses:
-                sizes[name] = compute_sizes(rays[name], numbers)
+                sizes[name] = compute_sizes(rays[name], numbers, joint)
         subsets.append(frozenset(sizes))
         start.append(sizes)
     if not any(subsets):
@@ -58,8 +58,10 @@ def fit_shown_effects(
     return [best, *tried] if best and list_subsets(best) != known else []
 
 
-def compute_sizes(rays: Sequence[ParameterRay], numbers: Mapping[str, float]) -> np.ndarray:
-    """Return the size along each ray of an effect with these numbers, `(R,)`.
+def compute_sizes(
+    rays: Sequence[ParameterRay], numbers: Mapping[str, float], joint: int
+) -> np.ndarray:
+    """Return the size along each ray of an effect with these numbers on a joint, `(R,)`.
 
     A ray of all numbers at once takes the mean of their sizes.
     """
@@ -69,7 +71,7 @@ def compute_sizes(rays: Sequence[ParameterRay], numbers: Mapping[str, float]) ->
         sizes = []
         for name in names:
             none = ray.kind.numbers[name].none or 0.0
-            sizes.append((numbers[name] - none) / ray.kind.size(name))
+            sizes.append((numbers[name] - none) / ray.kind.size_on(name, joint))
         found.append(float(np.mean(sizes)))
     return np.array(found)
 

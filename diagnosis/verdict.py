@@ -96,13 +96,13 @@ def judge_findings(
             empty = EffectSet((frozenset(),) * len(result.chosen.subsets), 0.0)
             result, fitted = replace(result, chosen=empty, fitted=None), None
             reach = _build_reach(result, None, base, case.machine, generator)
-    late = [one for one in found if _acts_on_arrival(one)]
+    late = [one for one in found if _is_delay_by_chance(one)]
     if fitted is None and late:
         gate = gates.judge_late_frames(reach, [one.kind.name for one in late])
         told.append(gate)
         if not gate.passed:
             failed = "; ".join(filter(None, (failed, gate.text)))
-            found = [one for one in found if not _acts_on_arrival(one)]
+            found = [one for one in found if not _is_delay_by_chance(one)]
             residuals = replace(result.residuals, mean=None)
             result = replace(result, detected=found, residuals=residuals)
             reach = _build_reach(result, None, base, case.machine, generator)
@@ -115,7 +115,7 @@ def judge_findings(
     return Judgement(verdict, result, None, [], reach, tuple(told), failed)
 
 
-def _acts_on_arrival(one: DetectedEffect) -> bool:
+def _is_delay_by_chance(one: DetectedEffect) -> bool:
     """Return whether a detected effect delays commands by chance; see `timing`."""
     return one.kind.target.side == "command" and one.kind.target.stochastic
 

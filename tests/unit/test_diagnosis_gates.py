@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -245,15 +246,35 @@ def test_a_verdict_that_fails_gives_its_probability_to_unknown() -> None:
     ]  # fmt: skip
 
 
-def findings(machine: Machine, before: float, after: float | None, detected: int = 0) -> Any:
-    """Returns findings whose fitted set errs by `after`; `None`: none is fitted."""
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """Free runs of the simulator, and the mean response of late frames."""
+
+    base: np.ndarray
+    mean: Any
+
+
+SENSOR = SimpleNamespace(
+    name="sensor_noise", target=SimpleNamespace(side="measurement", stochastic=True)
+)
+FRAMES = SimpleNamespace(name="frame_loss", target=SimpleNamespace(side="command", stochastic=True))
+
+
+def findings(
+    machine: Machine, before: float, after: float | None, detected: int = 0, mean: Any = None
+) -> Any:
+    """Returns findings whose fitted set errs by `after`; `None`: none is fitted.
+
+    With a `mean` response of late frames the detected effects are late frames, else those of sensors.
+    """
     seen = reach(machine, before, after or before, before, 0.010, scatter=0.1)
     draw = 1.0 + 0.05 * np.random.default_rng(3).standard_normal((40, 1, 1))
     fitted = None if after is None else SimpleNamespace(after=seen.after * draw, own=seen.after)
     result = verdict.DetectionResult(
-        residuals=SimpleNamespace(base=seen.base.field.residuals.base, mean=None), tables=[], rays={},  # pyright: ignore[reportArgumentType]
+        residuals=Found(seen.base.field.residuals.base, mean), tables=[], rays={},  # pyright: ignore[reportArgumentType]
         price=lambda j, subset: 0.0, chosen=EffectSet((frozenset({"lag"}),) * 5, 1.0), fitted=fitted,  # pyright: ignore[reportArgumentType]
-        detected=[SimpleNamespace()] * detected, clue_gains=np.zeros(1), reference_clue_gains=np.zeros(1),  # pyright: ignore[reportArgumentType]
+        detected=[SimpleNamespace(kind=SENSOR if mean is None else FRAMES)] * detected,  # pyright: ignore[reportArgumentType]
+        clue_gains=np.zeros(1), reference_clue_gains=np.zeros(1),  # pyright: ignore[reportArgumentType]
         scatter=np.zeros(1), strays=np.zeros(1), tool_left=0.0,
     )  # fmt: skip
     return result, seen.base
@@ -291,6 +312,19 @@ def test_verdicts_follow_their_gates(machine: Machine, thresholds: InspectionThr
     assert slow.verdict == "unknown" and "standing still" in slow.failed
     outside = told(machine, thresholds, findings(machine, 0.03, 0.015), unknown=True)
     assert outside.verdict == "unknown" and outside.fitted is None and not outside.gates
+
+
+def test_late_frames_that_surely_add_to_the_error_are_not_named(
+    machine: Machine, thresholds: InspectionThresholds
+) -> None:
+    draw = np.random.default_rng(4).standard_normal((40, 1, 1))
+    for more, name in ((0.01, ["frame_loss"]), (-0.01, [])):
+        # errors of 30 mrad, from which the mean delay takes or to which it adds a third
+        found = findings(machine, 0.03, None, detected=1, mean=-more * (1.0 + 0.1 * draw))
+        seen = told(machine, thresholds, found)
+        assert [one.kind.name for one in seen.found] == name
+        assert seen.verdict == ("effects" if name else "unknown")
+        assert bool(name) or ("frame_loss" in seen.failed and seen.result.residuals.mean is None)
 
 
 def test_a_size_at_its_bound_is_marked(machine: Machine) -> None:

@@ -94,12 +94,12 @@ def test_numbers_become_sizes_along_the_rays_of_an_effect(axis: Machine) -> None
     sizes = dict(
         zip(
             (ray.name for ray in rays),
-            compute_sizes(rays, {"extend": 0.12, "retract": 0.0}),
+            compute_sizes(rays, {"extend": 0.12, "retract": 0.0}, 0),
             strict=True,
         )
     )
     assert sizes == {
-        "extend": pytest.approx(0.12 / kinds["dead_band"].size("extend")),
+        "extend": pytest.approx(0.12 / kinds["dead_band"].size_on("extend", 0)),
         "retract": 0.0,
     }
 
