@@ -153,7 +153,7 @@ class _RecordingScan:
             [_find_held(np.abs(u) < thresholds.commanded, self._lead) for u in self._u.T], 1
         )
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
-        self._step = np.array([_estimate_step(q) for q in self._q.T])
+        self._step = np.array([estimate_step(q) for q in self._q.T])
         self._visible = thresholds.steps * np.fmax(
             np.nan_to_num(self._step), np.nan_to_num(self._noise)
         )
@@ -351,7 +351,7 @@ def _find_held(condition: np.ndarray, num_rows: int) -> np.ndarray:
     return held
 
 
-def _estimate_step(q: np.ndarray) -> float:
+def estimate_step(q: np.ndarray) -> float:
     """Return the step of a coarse sensor from repeated values, NaN if they are few."""
     values, counts = np.unique(q[np.isfinite(q)], return_counts=True)
     codes = values[counts >= CODE_REPEATS]

@@ -181,6 +181,22 @@ class Recording:
         return float(self.t_s[-1] - self.t_s[0]) if self.num_samples else 0.0
 
 
+def make_motion(
+    machine: Machine, run: str, t_s: np.ndarray, u: np.ndarray, q: np.ndarray
+) -> Recording:
+    """Return a planned motion, commands and positions `(T, J)`, in the form of a recording."""
+    return Recording(
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=tuple(joint.unit for joint in machine.joints),
+        rate_hz=1.0 / machine.period_s,
+        t_s=t_s,
+        u=u.astype(np.float32),
+        q=q.astype(np.float32),
+        metadata={"run": run},
+    )
+
+
 def name_command_column(joint: str) -> str:
     """Return the name of the column with the command of `joint`."""
     return f"u_{joint}"

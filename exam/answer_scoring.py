@@ -149,6 +149,7 @@ class AnswerScoring:
             said = None
             if (place / answer.ANSWER_FILE).is_file():
                 said = json.loads((place / answer.ANSWER_FILE).read_text())
+                said.pop("weighed", None)  # candidate sets, for calibration: half of the bytes
             note = run_cases.read_note(place)
             lines.append(json.dumps({"case": label["case"], "note": note, "answer": said}) + "\n")
         write_text(path, "".join(lines))

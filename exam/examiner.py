@@ -23,6 +23,7 @@ from actuators.effects.composition import ActuatorWithEffects, MeasuredActuatorM
 from brokk_rl import open_loop, record, registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import BrokkError, RecordingError
+from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.record import Recording
@@ -178,7 +179,7 @@ class TimedActuator:
     effects: Mapping[str, Any]
     running_s: np.ndarray
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> MeasuredActuatorModel:
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> WarmedActuatorModel:
         """Return a model for as many environments as there are running times."""
         around = ActuatorWithEffects(actuator=self.actuator, effects=dict(self.effects))
         model = around.build(machine, num_envs, device)
@@ -188,7 +189,39 @@ class TimedActuator:
                 wrapped: Any = model.effects[name]
                 times = torch.as_tensor(self.running_s, dtype=torch.float32, device=device)
                 wrapped.parameters[running].copy_(times[:, None])
-        return model
+        warm_up = open_loop.count_samples_before(machine) - machine.num_history + 1
+        return WarmedActuatorModel(model, warm_up)
+
+
+class WarmedActuatorModel:
+    """A measured actuator that takes the recorded positions until its free run begins.
+
+    By itself it keeps its own positions from its first step on, and would run freely through the
+    warm-up, where the simulator without effects sees the recording.
+
+    Args:
+        model: The model.
+        warm_up: Steps that begin at recorded positions.
+    """
+
+    def __init__(self, model: MeasuredActuatorModel, warm_up: int) -> None:
+        self._model, self._left = model, warm_up
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """State of the model."""
+        return self._model.state
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Forget the environments of `mask`, `(N,)` bool."""
+        self._model.reset(mask)
+
+    def step(self, history: History) -> torch.Tensor:
+        """Return the measured positions one control period later, `(N, J)`."""
+        if self._left:
+            self._model.state["fresh"].fill_(True)
+            self._left -= 1
+        return self._model.step(history)
 
 
 def read_effects(path: Path, machine: Machine) -> dict[str, Any]:

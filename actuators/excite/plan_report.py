@@ -11,7 +11,9 @@ from matplotlib.patches import Patch
 
 from actuators.excite.player import Sample
 from actuators.excite.schedule import ExcitationPlan
+from actuators.recordings.preview_report import draw_preview, measure_picture_height
 from brokk_rl.contracts.actuator import Segment
+from brokk_rl.contracts.preview import PreviewResult
 from brokk_rl.machine import Machine
 
 BEFORE, PLAYING, AWAY, AFTER = range(4)
@@ -160,8 +162,9 @@ def draw_plan(
     tool_speed_m_s: np.ndarray | None,
     path: Path,
     run: int = 0,
+    preview: PreviewResult | None = None,
 ) -> None:
-    """Draw one run as PNG: segments, commands, predicted positions and tool speed.
+    """Draw one run as PNG: segments, commands, predicted positions, tool speed, and the preview.
 
     Args:
         plan: Gives names.
@@ -171,17 +174,19 @@ def draw_plan(
             known.
         path: Where to write.
         run: Which of the runs.
+        preview: Effects that the plan could tell.
     """
     rows = machine.num_joints + (tool_speed_m_s is not None)
     ratios = [0.55, *[1.0] * machine.num_joints, *([0.8] if tool_speed_m_s is not None else [])]
-    figure, axes = plt.subplots(
-        rows + 1,
-        1,
-        figsize=(17, 1.0 + 1.65 * rows),
-        sharex=True,
-        height_ratios=ratios,
-        layout="constrained",
-    )
+    heights = [1.0 + 1.65 * rows]
+    if preview:
+        heights.append(measure_picture_height(machine))
+    whole = plt.figure(figsize=(17, sum(heights)), layout="constrained")
+    parts = whole.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
+    figure = parts[0]
+    axes = figure.subplots(rows + 1, 1, sharex=True, height_ratios=ratios)
+    if preview:
+        draw_preview(parts[1], preview, machine)
     minutes = track.t_s / 60.0
     spans = _find_spans(plan, track, run)
     _draw_segments(axes[0], spans)
@@ -212,8 +217,8 @@ def draw_plan(
         frameon=False,
         fontsize=9,
     )
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    whole.savefig(path, dpi=110)
+    plt.close(whole)
 
 
 def _find_spans(plan: ExcitationPlan, track: PlanTrack, run: int) -> list[dict[str, Any]]:

@@ -20,9 +20,11 @@ from actuators.excite.player import (
     predict_tool_speed,
 )
 from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
+from actuators.recordings import preview_report
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.contracts.link import Connection
+from brokk_rl.contracts.preview import EffectPreview, PreviewResult
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import RATE_TOLERANCE
@@ -79,9 +81,10 @@ class Collect:
     link: Connection
     excitation: dict[str, Excitation]
     collect: Collection
+    preview: EffectPreview | None
 
     def run(self) -> None:
-        """Write `plan.png`, `plan.json` and `recordings/<run>_<part>.parquet` into the run folder.
+        """Write `plan.png` and `plan.json`, both with the preview, and `recordings/<run>_<part>.parquet` into the run folder.
 
         Raises:
             ConfigError: the plan finds no room in a run.
@@ -134,14 +137,19 @@ class Collect:
             drive(NominalLink(machine, count), self._runner(plan), machine, count, plan.run_s)
         )
         summary = plan_report.summarise_plan(plan, track, machine)
-        write_json(self.session.folder / "plan.json", summary)
+        preview = self._preview(track)
+        told = {"preview": preview.plain()} if preview else {}
+        write_json(self.session.folder / "plan.json", summary | told)
         plan_report.draw_plan(
             plan,
             track,
             machine,
             predict_tool_speed(machine, track.q[:, 0]),
             self.session.folder / "plan.png",
+            preview=preview,
         )
+        if preview:
+            preview_report.show_preview(preview, machine)
         unplayed = set()
         for run in summary["runs"]:
             for entry in run:
@@ -158,6 +166,18 @@ class Collect:
             count,
             self.session.folder / "plan.png",
         )
+
+    def _preview(self, track: PlanTrack) -> PreviewResult | None:
+        """Return which effects the plan could tell; `None` without a preview, or without any motion long enough."""
+        if self.preview is None:
+            return None
+        motions = []
+        for n in range(self.collect.num_runs):
+            motions.append(
+                record.make_motion(self.machine, f"{n}", track.t_s, track.u[:, n], track.q[:, n])
+            )
+        generator = self.session.generator("preview")
+        return preview_report.run_preview(self.preview, motions, self.machine, generator, False)
 
     def _metadata(self, plan: ExcitationPlan) -> dict[str, str]:
         return {

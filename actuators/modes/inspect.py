@@ -15,11 +15,13 @@ from rich.progress import track
 from rich.table import Table
 
 from actuators.identify import dead_time
-from actuators.recordings import inspection_picture
+from actuators.recordings import inspection_picture, preview_report
 from brokk_rl import record
+from brokk_rl.contracts.preview import EffectPreview, PreviewResult
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.inspection import KINDS, Inspection, InspectionThresholds, inspect_recording
 from brokk_rl.machine import Machine
+from brokk_rl.plot import make_figure
 from brokk_rl.record import Breach, Recording
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json
@@ -89,6 +91,7 @@ class Inspect:
     machine: Machine
     inspect: InspectionRequest
     thresholds: InspectionThresholds
+    preview: EffectPreview | None
 
     def run(self) -> None:
         """Write `inspection.json`, `inspection.html` and pictures, and print the tables.
@@ -110,6 +113,10 @@ class Inspect:
             "remarks": [*_list_resampled(inspected), *_check_clocks(inspected)],
             "recordings": [one.plain() for one in inspected],
         }
+        sound = [one.recording for one in inspected if one.recording and not one.breaches]
+        preview = self._preview(sound)
+        if preview:
+            result["preview"] = preview.plain()
         write_json(folder / "inspection.json", result)
         pictures = {"overview": folder / "overview.png"}
         inspection_picture.draw_overview(
@@ -125,8 +132,10 @@ class Inspect:
                     one.inspection,
                     one.breaches,
                 )
-        self._page(result, inspected, pictures).write(folder / "inspection.html")
+        self._page(result, inspected, pictures, preview).write(folder / "inspection.html")
         self._show(result, inspected)
+        if preview:
+            preview_report.show_preview(preview, self.machine)
         log.info("report: %s", folder / "inspection.html")
 
     def _look(self, path: Path) -> InspectedFile:
@@ -136,6 +145,13 @@ class Inspect:
         return InspectedFile(
             path, recording, breaches, inspect_recording(recording, self.machine, self.thresholds)
         )
+
+    def _preview(self, recordings: Sequence[Recording]) -> PreviewResult | None:
+        """Return which effects these recordings could tell; `None` without a preview, or where none is long enough."""
+        if self.preview is None or not recordings:
+            return None
+        generator = self.session.generator("preview")
+        return preview_report.run_preview(self.preview, recordings, self.machine, generator, True)
 
     def _delays(self, recordings: Sequence[Recording]) -> dict[str, Any]:
         """Return each joint's dead time from all sound recordings, `None` where unknown."""
@@ -264,7 +280,11 @@ class Inspect:
             console.print(remark, markup=False, highlight=False, soft_wrap=True)
 
     def _page(
-        self, result: dict[str, Any], inspected: Sequence[InspectedFile], pictures: dict[str, Path]
+        self,
+        result: dict[str, Any],
+        inspected: Sequence[InspectedFile],
+        pictures: dict[str, Path],
+        preview: PreviewResult | None,
     ) -> Report:
         broken = sum(bool(one.breaches) for one in inspected)
         minutes = (
@@ -285,6 +305,8 @@ class Inspect:
             *self._figures(result),
             "Shares are of the time; noise and step in the unit of the joint.",
         )
+        if preview:
+            self._add_preview(page, preview)
         page.add_heading("Findings")
         page.add_table(*self._counts(result))
         page.add_list([f"{kind}: {meaning}" for kind, meaning in KINDS.items()])
@@ -319,6 +341,20 @@ class Inspect:
                         ["kind", "joint", "row", "rows", "from, s", "for, s", "what"], rows
                     )
         return page
+
+    def _add_preview(self, page: Report, preview: PreviewResult) -> None:
+        page.add_heading("Effects that these recordings could tell")
+        page.add_table(
+            *preview_report.describe_effects(preview, self.machine), preview_report.EXPLANATION
+        )
+        if preview.pairs:
+            page.add_table(
+                *preview_report.describe_pairs(preview), "Effects that nothing here tells apart."
+            )
+        page.add_list(preview_report.list_remarks(preview))
+        figure = make_figure(14.0, preview_report.measure_picture_height(self.machine))
+        preview_report.draw_preview(figure, preview, self.machine)
+        page.add_picture(figure, "smallest over typical size; green: told, red: not told")
 
 
 def _list_resampled(inspected: Sequence[InspectedFile]) -> list[str]:

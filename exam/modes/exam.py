@@ -441,7 +441,10 @@ class Exam:
         for name, folder in folders.items():
             marking.publish(folder, out / f"answers_{name}.jsonl")
             line = {**facts, **report.collect_headlines(name, tables[name])}
-            line |= {"engines": tables[name]["engines"], "warnings": tables[name]["warnings"]}
+            engines = tables[name]["engines"]
+            # the engine that sat, not the one that scores
+            line["engine"] = engines[0] if len(engines) == 1 else None
+            line |= {"engines": engines, "warnings": tables[name]["warnings"]}
             registration.append_event(self._folder, "scored", line, self.exam.ledger)
         _show(tables)
         log.info("report: %s", out / report.REPORT_FILE)

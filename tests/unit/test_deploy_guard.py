@@ -341,12 +341,13 @@ def test_a_joint_changes_its_direction_so_often_in_a_second_and_no_more() -> Non
     assert hand.decide(u=(-0.05, 0.0, 0.05), dt=0.02).u[0] == -0.05
 
 
-def test_a_direction_is_remembered_through_zero_and_the_first_is_no_change() -> None:
+@pytest.mark.parametrize("first", [0.05, -0.05])
+def test_a_direction_is_remembered_through_zero_and_the_first_is_no_change(first: float) -> None:
     hand = Hand().active()
-    for value in (0.05, 0.0, -0.05, 0.0, 0.05, 0.0, -0.05):
+    for value in (first, 0.0, -first, 0.0, first, 0.0, -first):
         assert hand.decide(u=(value, 0.0, 0.0), dt=0.02).u[0] == value
-    assert hand.decide(u=(0.05, 0.0, 0.0), dt=0.02).u[0] == 0.0
-    assert hand.decide(u=(-0.05, 0.0, 0.0), dt=0.02).u[0] == -0.05
+    assert hand.decide(u=(first, 0.0, 0.0), dt=0.02).u[0] == 0.0
+    assert hand.decide(u=(-first, 0.0, 0.0), dt=0.02).u[0] == -first
 
 
 def test_numbers_of_the_states_mean_what_the_description_says() -> None:

@@ -131,6 +131,21 @@ def test_a_late_cycle_keeps_the_phase_and_sends_no_burst(loop: Loop) -> None:
     assert np.diff(times)[1:] == pytest.approx(0.02) and len(times) <= 11
 
 
+def test_half_a_cycle_early_is_on_time_and_more_is_not(loop: Loop) -> None:
+    for early_s, is_due in ((0.0045, True), (0.0055, False)):
+        while not (loop.sent and loop.sent[-1][0] == loop.now_s and loop.commands()):
+            loop.cycle()
+        loop.sender.go(0.01)
+        loop.decide()
+        before = len(loop.commands())
+        loop.sender.now_s += 0.01 - early_s
+        loop.decide()
+        assert (len(loop.commands()) > before) == is_due
+        loop.sender.now_s += early_s
+        loop.go(0.1)
+        loop.sent.clear()
+
+
 def test_many_missed_cycles_fit_into_the_heartbeat(loop: Loop) -> None:
     loop.missed = 10_000
     loop.go(0.1)

@@ -103,6 +103,17 @@ def test_what_became_invalid_needs_twenty_five_good_messages_in_a_row() -> None:
     assert one.trust is VALID, "the errors of before are forgotten"
 
 
+def test_a_channel_that_recovered_bears_as_much_as_a_new_one() -> None:
+    one = Listener()
+    one.hear([0, 1, None, None, *range(2, 28), 27, 27])
+    assert one.trust is VALID, "two repetitions"
+    one.hear([27])
+    assert one.trust is INVALID
+    other = Listener()
+    other.hear([0, 1, None, None, *range(2, 28), None])
+    assert other.trust is VALID, "one error"
+
+
 @pytest.mark.parametrize("offset", range(16))
 def test_two_senders_of_one_message_are_found_whatever_their_counters(offset: int) -> None:
     one = Listener()

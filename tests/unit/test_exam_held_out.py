@@ -243,9 +243,9 @@ def test_each_cause_shows_on_its_joint_and_a_machine_of_severity_zero_is_well(
     well = draw_machine(machine, 3, 0.0)
     ill = change_machine(well, {})
     ill["severity"] = on_q3(machine, 0.0, 1.0)
-    levels = (0.8, 0.8, 0.8, -0.8, 0.0, 0.25, -0.9, -0.9, -0.9, 0.7, 0.7, 0.7)
+    levels = (0.8, 0.8, 0.0, -0.8, 0.0, 0.25, -0.9, -0.9, -0.9, 0.7, 0.7, 0.7)
     u = np.concatenate([push(machine, level, 50) for level in levels])
-    u[:, Q4] = np.where(np.arange(len(u)) % 150 < 40, 0.4, 0.0)  # q3 starts alone now and then
+    u[:, Q4] = np.where(np.arange(len(u)) % 150 > 109, 0.4, 0.0)  # q3 lifts alone at first
     u[-150:] = push(machine, 1.0, 150)  # to the end of the travel
     kinds: list[str | None] = list(causes.CAUSES)
     runs = [(ill, u)] * len(kinds) + [(well, u)] * (len(kinds) + 1)

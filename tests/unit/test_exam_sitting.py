@@ -219,6 +219,8 @@ def test_the_examiner_believes_its_own_simulation(
     nothing = simulator.examine({}, None)
     right, half, wrong = (simulator.examine(write(gain), say(0.95)) for gain in (0.6, 0.8, 1.4))
     assert nothing.after == nothing.before and nothing.closed == 0.0
+    # an effect that changes nothing runs as none does, warm-up included
+    assert simulator.examine(write(1.0), None).after == pytest.approx(nothing.before, rel=1e-4)
     assert nothing.before > 1.5 * nothing.floor, "a joint at 0.6 of its speed is seen"
     assert right.closed is not None and right.closed > 0.8 and not right.differs
     assert half.closed is not None and 0.2 < half.closed < 0.8 and half.differs

@@ -223,7 +223,11 @@ def test_parts_of_a_run_that_overlap_in_time_are_told(
         replace(first, metadata={**first.metadata, "created": later}), tmp_path / "a_1.parquet"
     )
     done = brokk(
-        "mode=inspect", "inspect.recordings=*.parquet", "session.out=out", "inspect.pictures=0"
+        "mode=inspect",
+        "inspect.recordings=*.parquet",
+        "session.out=out",
+        "inspect.pictures=0",
+        "~preview",
     )
     assert done.code == 0, done.err
     assert (

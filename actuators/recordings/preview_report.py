@@ -1,0 +1,218 @@
+"""Preview of a diagnosis in the terminal, in reports and in pictures."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from brokk_rl.contracts.preview import EffectLimit, EffectPreview, PreviewResult
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure, SubFigure
+
+log = logging.getLogger(__name__)
+
+Rows = tuple[list[str], list[list[str]]]
+"""Heading and cells of a table."""
+EXPLANATION = (
+    "Smallest size that would be told, as a distance from the value without the effect. In brackets: "
+    "larger than the typical size. – : none of the sizes that were tried."
+)
+COLOURS = ("#009e73", "#f0e442", "#d55e00")
+"""Told with ease, just told, not told: distinguishable by those who see no red or green (Okabe and
+Ito)."""
+LOWEST_RATIO, HIGHEST_RATIO = 0.1, 10.0
+"""Ends of the colours, smallest over typical size."""
+CELL_INCHES = 0.34
+"""Height of a row of the picture."""
+
+
+def run_preview(
+    preview: EffectPreview,
+    motions: Sequence[Recording],
+    machine: Machine,
+    generator: np.random.Generator,
+    are_measured: bool,
+) -> PreviewResult | None:
+    """Return the preview of some motions, with a bar of progress; `None` where none is long enough."""
+    try:
+        with Progress(transient=True) as progress:
+            task = progress.add_task("preview", total=1.0)
+            return preview.assess(
+                motions,
+                machine,
+                generator,
+                lambda doing, done: progress.update(task, description=doing, completed=done),
+                are_measured,
+            )
+    except RecordingError as error:
+        log.warning("no preview of the effects that these motions could tell: %s", error)
+        return None
+
+
+def describe_effects(result: PreviewResult, machine: Machine) -> Rows:
+    """Return the table of effects: a row a number, a column a joint."""
+    head = ["effect", *machine.joint_names, "unit", "typical", "told soonest by"]
+    rows, names = [], _name_numbers(result)
+    for limits in _group_limits(result):
+        first = limits[0]
+        sizes: dict[str, str] = dict.fromkeys(machine.joint_names, "")
+        for one in limits:
+            first_joint, shared = one.joints[0], "all " if len(one.joints) > 1 else ""
+            sizes[first_joint] = shared + _format_size(one)
+        typical = sorted({f"{one.typical:.2g}" for one in limits}, key=float)
+        rows.append(
+            [
+                names[first.effect, first.number],
+                *sizes.values(),
+                " or ".join(sorted({one.unit.replace("1", "–") for one in limits})),
+                " to ".join([typical[0], typical[-1]] if len(typical) > 1 else typical),
+                _format_soonest(limits),
+            ]
+        )
+    return head, rows
+
+
+def describe_pairs(result: PreviewResult) -> Rows:
+    """Return the table of effects that look alike."""
+    head, rows = ["look alike", "joints", "told apart soonest by"], []
+    for pair in result.pairs:
+        soonest = _format_excitation(pair.excitation, pair.minutes)
+        rows.append([" and ".join(pair.effects), ", ".join(pair.joints), soonest])
+    return head, rows
+
+
+def list_remarks(result: PreviewResult) -> list[str]:
+    """Return what the tables leave out, and what they rest on."""
+    hidden = sorted({one.effect for one in result.limits if one.shows_in == "tool points"})
+    found = []
+    if hidden:
+        found.append(
+            f"{', '.join(hidden)}: only measured tool points (ee_x_m, ee_y_m, ee_z_m) show them"
+        )
+    source = "of these recordings" if result.assumed["noise_is_measured"] else "expected"
+    price = sum(result.assumed["price"].values())
+    found.append(
+        f"simulator: {result.assumed['simulator']}; noise of the sensors: {source}; an effect on one joint is told "
+        f"from {price:g} nats of log likelihood on, one with a cause behind all joints from "
+        f"{result.assumed['price']['name']:g}"
+    )
+    return found
+
+
+def show_preview(result: PreviewResult, machine: Machine) -> None:
+    """Print the tables."""
+    console = Console()
+    untold = [one for one in result.limits if not one.is_told and one.shows_in != "tool points"]
+    title = (
+        f"effects that {result.minutes:.1f} minutes of these motions would tell "
+        f"({len(untold)} of {len(result.limits)} numbers not at their typical size)"
+    )
+    for name, (head, rows) in {
+        title: describe_effects(result, machine),
+        "pairs": describe_pairs(result),
+    }.items():
+        if not rows:
+            continue
+        table = Table(title=name, box=None, padding=(0, 1, 0, 0), title_justify="left")
+        for column in head:
+            table.add_column(column, overflow="fold", no_wrap=column in machine.joint_names)
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+    for remark in (EXPLANATION, *list_remarks(result)):
+        console.print(remark, markup=False, highlight=False, soft_wrap=True)
+
+
+def measure_picture_height(machine: Machine) -> float:
+    """Return the height that the picture needs, inches."""
+    return 2.4 + CELL_INCHES * machine.num_joints
+
+
+def draw_preview(figure: Figure | SubFigure, result: PreviewResult, machine: Machine) -> None:
+    """Draw the smallest over the typical size of each effect on each joint."""
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm
+
+    groups, names = _group_limits(result), machine.joint_names
+    ratios = np.full((machine.num_joints, len(groups)), np.inf)
+    for column, limits in enumerate(groups):
+        for one in limits:
+            if one.smallest is not None:
+                rows = [names.index(joint) for joint in one.joints]
+                ratios[rows, column] = one.smallest / one.typical
+    axis: Any = figure.subplots()
+    colours = LinearSegmentedColormap.from_list("told", COLOURS)
+    axis.imshow(
+        np.clip(ratios, LOWEST_RATIO, HIGHEST_RATIO),
+        norm=LogNorm(LOWEST_RATIO, HIGHEST_RATIO),
+        cmap=colours,
+        aspect="auto",
+    )
+    for (j, column), ratio in np.ndenumerate(ratios):
+        text = "–" if np.isinf(ratio) else f"{ratio:.2g}"
+        axis.text(column, j, text, ha="center", va="center", fontsize=8)
+    axis.set_yticks(range(len(names)), names)
+    labels = [_name_numbers(result)[one[0].effect, one[0].number] for one in groups]
+    axis.set_xticks(range(len(groups)), labels, rotation=60, ha="right", fontsize=8)
+    axis.set_title(
+        f"smallest size that {result.minutes:.1f} minutes of these motions would tell, over the typical one",
+        loc="left",
+        fontsize=10,
+    )
+
+
+def _group_limits(result: PreviewResult) -> list[list[EffectLimit]]:
+    """Return the limits of each number that commands and positions show."""
+    found: dict[tuple[str, str], list[EffectLimit]] = {}
+    for one in result.limits:
+        if one.shows_in != "tool points":
+            found.setdefault((one.effect, one.number), []).append(one)
+    return list(found.values())
+
+
+def _name_numbers(result: PreviewResult) -> dict[tuple[str, str], str]:
+    """Return the name of each number: that of the effect where it has no other."""
+    numbers: dict[str, set[str]] = {}
+    for one in result.limits:
+        numbers.setdefault(one.effect, set()).add(one.number)
+    found = {}
+    for effect, several in numbers.items():
+        for number in several:
+            found[effect, number] = effect if len(several) == 1 else f"{effect} {number}"
+    return found
+
+
+def _format_size(one: EffectLimit) -> str:
+    if one.smallest is None:
+        return "–"
+    return f"{one.smallest:.2g}" if one.is_told else f"({one.smallest:.2g})"
+
+
+def _format_soonest(limits: Sequence[EffectLimit]) -> str:
+    """Return the excitation of the joint that needs the longest time, of those that any tells."""
+    if limits[0].shows_in == "scatter":
+        return "any rest or motion"
+    if limits[0].shows_in == "frames":
+        return "more changes of commands"
+    known = [one for one in limits if one.minutes is not None]
+    if not known:
+        return "none"
+    slowest = max(known, key=lambda one: one.minutes or 0.0)
+    text = _format_excitation(slowest.excitation, slowest.minutes)
+    without = [one.joints[0] for one in limits if one.minutes is None]
+    return f"{text}; none on {', '.join(without)}" if without else text
+
+
+def _format_excitation(name: str | None, minutes: float | None) -> str:
+    if name is None or minutes is None:
+        return "none"
+    return f"{name}, {minutes:.2g} min"

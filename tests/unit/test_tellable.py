@@ -1,0 +1,329 @@
+"""A preview tells beforehand what a diagnosis finds afterwards."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+from hydra import compose, initialize_config_module
+from hydra.utils import instantiate
+
+from actuators.models.lag import FirstOrderLag
+from brokk_rl import record
+from brokk_rl.contracts.preview import EffectLimit, PreviewResult
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.scales import choose_horizon_s
+from diagnosis import effect_library, tellable
+from diagnosis.detection import choose_by_penalties
+from diagnosis.late_frames import compute_divergence
+from diagnosis.residuals import Residuals, build_rays, to_increments
+from diagnosis.response_table import ResponseTable
+from diagnosis.responses import Response, add_responses, choose_rays, fit_joint_faults
+from diagnosis.search import SubsetTable
+from diagnosis.tellable import ExpectedError, TellableEffects
+
+torch.set_num_threads(1)
+PLANT = FirstOrderLag(
+    dead_time_s=0.2,
+    dead_band_extend=0.0,
+    dead_band_retract=0.0,
+    gain=1.0,
+    time_constant_s=0.0,
+    spread={},
+)
+NOISY = ExpectedError(sensor=0.03, change=0.0, wander=0.02, memory=17.0, reading=0.0)
+"""So much noise that no smallest size is below the least one that is ever named."""
+EFFECTS = ("backlash", "dead_band", "flow_gain", "lag", "saturation")
+
+
+@pytest.fixture(scope="module")
+def axis(machine: Machine) -> Machine:
+    joint = replace(machine.joints[2], body=None)
+    return replace(
+        machine, name="axis", mjcf=None, tool_m=None, joints=(joint,), exclusive=(), levers=()
+    )
+
+
+def preview(effects: Sequence[str] | None = EFFECTS, **changes: Any) -> TellableEffects:
+    fields = {
+        "actuator": PLANT,
+        "effects": None if effects is None else tuple(effects),
+        "prices": option("prices", "default"),
+        "error": NOISY,
+        "excitations": {},
+        "num_windows": 400,
+        "num_compared": 8,
+        "compared_s": 120.0,
+    }
+    return TellableEffects(**fields | changes)
+
+
+def motions(machine: Machine, seconds: float, seed: int, name: str = "levels") -> list[Recording]:
+    return tellable.simulate_programs(
+        option("excitation", name), machine, seconds, np.random.default_rng(seed)
+    )
+
+
+def assess(
+    one: TellableEffects, machine: Machine, some: Sequence[Recording], are_measured: bool = False
+) -> PreviewResult:
+    generator = np.random.default_rng(0)
+    return one.assess(some, machine, generator, lambda doing, done: None, are_measured)
+
+
+def limit(result: PreviewResult, effect: str, joint: str, number: str = "") -> EffectLimit:
+    (found,) = [
+        one
+        for one in result.limits
+        if one.effect == effect and joint in one.joints and number in ("", one.number)
+    ]
+    return found
+
+
+def play(
+    machine: Machine, some: Sequence[Recording], effect: str, number: str, size: float, seed: int
+) -> Residuals:
+    """Returns the plant without an effect held against the plant with it, both with errors as expected."""
+    one = preview()
+    cut, running_s, _ = tellable.cut_motions(some, machine, 400)
+    noise = one.error.expect_noise(machine)
+    plain = one._hold(machine, cut, running_s, noise)
+    (kind,) = effect_library.load_effects(machine, [effect])
+    (ray,) = [ray for ray in build_rays(kind) if ray.name in ("", number)]
+    changed = plain.simulator.simulate([(kind, ray.values(np.full((1, 1), size)))])[0]
+    random, error = np.random.default_rng(seed), np.zeros_like(plain.increments)
+    for group in plain.groups:  # errors wander from window to window
+        covariance = noise[0].covariance(plain.increments[group, :, 0].reshape(1, -1))[0]
+        drawn = np.linalg.cholesky(covariance) @ random.standard_normal(len(covariance))
+        error[group, :, 0] = drawn.reshape(len(group), -1)
+    ends = plain.start[:, None] + np.cumsum(to_increments(changed, plain.start) + error, 1)
+    q = cut.q.copy()
+    q[:, cut.num_before :] = np.repeat(ends, 5, 1)
+    return one._hold(machine, replace(cut, q=q), running_s, noise)
+
+
+def search(residuals: Residuals, machine: Machine) -> set[str]:
+    """Returns the names that the search of a diagnosis chooses."""
+    penalties = option("prices", "default")
+    kinds = effect_library.load_effects(machine, EFFECTS)
+    shapes: list[dict[str, list[Response]]] = [{}]
+    for kind in kinds:
+        add_responses(shapes, kind.name, choose_rays(kind), residuals)
+    tables = [
+        SubsetTable(joint, mine, residuals.block)
+        for joint, mine in zip(fit_joint_faults(residuals), shapes, strict=True)
+    ]
+    for table in tables:
+        table.explore(dict.fromkeys(EFFECTS, penalties.joint), 3)
+    chosen = choose_by_penalties(
+        tables, lambda j, subset: penalties.joint * len(subset), penalties, frozenset()
+    )
+    return set(chosen.names)
+
+
+@pytest.mark.parametrize(
+    ("effect", "number"),
+    [
+        ("backlash", "gap_rad"),
+        ("dead_band", "extend"),
+        ("flow_gain", "gain"),
+        ("lag", "time_constant_s"),
+    ],
+)
+def test_an_effect_is_found_at_twice_the_foretold_size_and_not_at_a_fifth(
+    effect: str, number: str, axis: Machine
+) -> None:
+    some = motions(axis, 300.0, 1)
+    foretold = limit(assess(preview(), axis, some), effect, "q3", number)
+    assert foretold.smallest is not None and foretold.is_told
+    size = foretold.smallest / foretold.typical
+    for seed in (1, 2, 3):
+        assert effect in search(play(axis, some, effect, number, 2.0 * size, seed), axis)
+        assert not search(play(axis, some, effect, number, 0.2 * size, seed), axis)
+
+
+@pytest.mark.parametrize(("effect", "sensor"), [("backlash", 0.06), ("creep", 0.015)])
+def test_four_times_the_data_halve_the_smallest_size(
+    effect: str, sensor: float, axis: Machine
+) -> None:
+    """Up to Occam's factor, which is a logarithm; the responses to both grow with the size."""
+    once = motions(axis, 150.0, 1)
+    often = [replace(one, metadata={"run": f"{n}"}) for n in range(4) for one in once]
+    loud = preview([effect], error=replace(NOISY, sensor=sensor))
+    first, then = (limit(assess(loud, axis, some), effect, "q3") for some in (once, often))
+    assert first.smallest and then.smallest
+    assert then.smallest > 0.15 * then.typical * 1.05, "above the least size that is named"
+    assert first.smallest / then.smallest == pytest.approx(2.0, rel=0.12)
+
+
+def test_what_simulators_get_wrong_from_day_to_day_is_never_told(axis: Machine) -> None:
+    """A lag has the form of the simulator's own time constant, which is off by 4 ms: 16 nats are sqrt(32) of these."""
+    some = motions(axis, 300.0, 2)
+    often = [replace(one, metadata={"run": f"{n}"}) for n in range(8) for one in some]
+    found = limit(assess(preview(["lag"]), axis, often), "lag", "q3")
+    assert found.smallest and found.smallest > 0.95 * np.sqrt(32.0) * 0.004
+
+
+def test_some_free_runs_stand_for_all(axis: Machine) -> None:
+    some = motions(axis, 600.0, 2)
+    whole, part = (
+        limit(assess(preview(num_windows=count), axis, some), "lag", "q3") for count in (400, 40)
+    )
+    assert whole.smallest and part.smallest
+    assert part.smallest == pytest.approx(whole.smallest, rel=0.25)
+
+
+def test_a_joint_that_stands_still_tells_nothing_and_an_excitation_would(machine: Machine) -> None:
+    steps = 1200
+    u = np.zeros((steps, 5))
+    u[:, 2] = np.repeat([0.0, 0.5, 0.0, -0.5], 60)[np.arange(steps) % 240]
+    q = machine.home + np.cumsum(u * machine.max_speed * machine.period_s, 0)
+    still = record.make_motion(machine, "still", np.arange(steps) * machine.period_s, u, q)
+    excitations = {"levels": option("excitation", "levels")}
+    result = assess(preview(("lag", "load_dependence"), excitations=excitations), machine, [still])
+    for one in result.limits:
+        assert (one.smallest is None) == (one.joints != ("q3",)), one
+    assert limit(result, "lag", "q4").excitation == "levels"
+    assert limit(result, "load_dependence", "q1").excitation is None, (
+        "a slewing joint lifts nothing"
+    )
+
+
+def test_a_delay_and_an_offset_of_clocks_look_alike_in_any_motion(machine: Machine) -> None:
+    excitations = {name: option("excitation", name) for name in ("levels", "ramps")}
+    one = preview(("clock_offset", "dead_time", "dead_band"), excitations=excitations)
+    result = assess(
+        replace(one, error=option("preview", "default").error), machine, motions(machine, 300.0, 3)
+    )
+    (pair,) = result.pairs
+    assert pair.effects == ("clock_offset", "dead_time") and pair.joints == machine.joint_names
+    assert pair.excitation is None and pair.minutes is None
+
+
+def test_noise_that_is_measured_hides_small_effects(axis: Machine) -> None:
+    quiet = motions(axis, 150.0, 4)
+    draw, told = np.random.default_rng(5), []
+    for sigma in (1e-4, 3e-3):
+        some = [
+            replace(one, q=one.q + sigma * draw.standard_normal(one.q.shape).astype(np.float32))
+            for one in quiet
+        ]
+        error = ExpectedError(sensor=0.001, change=0.0, wander=0.001, memory=17.0, reading=0.0)
+        result = assess(preview(("backlash", "sensor_noise"), error=error), axis, some, True)
+        told.append(limit(result, "backlash", "q3").smallest)
+        assert limit(result, "sensor_noise", "q3").smallest == pytest.approx(sigma, rel=0.15)
+    assert told[0] and (told[1] is None or told[1] > 1.2 * told[0])
+
+
+def test_a_coarse_sensor_has_the_noise_of_rounding(axis: Machine) -> None:
+    """The root mean square of a rounding error is the step over sqrt(12)."""
+    step, error = 0.004, option("preview", "default").error
+    some = motions(axis, 150.0, 4)
+    coarse = [replace(one, q=(np.round(one.q / step) * step).astype(np.float32)) for one in some]
+    assert error.measure_reading(coarse, axis) == pytest.approx([step / np.sqrt(12.0)], rel=0.05)
+    resting = [replace(one, q=np.zeros_like(one.q)) for one in some]
+    expected = 0.00011 * (axis.upper - axis.lower)
+    assert error.measure_reading(resting, axis) == pytest.approx(expected), "nothing shows it"
+
+
+def test_information_is_what_faults_leave() -> None:
+    """One fault of length 2 at 60 degrees to a response of length 3: worked by hand."""
+    products = np.array([[[4.0, 3.0], [3.0, 9.0]]])
+    table = ResponseTable(products, 1, {("lag", "t"): [1]}, {("lag", "t"): np.ones(1)}, 60.0)
+    # 3/4 of all products; the prior of the fault adds 1
+    assert table.measure_information(0, 1) == pytest.approx(0.75 * 9.0 - (0.75 * 3.0) ** 2 / 4.0)
+    twice = table.scale_to(120.0)
+    assert twice.measure_information(0, 1) == pytest.approx(1.5 * 9.0 - (1.5 * 3.0) ** 2 / 7.0)
+
+
+def test_late_frames_are_told_by_the_divergence_of_their_times() -> None:
+    """Where no change is late nothing is gained; where half are late by far more than the error, log 2 is, or the square of it."""
+    width, chances = np.full(10, 0.1), np.array([0.5, 0.5])
+    assert compute_divergence(width, np.zeros(2), chances) == pytest.approx(0.0, abs=1e-9)
+    far = compute_divergence(width, np.array([-0.5, 0.5]), chances)
+    # the density of either place is half as high, and the place is 5 standard errors from 0
+    assert far / 10 == pytest.approx(0.5 * 25.0 - np.log(2.0), rel=0.02)
+
+
+def test_too_short_motions_are_refused(axis: Machine) -> None:
+    short = motions(axis, 150.0, 1)[0]
+    part = replace(short, t_s=short.t_s[:60], u=short.u[:60], q=short.q[:60])
+    assert choose_horizon_s(axis) == 5.0
+    with pytest.raises(RecordingError, match="no motion is long enough for a free run of 5 s"):
+        assess(preview(), axis, [part])
+
+
+@pytest.mark.parametrize("name", ["mini_excavator", "emps"])
+def test_machines_without_masses_have_a_preview(name: str) -> None:
+    machine = option("machine", name)
+    some = motions(machine, 120.0, 1, "reversals")
+    result = assess(replace(option("preview", "default"), excitations={}), machine, some)
+    joint = machine.joint_names[0]
+    assert limit(result, "creep", joint).number == "drift_rad_s"
+    assert limit(result, "backlash", joint).unit == "m" and limit(result, "backlash", joint).is_told
+
+
+FAST = (
+    "preview.num_windows=6",
+    "preview.num_compared=2",
+    "preview.compared_s=120",
+    "preview.effects=[lag,dead_time,clock_offset,link_length,sensor_noise]",
+)
+
+
+def test_collect_says_it_before_anything_moves(brokk: Callable[..., Any]) -> None:
+    done = brokk(
+        "mode=collect", "collect.only_plan=true", "collect.num_runs=2", "collect.run_minutes=2",
+        "collect.file_minutes=2", "excitation=levels", "session.out=plan", *FAST,
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert {path.suffix for path in Path("plan").glob("plan.*")} == {".png", ".json"}
+    plan = json.loads(Path("plan/plan.json").read_text())
+    rows = {(one["effect"], *one["joints"]): one for one in plan["preview"]["effects"]}
+    assert rows["lag", "q3"]["told"] and rows["lag", "q3"]["unit"] == "s"
+    assert plan["preview"]["minutes"] > 3.0
+    assert "these motions would tell" in done.out and "link_length: only measured tool" in done.out
+    plain = brokk(
+        "mode=collect", "collect.only_plan=true", "collect.num_runs=1", "collect.run_minutes=2",
+        "collect.file_minutes=2", "excitation=levels", "session.out=plain", "~preview",
+    )  # fmt: skip
+    assert plain.code == 0, plain.err
+    assert "preview" not in json.loads(Path("plain/plan.json").read_text())
+
+
+def test_inspect_says_it_of_recordings(brokk: Callable[..., Any], machine: Machine) -> None:
+    (some, *_) = motions(machine, 120.0, 1)
+    noisy = some.q + 3e-4 * np.random.default_rng(0).standard_normal(some.q.shape)
+    record.write_recording(replace(some, q=noisy.astype(np.float32)), Path("a.parquet"))
+    done = brokk("mode=inspect", "inspect.recordings=*.parquet", "session.out=out", *FAST)
+    assert done.code == 0, done.err
+    result = json.loads(Path("out/inspection.json").read_text())["preview"]
+    noise = result["assumed"]["noise"]["q3"]
+    assert result["assumed"]["noise_is_measured"]
+    assert noise["reading"] == pytest.approx(3e-4, rel=0.15)
+    page = Path("out/inspection.html").read_text()
+    assert "Effects that these recordings could tell" in page and "sensor_noise" in page
+
+
+def test_the_shipped_preview_is_that_of_the_search() -> None:
+    with initialize_config_module("conf", version_base="1.3"):
+        cfg = compose("config", overrides=["mode=collect"])
+    shipped = instantiate(cfg.preview, _convert_="all")
+    assert shipped.prices == option("prices", "default")
+    assert list(shipped.excitations) == [
+        "levels",
+        "sine",
+        "ramps",
+        "holds",
+        "reversals",
+        "staircase",
+    ]
