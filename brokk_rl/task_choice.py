@@ -21,8 +21,9 @@ from brokk_rl.task_description import compare_tables, name_target, read_task_nam
 
 NAMED = ("experiment", "ablation", "preset", "search")
 """Groups whose options may change the task."""
-FOLLOWER = "follower"
-"""Group that belongs to the plant and brings values of the task: how to propose to a person."""
+PLANT = ("machine", "sim", "actuator", "follower")
+"""Groups that belong to the plant, and that an experiment may choose. The follower brings values of
+the task too: how to propose to a person."""
 MAIN = "config"
 """Name of the composed configuration; others, such as `resolved`, are given whole."""
 
@@ -78,8 +79,7 @@ def _find_brought(cfg: DictConfig, overrides: list[Override]) -> set[str]:
     if not brings:
         return set()
     choices = HydraConfig.get().runtime.choices
-    if FOLLOWER in choices:
-        kept.append(f"{FOLLOWER}={choices[FOLLOWER]}")
+    kept = [f"{group}={choices[group]}" for group in PLANT if group in choices] + kept
     name = name_target(cfg.task._target_)
     plain = hydra.compose(MAIN, [f"mode={choices['mode']}", *kept, f"task={name}"])
     here, there = (OmegaConf.to_container(one.task, resolve=True) for one in (cfg, plain))
