@@ -227,6 +227,7 @@ def test_effects_must_close_a_share_on_windows_apart(machine: Machine) -> None:
     assert less(0.055, 0.005)["reduces"].passed
     assert not less(0.045, 0.005)["reduces"].passed
     chance = less(-0.01, 0.6)["reduces"]
+    assert chance.value is not None and chance.limit is not None
     assert chance.value > chance.limit and not chance.passed
     assert not less(-0.10, 0.02)["reduces"].passed
 
