@@ -82,7 +82,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class JointGap:
-    """Error of one joint over free runs of 5 s (rad or m), its floor, and its share of the gap."""
+    """Error of one joint over free runs (rad or m), its floor, and its share of the gap."""
 
     rmse: float
     floor: float

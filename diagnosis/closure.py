@@ -33,7 +33,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class JointClosed:
-    """Error of one joint over free runs of 5 s, in rad or m, and the closed share of its gap.
+    """Error of one joint over free runs, in rad or m, and the closed share of its gap.
 
     Attributes:
         before: Of the simulator as it was.
@@ -52,7 +52,7 @@ class JointClosed:
 
 @dataclass(frozen=True)
 class Gap:
-    """Error of all joints over free runs of 5 s on parts of the field that no effect was fitted to.
+    """Error of all joints over free runs on parts of the field that no effect was fitted to.
 
     Attributes:
         before: Of the simulator as it was.

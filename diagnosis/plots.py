@@ -63,7 +63,7 @@ def draw_gap_bars(answer: Answer) -> Figure | None:
         axis.axvline(scale * gap.floor, color=FLOOR, lw=1.0, ls=":")
     axis.set_xlim(0.0, scale * max(width for _, width, _ in rows) * 1.16)
     unit = "% of travel" if gap.unit == "travel" else f"m{gap.unit}"
-    axis.set_xlabel(f"error over 5 s free runs, all joints, RMS [{unit}]")
+    axis.set_xlabel(f"error over free runs, all joints, RMS [{unit}]")
     remove_frame(axis)
     return figure
 

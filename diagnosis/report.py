@@ -8,6 +8,7 @@ from typing import Any
 
 from brokk_rl.machine import Machine
 from brokk_rl.report import Cell, Report, Tone
+from brokk_rl.scales import choose_horizon_s
 from diagnosis import plots, report_checks
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 from diagnosis.error_growth import READINGS
@@ -22,7 +23,7 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
     gap = answer.gap
     told = ""
     if gap is not None:
-        told = f" Error over 5 s free runs: {format_error(gap.before, gap.unit)} before"
+        told = f" Error over free runs: {format_error(gap.before, gap.unit)} before"
         told += f", {format_error(gap.after, gap.unit)} after" if answer.selected else ""
         told += "; " + _describe_floor(gap) + "."
     told += _describe_tool(answer)
@@ -207,8 +208,8 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
     if figure := plots.draw_gap_bars(answer):
         page.add_picture(
             figure,
-            "Error of free runs of 5 s on recordings that no effect was fitted to: before, after, "
-            "and the floor.",
+            f"Error of free runs of {choose_horizon_s(machine):g} s on recordings that no effect was "
+            "fitted to: before, after, and the floor.",
         )
     report_checks.add_rivals(page, answer)
     for remark in more.get("sanity", []):
@@ -224,7 +225,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
     page.add_picture(
         plots.draw_paths(outcome, machine),
         "Joints with the largest gaps. The simulator gets the recorded commands (grey, below) and "
-        "starts anew every 5 s (thin lines). Black: measured; red: simulated as it was; blue: "
+        f"starts anew every {choose_horizon_s(machine):g} s (thin lines). Black: measured; red: simulated as it was; blue: "
         "simulated with the effects.",
     )
     _add_growth(page, outcome, machine, units)
@@ -298,7 +299,7 @@ def _add_errors_by_joint(page: Report, answer: Answer, units: Mapping[str, str])
             row += [_scale(other["before"]), _scale(other["after"]), f"{100 * other['share']:.0f}"]
         rows.append(row)
     columns = ["joint", "before", "after", "floor", "% less"]
-    caption = "Root mean square error of free runs of 5 s, on parts that sizes were not fitted to"
+    caption = "Root mean square error of free runs, on parts that sizes were not fitted to"
     if unseen:
         columns += ["unseen: before", "after", "% less"]
         caption += f"; unseen: {unseen['recordings']} further recordings"
@@ -333,7 +334,7 @@ def _add_where(page: Report, outcome: Outcome, machine: Machine, units: Mapping[
     page.add_picture(
         plots.draw_gap_map(outcome.answer, outcome.before, machine),
         "Left: share of the gap, all cells together are 100 %; an error counts at its origin. "
-        "Right: error of free runs of 5 s along the recordings.",
+        "Right: error of free runs along the recordings.",
     )
     rows = []
     for name, joint in location["joints"].items():
@@ -341,7 +342,7 @@ def _add_where(page: Report, outcome: Outcome, machine: Machine, units: Mapping[
         row = [f"{name} [m{units[name]}]", _scale(joint["rmse"]), _scale(joint["floor"])]
         rows.append([*row, f"{100 * joint['error']:.0f}", Cell(f"{100 * joint['gap']:.0f}", sure)])
     columns = ["joint", "error", "floor", "% of the error", "% of the gap"]
-    page.add_table(columns, rows, "Root mean square error of free runs of 5 s")
+    page.add_table(columns, rows, "Root mean square error of free runs")
     if not location["has_gap"]:
         page.add_text("No joint exceeds its floor beyond chance; the shares are noise.", "warn")
     if location["blocks"]:

@@ -32,7 +32,7 @@ def add_rivals(page: Report, answer: Answer) -> None:
     for name, one in answer.rivals.items():
         error = None if one.rmse is None else format_error(one.rmse, gap.unit)
         rows.append([Cell(RIVALS.get(name, name), one.reason), error])
-    page.add_table(["model", "error"], rows, "Error of free runs of 5 s on the same windows")
+    page.add_table(["model", "error"], rows, "Error of free runs on the same windows")
 
 
 def add_gates(page: Report, answer: Answer) -> None:

@@ -137,7 +137,7 @@ def add_hold_errors(
 
 
 def compute_hold_error(recordings: Sequence[Recording], machine: Machine, unit: str) -> float:
-    """Return the error of standing still over free runs of 5 s, all joints together.
+    """Return the error of standing still over free runs, all joints together.
 
     Args:
         recordings: The recordings.
@@ -291,7 +291,7 @@ def write_scorecard(
     page.add_table(
         COLUMNS,
         build_rows(cases),
-        "Errors are those of free runs of 5 s on field recordings outside the fit; apart: "
+        "Errors are those of free runs on field recordings outside the fit; apart: "
         "recordings to which nothing was fitted; hold: standing still",
     )
     for name, case in cases.items():
