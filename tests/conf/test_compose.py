@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
 
-OVERRIDES = ("experiment", "ablation", "preset", "search")
+OVERRIDES = ("experiment", "ablation", "preset", "search", "exam_protocol")
 PARTS = [
     (entry.group, entry.name)
     for entry in registry.list_options()
@@ -45,6 +45,12 @@ def test_every_experiment_composes(name: str) -> None:
 @every("preset")
 def test_every_preset_composes(name: str) -> None:
     assert composed(f"preset={name}")._target_
+
+
+@every("exam_protocol")
+def test_every_exam_protocol_composes(name: str) -> None:
+    cfg = composed("mode=exam", f"exam_protocol={name}")
+    assert cfg.exam.sealed is (name == "sealed")
 
 
 @every("ablation")
