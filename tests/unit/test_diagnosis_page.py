@@ -171,7 +171,7 @@ def test_an_answer_that_cannot_tell_says_why(
         next_experiment=None, reason="cannot tell, because nothing moves",
     )  # fmt: skip
     assert report.write_headline(bare)[0].startswith(
-        "There is no telling. Cannot tell, because nothing moves. Error over 5 s"
+        "There is no telling. Cannot tell, because nothing moves. Error over free runs: "
     )
     assert plots.draw_paths(Outcome(bare, seen[0].before, None, None), machine).axes
 

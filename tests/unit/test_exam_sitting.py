@@ -140,6 +140,7 @@ def test_a_make_that_was_interrupted_goes_on_and_gives_the_same_cases(
         assert path.read_bytes() == (part / path.relative_to(whole)).read_bytes()
 
 
+@pytest.mark.slow
 def test_an_exam_of_arms_known_by_their_joints_asks_nothing_that_needs_masses(
     brokk: Callable[..., Any], machine: Machine, tmp_path: Path
 ) -> None:

@@ -136,6 +136,7 @@ def test_the_run_of_another_kind_is_found(machine: Machine) -> None:
     assert select_unlike(runs, machine)[0].run == "run 2"
 
 
+@pytest.mark.slow
 def test_a_coupling_that_the_curve_lacks_is_learned(machine: Machine, tmp_path: Path) -> None:
     runs = make_recordings(machine)
     unseen = make_recordings(machine, 5)[4:]

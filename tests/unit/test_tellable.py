@@ -134,8 +134,8 @@ def search(residuals: Residuals, machine: Machine) -> set[str]:
     ("effect", "number"),
     [
         ("backlash", "gap_rad"),
-        ("dead_band", "extend"),
-        ("flow_gain", "gain"),
+        pytest.param("dead_band", "extend", marks=pytest.mark.slow),
+        pytest.param("flow_gain", "gain", marks=pytest.mark.slow),
         ("lag", "time_constant_s"),
     ],
 )
