@@ -46,6 +46,8 @@ class ProbabilityModel:
         none: Of the signs that there is nothing to find, where nothing was found.
         form: Relative model-form error of the size of an effect, 1 sigma, by stage.
         temperature: Deficit of net gain, nats, that divides the odds of an effect that was not named by e.
+        choice: Of the signs of hypotheses, by verdict (`hypotheses`); of each effect (`kinds`), and of
+            each verdict when one is chosen (`stakes`).
     """
 
     outside: dict[str, float]
@@ -53,6 +55,7 @@ class ProbabilityModel:
     none: dict[str, float]
     form: dict[str, float]
     temperature: float
+    choice: dict[str, dict[str, float]]
 
     def check(self) -> None:
         known = {

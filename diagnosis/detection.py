@@ -83,6 +83,21 @@ class Penalties:
     tool: float
 
 
+@dataclass(frozen=True)
+class CandidateEffects:
+    """Effects to choose among.
+
+    Attributes:
+        residuals: Residuals of the simulator on the field.
+        rays: Rays of each effect.
+        shapes: Responses of each joint to each effect, one a ray.
+    """
+
+    residuals: Residuals
+    rays: dict[str, list[ParameterRay]]
+    shapes: list[dict[str, list[Response]]]
+
+
 @dataclass
 class DetectionResult:
     """Result of the search.
@@ -102,6 +117,8 @@ class DetectionResult:
         strays: Free-run error with the set over that on the reference, each over its expectation
             under the noise, `(J,)`.
         tool_left: Remaining error of measured tool points over that of the reference.
+        alone: Scores of effects by themselves, before any was chosen.
+        alone_rays: Their rays; `None` for restored findings.
     """
 
     residuals: Residuals
@@ -116,26 +133,13 @@ class DetectionResult:
     scatter: np.ndarray
     strays: np.ndarray
     tool_left: float
+    alone: Sequence[SubsetTable] = ()
+    alone_rays: dict[str, list[ParameterRay]] | None = None
 
     @property
     def names(self) -> set[str]:
         """All effects that were found."""
         return {*self.chosen.names, *(one.kind.name for one in self.detected)}
-
-
-@dataclass(frozen=True)
-class CandidateEffects:
-    """Effects to choose among.
-
-    Attributes:
-        residuals: Residuals of the simulator on the field.
-        rays: Rays of each effect.
-        shapes: Responses of each joint to each effect, one a ray.
-    """
-
-    residuals: Residuals
-    rays: dict[str, list[ParameterRay]]
-    shapes: list[dict[str, list[Response]]]
 
 
 @dataclass(frozen=True)
@@ -193,8 +197,9 @@ class EffectSearch:
         effects = self._simulate_effects(residuals)
         price = self._build_price(effects)
         search = self._choose(effects, price, np.ones(self.case.machine.num_joints))
+        alone = search.tables
         self.tell("what the speed curves show", 0.71)
-        shown = []
+        shown, proposed = [], []
         if self.curves is not None:
             proposed = shown_effects.propose_effects(self.curves, self.kinds, self.case.machine)
             parts = (effects.rays, effects.shapes, search.fitted, price)
@@ -215,6 +220,11 @@ class EffectSearch:
             # The mean delay depends on the other effects, and these on it: hence two rounds.
             search = _add_mean_delay(search, late) if late else search
             search = self._choose(search.effects, price, scatter, search.wide)
+        parts = (search.effects.rays, search.effects.shapes, search.fitted)
+        kept = shown_effects.keep_shown_numbers(search.effects.residuals, proposed, *parts)
+        if kept is not None:
+            chosen = EffectSet(refine.list_subsets(kept), search.chosen.net_gain)
+            search = replace(search, chosen=chosen, fitted=kept)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
         beside = residual_model.apply_fitted_set(search.effects.residuals, search.fitted)
@@ -222,6 +232,7 @@ class EffectSearch:
         return DetectionResult(
             search.effects.residuals, search.tables, search.effects.rays, price, search.chosen, search.fitted,
             others, left, reference_clue_gains, self._scatter(beside.z), self._strays(beside), on_tool.left,
+            alone, effects.rays,
         )  # fmt: skip
 
     @property

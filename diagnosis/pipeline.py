@@ -18,7 +18,9 @@ from diagnosis import (
     calibration,
     decision,
     detection,
+    effect_library,
     gates,
+    hypotheses,
     next_experiment,
     sanity,
     speed_curves,
@@ -34,6 +36,7 @@ from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
 from diagnosis.effect_library import DetectedEffect, EffectSimulator, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
+from diagnosis.hypotheses import Choice
 from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
 from diagnosis.speed_curves import SpeedCurves
@@ -118,10 +121,14 @@ class DiagnosisPipeline:
         self, result: DetectionResult, told: Sequence[Gate], curves: SpeedCurves
     ) -> Outcome:
         weighed = decision.record_weights(result, self.penalties)
-        result = decision.drop_unlikely_effects(result, self.penalties, self.calibration)
         field, machine = self.base.field, self.case.machine
         rivals = verdict.collect_rivals(self.base)
-        unknown = decision.is_unknown(result, self.penalties, self.calibration)
+        shared = effect_library.list_shared_effects(self.kinds)
+        known = hypotheses.list_hypotheses(result, self._known(), self.penalties, shared)
+        weighed["hypotheses"] = hypotheses.serialize_hypotheses(known)
+        weighing = hypotheses.choose_hypothesis(known, self.calibration)
+        result = hypotheses.adopt_choice(result, weighing, self.penalties, self.calibration)
+        unknown = weighing.verdict == "unknown" and not result.detected
         seen = verdict.judge_findings(
             result, self.case, self.base, rivals, self.thresholds, self.generator, unknown
         )
@@ -130,16 +137,13 @@ class DiagnosisPipeline:
         named = seen.verdict == "effects"
         parts = EffectAttribution(result, reach).measure_parts() if named else {}
         selected = self._describe_detected(result, seen.found, parts)
-        selected += self._selected(result, parts) if seen.fitted else []
+        selected += self._selected(result, parts, weighing) if seen.fitted else []
         selected.sort(key=lambda one: -one.probability)
         before, floor = field.runs(field.residuals.base), self._floor()
         after = field.runs(reach.after) if named else None
         survey = self._examine(before, floor, after)
         remainder = self._remainder(result, reach) if named else None
-        chance = decision.compute_unknown_probability(result, self.penalties, self.calibration)
-        ranking: Sequence[Ranked] = decision.rank_hypotheses(
-            result, selected, self.penalties, self.calibration, machine, chance
-        )
+        ranking: Sequence[Ranked] = weighing.rank(selected, machine.joint_names)
         if seen.verdict == "unknown" and seen.failed:
             ranking = gates.rank_unknown_first(ranking)
         answer = Answer(
@@ -187,7 +191,9 @@ class DiagnosisPipeline:
             selected.append(_add_part(answer, parts.get(one.kind.name), own))
         return selected
 
-    def _selected(self, result: DetectionResult, parts: Mapping[str, EffectPart]) -> list[Selected]:
+    def _selected(
+        self, result: DetectionResult, parts: Mapping[str, EffectPart], weighing: Choice
+    ) -> list[Selected]:
         kinds = {kind.name: kind for kind in self.kinds}
         chosen = decision.rank_chosen_effects(result, kinds)
         assert result.fitted is not None, "what is selected has been simulated"
@@ -198,6 +204,10 @@ class DiagnosisPipeline:
             signs = decision.read_chosen_signs(
                 result, self.penalties, self.calibration, kind.name, swaps, like
             )
+            probability = calibration.compute_probability(self.calibration.right, signs)
+            if weighing.best and weighing.best.name == kind.name:
+                like = weighing.list_equivalents() or like
+                probability = weighing.probability(kind.name, *like)
             joints = result.fitted.joints_of(kind)
             decided = next(
                 (how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)),
@@ -209,7 +219,7 @@ class DiagnosisPipeline:
             answer = Selected(
                 effect=kind.name,
                 joints=tuple(names),
-                probability=calibration.compute_probability(self.calibration.right, signs),
+                probability=probability,
                 parameters=verdict.mark_bounds(
                     decision.estimate_numbers(
                         result, kind, self.case.machine, self.calibration.form[kind.stage]

@@ -161,6 +161,38 @@ def fit_set(
     )
 
 
+def hold_set(
+    residuals: Residuals,
+    rays: Mapping[str, Sequence[ParameterRay]],
+    sizes_by_joint: Sequence[Mapping[str, np.ndarray]],
+    known: FittedSet | None = None,
+) -> FittedSet:
+    """Return a set with given sizes, nothing fitted; joints with the sizes of `known` keep its halves.
+
+    Args:
+        residuals: Residuals of the simulator without them.
+        rays: Ways in which each effect can grow.
+        sizes_by_joint: Sizes of each effect along its rays, by joint and name.
+        known: A fitted set.
+    """
+    subsets = [frozenset(sizes) for sizes in sizes_by_joint]
+    found, mask, sizes = _lay_out(subsets, rays, sizes_by_joint)
+    sizes = np.clip(sizes, *_Fit(residuals, found, mask).bounds) * mask
+    z, slopes, paths = _linearise(residuals, found, sizes[None])
+    after, own, held = paths[0], paths[0], z[0]
+    after = after + (0.0 if residuals.mean is None else residuals.mean)
+    own, halves = after.copy(), np.stack([sizes, sizes])
+    if known is not None:
+        before = look_up_sizes(found, known)
+        for j in np.flatnonzero((np.abs(before - sizes) < 1e-9).all(0) & mask.any(0)):
+            after[..., j], own[..., j], held[j] = known.after[..., j], known.own[..., j], known.z[j]
+            for k, half in enumerate(known.halves):
+                one = replace(known, sizes=half)
+                halves[k, :, j] = look_up_sizes(found, one)[:, j]
+    deviation = _estimate_deviations(z[0], slopes[0], residuals, mask)
+    return FittedSet(found, mask, sizes, halves, after, own, held, deviation)
+
+
 def simulate_refit(
     residuals: Residuals,
     subsets: Sequence[frozenset[str]],
