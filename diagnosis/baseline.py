@@ -434,9 +434,7 @@ def _find_effects(
     parts: Sequence[Residuals], ways: RaysByTrial, joint_names: Sequence[str]
 ) -> list[tuple[EffectType, EffectValues]]:
     """Return the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
-    responses: dict[str, list[list[np.ndarray]]] = {}
-    for key, way in ways.items():
-        responses[key] = [[part.response(ray) for part in parts] for ray in way]
+    responses = _simulate_ways(parts, ways)
     of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
     found: dict[str, tuple[EffectType, dict[str, np.ndarray]]] = {}
     for j in range(parts[0].z.shape[0]):
@@ -466,6 +464,23 @@ def _find_effects(
         for name, value in _expand_values(kind, ways[best], scored[best].sizes[best]).items():
             values[name][:, j] = value[:, j]
     return list(found.values())
+
+
+def _simulate_ways(
+    parts: Sequence[Residuals], ways: RaysByTrial
+) -> dict[str, list[list[np.ndarray]]]:
+    """Return the responses of each part to each ray, by trial; those of one effect are simulated together."""
+    by_kind: dict[str, list[str]] = {}
+    for key, way in ways.items():
+        by_kind.setdefault(way[0].kind.name, []).append(key)
+    found: dict[str, list[list[np.ndarray]]] = {}
+    for keys in by_kind.values():
+        rays = [ray for key in keys for ray in ways[key]]
+        by_part = [part.list_responses(rays) for part in parts]
+        by_ray = iter([list(one) for one in zip(*by_part, strict=True)])
+        for key in keys:
+            found[key] = [next(by_ray) for _ in ways[key]]
+    return found
 
 
 def _expand_values(

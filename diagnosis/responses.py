@@ -272,11 +272,12 @@ def add_responses(
     """
     kind = ways[0].kind
     trials = [{}] if ways[0].shape else list_shape_trials(kind)
-    responses = []
+    shaped = []
     for trial in trials:
         shape = _repeat_per_joint(trial, len(shapes))
-        shaped = [replace(ray, shape=shape) for ray in ways] if trial else ways
-        responses.append([residuals.response(ray) for ray in shaped])
+        shaped += [replace(ray, shape=shape) for ray in ways] if trial else ways
+    every = residuals.list_responses(shaped)
+    responses = [every[t * len(ways) : (t + 1) * len(ways)] for t in range(len(trials))]
     made: list[list[list[Response]]] = []  # by trial and joint, one a ray
     losses = np.zeros((len(trials), len(shapes)))
     for t, response in enumerate(responses):
