@@ -33,7 +33,7 @@ from deploy.runtime.receiver import BusReceiver
 CYCLE_S = 0.01
 """Half the cycle time of valve commands in the example DBC (20 ms)."""
 LARGEST_OVERRUNS = 4095
-"""Of the 12-bit signal `Overruns`."""
+"""Largest value of the signal `Overruns`, which has 12 bits."""
 LAST_ZEROS = 5
 """Zero commands before silence: 100 ms of the example bus, longer than the 70 ms after which the
 gateway misses commands. One of them would do; the others are for a bus that loses some."""
