@@ -38,6 +38,25 @@ class Gravity:
 
     def load(self, q: torch.Tensor) -> torch.Tensor:
         """Return the gravity load in the positive direction at `q`, `(N, J)`, Nm or N."""
+        axis, origin_m, moments = self._place(q)
+        carried = moments.flip(1).cumsum(1).flip(1) - self._carried_kg[:, None] * origin_m
+        turning = (
+            axis[..., 0] * carried[..., 1] - axis[..., 1] * carried[..., 0]
+        )  # z of axis x lever arm, times mass
+        lifting = self._carried_kg * axis[..., 2]
+        return -GRAVITY_M_S2 * (self._hinge * turning + (1.0 - self._hinge) * lifting)
+
+    def overturn(self, q: torch.Tensor) -> torch.Tensor:
+        """Return the moment of the arm's weight about the base frame's origin, `(N, 3)`, Nm."""
+        moment = self._place(q)[2].sum(1)
+        x, y = moment[:, 0], moment[:, 1]
+        return GRAVITY_M_S2 * torch.stack((-y, x, torch.zeros_like(x)), 1)
+
+    def _place(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return joint axes, joint origins (m), and mass times place of each body (kg m).
+
+        Each `(N, J, 3)`, in the base frame.
+        """
         angle = (q * self._hinge)[..., None, None]
         turn = (
             self._eye + angle.sin() * self._cross + (1.0 - angle.cos()) * self._cross_twice
@@ -51,15 +70,7 @@ class Gravity:
             rotation = rotation @ turn[:, j]
             origins.append(at_m)
             moments.append(self._mass_kg[j] * (at_m + rotation @ self._com_m[j]))
-        axis, origin_m = torch.stack(axes, 1), torch.stack(origins, 1)
-        carried = (
-            torch.stack(moments, 1).flip(1).cumsum(1).flip(1) - self._carried_kg[:, None] * origin_m
-        )
-        turning = (
-            axis[..., 0] * carried[..., 1] - axis[..., 1] * carried[..., 0]
-        )  # z of axis x lever arm, times mass
-        lifting = self._carried_kg * axis[..., 2]
-        return -GRAVITY_M_S2 * (self._hinge * turning + (1.0 - self._hinge) * lifting)
+        return torch.stack(axes, 1), torch.stack(origins, 1), torch.stack(moments, 1)
 
 
 NUM_POSES = 256

@@ -207,6 +207,7 @@ class FittedCurve:
         draws: Bootstrap of both, `(1 + B, C + 4)`; the first row is the fit itself.
         information: Information of the recordings on the curve, `(C, C)`.
         points: Stroke and speed of single increments, `(I, 2)`.
+        sides: Whether each side, positive first, was commanded often enough for its numbers.
     """
 
     curve: np.ndarray
@@ -214,6 +215,7 @@ class FittedCurve:
     draws: np.ndarray
     information: np.ndarray
     points: np.ndarray
+    sides: tuple[bool, bool]
 
 
 class CurveFit(Protocol):
