@@ -40,7 +40,13 @@ from diagnosis.residuals import (
     fit_noise,
     weigh_residuals,
 )
-from diagnosis.responses import MIN_RESPONSE, Response, fit_faults, list_shape_trials
+from diagnosis.responses import (
+    MIN_RESPONSE,
+    Response,
+    fit_faults,
+    list_shape_trials,
+    simulate_trials,
+)
 from diagnosis.search import SubsetTable
 
 log = logging.getLogger(__name__)
@@ -401,11 +407,8 @@ def add_reference_effects(
             ways |= _list_trials(kind)
     if len(base.left_out) < 2 or base.is_flexible:
         return base
-    found = _find_effects(
-        [drop_windows(one.residuals, REFERENCE_WINDOWS) for one in base.left_out],
-        ways,
-        machine.joint_names,
-    )
+    parts = [drop_windows(one.residuals, REFERENCE_WINDOWS) for one in base.left_out]
+    found = _find_effects(parts, ways, machine.joint_names)
     return _wrap_simulator(base, found, machine) if found else base
 
 
@@ -434,7 +437,7 @@ def _find_effects(
     parts: Sequence[Residuals], ways: RaysByTrial, joint_names: Sequence[str]
 ) -> list[tuple[EffectType, EffectValues]]:
     """Return the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
-    responses = _simulate_ways(parts, ways)
+    responses = simulate_trials(parts, ways)
     of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
     found: dict[str, tuple[EffectType, dict[str, np.ndarray]]] = {}
     for j in range(parts[0].z.shape[0]):
@@ -464,23 +467,6 @@ def _find_effects(
         for name, value in _expand_values(kind, ways[best], scored[best].sizes[best]).items():
             values[name][:, j] = value[:, j]
     return list(found.values())
-
-
-def _simulate_ways(
-    parts: Sequence[Residuals], ways: RaysByTrial
-) -> dict[str, list[list[np.ndarray]]]:
-    """Return the responses of each part to each ray, by trial; those of one effect are simulated together."""
-    by_kind: dict[str, list[str]] = {}
-    for key, way in ways.items():
-        by_kind.setdefault(way[0].kind.name, []).append(key)
-    found: dict[str, list[list[np.ndarray]]] = {}
-    for keys in by_kind.values():
-        rays = [ray for key in keys for ray in ways[key]]
-        by_part = [part.list_responses(rays) for part in parts]
-        by_ray = iter([list(one) for one in zip(*by_part, strict=True)])
-        for key in keys:
-            found[key] = [next(by_ray) for _ in ways[key]]
-    return found
 
 
 def _expand_values(

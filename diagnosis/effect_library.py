@@ -376,7 +376,10 @@ class EffectSimulator:
 
     @cached_property
     def _drive(self) -> Any:
-        """What the recorded commands ask of the base in each window; `None` where it cannot say or its numbers are drawn."""
+        """Demand of the recorded commands on the base in each window.
+
+        `None` where the base has no `drive`, or where its numbers are drawn.
+        """
         device, size = torch.device("cpu"), self.cut.num_history
         with torch.random.fork_rng(devices=[]), torch.inference_mode():
             model: Any = self.base.build(self.machine, len(self.cut.u), device)

@@ -302,6 +302,23 @@ def add_responses(
     return [replace(ray, shape=shape) for ray in ways]
 
 
+def simulate_trials(
+    parts: Sequence[Residuals], ways: Mapping[str, Sequence[ParameterRay]]
+) -> dict[str, list[list[np.ndarray]]]:
+    """Return the responses of each part to each ray, by trial; those of one effect are simulated together."""
+    by_kind: dict[str, list[str]] = {}
+    for key, way in ways.items():
+        by_kind.setdefault(way[0].kind.name, []).append(key)
+    found: dict[str, list[list[np.ndarray]]] = {}
+    for keys in by_kind.values():
+        rays = [ray for key in keys for ray in ways[key]]
+        by_part = [part.list_responses(rays) for part in parts]
+        by_ray = iter([list(one) for one in zip(*by_part, strict=True)])
+        for key in keys:
+            found[key] = [next(by_ray) for _ in ways[key]]
+    return found
+
+
 def fit_joint_faults(
     residuals: Residuals, scatter: np.ndarray | None = None, z: np.ndarray | None = None
 ) -> list[JointResiduals]:

@@ -175,7 +175,8 @@ class EffectChain:
         shares: Mapping[str, float] = MappingProxyType({}),
         num_recent: int | None = None,
     ) -> None:
-        self.inner, self.effects, self._num_recent = inner, dict(effects), num_recent
+        self.inner: Any = inner
+        self.effects, self._num_recent = dict(effects), num_recent
         given: dict[str, Value] = {}
         numbers: dict[str, EffectNumber] = {}
         joints: dict[str, Joints] = {}
@@ -197,8 +198,8 @@ class EffectChain:
         commanding = {name: e for name, e in effects.items() if e.side == "command"}
         self._delays = {name: effect for name, effect in commanding.items() if effect.delays}
         self._others = {n: e for n, e in reversed(commanding.items()) if not e.delays}
-        self.commands = self._others | self._delays
-        self.motions = {name: e for name, e in effects.items() if e.side in MOTION}
+        self.commands: dict[str, Any] = self._others | self._delays
+        self.motions: dict[str, Any] = {name: e for name, e in effects.items() if e.side in MOTION}
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
         self.is_weighed = machine.has_bodies and any(e.weighed for e in self.motions.values())
@@ -252,7 +253,7 @@ class EffectChain:
 
     @property
     def is_plannable(self) -> bool:
-        """Whether all commands of a run can be given to its effects beforehand."""
+        """True if all commands of a run can be given to its effects beforehand."""
         told = all(e.pointwise or e.delays or e.recent for e in self.commands.values())
         told &= all(len(effect.numbers) == 1 for effect in self._delays.values())
         # One counter a step: several effects that draw would draw in another order.
@@ -262,8 +263,7 @@ class EffectChain:
     def delay_s(self) -> torch.Tensor:
         """See `brokk_rl.contracts.actuator.PlannedModel`."""
         own_s = [value for name in self._delays for value in self.get_values(name).values()]
-        inner: Any = self.inner
-        return (inner.delay_s + sum(own_s)).clamp(min=0.0)
+        return (self.inner.delay_s + sum(own_s)).clamp(min=0.0)
 
     def advance_draws(self) -> torch.Tensor | None:
         """Advance to the next draws and return their counter, `(N,)`; `None` without draws."""

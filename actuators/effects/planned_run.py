@@ -6,20 +6,48 @@ what depends on positions. Axes: `T` commands of the run, `N` environments, `J` 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Any, Protocol
 
 import torch
 
-from actuators.effects.step_inputs import Memory, StepInputs
+from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
 from brokk_rl.contracts.actuator import PlannedRun
 from brokk_rl.history import History
 
-if TYPE_CHECKING:
-    from actuators.effects.effect import EffectChain, EffectSpec
+
+class PlannableChain(Protocol):
+    """Part of `EffectChain` that a run uses; attributes and methods are explained there."""
+
+    inner: Any
+    commands: dict[str, Any]
+    motions: dict[str, Any]
+    plant: MachineTensors
+    is_weighed: bool
+
+    @property
+    def is_plannable(self) -> bool:
+        """True if all commands of a run can be given to its effects beforehand."""
+        ...
+
+    def get_values(self, name: str) -> dict[str, torch.Tensor]:
+        """Return the parameters of one effect."""
+        ...
+
+    def advance_draws(self) -> torch.Tensor | None:
+        """Advance to the next draws and return their counter."""
+        ...
+
+    def salt_counter(self, name: str, counter: torch.Tensor | None) -> torch.Tensor | None:
+        """Return the counter of one effect's draws."""
+        ...
+
+    def hold_in_travel(self, moved_to: torch.Tensor, predicted: torch.Tensor) -> torch.Tensor:
+        """Return positions after the effects, within the travel."""
+        ...
 
 
 class ChainRun:
-    """A run of an `EffectChain`.
+    """A run of effects around a model.
 
     Args:
         chain: The chain.
@@ -28,13 +56,15 @@ class ChainRun:
         first: Number of the first position that is asked for.
     """
 
-    def __init__(self, chain: EffectChain, inner: PlannedRun, u: torch.Tensor, first: int) -> None:
+    def __init__(
+        self, chain: PlannableChain, inner: PlannedRun, u: torch.Tensor, first: int
+    ) -> None:
         self._chain, self._inner, self._u, self._first = chain, inner, u, first
         self._values = {name: chain.get_values(name) for name in chain.motions}
         self._memory: dict[str, Memory] = {}
 
     @classmethod
-    def plan(cls, chain: EffectChain, u: torch.Tensor, first: int) -> PlannedRun | None:
+    def plan(cls, chain: PlannableChain, u: torch.Tensor, first: int) -> PlannedRun | None:
         """Return the run; `None` where an effect or the model inside has to be stepped."""
         plan_inner = getattr(chain.inner, "plan_run", None)
         if plan_inner is None or not chain.is_plannable:
@@ -68,12 +98,12 @@ class ChainRun:
 
 
 def _change_commands(
-    chain: EffectChain, name: str, effect: EffectSpec, u: torch.Tensor, first: int
+    chain: PlannableChain, name: str, effect: Any, u: torch.Tensor, first: int
 ) -> torch.Tensor:
     """Return the commands of a run `(T, N, J)` after one effect."""
     values, still, rows = chain.get_values(name), torch.zeros_like(u[0]), u.transpose(0, 1)
     if effect.delays:  # in a step no command is known before it is given
-        earliest_s = -chain.inner.delay_s  # pyright: ignore[reportAttributeAccessIssue]
+        earliest_s = -chain.inner.delay_s
         values = {key: torch.maximum(value, earliest_s) for key, value in values.items()}
     if effect.pointwise or effect.delays:
         now = StepInputs(values, {}, History(q=rows, u=rows), chain.plant, still, None)

@@ -266,7 +266,7 @@ class ValveModel:
         return ValveRun(self, self.drive(u, first) if drive is None else drive, kept, first)
 
     def drive(self, u: torch.Tensor, first: int) -> "ValveDrive":
-        """Return what the commands of a run `(T, N, J)` ask for, whatever the positions are."""
+        """Return the demand of the commands of a run `(T, N, J)`, whatever the positions are."""
         value = self.parameters
         earlier, later, part = split_run_commands(u, value["dead_time_s"] / self._period_s, first)
         commands, before = torch.lerp(later, earlier, part), earlier[0]
@@ -322,7 +322,7 @@ class ValveModel:
 
 @dataclass(frozen=True, eq=False)
 class ValveDrive:
-    """What commands ask of a valve in each step of a run.
+    """Demand of commands on a valve in each step of a run.
 
     Attributes:
         wanted: Motion in a period in the mean pose, `(K, N, J)`.

@@ -68,7 +68,7 @@ class PlannedModel(ActuatorModel, Protocol):
 
     @property
     def delay_s(self) -> torch.Tensor:
-        """How long a command takes until it begins to act, `(N, J)`, s."""
+        """Time until a command begins to act, `(N, J)`, s."""
         ...
 
     def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun | None:
