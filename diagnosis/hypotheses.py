@@ -136,6 +136,11 @@ def _compress(nats: float) -> float:
     return float(np.arcsinh(nats / LITTLE_NATS))
 
 
+def read_hypotheses(rows: Sequence[Mapping[str, Any]]) -> list[Hypothesis]:
+    """Return the hypotheses of `serialize_hypotheses`."""
+    return [Hypothesis(row["name"], tuple(row["joints"]), row["signs"]) for row in rows]
+
+
 def serialize_hypotheses(known: Sequence[Hypothesis]) -> list[dict[str, Any]]:
     """Return hypotheses with their signs as plain JSON data: the weights are learned from them."""
     rows = []
@@ -225,22 +230,24 @@ def adopt_choice(
     if choice.verdict != "effects" or best is None:
         empty = EffectSet((frozenset(),) * len(result.tables), 0.0)
         return replace(result, chosen=empty, fitted=None, detected=detected)
-    if best.name in searched.chosen.names and searched.fitted is not None:
+    if best.name in searched.chosen.names:
         return replace(searched, detected=detected)
-    if result.alone_rays is None:
-        return replace(searched, detected=detected)
-    subsets = [frozenset[str]() for _ in result.tables]
-    start: list[dict[str, np.ndarray]] = [{} for _ in subsets]
+    alone = result.alone or result.tables
+    subsets = [frozenset[str]() for _ in alone]
+    start: list[dict[str, np.ndarray]] = [{} for _ in alone]
     for j in best.joints:
         subsets[j] = frozenset({best.name})
-        start[j] = dict(result.alone[j].score(subsets[j]).sizes)
-    fitted = fit_set(result.residuals, subsets, result.alone_rays, start)
-    gain = sum(result.alone[j].score(subsets[j]).total for j in best.joints)
+        start[j] = dict(alone[j].score(subsets[j]).sizes)
+    gain = sum(alone[j].score(subsets[j]).total for j in best.joints)
+    chosen, fitted, rays = EffectSet(tuple(subsets), gain), None, result.rays
+    if result.alone_rays is not None:
+        rays = result.alone_rays
+        fitted = fit_set(result.residuals, subsets, rays, start)
     return replace(
-        result,
-        tables=list(result.alone),
-        rays=result.alone_rays,
-        chosen=EffectSet(tuple(subsets), gain),
-        fitted=fitted,
-        detected=detected,
+        result, tables=list(alone), rays=rays, chosen=chosen, fitted=fitted, detected=detected
     )
+
+
+def is_unknown(choice: Choice, result: DetectionResult) -> bool:
+    """Return whether an unknown cause is told: nothing that was detected for sure stands beside it."""
+    return choice.verdict == "unknown" and not result.detected

@@ -128,7 +128,7 @@ class DiagnosisPipeline:
         weighed["hypotheses"] = hypotheses.serialize_hypotheses(known)
         weighing = hypotheses.choose_hypothesis(known, self.calibration)
         result = hypotheses.adopt_choice(result, weighing, self.penalties, self.calibration)
-        unknown = weighing.verdict == "unknown" and not result.detected
+        unknown = hypotheses.is_unknown(weighing, result)
         seen = verdict.judge_findings(
             result, self.case, self.base, rivals, self.thresholds, self.generator, unknown
         )

@@ -147,6 +147,21 @@ def test_no_effect_is_kept_beside_another_verdict(weights: ProbabilityModel, ver
     assert not kept.chosen.names and kept.fitted is None
 
 
+@pytest.mark.parametrize(("shown", "unknown"), [(0.95, False), (0.6, True)])
+def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
+    weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch, shown: float, unknown: bool
+) -> None:
+    prices: Penalties = option("prices", "default")
+    one = SimpleNamespace(kind=SimpleNamespace(name="link_length", stage="kinematics"))
+    result = dataclasses.replace(findings(0.5, ("lag",)), detected=cast(Any, [one]))
+    monkeypatch.setattr(hypotheses.decision, "read_detected_signs", lambda *_: {})
+    monkeypatch.setattr(hypotheses.calibration, "compute_probability", lambda *_: shown)
+    monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
+    choice = choice_of("unknown", "lag")
+    kept = hypotheses.adopt_choice(result, choice, prices, weights)
+    assert hypotheses.is_unknown(choice, kept) is unknown and not kept.chosen.names
+
+
 def test_the_searched_set_stays_where_it_holds_the_likeliest_effect(
     weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
