@@ -325,8 +325,14 @@ def drop_unlikely_effects(
     The rest is judged again each time: an effect may gain only beside another.
     """
     kept = result
+    held = result.fitted.held if result.fitted else ()
+    # Sizes that carry further than the likelihood's say more than its gain.
+    shown = frozenset[str]().union(*(result.chosen.subsets[j] for j in held))
     while len(chances := compute_effect_probabilities(kept, penalties, weights)) > 1:
-        least = min(chances, key=chances.__getitem__)
+        rest = chances.keys() - shown
+        if not rest:
+            break
+        least = min(rest, key=chances.__getitem__)
         if chances[least] >= MIN_NAMED:
             break
         chosen = EffectSet(

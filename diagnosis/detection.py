@@ -71,8 +71,6 @@ class Penalties:
         partial: For each joint that lacks an effect with one cause for all joints.
         share: Least part of the gain of its joint's set: an effect that adds less only corrects the
             form of another.
-        tool: Error of measured tool points over that of the reference from which something unknown
-            is there.
     """
 
     joint: float
@@ -80,7 +78,6 @@ class Penalties:
     name: float
     partial: float
     share: float
-    tool: float
 
 
 @dataclass(frozen=True)

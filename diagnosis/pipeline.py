@@ -36,13 +36,17 @@ from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
 from diagnosis.effect_library import DetectedEffect, EffectSimulator, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
-from diagnosis.hypotheses import Choice
+from diagnosis.hypotheses import Choice, Hypothesis
 from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
+from diagnosis.rivals import Rival
 from diagnosis.speed_curves import SpeedCurves
 from diagnosis.stages import Survey, examine_gap
 from diagnosis.verdict import Judgement
 
+MAX_TRIED = 3
+"""Effects that are tried in turn where the likeliest fail their gates. Chosen by hand: each is fitted
+by simulation."""
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
 CURVE_SEED = 0
@@ -126,12 +130,7 @@ class DiagnosisPipeline:
         shared = effect_library.list_shared_effects(self.kinds)
         known = hypotheses.list_hypotheses(result, self._known(), self.penalties, shared)
         weighed["hypotheses"] = hypotheses.serialize_hypotheses(known)
-        weighing = hypotheses.choose_hypothesis(known, self.calibration)
-        result = hypotheses.adopt_choice(result, weighing, self.penalties, self.calibration)
-        unknown = hypotheses.is_unknown(weighing, result)
-        seen = verdict.judge_findings(
-            result, self.case, self.base, rivals, self.thresholds, self.generator, unknown
-        )
+        weighing, seen = self._settle(result, known, rivals)
         result, reach = seen.result, seen.reach
         foretold = reach.foretold()
         named = seen.verdict == "effects"
@@ -163,6 +162,26 @@ class DiagnosisPipeline:
             | self._unseen(result, seen.fitted),
         )
         return Outcome(answer, before, after, floor)
+
+    def _settle(
+        self, result: DetectionResult, known: Sequence[Hypothesis], rivals: Mapping[str, Rival]
+    ) -> tuple[Choice, Judgement]:
+        """Return the choice and its verdict: an effect that fails its gates is left out, and the rest is weighed again."""
+        tried = 0
+        while True:
+            choice = hypotheses.choose_hypothesis(known, self.calibration)
+            found = hypotheses.adopt_choice(result, choice, self.penalties, self.calibration)
+            unknown = hypotheses.is_unknown(choice, found)
+            seen = verdict.judge_findings(
+                found, self.case, self.base, rivals, self.thresholds, self.generator, unknown
+            )
+            if choice.best is None or found.fitted is None or seen.fitted is not None:
+                return choice, seen
+            tried += 1
+            if tried < MAX_TRIED:
+                known = [one for one in known if one.name != choice.best.name]
+            else:
+                known = [one for one in known if one.verdict != "effects"]
 
     def _examine(
         self, before: WindowedRuns, floor: WindowedRuns | None, after: WindowedRuns | None

@@ -13,7 +13,7 @@ import numpy as np
 from brokk_rl.machine import Machine
 from diagnosis.effect_library import EffectType
 from diagnosis.nonadditive_refit import combine_best
-from diagnosis.refine import FittedSet, fit_set, hold_set, list_subsets
+from diagnosis.refine import FittedSet, fit_set, hold_set, list_sizes, list_subsets
 from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import Response
 from diagnosis.search import PenaltyFunction
@@ -96,11 +96,7 @@ def keep_shown_numbers(
     shown = _list_sizes(proposed, rays, shapes)
     if not any(shown):
         return None
-    known: list[dict[str, np.ndarray]] = [{} for _ in shown]
-    for ray, sizes, mask in zip(found.rays, found.sizes, found.mask, strict=True) if found else ():
-        for j in np.flatnonzero(mask):
-            own = known[j].setdefault(ray.kind.name, np.zeros(0))
-            known[j][ray.kind.name] = np.append(own, sizes[j])
+    known = list_sizes(found) if found else [{} for _ in shown]
     measured = residuals.simulator.cut.measured
     fixed = hold_set(residuals, rays, shown)
     paths = [residuals.base, found.after if found else residuals.base, fixed.after]
@@ -108,9 +104,8 @@ def keep_shown_numbers(
     better = errors[1] - errors[2] > LEAST_BETTER * errors[0]
     if not better.any():
         return None
-    return hold_set(
-        residuals, rays, [shown[j] if has else known[j] for j, has in enumerate(better)], found
-    )
+    sizes = [shown[j] if has else known[j] for j, has in enumerate(better)]
+    return hold_set(residuals, rays, sizes, found, frozenset(np.flatnonzero(better).tolist()))
 
 
 def compute_sizes(

@@ -34,7 +34,6 @@ log = logging.getLogger(__name__)
 
 RANGES = {
     "joint": (2.0, 12.0), "reference": (0.5, 3.0), "name": (2.0, 25.0), "partial": (2.0, 25.0), "share": (0.005, 0.08),
-    "tool": (1.5, 3.0),
 }  # fmt: skip
 """Ranges of the penalties, log-uniform; chosen by hand: wider than any good answer needs."""
 TRIAL_SIGMA = 0.25
