@@ -131,9 +131,8 @@ class DiagnosisPipeline:
         known = hypotheses.list_hypotheses(result, self._known(), self.penalties, shared)
         weighed["hypotheses"] = hypotheses.serialize_hypotheses(known)
         weighing, seen = self._settle(result, known, rivals)
-        result, reach = seen.result, seen.reach
+        result, reach, named = seen.result, seen.reach, seen.verdict == "effects"
         foretold = reach.foretold()
-        named = seen.verdict == "effects"
         parts = EffectAttribution(result, reach).measure_parts() if named else {}
         selected = self._describe_detected(result, seen.found, parts)
         selected += self._selected(result, parts, weighing) if seen.fitted else []
@@ -166,7 +165,7 @@ class DiagnosisPipeline:
     def _settle(
         self, result: DetectionResult, known: Sequence[Hypothesis], rivals: Mapping[str, Rival]
     ) -> tuple[Choice, Judgement]:
-        """Return the choice and its verdict: an effect that fails its gates is left out, and the rest is weighed again."""
+        """Return choice and verdict: an effect that fails its gates is left out, and the rest weighed again."""
         tried = 0
         while True:
             choice = hypotheses.choose_hypothesis(known, self.calibration)
@@ -178,9 +177,8 @@ class DiagnosisPipeline:
             if choice.best is None or found.fitted is None or seen.fitted is not None:
                 return choice, seen
             tried += 1
-            if tried < MAX_TRIED:
-                known = [one for one in known if one.name != choice.best.name]
-            else:
+            known = [one for one in known if one.name != choice.best.name]
+            if tried == MAX_TRIED:
                 known = [one for one in known if one.verdict != "effects"]
 
     def _examine(
