@@ -184,7 +184,8 @@ class DiagnosisPipeline:
     def _examine(
         self, before: WindowedRuns, floor: WindowedRuns | None, after: WindowedRuns | None
     ) -> Survey:
-        machine, dead_time_s = self.case.machine, self._dead_time_s()
+        machine = self.case.machine
+        dead_time_s = np.full(machine.num_joints, machine.dead_time_s)
         return examine_gap(
             before, floor, after, machine, self.thresholds, dead_time_s, self.generator
         )
@@ -330,9 +331,6 @@ class DiagnosisPipeline:
             np.concatenate(row),
             np.concatenate(paths).astype(float),
         )
-
-    def _dead_time_s(self) -> np.ndarray:
-        return np.full(self.case.machine.num_joints, self.case.machine.dead_time_s)
 
     def _more(
         self, result: DetectionResult, weighed: Mapping[str, Any], foretold: Estimate | None
