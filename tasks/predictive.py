@@ -164,9 +164,7 @@ class PredictivePlanner:
         base = groups["guide"][:, : command.shape[1]] if action.kind == "residual" else 0.0
         return (command - base) / action.scale
 
-    def _draw(
-        self, plan: torch.Tensor, classical: torch.Tensor, q: torch.Tensor
-    ) -> torch.Tensor:
+    def _draw(self, plan: torch.Tensor, classical: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Return sequences of speeds, of full speed, `(N, K, T, J)`, around `plan`, `(N, T, J)`.
 
         Args:

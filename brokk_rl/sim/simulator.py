@@ -15,7 +15,7 @@ from brokk_rl.spec import spec
 if TYPE_CHECKING:
     import torch
 
-    from brokk_rl.contracts.world import World
+    from brokk_rl.contracts.world import Property, World
     from brokk_rl.sim.native_world import NativeWorld
     from brokk_rl.sim.warp_world import WarpWorld
 
@@ -42,9 +42,15 @@ class NativeSimulator:
             )
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> NativeWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
+
+        `varied` names properties of the machine that differ from world to world.
 
         Raises:
             DeviceError: `device` is not the CPU.
@@ -57,7 +63,7 @@ class NativeSimulator:
         from brokk_rl.sim.native_world import NativeWorld
 
         return NativeWorld(
-            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads
+            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads, varied
         )
 
 
@@ -106,9 +112,15 @@ class WarpSimulator:
             )
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> WarpWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
+
+        `varied` names properties of the machine that differ from world to world.
 
         On a CPU this is slow and meant for tests.
 
@@ -138,6 +150,7 @@ class WarpSimulator:
             linesearch_iterations=self.linesearch_iterations,
             tolerance=self.tolerance,
             fused=self.fused,
+            varied=varied,
         )
 
 
@@ -154,11 +167,15 @@ class AutoSimulator:
     warp: WarpSimulator
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> World:
         """Return the worlds on `device`; `num_worlds` overrides the configured number."""
         chosen = self.native if _is_cpu(device) else self.warp
-        return chosen.build(machine, device, num_worlds)
+        return chosen.build(machine, device, num_worlds, varied)
 
 
 def _is_cpu(device: torch.device | str) -> bool:
