@@ -325,6 +325,7 @@ class ArmDynamics:
 
 def _view_parameter(parameters: wp.array, index: int) -> wp.array:
     """Return one number of each vector of an array `(N, J)` of vectors, without a copy."""
+    assert parameters.ptr is not None
     size = wp.types.type_size_in_bytes(wp.float32)
     return wp.array(
         ptr=parameters.ptr + index * size,

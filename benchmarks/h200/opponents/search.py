@@ -26,6 +26,7 @@ from hydra.utils import instantiate
 
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from tasks.classical import ClassicalController, ControllerGuidance
+from tasks.process import ToolPoseProcess
 
 SEED = 20261123
 NUM_CANDIDATES, NUM_STARTS, NUM_ELITES = 32, 64, 6
@@ -102,7 +103,8 @@ class CandidateController:
             in_flight = (given["in_flight_samples"] - age).clamp(0.0, 1.0)
             one._in_flight = in_flight[:, None] * period_s
             one._damping = given["damping"] ** 2 * identity
-            found = one.guide(*inputs, reach_m)
+            q, u, target_m, pitch_rad = inputs
+            found = one.guide(q, u, target_m, pitch_rad, reach_m)
             return tuple(getattr(found, name) for name in names)
 
         count = len(self._numbers)
@@ -135,8 +137,11 @@ class Trial:
         )
         first = torch.tensor(list_numbers(self.config), device=device)
         self.numbers = first.repeat(NUM_CANDIDATES, 1)
-        control = self.loop.task.control
-        control.controller = CandidateController(control.controller, self.numbers, straight)
+        task = self.loop.task
+        assert isinstance(task, ToolPoseProcess)
+        control = task.control
+        candidates: Any = CandidateController(control.controller, self.numbers, straight)
+        control.controller = candidates
         self.loop.capture()
 
     def run(self, numbers: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:

@@ -95,7 +95,7 @@ def main(folder: Path, plants: list[str], before: dict[str, Any]) -> None:
             for name in ("machine", "sim", "task", "actuator", "follower")
         }
         config = ControlLoopConfig(**parts, effects=instantiate(cfg.effect, _convert_="all"))
-        task = config.task
+        task: Any = config.task
         trained = TrainedPolicy(folder="tasks:policies/borehole_insertion")
         numbers = dataclasses.replace(task.classical, **before)
         cases = {
