@@ -1,4 +1,4 @@
-"""What the backends simulate of a machine, as a table: the parts of its MJCF, and measured parity."""
+"""Table of the parts of an MJCF that each backend simulates, with its measured parity."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ WORDS = {"native": "sim=native", "staged": "sim.fused=false", "fused": "sim=warp
 def inspect_machine(
     machine: Machine, simulator: WarpSimulator, device: torch.device
 ) -> dict[str, Any]:
-    """Return what each backend simulates of a machine, as plain JSON data.
+    """Return the parts that each backend simulates of a machine, as plain JSON data.
 
     Args:
         machine: The machine.
@@ -56,7 +56,7 @@ def inspect_machine(
 
 
 def show_machine(found: dict[str, Any]) -> None:
-    """Print what `inspect_machine` returned."""
+    """Print the result of `inspect_machine`."""
     console = Console()
     title = f"{found['machine']}: parts of the MJCF that not every backend simulates"
     table = Table(title=title, box=None, padding=(0, 2, 0, 0), title_justify="left")

@@ -1,4 +1,4 @@
-"""What the backends simulate of a MuJoCo model: a list of every field that a model has.
+"""List of every field of a MuJoCo model, and of the backends that simulate it.
 
 MuJoCo C (`sim=native`) simulates all of MuJoCo. `sim=warp` leaves stages out so that a control step
 takes few launches, and our kernels (`sim.fused`) write the dynamics of one kind of machine anew: a
@@ -317,7 +317,7 @@ def list_unknown_fields(model: mujoco.MjModel) -> list[str]:
 
 
 def list_left_out(model: mujoco.MjModel, backend: Backend) -> list[str]:
-    """Return what a model has and a backend does not simulate, as an error names it.
+    """Return the parts of a model that a backend does not simulate, as an error names them.
 
     An unknown field counts for all but `native` where it differs from MuJoCo's default.
     """
@@ -325,7 +325,7 @@ def list_left_out(model: mujoco.MjModel, backend: Backend) -> list[str]:
     if backend != "native":
         bare = mujoco.MjModel.from_xml_string(_BARE_MJCF)
         for name in list_unknown_fields(model):
-            if _differs(read_field(model, name), read_field(bare, name)):
+            if _is_different(read_field(model, name), read_field(bare, name)):
                 found.append(f"'{name}', which is new in MuJoCo {mujoco.__version__}")
     return found
 
@@ -349,7 +349,7 @@ def check_simulated(model: mujoco.MjModel, machine: str, backend: Backend) -> No
     )
 
 
-def _differs(value: Any, default: Any) -> bool:
+def _is_different(value: Any, default: Any) -> bool:
     """Return whether a value, or a row of it, is not the default's, or is not zero without one."""
     value, default = np.asarray(value), np.asarray(default)
     if value.dtype.kind not in "biuf":

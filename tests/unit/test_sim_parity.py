@@ -1,4 +1,4 @@
-"""What each backend simulates of an MJCF: refused by name, or right against MuJoCo C."""
+"""Parts of an MJCF are refused by name, or simulated as MuJoCo C does."""
 
 import dataclasses
 
