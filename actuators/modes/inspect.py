@@ -151,9 +151,7 @@ class Inspect:
     def _inspect_machine(self) -> None:
         from brokk_rl.sim import machine_table
 
-        found = machine_table.inspect_machine(
-            self.machine, self.sim, self.session.torch_device()
-        )
+        found = machine_table.inspect_machine(self.machine, self.sim, self.session.torch_device())
         write_json(self.session.folder / "machine.json", found)
         machine_table.show_machine(found)
 

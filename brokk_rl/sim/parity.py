@@ -69,7 +69,7 @@ class ParityResult:
 
     @property
     def is_alike(self) -> bool:
-        """Whether the simulator may be used for this machine."""
+        """True where the simulator may be used for this machine."""
         return self.num_different <= EXCEPTIONS * self.num_worlds / 64
 
     def describe(self) -> str:
