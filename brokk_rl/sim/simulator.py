@@ -148,9 +148,15 @@ class WarpSimulator:
             device = torch.device("cuda", torch.cuda.current_device())
         if self.parity_worlds:
             _check_parity(self, machine, device)
-        return self._make_world(machine, device, _choose(num_worlds, self.num_worlds))
+        return self._make_world(machine, device, _choose(num_worlds, self.num_worlds), varied)
 
-    def _make_world(self, machine: Machine, device: torch.device, num_worlds: int) -> WarpWorld:
+    def _make_world(
+        self,
+        machine: Machine,
+        device: torch.device,
+        num_worlds: int,
+        varied: tuple[Property, ...] = (),
+    ) -> WarpWorld:
         from brokk_rl.sim.warp_world import WarpWorld
 
         return WarpWorld(
