@@ -55,7 +55,8 @@ def main() -> None:
             seed, count, file_s = given.seed, given.cases, 60.0 * minutes / NUM_FILES
             run(HERE, Path(folder), "mode=exam", "exam.do=make", f"session.seed={seed}", f"exam.mix.num_cases={count}",
                 "exam.mix.shares={none: 0.0, faint: 0.0, one: 0.5, several: 0.5, outside: 0.0}", "exam.mix.tracked_share=0.0",
-                f"exam.field.file_s={file_s}", f"session.out={exam}", "session.device=cpu", f"exam.workers={given.makers}")  # fmt: skip
+                f"exam.field.file_s={file_s}", f"session.out={exam}", "session.device=cpu",
+                f"exam.workers={given.makers}")  # fmt: skip
             for case in sorted((exam / "cases").iterdir()):
                 row: dict[str, Any] = {"case": case.name, "field_minutes": minutes}
                 for name, (tree, workers) in versions.items():
