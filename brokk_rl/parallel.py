@@ -56,20 +56,22 @@ def map_parallel(
     """
     todo = list(items)
 
-    def work(number: int) -> Result:
+    def begin(number: int) -> Result:
         if tell:
             tell(todo[number], number / len(todo))
         return function(todo[number])
 
     count = min(_workers.get(), len(todo))
     if count < 2 or not _can_fork():
-        return [work(number) for number in range(len(todo))]
+        return [begin(number) for number in range(len(todo))]
     context = multiprocessing.get_context("fork")
     place: Any = context.Value("i", 0)
     helpers = []
     for _ in range(count - 1):
         receiving, sending = context.Pipe(duplex=False)
-        process = context.Process(target=_work, args=(function, todo, place, sending), daemon=True)
+        process = context.Process(
+            target=_serve_items, args=(function, todo, place, sending), daemon=True
+        )
         with warnings.catch_warnings():
             # Helpers neither log nor take locks of other threads.
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -80,7 +82,7 @@ def map_parallel(
     try:
         with use_workers(1):
             while (number := _take(place, len(todo))) is not None:
-                found[number] = work(number)
+                found[number] = begin(number)
         limit_s = PATIENCE_S + PATIENCE * (time.monotonic() - begun_s)
         for _, receiving in helpers:
             with contextlib.suppress(EOFError, OSError):
@@ -92,7 +94,7 @@ def map_parallel(
             process.kill()
             process.join()
     # The work of a helper that failed is done here, where its error is raised too.
-    return [found[number] if number in found else work(number) for number in range(len(todo))]
+    return [found[number] if number in found else begin(number) for number in range(len(todo))]
 
 
 def _can_fork() -> bool:
@@ -107,7 +109,7 @@ def _take(place: Any, count: int) -> int | None:
     return number if number < count else None
 
 
-def _work(
+def _serve_items(
     function: Callable[[Item], Any], items: list[Item], place: Any, sending: Connection
 ) -> None:
     """Do items until none is left or one fails, then send the results by number."""
