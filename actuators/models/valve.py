@@ -15,7 +15,7 @@ The curve takes in dead bands, gain, asymmetry, notches and saturation; load and
 cylinder are in the pose.
 """
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -92,6 +92,21 @@ class ValveActuator:
         """
         return ValveModel(self, machine, num_envs, device)
 
+    def export_tables(self, machine: Machine) -> dict[str, Any]:
+        """Return all numbers by joint, as plain data, for a computer without torch.
+
+        Raises:
+            ConfigError: as `build`, or the weight on the joints is no sum of sines and cosines.
+        """
+        model = self.build(machine, 1, torch.device("cpu"))
+        found: dict[str, Any] = {name: model.parameters[name][0].tolist() for name in NUMBERS}
+        found["knots"] = list(self.knots)
+        for name, value in _list_curves(self):
+            rows = _expand_rows(value, machine, len(self.knots), f"actuator.{name}")
+            found[name] = rows.tolist()
+        found["pose"] = model.export_pose()
+        return found
+
 
 class PoseFeatures:
     """Features of the speed besides the command: load, its square, and all positions.
@@ -140,6 +155,21 @@ class PoseFeatures:
             return place
         weight = self._weight(q)[..., None]
         return torch.cat((weight, weight.square(), place), 2)
+
+    def export_weight(self) -> dict[str, Any]:
+        """Return the sums of angles and the coefficients of the weight; empty without masses.
+
+        Raises:
+            ConfigError: the weight is no sum of sines and cosines.
+        """
+        if not self._weighs:
+            return {"sums": [], "linear": []}
+        if not self._planar:
+            raise ConfigError(
+                "actuator: expected an arm whose weight is a sum of sines and cosines of its angles; "
+                "leave out pose_extend and pose_retract"
+            )
+        return {"sums": self._sums.tolist(), "linear": self._linear.tolist()}
 
     def _weight(self, q: torch.Tensor) -> torch.Tensor:
         return (
@@ -217,6 +247,17 @@ class ValveModel:
     def state(self) -> dict[str, torch.Tensor]:
         """`pilot`, `spool` (of full stroke), `step` (motion in a period), each `(N, J)`; draws."""
         return {**self._state, "fresh": self._fresh, **self._parameters.state}
+
+    def export_pose(self) -> dict[str, Any] | None:
+        """Return the tables of the pose as plain data; `None` without any.
+
+        Raises:
+            ConfigError: the weight on the joints is no sum of sines and cosines.
+        """
+        if self._pose is None:
+            return None
+        extend, retract = (slope.tolist() for slope in self._slopes)
+        return self._pose.export_weight() | {"extend": extend, "retract": retract}
 
     def reset(self, mask: torch.Tensor) -> None:
         """Let the environments of `mask`, `(N,)` bool, start from their history."""
