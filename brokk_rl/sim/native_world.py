@@ -8,6 +8,7 @@ from mujoco.batch import Batch, SimulationError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model, mask_contact_sensors
+from brokk_rl.sim.model_features import check_simulated
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
 
@@ -28,6 +29,7 @@ class NativeWorld:
     def __init__(self, machine: Machine, num_worlds: int, substeps: int, num_threads: int) -> None:
         self.num_worlds, self.device = num_worlds, torch.device("cpu")
         self.model = compile_model(machine, machine.period_s / substeps)
+        check_simulated(self.model, machine.name, "native")
         self._batch = Batch(self.model, num_worlds, num_threads)
         self._substeps = substeps
         self._state, self._warning = (
@@ -43,6 +45,8 @@ class NativeWorld:
         self._geom_size, self._geom_pos = (
             torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos")
         )
+        # zeros would switch the equalities of the MJCF off
+        self._first_state = self._state[0].clone()
         self._placement = ScenePlacement(self.model, self.device, torch.float64)
         self._drive = DriveReferences(self.model, machine, num_worlds, self.device, torch.float64)
         # touch sensors measure in every substep; recording them all catches a peak between two
@@ -82,7 +86,7 @@ class NativeWorld:
         if not len(rows):
             return
         start, placed = q[rows], scene[rows]
-        self._state[rows] = 0.0
+        self._state[rows] = self._first_state
         self._qpos[rows] = self._act[rows] = start.double()
         self._drive.reset(mask, q)
         position, turn = self._placement.pose(placed)

@@ -27,10 +27,6 @@ import mujoco_warp as mjw
 import numpy as np
 import warp as wp
 
-MAX_DOFS = 16
-"""Up to here Warp unrolls the loops over degrees of freedom; beyond, a solver for any size is the
-better one."""
-
 
 class JointAlgebra(NamedTuple):
     """Types and functions of Warp for one number of degrees of freedom.
