@@ -49,7 +49,9 @@ def moving(
     base = start[:, None] + np.cumsum(np.repeat(way, INCREMENT_SAMPLES, 1) / INCREMENT_SAMPLES, 1)
     return cast(
         Residuals,
-        SimpleNamespace(increments=way, base=base, start=start, simulator=simulator, **white),
+        SimpleNamespace(
+            increments=way, base=base, start=start, simulator=simulator, z=None, **white
+        ),
     )
 
 
