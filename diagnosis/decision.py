@@ -100,18 +100,14 @@ def restore_result(
                 )
             )
     residuals = cast(Residuals, SimpleNamespace(z=np.zeros((len(tables), told["entries"]))))
-    arrays = {
-        "clue_gains": np.array(told["left"]),
-        "reference_clue_gains": np.array(told["left_null"]),
-        "scatter": np.array(told["scatter"]),
-        "strays": np.array(told["strays"]),
-    }
     rays = {}
     for joint in told["joints"]:
         rays |= {name: [] for name in joint["felt"]}
     return DetectionResult(
-        residuals, tables, rays, price, chosen, None, others, tool_left=told["tool_left"], **arrays
-    )
+        residuals, tables, rays, price, chosen, None, others,
+        np.array(told["left"]), np.array(told["left_null"]), np.array(told["scatter"]),
+        np.array(told["strays"]), told["tool_left"],
+    )  # fmt: skip
 
 
 def choose_again(
