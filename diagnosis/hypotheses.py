@@ -17,10 +17,10 @@ import numpy as np
 
 from diagnosis import calibration, decision
 from diagnosis.answer import Ranked, Selected, Verdict
-from diagnosis.calibration import LITTLE_NATS, ProbabilityModel
+from diagnosis.calibration import LITTLE_NATS, MUCH_NATS, ProbabilityModel
 from diagnosis.detection import DetectionResult, Penalties
 from diagnosis.gap import GapClosure
-from diagnosis.refine import fit_set
+from diagnosis.refine import compute_gain, fit_set
 from diagnosis.search import MIN_SIZE, EffectSet, Subset
 
 # Chosen by hand; not searched.
@@ -32,6 +32,9 @@ SAME_ODDS = 0.4
 """Odds against the likeliest effect from which recordings cannot tell another one from it: 2.5 to 1."""
 MAX_SAME = 3
 """Most names that are given as equivalent."""
+SET_RATIO = 1.5
+"""Gain of a set over that of the likeliest effect alone from which the set is told, where it does not hold
+that effect."""
 MIN_NAMED = 0.5
 """Probability from which an effect that sensors, frames or tool points show is named."""
 MAX_LISTED = 8
@@ -230,15 +233,15 @@ def adopt_choice(
     if choice.verdict != "effects" or best is None:
         empty = EffectSet((frozenset(),) * len(result.tables), 0.0)
         return replace(result, chosen=empty, fitted=None, detected=detected)
-    if best.name in searched.chosen.names:
-        return replace(searched, detected=detected)
     alone = result.alone or result.tables
+    gain = sum(alone[j].score(frozenset({best.name})).total for j in best.joints)
+    if best.name in searched.chosen.names or _explains_more(searched, gain):
+        return replace(searched, detected=detected)
     subsets = [frozenset[str]() for _ in alone]
     start: list[dict[str, np.ndarray]] = [{} for _ in alone]
     for j in best.joints:
         subsets[j] = frozenset({best.name})
         start[j] = dict(alone[j].score(subsets[j]).sizes)
-    gain = sum(alone[j].score(subsets[j]).total for j in best.joints)
     chosen, fitted, rays = EffectSet(tuple(subsets), gain), None, result.rays
     if result.alone_rays is not None:
         rays = result.alone_rays
@@ -246,6 +249,14 @@ def adopt_choice(
     return replace(
         result, tables=list(alone), rays=rays, chosen=chosen, fitted=fitted, detected=detected
     )
+
+
+def _explains_more(searched: DetectionResult, gain: float) -> bool:
+    """Return whether a set of the search explains much more than `gain`: no effect alone explains a large gap."""
+    if searched.fitted is None or len(searched.chosen.names) < 2:
+        return False
+    explained = compute_gain(searched.residuals.z, searched.fitted.z)
+    return explained > max(SET_RATIO * gain, gain + MUCH_NATS)
 
 
 def is_unknown(choice: Choice, result: DetectionResult) -> bool:
