@@ -179,3 +179,22 @@ def test_the_searched_set_stays_where_it_holds_the_likeliest_effect(
     )
     ((_, subsets, _, start),) = fits
     assert subsets == [{"dead_band"}, set()] and set(start[0]) == {"dead_band"}
+
+
+@pytest.mark.parametrize(("left", "kept"), [(0.0, True), (1.0, False)])
+def test_a_set_that_explains_half_as_much_again_is_told(
+    weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch, left: float, kept: bool
+) -> None:
+    """No effect alone explains a large gap, so that the likeliest one need not be part of the cause."""
+    prices: Penalties = option("prices", "default")
+    result = findings(0.5, ("lag", "play"))
+    z = np.full((2, 800), 3.0)
+    result = dataclasses.replace(
+        result,
+        residuals=cast(Any, SimpleNamespace(z=z)),
+        fitted=cast(Any, SimpleNamespace(z=left * z)),
+    )
+    monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
+    monkeypatch.setattr(hypotheses, "fit_set", lambda *_: "anew")
+    found = hypotheses.adopt_choice(result, choice_of("effects", "dead_band"), prices, weights)
+    assert (found.fitted is result.fitted) is kept
