@@ -99,7 +99,7 @@ def list_hypotheses(
 
 @dataclass(frozen=True)
 class _JointRow:
-    """What a joint says about an effect: gain, gain on the reference, gain beyond its price there, size."""
+    """Evidence of a joint for an effect: gain, gain on the reference, gain beyond its price there, size."""
 
     joint: int
     gain: float
