@@ -23,7 +23,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
 from tasks.control import DeployedPolicy, ToolPoseControl
 from tasks.noise import MeasuredNoise, ObservationNoise
-from tasks.reward import RewardTerm, ToolState
+from tasks.reward import RewardCurriculum, RewardTerm, ToolState
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
@@ -86,6 +86,7 @@ class ToolPoseOptions:
     scaling: TargetScaling
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
+    curriculum: RewardCurriculum | None
 
     @classmethod
     def of(cls, task: object, **fixed: Any) -> Self:
@@ -144,9 +145,10 @@ class ToolPoseProcess:
         self._kinematics = Kinematics(machine, device)
         self._lower = to_constant(machine.lower) + options.limit_margin
         self._upper = to_constant(machine.upper) - options.limit_margin
-        self._terms: list[tuple[Callable[[ToolState], torch.Tensor], float]] = [
-            (resolve_name(term.function), term.weight) for term in options.reward.values()
-        ]
+        self._terms: dict[str, tuple[Callable[[ToolState], torch.Tensor], float]] = {
+            name: (resolve_name(term.function), term.weight)
+            for name, term in options.reward.items()
+        }
         self.state = {
             name: torch.zeros((num_envs, *shape), device=device)
             for name, shape in self._list_state_shapes().items()
@@ -164,6 +166,8 @@ class ToolPoseProcess:
         shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,)}
         shapes |= {"q_scale": (), "u_scale": ()}
         shapes |= {"steps": (), "age": ()}
+        if self.options.curriculum:
+            shapes["succeeded"] = ()
         # the step before
         shapes |= {"u": joints, "u_before": joints, "closeness": (), "contact_force_n": ()}
         # the observation, and what the next command needs of it
@@ -200,6 +204,7 @@ class ToolPoseProcess:
             "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1),
             "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1),
             "closeness": start["closeness"],
+            "succeeded": self.episode["success_strict"],
         }
         zero = torch.zeros((), device=mask.device)
         for name, value in state.items():
@@ -244,8 +249,7 @@ class ToolPoseProcess:
         force_n = torch.where(fault, 0.0, world.contact_force_n)
         success = verdict["success"] & ~fault & ~touching
         tool = self._make_tool_state(pose, verdict, force_n, success, failed)
-        reward = sum(weight * term(tool) for term, weight in self._terms)
-        reward = torch.where(fault | touching, 0.0, reward)
+        reward = torch.where(fault | touching, 0.0, self._sum_reward(tool))
         timed_out = state["steps"] >= self.max_episode_steps
         ended = failed | touching | fault
         if options.end_on_success:
@@ -259,6 +263,14 @@ class ToolPoseProcess:
             reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason
         )
 
+    def _sum_reward(self, tool: ToolState) -> torch.Tensor:
+        """Return the weighted sum of all terms, `(N,)`."""
+        curriculum, reward = self.options.curriculum, torch.zeros_like(tool.reach_m)
+        scale = curriculum.scale(self.state["succeeded"]) if curriculum else {}
+        for name, (term, weight) in self._terms.items():
+            reward = reward + scale.get(name, 1.0) * weight * term(tool)
+        return reward
+
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
@@ -270,7 +282,7 @@ class ToolPoseProcess:
         estimate_m = self._estimate_target(shift_m)
         seen = self.control.process(
             estimate_m,
-            history.q * state["q_scale"][:, None, None],
+            self._scale_positions(history.q),
             history.u * state["u_scale"][:, None, None],
             state["start.target_pitch_rad"],
             state.get("proposed"),
@@ -395,6 +407,14 @@ class ToolPoseProcess:
             sample = state["estimate_sum_m"] / (state["age"] + 1)[:, None]
         state["estimate_m"].copy_(sample)
         return sample
+
+    def _scale_positions(self, q: torch.Tensor) -> torch.Tensor:
+        """Return measured positions `(N, H, J)` with this episode's scale error."""
+        scale = self.state["q_scale"][:, None, None]
+        if self.options.noise.q_scale_of == "position":
+            return q * scale
+        newest = q[:, -1:]
+        return newest + (q - newest) * scale
 
     def _compute_privileged(self, estimate_m: torch.Tensor) -> torch.Tensor:
         """Return the group that only the critic sees, scaled to about 1.

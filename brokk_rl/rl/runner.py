@@ -15,6 +15,7 @@ from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.errors import CheckpointError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
+from brokk_rl.rl.exploration import FlooredGaussian
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
@@ -78,6 +79,7 @@ class TrainingRunner(OnPolicyRunner):
                     self.training.budget.share_spent(self._book.env_steps, self._book.seconds)
                 )
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
+                self._move_floor(share)
             with contextlib.redirect_stdout(io.StringIO()):
                 self.learn(
                     num, init_at_random_ep_len=first and self.training.random_episode_lengths
@@ -89,6 +91,12 @@ class TrainingRunner(OnPolicyRunner):
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
+
+    def _move_floor(self, share_spent: float) -> None:
+        """Set the floor of the exploration noise where it has a schedule."""
+        distribution = self.alg.actor.distribution
+        if self.training.exploration and isinstance(distribution, FlooredGaussian):
+            distribution.set_floor(self.training.exploration.floor_at(share_spent))
 
     @property
     def _book(self) -> TrainingLogger:

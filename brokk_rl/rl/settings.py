@@ -15,6 +15,8 @@ from brokk_rl.spec import spec
 SETTLED_PART = 0.9
 """Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
 `TrainingConfig.settling`."""
+FLOORED = "brokk_rl.rl.exploration:FlooredGaussian"
+"""The distribution whose floor `Exploration` moves."""
 RUNNER_BOUNDS: dict[str, dict[str, Any]] = {
     "num_steps_per_env": {"least": 1, "whole": True},
     "algorithm.num_learning_epochs": {"least": 1, "whole": True},
@@ -65,6 +67,33 @@ class TrainingBudget:
 
 
 @spec
+class Exploration:
+    """Schedule of the floor of the exploration noise over the budget.
+
+    Attributes:
+        floor: Smallest standard deviation of the actions, (at the beginning, at the end).
+        over: Shares of the budget between which it falls; in equal ratios.
+    """
+
+    floor: tuple[float, float]
+    over: tuple[float, float]
+
+    def check(self) -> None:
+        for value in self.floor:
+            require_number("rl.exploration.floor", value, above=0)
+        require_range("rl.exploration.over", self.over, least=0)
+        require_number("rl.exploration.over", self.over[1], most=1)
+
+    def floor_at(self, share_spent: float) -> float:
+        """Return the floor when this share of the budget is spent."""
+        (first, last), (begin, end) = self.floor, self.over
+        done = float(share_spent >= end)
+        if end > begin:
+            done = min(1.0, max(0.0, (share_spent - begin) / (end - begin)))
+        return first * (last / first) ** done
+
+
+@spec
 class TrainingConfig:
     """Numbers of a training with rsl-rl's PPO.
 
@@ -78,6 +107,9 @@ class TrainingConfig:
         keep_checkpoints: Newest checkpoints kept.
         settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
             learn fast, small ones keep it.
+        exploration: Schedule of the floor of the exploration noise; `null` for that of the
+            distribution. The actor's distribution must be
+            `brokk_rl.rl.exploration:FlooredGaussian`.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
@@ -95,6 +127,7 @@ class TrainingConfig:
     save_interval: int
     keep_checkpoints: int
     settling: float
+    exploration: Exploration | None
     max_fault_rate: float
     fuse: bool
     random_episode_lengths: bool
@@ -107,6 +140,13 @@ class TrainingConfig:
         for name in ("settling", "max_fault_rate"):
             require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
         self._check_runner()
+        distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}
+        if self.exploration and distribution.get("class_name") != FLOORED:
+            raise ConfigError(
+                f"rl.exploration: expected the distribution {FLOORED} "
+                "(rl.runner.actor.distribution_cfg.class_name), got "
+                f"{distribution.get('class_name')}"
+            )
 
     def _check_runner(self) -> None:
         """Refuse numbers that rsl-rl would take without a word."""
