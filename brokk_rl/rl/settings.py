@@ -94,6 +94,29 @@ class Exploration:
 
 
 @spec
+class Teacher:
+    """A trained policy that a training follows at its beginning.
+
+    Attributes:
+        folder: Its bundle, as `policy.folder`; its task must act as the one that is trained.
+        weight: Weight of the mean squared distance between the actions of both at the beginning.
+        until: Share of the budget at which the weight has fallen to 0, linearly.
+    """
+
+    folder: str
+    weight: float
+    until: float
+
+    def check(self) -> None:
+        require_number("rl.teacher.weight", self.weight, above=0)
+        require_number("rl.teacher.until", self.until, above=0, most=1)
+
+    def weight_at(self, share_spent: float) -> float:
+        """Return the weight when this share of the budget is spent."""
+        return self.weight * max(0.0, 1.0 - share_spent / self.until)
+
+
+@spec
 class TrainingConfig:
     """Numbers of a training with rsl-rl's PPO.
 
@@ -110,6 +133,7 @@ class TrainingConfig:
         exploration: Schedule of the floor of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.exploration:FlooredGaussian`.
+        teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
@@ -128,6 +152,7 @@ class TrainingConfig:
     keep_checkpoints: int
     settling: float
     exploration: Exploration | None
+    teacher: Teacher | None
     max_fault_rate: float
     fuse: bool
     random_episode_lengths: bool
