@@ -41,9 +41,7 @@ class HistoryEncoding(nn.Module):
 
     def forward(self, vector: torch.Tensor) -> torch.Tensor:
         """Return the transformed vector, `(N, O + num_added)`."""
-        head, q, rest = vector.split(
-            (3, self._num, vector.shape[-1] - 3 - self._num), dim=-1
-        )
+        head, q, rest = vector.split((3, self._num, vector.shape[-1] - 3 - self._num), dim=-1)
         q = q.reshape(-1, *self._shape)
         increments = (q[:, 1:] - q[:, :-1]).flatten(1) * INCREMENT_GAIN
         place = torch.cat((head, q[:, -1]), -1)

@@ -17,7 +17,7 @@ from training import make, small, train
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.exploration import FlooredGaussian
-from brokk_rl.rl.settings import FLOORED, Exploration, TrainingConfig
+from brokk_rl.rl.settings import FLOORED, Exploration, Teacher, TrainingConfig
 
 
 def floored(training: TrainingConfig, **schedule: Any) -> TrainingConfig:
@@ -87,3 +87,9 @@ def test_a_schedule_for_another_distribution_is_refused() -> None:
 def test_shares_outside_of_the_budget_are_refused(over: tuple[float, float]) -> None:
     with pytest.raises(ConfigError, match="rl.exploration.over"):
         Exploration(floor=(0.5, 0.1), over=over)
+
+
+@pytest.mark.parametrize(("share", "weight"), [(0.0, 4.0), (0.25, 2.0), (0.5, 0.0), (0.9, 0.0)])
+def test_the_weight_of_a_teacher_falls_to_nothing(share: float, weight: float) -> None:
+    teacher = Teacher(folder="there", weight=4.0, until=0.5)
+    assert teacher.weight_at(share) == pytest.approx(weight)
