@@ -79,13 +79,13 @@ def test_training_moves_the_floor_and_a_checkpoint_keeps_it(
 
 
 def test_a_schedule_for_another_distribution_is_refused() -> None:
-    with pytest.raises(ConfigError, match="expected the distribution .*FlooredGaussian.*, got Gau"):
+    with pytest.raises(ConfigError, match=r"expected the distribution .*FlooredGaussian.*, got Gau"):
         replace(option("rl", "ppo"), exploration=Exploration(floor=(0.5, 0.1), over=(0.0, 1.0)))
 
 
 @pytest.mark.parametrize("over", [(0.6, 0.2), (-0.1, 0.5), (0.5, 1.1)])
 def test_shares_outside_of_the_budget_are_refused(over: tuple[float, float]) -> None:
-    with pytest.raises(ConfigError, match="rl.exploration.over"):
+    with pytest.raises(ConfigError, match=r"rl\.exploration\.over"):
         Exploration(floor=(0.5, 0.1), over=over)
 
 
