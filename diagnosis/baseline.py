@@ -40,7 +40,13 @@ from diagnosis.residuals import (
     fit_noise,
     weigh_residuals,
 )
-from diagnosis.responses import MIN_RESPONSE, Response, fit_faults, list_shape_trials
+from diagnosis.responses import (
+    MIN_RESPONSE,
+    Response,
+    fit_faults,
+    list_shape_trials,
+    simulate_trials,
+)
 from diagnosis.search import SubsetTable
 
 log = logging.getLogger(__name__)
@@ -401,11 +407,8 @@ def add_reference_effects(
             ways |= _list_trials(kind)
     if len(base.left_out) < 2 or base.is_flexible:
         return base
-    found = _find_effects(
-        [drop_windows(one.residuals, REFERENCE_WINDOWS) for one in base.left_out],
-        ways,
-        machine.joint_names,
-    )
+    parts = [drop_windows(one.residuals, REFERENCE_WINDOWS) for one in base.left_out]
+    found = _find_effects(parts, ways, machine.joint_names)
     return _wrap_simulator(base, found, machine) if found else base
 
 
@@ -434,9 +437,7 @@ def _find_effects(
     parts: Sequence[Residuals], ways: RaysByTrial, joint_names: Sequence[str]
 ) -> list[tuple[EffectType, EffectValues]]:
     """Return the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
-    responses: dict[str, list[list[np.ndarray]]] = {}
-    for key, way in ways.items():
-        responses[key] = [[part.response(ray) for part in parts] for ray in way]
+    responses = simulate_trials(parts, ways)
     of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
     found: dict[str, tuple[EffectType, dict[str, np.ndarray]]] = {}
     for j in range(parts[0].z.shape[0]):

@@ -20,7 +20,7 @@ import torch
 import yaml
 
 from brokk_rl import registry
-from brokk_rl.contracts.actuator import Actuator, ActuatorModel
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel, PlannedRun
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -307,59 +307,126 @@ class EffectSimulator:
             for kind, values in self.fixed
         ]
         effects = sorted([*effects, *fixed], key=lambda one: one[0].order)
-        windows = len(self.cut.q)
-        found = np.empty((count * windows, *self.cut.measured.shape[1:]), dtype=np.float32)
-        for start in range(0, len(found), BATCH_ROWS):
-            rows = np.arange(start, min(start + BATCH_ROWS, len(found)))
-            found[rows] = self._run(effects, own, rows // windows, rows % windows)
+        found = np.empty((count, *self.cut.measured.shape), dtype=np.float32)
+        at_once = max(1, BATCH_ROWS // len(self.cut.q))
+        for start in range(0, count, at_once):
+            part = np.arange(start, min(start + at_once, count))
+            found[part] = self._run(effects, own, part)
         if not np.isfinite(found).all():
             names = ", ".join(kind.name for kind, _ in effects) or "no effect"
             raise BrokkError(
                 f"the simulator ran into NaN in a free run with {names}; look at its fit"
             )
-        return found.reshape(count, windows, *found.shape[1:])
+        return found
 
     def _run(
         self,
         effects: Sequence[tuple[EffectType, EffectValues]],
         own: EffectValues,
-        candidate: np.ndarray,
-        window: np.ndarray,
+        candidates: np.ndarray,
     ) -> np.ndarray:
-        """Return one free run a row, `(N, K, J)`."""
-        cut, count, device = self.cut, len(window), torch.device("cpu")
+        """Return the free runs of some candidates, `(C, W, K, J)`."""
+        cut, windows, device = self.cut, len(self.cut.q), torch.device("cpu")
         size, before = cut.num_history, cut.num_before
+        count, rows = len(candidates) * windows, np.repeat(candidates, windows)
+        u = self._commands.repeat(1, len(candidates), 1)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(
-                self.seed + int(candidate[0])
+                self.seed + int(candidates[0])
             )  # rows of other batches draw other numbers
             model: Any = self.base.build(self.machine, count, device)
             for name, value in own.items():
-                model.parameters[name].copy_(torch.as_tensor(value[candidate], dtype=torch.float32))
+                model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))
+            if not own and self._drive is not None:
+                model = _DrivenModel(model, u, self._drive.repeat(len(candidates)))
             for kind, values in effects:
                 model = kind.wrap(model, self.machine, count, device)
                 for name, value in values.items():
-                    model.parameters[name].copy_(
-                        torch.as_tensor(value[candidate], dtype=torch.float32)
-                    )
+                    model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))
                 if kind.running:
-                    begun_s = self.running_s[window] - (before - size) * self.machine.period_s
+                    begun_s = (
+                        np.tile(self.running_s, len(candidates))
+                        - (before - size) * self.machine.period_s
+                    )
                     model.parameters[kind.running].copy_(
                         torch.as_tensor(begun_s, dtype=torch.float32)[:, None]
                     )
         measure, truth = (getattr(model, name, None) for name in ("measure", "truth"))
         measure = measure if "measurement" in getattr(model, "sides", ()) else None
-        u = torch.as_tensor(cut.u[window], dtype=torch.float32)
-        q = torch.empty(count, before + cut.measured.shape[1], u.shape[2])
-        q[:, :before] = torch.as_tensor(cut.q[window, :before])
-        if measure and truth:
-            q[:, :before] = truth(q[:, :before])
-        seen = torch.empty_like(q[:, before:])
+        q = torch.empty(len(u) + 1, count, u.shape[2])
+        known = torch.as_tensor(np.tile(cut.q[:, :before], (len(candidates), 1, 1)))
+        q[:before] = (truth(known) if measure and truth else known).transpose(0, 1)
+        seen = torch.empty_like(q[before:])
         with torch.inference_mode():
             model.reset(torch.ones(count, dtype=torch.bool))
-            for k in range(size, q.shape[1]):
-                position = model.step(History(q=q[:, k - size : k], u=u[:, k - size : k]))
+            plan = getattr(model, "plan_run", None)
+            run = (plan(u, size) if plan else None) or _SteppedRun(model, u, size)
+            for k in range(size, len(q)):
+                position = run.step(k, q)
                 if k >= before:
-                    q[:, k] = position
-                    seen[:, k - before] = measure(position) if measure else position
-        return seen.numpy()
+                    q[k] = position
+                    seen[k - before] = measure(position) if measure else position
+        return seen.numpy().swapaxes(0, 1).reshape(len(candidates), windows, *seen.shape[::2])
+
+    @cached_property
+    def _commands(self) -> torch.Tensor:
+        """Recorded commands of the windows, `(T, W, J)`: time comes first, so that a step reads one piece of memory."""
+        u = torch.as_tensor(self.cut.u, dtype=torch.float32)
+        return u.transpose(0, 1).contiguous()
+
+    @cached_property
+    def _drive(self) -> Any:
+        """Demand of the recorded commands on the base in each window.
+
+        `None` where the base has no `drive`, or where its numbers are drawn.
+        """
+        device, size = torch.device("cpu"), self.cut.num_history
+        with torch.random.fork_rng(devices=[]), torch.inference_mode():
+            model: Any = self.base.build(self.machine, len(self.cut.u), device)
+            model.reset(torch.ones(len(self.cut.u), dtype=torch.bool))
+            if not hasattr(model, "drive"):
+                return None
+            if any((one != one[:1]).any() for one in model.parameters.values()):
+                return None
+            return model.drive(self._commands, size)
+
+
+class _DrivenModel:
+    """A model that knows already what the commands `u` of a run ask of it."""
+
+    def __init__(self, model: Any, u: torch.Tensor, drive: Any) -> None:
+        self._model, self._u, self._drive = model, u, drive
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """State of the model."""
+        return self._model.state
+
+    @property
+    def delay_s(self) -> torch.Tensor:
+        """Dead time of the model."""
+        return self._model.delay_s
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Reset the model."""
+        self._model.reset(mask)
+
+    def step(self, history: History) -> torch.Tensor:
+        """Return the positions one control period later."""
+        return self._model.step(history)
+
+    def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun:
+        """Return a run; an effect on commands makes other commands of `u`."""
+        return self._model.plan_run(u, first, self._drive if u is self._u else None)
+
+
+class _SteppedRun:
+    """A run of a model that is stepped through its history."""
+
+    def __init__(self, model: ActuatorModel, u: torch.Tensor, size: int) -> None:
+        self._model, self._u, self._size = model, u, size
+
+    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
+        """Return positions `k`, `(N, J)`."""
+        past = slice(k - self._size, k)
+        return self._model.step(History(q=q[past].transpose(0, 1), u=self._u[past].transpose(0, 1)))

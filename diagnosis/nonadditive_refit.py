@@ -100,7 +100,7 @@ def simulate_beside(
         # As close as before: an effect that rings is out of step on a coarser grid.
         grid = sorted({*WIDE_GRID, *ways[0].sizes[ways[0].sizes > 0.0].tolist()})
         wide[name] = [replace(ray, shape=ways[0].shape) for ray in build_rays(ways[0].kind, grid)]
-        responses = [_simulate_response(residuals, ray, wide[name], fitted) for ray in wide[name]]
+        responses = _simulate_responses(residuals, wide[name], fitted)
         for j in range(joints):
             if max(np.abs(response[j]).max() for response in responses) >= MIN_RESPONSE:
                 pairs = zip(wide[name], responses, strict=True)
@@ -113,18 +113,26 @@ def simulate_beside(
     return WideResponses(left, wide, shapes)
 
 
-def _simulate_response(
-    residuals: Residuals, ray: ParameterRay, ways: Sequence[ParameterRay], fitted: FittedSet
-) -> np.ndarray:
-    """Return the whitened response at each size of a ray, beside the fitted set, `(J, C, E)`."""
-    has = any(one.kind.name == ray.kind.name for one in fitted.rays)
+def _simulate_responses(
+    residuals: Residuals, ways: Sequence[ParameterRay], fitted: FittedSet
+) -> list[np.ndarray]:
+    """Return the whitened response at each size of the rays of an effect, beside the fitted set, each `(J, C, E)`."""
+    has = any(one.kind.name == ways[0].kind.name for one in fitted.rays)
     company = [*fitted.rays, *([] if has else ways)]
-    place = [(one.kind.name, one.name) for one in company].index((ray.kind.name, ray.name))
-    sizes = np.zeros((len(ray.sizes), len(company), fitted.sizes.shape[1]))
-    sizes[:, : len(fitted.rays)] = fitted.sizes
-    sizes[:, place] = ray.sizes[:, None]
-    ends = to_increments(simulate_sizes(residuals.simulator, company, sizes), residuals.start)
-    return residuals.whiten(ends - ends[np.flatnonzero(ray.sizes == 0.0)[0]])
+    places = [(one.kind.name, one.name) for one in company]
+    trials = []
+    for ray in ways:
+        sizes = np.zeros((len(ray.sizes), len(company), fitted.sizes.shape[1]))
+        sizes[:, : len(fitted.rays)] = fitted.sizes
+        sizes[:, places.index((ray.kind.name, ray.name))] = ray.sizes[:, None]
+        trials.append(sizes)
+    paths = simulate_sizes(residuals.simulator, company, np.concatenate(trials))
+    ends, found, first = to_increments(paths, residuals.start), [], 0
+    for ray in ways:
+        own = ends[first : first + len(ray.sizes)]
+        found.append(residuals.whiten(own - own[np.flatnonzero(ray.sizes == 0.0)[0]]))
+        first += len(ray.sizes)
+    return found
 
 
 def add_effect(

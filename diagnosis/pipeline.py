@@ -43,7 +43,7 @@ from diagnosis.verdict import Judgement
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
 CURVE_SEED = 0
-"""Of the bootstrap of the speed curves: they do not change the draws of what follows."""
+"""Seed for the bootstrap of the speed curves. Draws of later steps stay as they are."""
 DECIDED_BY = {
     frozenset(
         {"flow_gain", "encoder_scale"}

@@ -30,6 +30,8 @@ T_FREEDOM = 5.0
 """Degrees of freedom of the t distribution that whitened errors are taken to have."""
 MAX_BLOCK_INCREMENTS = 80
 """Increments in a block."""
+NO_BORDER = 1e300
+"""Last element of a bordered covariance: so large that the matrix stays positive definite."""
 MIN_TYPICAL_ERROR = 0.1
 """Smallest typical error, over the root of the mean square."""
 
@@ -73,20 +75,25 @@ class ErrorCovariance:
 
     def covariance(self, increments: np.ndarray) -> np.ndarray:
         """Return the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `increments` `(B, S)`."""
-        lag = np.abs(
-            np.subtract.outer(np.arange(increments.shape[1]), np.arange(increments.shape[1]))
+        lag = _count_between(increments.shape[1])
+        read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
+        kept = self.remember(increments.shape[1])
+        return (
+            self.wander**2 * increments[:, :, None] * increments[:, None, :] * kept
+            + self.vary(increments)[:, :, None] * np.eye(increments.shape[1])
+            + read
         )
-        kept = np.exp(-lag / self.memory)
+
+    def remember(self, size: int) -> np.ndarray:
+        """Return the correlation of a wandering speed between `size` increments in a row, `(S, S)`."""
+        return np.exp(-_count_between(size) / self.memory)
+
+    def vary(self, increments: np.ndarray) -> np.ndarray:
+        """Return the variance of each increment that it shares with no other, `(B, S)`."""
         turn = np.abs(np.diff(increments, axis=1, prepend=increments[:, :1])) + np.abs(
             np.diff(increments, axis=1, append=increments[:, -1:])
         )
-        single = self.sensor**2 + (self.change * turn) ** 2
-        read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
-        return (
-            self.wander**2 * increments[:, :, None] * increments[:, None, :] * kept
-            + single[:, :, None] * np.eye(increments.shape[1])
-            + read
-        )
+        return self.sensor**2 + (self.change * turn) ** 2
 
     def strayed(self, increments: np.ndarray) -> np.ndarray:
         """Return the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
@@ -95,6 +102,11 @@ class ErrorCovariance:
     def whitener(self, increments: np.ndarray) -> np.ndarray:
         """Return the inverse Cholesky factors of the covariance, `(B, S, S)`."""
         return np.linalg.inv(np.linalg.cholesky(self.covariance(increments)))
+
+
+def _count_between(size: int) -> np.ndarray:
+    """Return how many increments lie between two of `size` in a row, `(S, S)`."""
+    return np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
 
 
 def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
@@ -109,13 +121,21 @@ def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
         error, -12.0 * typical - 0.3 * np.abs(increments), 12.0 * typical + 0.3 * np.abs(increments)
     )
 
+    steps = increments.shape[1]
+    # The Cholesky factor of the covariance bordered by the error has the whitened error in its last row.
+    bordered = np.zeros((len(error), steps + 1, steps + 1))
+    bordered[:, -1, :-1] = error
+    products = increments[:, :, None] * increments[:, None, :]
+    diagonal = np.arange(steps)
+
     def minus_log(x: np.ndarray) -> float:
         noise = ErrorCovariance(*np.exp(x))
-        factor = np.linalg.cholesky(
-            noise.covariance(increments) + 1e-18 * np.eye(increments.shape[1])
-        )
-        z = np.linalg.solve(factor, error[..., None])[..., 0]
-        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
+        bordered[:, :-1, :-1] = noise.wander**2 * noise.remember(steps) * products
+        bordered[:, diagonal, diagonal] += noise.vary(increments) + 1e-18
+        bordered[:, -1, -1] = NO_BORDER
+        factor = np.linalg.cholesky(bordered)
+        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)[:, :-1]).sum()
+        z = factor[:, -1, :-1]
         return float(compute_loss(z) + log_size + 0.02 * np.square(x[3] - np.log(10.0)) * 10)
 
     start = np.log([typical, 0.05, max(0.01, 0.5 * np.sqrt(np.mean(error**2)) / size), 10.0])
@@ -372,11 +392,30 @@ class Residuals:
 
     def response(self, ray: ParameterRay) -> np.ndarray:
         """Return the whitened response to an effect on all joints at each size of the ray, `(J, C, E)`."""
-        joints = self.increments.shape[2]
-        sizes = ray.sizes[ray.sizes != 0.0]
-        paths = self.simulator.simulate(
-            [(ray.kind, ray.values(np.repeat(sizes[:, None], joints, 1)))], len(sizes)
-        )
-        changed = np.zeros((len(ray.sizes), *self.increments.shape))
-        changed[ray.sizes != 0.0] = to_increments(paths, self.start) - self.increments
-        return self.whiten(changed)
+        return self.list_responses([ray])[0]
+
+    def list_responses(self, rays: Sequence[ParameterRay]) -> list[np.ndarray]:
+        """Return `response` of each of the rays of one effect, which are simulated together."""
+        kind, joints = rays[0].kind, self.increments.shape[2]
+        sizes = [ray.sizes[ray.sizes != 0.0] for ray in rays]
+        values: dict[str, list[np.ndarray]] = {}
+        names = {
+            name
+            for ray in rays
+            for name in (*ray.shape, *((ray.name,) if ray.name else kind.fitted))
+        }
+        for ray, own in zip(rays, sizes, strict=True):
+            known = ray.values(np.repeat(own[:, None], joints, 1))
+            for name in names:
+                off = np.full((len(own), len(kind.typical(name))), getattr(kind.neutral, name))
+                values.setdefault(name, []).append(known.get(name, off))
+        together = {name: np.concatenate(parts) for name, parts in values.items()}
+        count = sum(len(own) for own in sizes)
+        moved = to_increments(self.simulator.simulate([(kind, together)], count), self.start)
+        found, first = [], 0
+        for ray, own in zip(rays, sizes, strict=True):
+            changed = np.zeros((len(ray.sizes), *self.increments.shape))
+            changed[ray.sizes != 0.0] = moved[first : first + len(own)] - self.increments
+            found.append(self.whiten(changed))
+            first += len(own)
+        return found

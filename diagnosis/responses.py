@@ -272,11 +272,12 @@ def add_responses(
     """
     kind = ways[0].kind
     trials = [{}] if ways[0].shape else list_shape_trials(kind)
-    responses = []
+    shaped = []
     for trial in trials:
         shape = _repeat_per_joint(trial, len(shapes))
-        shaped = [replace(ray, shape=shape) for ray in ways] if trial else ways
-        responses.append([residuals.response(ray) for ray in shaped])
+        shaped += [replace(ray, shape=shape) for ray in ways] if trial else ways
+    every = residuals.list_responses(shaped)
+    responses = [every[t * len(ways) : (t + 1) * len(ways)] for t in range(len(trials))]
     made: list[list[list[Response]]] = []  # by trial and joint, one a ray
     losses = np.zeros((len(trials), len(shapes)))
     for t, response in enumerate(responses):
@@ -299,6 +300,23 @@ def add_responses(
         number: np.array([trials[b].get(number, 1.0) for b in best]) for number in kind.shaping
     }
     return [replace(ray, shape=shape) for ray in ways]
+
+
+def simulate_trials(
+    parts: Sequence[Residuals], ways: Mapping[str, Sequence[ParameterRay]]
+) -> dict[str, list[list[np.ndarray]]]:
+    """Return the responses of each part to each ray, by trial; those of one effect are simulated together."""
+    by_kind: dict[str, list[str]] = {}
+    for key, way in ways.items():
+        by_kind.setdefault(way[0].kind.name, []).append(key)
+    found: dict[str, list[list[np.ndarray]]] = {}
+    for keys in by_kind.values():
+        rays = [ray for key in keys for ray in ways[key]]
+        by_part = [part.list_responses(rays) for part in parts]
+        by_ray = iter([list(one) for one in zip(*by_part, strict=True)])
+        for key in keys:
+            found[key] = [next(by_ray) for _ in ways[key]]
+    return found
 
 
 def fit_joint_faults(

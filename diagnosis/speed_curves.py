@@ -149,7 +149,9 @@ def _compare_curves(
     information = measured.information
     root = np.linalg.cholesky(information + 1e-9 * np.trace(information) * np.eye(size)).T
     weight = root / max(1e-9, float(np.sqrt(np.mean(np.square(root @ measured.curve)))))
-    free = np.ones(len(NEUTRAL), dtype=bool)
+    extend, retract = np.logical_and(measured.sides, simulated.sides).tolist()
+    # A side that was hardly commanded shows nothing: its numbers stay neutral.
+    free = np.array([extend, retract, extend or retract, extend, retract])
     while True:
         values, error = _fit_change(measured, simulated, knots, weight, free, scatter)
         score = np.abs(values - NEUTRAL) / np.maximum(error, 1e-9)

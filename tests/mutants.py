@@ -34,6 +34,8 @@ CORE = {
     "deploy.bus.clock": ["test_deploy_protection.py"],
     "deploy.guard.guard": ["test_deploy_guard.py"],
     "deploy.guard.plausibility": ["test_deploy_guard.py"],
+    "deploy.guard.envelope": ["test_deploy_envelope.py"],
+    "deploy.guard.shapes": ["test_deploy_envelope.py"],
     "deploy.runtime.receiver": ["test_deploy_receiver.py"],
     "deploy.runtime.bus_logic": ["test_deploy_logic.py"],
     "deploy.twin.gateway": ["test_deploy_gateway.py"],

@@ -25,6 +25,7 @@ class DeadBand(EffectSpec):
     extend: Value
     retract: Value
     side = "command"
+    pointwise = True
     numbers: ClassVar = {
         "extend": EffectNumber(
             "1", none=0.0, typical=0.06, bounds=(0.0, 0.85)
@@ -51,6 +52,7 @@ class Saturation(EffectSpec):
     joints: Joints
     level: Value
     side = "command"
+    pointwise = True
     numbers: ClassVar = {"level": EffectNumber("1", none=1.0, typical=0.75, bounds=(0.05, 1.0))}
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
@@ -71,6 +73,7 @@ class RateLimit(EffectSpec):
     joints: Joints
     stroke_s: Value
     side = "command"
+    recent = 2
     numbers: ClassVar = {
         "stroke_s": EffectNumber("s", none=0.0, typical=0.4, bounds=(0.0, 5.0), scale="time")
     }
@@ -104,6 +107,7 @@ class Stiction(EffectSpec):
     start: Value
     stop: Value
     side = "command"
+    recent = 2
     smooth = False
     numbers: ClassVar = {
         "start": EffectNumber("1", none=0.0, typical=0.14, bounds=(0.0, 0.6)),

@@ -8,117 +8,24 @@ environment, memory, resets and random draws.
 import re
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import fields, replace
 from types import MappingProxyType
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import torch
 
-from actuators.effects.ranges import CHANCE, EffectNumber, Joints, ParameterRanges, Value
-from actuators.models import random_draws
-from brokk_rl.contracts.actuator import ActuatorModel
-from brokk_rl.gravity import Gravity
+from actuators.effects.planned_run import ChainRun
+from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
+from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
+from brokk_rl.contracts.actuator import ActuatorModel, PlannedRun
 from brokk_rl.history import History
-from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 
-Memory = dict[str, torch.Tensor]
 Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
 MOTION: tuple[Side, ...] = ("speed", "joints")
 """Sides that change the increment which the inner model returns."""
 SALT_STEP = 2_654_435_761
 """Knuth's multiplicative hash constant (2^32 / golden ratio): spreads the salts of effects."""
-
-
-class MachineTensors:
-    """Constants of the machine as tensors: full step, limits, weight, geometry.
-
-    Weight and geometry are built when an effect first asks for them. Most effects do not ask, and
-    so they also work on machines of which only the joints are known. A captured step can hold the
-    computation but not the construction: effects that always need them say so beforehand.
-
-    Args:
-        machine: The machine.
-        device: Where the tensors live.
-        weighed: Whether the weight is asked for in every step.
-        placed: Whether the geometry is asked for in every step.
-    """
-
-    def __init__(
-        self, machine: Machine, device: torch.device, weighed: bool = False, placed: bool = False
-    ) -> None:
-        def tensor(values: object) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        self.period_s = machine.period_s
-        self.full_step = tensor(machine.max_speed * machine.period_s)
-        self.lower, self.upper = tensor(machine.lower), tensor(machine.upper)
-        self.has_masses = machine.has_bodies
-        self._slides = torch.tensor([j.kind == "slide" for j in machine.joints], device=device)
-        self._machine, self._device = machine, device
-        if weighed:
-            self.weight(torch.zeros(1, machine.num_joints, device=device))
-        if placed:
-            self.kinematics  # noqa: B018
-
-    @cached_property
-    def yield_force(self) -> torch.Tensor:
-        """`Body.yield_force` of each joint, `(J,)`."""
-        values = [body.yield_force.value for body in self._machine.bodies]
-        return torch.tensor(values, dtype=torch.float32, device=self._device)
-
-    @cached_property
-    def gravity(self) -> Gravity:
-        """Gravity load on each joint."""
-        return Gravity(self._machine, self._device)
-
-    def weight(self, q: torch.Tensor) -> torch.Tensor:
-        """Return gravity load over yield force at `q`, positive direction, `(N, J)`."""
-        return self.gravity.load(q) / self.yield_force
-
-    def read_pose(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return cosine and sine of the angles from mid-travel, each `(N, J)`.
-
-        A sliding joint has 1, and its place in the travel from -1 to 1.
-        """
-        away, half = q - 0.5 * (self.lower + self.upper), 0.5 * (self.upper - self.lower)
-        cos = torch.where(self._slides, torch.ones_like(q), torch.cos(away))
-        return cos, torch.where(self._slides, away / half, torch.sin(away))
-
-    @cached_property
-    def kinematics(self) -> Kinematics:
-        """Forward kinematics."""
-        return Kinematics(self._machine, self._device)
-
-
-@dataclass(frozen=True)
-class StepInputs:
-    """Everything that an effect may use in one control period.
-
-    Attributes:
-        value: Parameters by name, `(N, J)` or `(N, 1)`.
-        memory: The memory that the effect returned one period ago.
-        history: Positions and commands; the newest command has just come into force.
-        plant: Constants of the machine.
-        moved: Increment of the inner model, `(N, J)`; speed side only.
-        counter: Counter of random draws, `(N,)`; stochastic effects only.
-        weight: `plant.weight` of the newest position, where it is computed already.
-    """
-
-    value: dict[str, torch.Tensor]
-    memory: Memory
-    history: History
-    plant: MachineTensors
-    moved: torch.Tensor
-    counter: torch.Tensor | None
-    weight: torch.Tensor | None = None
-
-    @property
-    def chance(self) -> torch.Tensor:
-        """A uniform number in [0, 1) per environment, `(N, 1)`; all joints share one frame."""
-        assert self.counter is not None, "only a stochastic effect has chances"
-        return random_draws.draw_uniform(self.counter, CHANCE, 1)
 
 
 class EffectSpec:
@@ -133,7 +40,12 @@ class EffectSpec:
         numbers: Unit, neutral value, typical size and bounds of each number.
         stochastic: Whether it draws random numbers in every step.
         smooth: Whether its numbers can be fitted by gradient.
-        delays: Whether it shifts all commands that the inner model sees, not only the newest.
+        delays: Whether it shifts all commands that the inner model sees, not only the newest; its
+            number is then the shift, s.
+        pointwise: Whether each command that it returns depends on the same command only, so that
+            all commands of a run can be given to it at once.
+        recent: Number of newest commands that it looks at, where it changes the newest only and
+            asks for no positions; `None`: any. See `EffectChain.plan_run`.
         weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
@@ -150,6 +62,8 @@ class EffectSpec:
     stochastic: ClassVar[bool] = False
     smooth: ClassVar[bool] = True
     delays: ClassVar[bool] = False
+    pointwise: ClassVar[bool] = False
+    recent: ClassVar[int | None] = None
     weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
     alike: ClassVar[bool] = True
@@ -239,6 +153,10 @@ class EffectChain:
     Attributes:
         effects: The effects by name.
         inner: The model inside.
+        commands: Effects on commands, in the order in which a command passes through them.
+        motions: Effects on motion, the first nearest to the machine.
+        plant: Constants of the machine.
+        is_weighed: Whether an effect on motion asks for the weight.
         parameters: Numbers by name, `(N, J)` or `(N, 1)`. Write in place or replace an entry to
             simulate `N` candidates side by side. Gradients flow to an entry that requires them
             until the next `reset`.
@@ -257,7 +175,8 @@ class EffectChain:
         shares: Mapping[str, float] = MappingProxyType({}),
         num_recent: int | None = None,
     ) -> None:
-        self.inner, self.effects, self._num_recent = inner, dict(effects), num_recent
+        self.inner: Any = inner
+        self.effects, self._num_recent = dict(effects), num_recent
         given: dict[str, Value] = {}
         numbers: dict[str, EffectNumber] = {}
         joints: dict[str, Joints] = {}
@@ -278,12 +197,13 @@ class EffectChain:
                 self._salts[name] = zlib.crc32(name.encode()) * SALT_STEP
         commanding = {name: e for name, e in effects.items() if e.side == "command"}
         self._delays = {name: effect for name, effect in commanding.items() if effect.delays}
-        self._commands = {n: e for n, e in reversed(commanding.items()) if not e.delays}
-        self._motions = {name: e for name, e in effects.items() if e.side in MOTION}
+        self._others = {n: e for n, e in reversed(commanding.items()) if not e.delays}
+        self.commands: dict[str, Any] = self._others | self._delays
+        self.motions: dict[str, Any] = {name: e for name, e in effects.items() if e.side in MOTION}
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
-        self._weighed = machine.has_bodies and any(e.weighed for e in self._motions.values())
-        self._plant = MachineTensors(machine, device, self._weighed, placed=bool(self._placed))
+        self.is_weighed = machine.has_bodies and any(e.weighed for e in self.motions.values())
+        self.plant = MachineTensors(machine, device, self.is_weighed, placed=bool(self._placed))
         self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._memory = self._build_memory(machine, num_envs, device)
         self._ranges.redraw(self._fresh)
@@ -312,49 +232,76 @@ class EffectChain:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        if not (self._commands or self._delays or self._motions):
+        if not (self.commands or self.motions):
             return self.inner.step(history)
         fresh = self._fresh
         if torch.is_grad_enabled():
             # history and `fresh` are written in place, and autograd may need what they were
             history, fresh = History(q=history.q.clone(), u=history.u.clone()), fresh.clone()
-        counter = self._ranges.advance() if self._salts else None
+        counter = self.advance_draws()
         u = self._change_commands(history, fresh, counter)
-        if self._motions:
+        if self.motions:
             q = self._change_motion(history, u, fresh, counter)
         else:
             q = self.inner.step(History(q=history.q, u=u))
         self._fresh.fill_(False)
         return q
 
+    def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun | None:
+        """See `brokk_rl.contracts.actuator.PlannedModel`."""
+        return ChainRun.plan(self, u, first)
+
+    @property
+    def is_plannable(self) -> bool:
+        """True if all commands of a run can be given to its effects beforehand."""
+        told = all(e.pointwise or e.delays or e.recent for e in self.commands.values())
+        told &= all(len(effect.numbers) == 1 for effect in self._delays.values())
+        # One counter a step: several effects that draw would draw in another order.
+        return told and self._num_recent is None and (not self._salts or len(self.effects) == 1)
+
+    @property
+    def delay_s(self) -> torch.Tensor:
+        """See `brokk_rl.contracts.actuator.PlannedModel`."""
+        own_s = [value for name in self._delays for value in self.get_values(name).values()]
+        return (self.inner.delay_s + sum(own_s)).clamp(min=0.0)
+
+    def advance_draws(self) -> torch.Tensor | None:
+        """Advance to the next draws and return their counter, `(N,)`; `None` without draws."""
+        return self._ranges.advance() if self._salts else None
+
+    def hold_in_travel(self, moved_to: torch.Tensor, predicted: torch.Tensor) -> torch.Tensor:
+        """Return positions after the effects: these never move a joint through a stop."""
+        lower = torch.minimum(self.plant.lower, predicted)
+        return moved_to.clamp(lower, torch.maximum(self.plant.upper, predicted))
+
     def measure(self, q: torch.Tensor) -> torch.Tensor:
         """Return the readings at true positions `q`, `(N, J)`; once a control period."""
         q = getattr(self.inner, "measure", _keep_unchanged)(q)
         if not self._measured:
             return q
-        counter = self._ranges.advance() if self._salts else None
+        counter = self.advance_draws()
         for name, effect in self._measured.items():
-            q = effect.measured(q, self._get_values(name), self._salt_counter(name, counter))
+            q = effect.measured(q, self.get_values(name), self.salt_counter(name, counter))
         return q
 
     def truth(self, q: torch.Tensor) -> torch.Tensor:
         """Return the likeliest true positions for readings `q`, `(N, J)` or `(N, H, J)`."""
         for name, effect in reversed(self._measured.items()):
-            q = effect.truth(q, self._get_values(name))
+            q = effect.truth(q, self.get_values(name))
         return getattr(self.inner, "truth", _keep_unchanged)(q)
 
     def tool(self, point_m: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Return the true place of the tool that the model has at `point_m`, `(N, 3)`."""
         point_m = getattr(self.inner, "tool", _keep_unchanged)(point_m, q)
         for name, effect in self._placed.items():
-            point_m = effect.tool(point_m, q, self._get_values(name), self._plant)
+            point_m = effect.tool(point_m, q, self.get_values(name), self.plant)
         return point_m
 
     def target(self, point_m: torch.Tensor) -> torch.Tensor:
         """Return where the camera sees a point, `(N, 3)` in the base frame."""
         point_m = getattr(self.inner, "target", _keep_unchanged)(point_m)
         for name, effect in self._placed.items():
-            point_m = effect.target(point_m, self._get_values(name))
+            point_m = effect.target(point_m, self.get_values(name))
         return point_m
 
     def misplacement(self, q: torch.Tensor) -> torch.Tensor:
@@ -365,7 +312,7 @@ class EffectChain:
         estimate moves.
         """
         if self._placed:
-            tip_m = self._plant.kinematics.pose(q).tip_in_base_m
+            tip_m = self.plant.kinematics.pose(q).tip_in_base_m
             return self.target(self.tool(tip_m, q)) - tip_m
         inner = getattr(self.inner, "misplacement", None)
         return torch.zeros_like(q[:, :3]) if inner is None else inner(q)
@@ -377,7 +324,7 @@ class EffectChain:
         still = torch.zeros_like(history.q[:, -1])
         recent = slice(-(self._num_recent or history.u.shape[1]), None)
         u = history.u[:, recent]
-        for name in self._commands:
+        for name in self._others:
             seen = History(q=history.q[:, recent], u=u)
             u = self._apply("commands", name, seen, still, fresh, counter)
         if self._num_recent is not None:
@@ -399,17 +346,15 @@ class EffectChain:
         from step to step. So it sees the increments as they would be without the effects, ending
         at the true position: `shift` is added to its history.
         """
-        q, plant = history.q[:, -1], self._plant
+        q, plant = history.q[:, -1], self.plant
         shift = self._memory["shift"]
         shift = torch.where(fresh[:, None, None], torch.zeros_like(shift), shift)
         predicted = moved_to = self.inner.step(History(q=history.q + shift, u=u))
-        weight = plant.weight(q) if self._weighed else None
-        for name in self._motions:
+        weight = plant.weight(q) if self.is_weighed else None
+        for name in self.motions:
             extra = self._apply("extra", name, history, moved_to - q, fresh, counter, weight)
             moved_to = moved_to + extra
-        # an effect never moves a joint through a stop
-        lower, upper = torch.minimum(plant.lower, predicted), torch.maximum(plant.upper, predicted)
-        moved_to = torch.minimum(torch.maximum(moved_to, lower), upper)
+        moved_to = self.hold_in_travel(moved_to, predicted)
         added = (moved_to - predicted)[:, None]
         self._memory["shift"].copy_(torch.cat((shift[:, 1:] + added, torch.zeros_like(added)), 1))
         return moved_to
@@ -427,12 +372,12 @@ class EffectChain:
         """Return the result of one effect and store its memory."""
         effect = self.effects[name]
         now = StepInputs(
-            self._get_values(name),
+            self.get_values(name),
             {},
             history,
-            self._plant,
+            self.plant,
             moved,
-            self._salt_counter(name, counter),
+            self.salt_counter(name, counter),
             weight,
         )
         memory = {}
@@ -448,24 +393,24 @@ class EffectChain:
         """Return memory of the right shapes, as it begins at rest."""
         rest = torch.zeros(num_envs, machine.num_history, machine.num_joints, device=device)
         found: Memory = {}
-        if self._motions or self._num_recent is not None:
+        if self.motions or self._num_recent is not None:
             found["shift"] = rest.clone()
         if self._num_recent is not None:
             found["valve"] = rest.clone()
-        for name, effect in (self._commands | self._delays | self._motions).items():
+        for name, effect in (self.commands | self.motions).items():
             u = rest if name in self._delays else rest[:, -(self._num_recent or len(rest[0])) :]
             now = StepInputs(
-                self._get_values(name), {}, History(q=rest, u=u), self._plant, rest[:, -1], None
+                self.get_values(name), {}, History(q=rest, u=u), self.plant, rest[:, -1], None
             )
             for key, value in effect.begin(now).items():
                 found[_join(name, key)] = value.clone()
         return found
 
-    def _get_values(self, name: str) -> dict[str, torch.Tensor]:
+    def get_values(self, name: str) -> dict[str, torch.Tensor]:
         """Return the parameters of one effect, by their own names."""
         return {key: self.parameters[_join(name, key)] for key in self.effects[name].numbers}
 
-    def _salt_counter(self, name: str, counter: torch.Tensor | None) -> torch.Tensor | None:
+    def salt_counter(self, name: str, counter: torch.Tensor | None) -> torch.Tensor | None:
         """Return the counter of one effect's draws; `None` for an effect that draws none."""
         if counter is None or name not in self._salts:
             return None

@@ -129,6 +129,7 @@ class FrameLoss(EffectSpec):
     persistence: Value = 0.0  # each frame by itself, as files from before this number mean
     side = "command"
     stage = "timing"
+    recent = 2
     stochastic = True
     smooth = False
     shared = True

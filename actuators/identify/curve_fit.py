@@ -30,6 +30,12 @@ TIME_STEP, PLAY_STEP = 0.02, 0.02
 """Finite differences of times, s, and of the play, of full command."""
 PLAY, NUM_DYNAMICS = 1, 4
 """Place of the play among the numbers of the dynamics, and how many these are."""
+RIDGE = 1e-9
+"""Least stiffness of every number, over the trace: the bend penalty leaves the straight line of a side
+free that is never commanded. `SpeedData.curve` has the same."""
+MIN_SIDE_BLOCKS = 4
+"""Fewest blocks in which a side is commanded for its bootstrap to show its scatter: of 4 blocks a draw
+misses all in 2 % of the draws, of one in 37 %."""
 
 
 @spec
@@ -144,6 +150,7 @@ def _fit_curve(
         normal[block] = weighted.T @ slopes[rows]
         right[block] = weighted.T @ left[rows]
     pull = data.pull(noise, size)
+    pull += RIDGE * np.trace(normal.sum(0) + pull) * np.eye(size)
     start = np.concatenate([curve, dynamics])
     # The pull acts on the curve itself, not on its change.
     held = pull @ np.concatenate([curve, np.zeros(NUM_DYNAMICS)])
@@ -155,11 +162,19 @@ def _fit_curve(
     # The fit of the sample itself is the curve: its own small step is taken off.
     away = np.stack(drawn) - drawn[0]
     information = normal.sum(0)[: len(curve), : len(curve)] / noise
+    sides = _find_known_sides(normal[:, : len(curve), : len(curve)])
     # A valve moves its joint one way: what a command that was never held leaves open is no speed.
     draws_of_both = start + away
     draws_of_both[:, : len(curve)] = np.maximum(draws_of_both[:, : len(curve)], 0.0)
     points = _list_points(data, j, dynamics)
-    return FittedCurve(np.maximum(curve, 0.0), dynamics, draws_of_both, information, points)
+    return FittedCurve(np.maximum(curve, 0.0), dynamics, draws_of_both, information, points, sides)
+
+
+def _find_known_sides(normal: np.ndarray) -> tuple[bool, bool]:
+    """Return whether each side is commanded in enough blocks `(P, C, C)`, the positive one first."""
+    told = np.diagonal(normal, axis1=1, axis2=2).reshape(len(normal), 2, -1).sum(2)
+    counts = (told > RIDGE * told.sum()).sum(0)
+    return bool(counts[0] >= MIN_SIDE_BLOCKS), bool(counts[1] >= MIN_SIDE_BLOCKS)
 
 
 def _list_points(data: SpeedData, j: int, dynamics: np.ndarray) -> np.ndarray:

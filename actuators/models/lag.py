@@ -1,11 +1,17 @@
 """Simple actuator models: ideal, and dead time with dead band and first-order lag."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 
 from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
-from actuators.models.transport import check_dead_time, open_valve, select_commands_in_force
+from actuators.models.transport import (
+    check_dead_time,
+    open_valve,
+    select_commands_in_force,
+    split_run_commands,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -177,4 +183,86 @@ class FirstOrderLagModel:
             speed.masked_fill(held != q, 0.0)
         )  # a joint at its stop has no speed left
         self._fresh.fill_(False)
+        return held
+
+    @property
+    def delay_s(self) -> torch.Tensor:
+        """Dead time, `(N, J)`."""
+        return self.parameters["dead_time_s"]
+
+    def plan_run(self, u: torch.Tensor, first: int, drive: "LagDrive | None" = None) -> "LagRun":
+        """See `brokk_rl.contracts.actuator.PlannedModel`; `drive`: that of the commands, if known."""
+        return LagRun(self, self.drive(u, first) if drive is None else drive, first)
+
+    def drive(self, u: torch.Tensor, first: int) -> "LagDrive":
+        """Return the speeds that the commands of a run `(T, N, J)` ask for, whatever the positions are."""
+        value, speeds = self.parameters, []
+        earlier, later, part = split_run_commands(u, value["dead_time_s"] / self._period_s, first)
+        for commands in (earlier, later):
+            opening = open_valve(commands, value["dead_band_extend"], value["dead_band_retract"])
+            speeds.append(opening * value["gain"] * self._max_speed)
+        return LagDrive(speeds[0], speeds[1], part)
+
+    @property
+    def period_s(self) -> float:
+        """Control period, s."""
+        return self._period_s
+
+    def hold(self, q: torch.Tensor) -> torch.Tensor:
+        """Return positions within the travel."""
+        return q.clamp(self._lower, self._upper)
+
+
+@dataclass(frozen=True, eq=False)
+class LagDrive:
+    """Speeds that commands ask for in each step of a run.
+
+    Attributes:
+        earlier: In the first part of the period, `(K, N, J)`.
+        later: In the rest, `(K, N, J)`.
+        part: Length of the first part, in periods, `(N, J)`.
+    """
+
+    earlier: torch.Tensor
+    later: torch.Tensor
+    part: torch.Tensor
+
+    def repeat(self, count: int) -> "LagDrive":
+        """Return that of all environments, `count` times one after the other."""
+        earlier, later = self.earlier.repeat(1, count, 1), self.later.repeat(1, count, 1)
+        return LagDrive(earlier, later, self.part.repeat(count, 1))
+
+
+class LagRun:
+    """A run of a `FirstOrderLagModel`; see `brokk_rl.contracts.actuator.PlannedRun`.
+
+    The solution of a period is linear in the speed at its beginning: motion and speed after it are
+    a constant of the commands plus a factor times that speed.
+    """
+
+    def __init__(self, model: FirstOrderLagModel, drive: LagDrive, first: int) -> None:
+        self._model, self._first = model, first
+        self._speed: torch.Tensor | None = None
+        time_constant_s = model.parameters["time_constant_s"].clamp(min=1e-6)  # as in `step`
+        first_s, second_s = drive.part * model.period_s, (1.0 - drive.part) * model.period_s
+        decays = [torch.exp(-one / time_constant_s) for one in (first_s, second_s)]
+        reach_s = [time_constant_s * (1.0 - decay) for decay in decays]
+        between = drive.earlier * (1.0 - decays[0])
+        self._kept = decays[0] * decays[1]
+        self._reach_s = reach_s[0] + decays[0] * reach_s[1]
+        self._speeds = between * decays[1] + drive.later * (1.0 - decays[1])
+        self._moves = (
+            drive.earlier * (first_s - reach_s[0])
+            + drive.later * (second_s - reach_s[1])
+            + between * reach_s[1]
+        )
+
+    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
+        """Return positions `k`, `(N, J)`."""
+        place, now = k - self._first, q[k - 1]
+        speed = (now - q[k - 2]) / self._model.period_s if self._speed is None else self._speed
+        moved = now + torch.addcmul(self._moves[place], speed, self._reach_s)
+        held = self._model.hold(moved)
+        after = torch.addcmul(self._speeds[place], speed, self._kept)
+        self._speed = after.masked_fill(held != moved, 0.0)  # as in `step`
         return held

@@ -44,6 +44,23 @@ def select_commands_in_force(
     return earlier, later, part
 
 
+def split_run_commands(
+    u: torch.Tensor, delay_periods: torch.Tensor, first: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return `select_commands_in_force` of each step of a run, the two commands `(T - first + 1, N, J)`.
+
+    Args:
+        u: Commands of the run, `(T, N, J)`; step `k` follows command `first + k - 1`.
+        delay_periods: Dead time in control periods, `(N, J)`.
+        first: Length of the history at the first step.
+    """
+    whole = torch.floor(delay_periods + 5e-7)  # see `select_commands_in_force`
+    part = (delay_periods - whole).clamp(0.0, 1.0)
+    steps = torch.arange(first - 2, len(u), device=u.device)[:, None, None]
+    found = u.gather(0, (steps - whole.to(torch.int64)).clamp(0, len(u) - 1))
+    return found[:-1], found[1:], part
+
+
 def open_valve(
     u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor
 ) -> torch.Tensor:

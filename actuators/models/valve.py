@@ -15,15 +15,16 @@ The curve takes in dead bands, gain, asymmetry, notches and saturation; load and
 cylinder are in the pose.
 """
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import torch
 
 from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
-from actuators.models.transport import check_dead_time, select_commands_in_force
+from actuators.models.transport import check_dead_time, select_commands_in_force, split_run_commands
 from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import Gravity
+from brokk_rl.gravity import build_joint_weight
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -32,6 +33,9 @@ NUMBERS = ("dead_time_s", "play", "spool_s", "speed_s", "demand")
 CELLS = 512
 """The curves are tabulated in so many equal steps of the spool's whole stroke: a step is finer than
 any valve repeats."""
+STEPS_AT_ONCE = 8
+"""Steps of a run whose flow is looked up together: their tables stay in the core's cache. Chosen by
+hand; 4 to 16 take the same time within a tenth."""
 BEYOND = 1.2
 """Positions, in halves of the travel from its middle, beyond which the pose counts no further."""
 
@@ -94,12 +98,7 @@ class ValveActuator:
 
 
 class PoseFeatures:
-    """Features of the speed besides the command: load, its square, and all positions.
-
-    The weight on the joints of a planar arm is linear in the sines and cosines of the sums of its
-    angles, which costs a tenth of the whole mechanics; where that is exact it is used, else the
-    mechanics are.
-    """
+    """Features of the speed besides the command: load, its square, and all positions."""
 
     def __init__(self, machine: Machine, device: torch.device) -> None:
         lower, upper = (
@@ -108,47 +107,62 @@ class PoseFeatures:
         )
         self._middle, self._half = (lower + upper) / 2, (upper - lower) / 2
         self.size = machine.num_joints + (2 if machine.has_bodies else 0)
-        self._weighs = machine.has_bodies
-        if not self._weighs:
-            return
-        self._gravity = Gravity(machine, device)
-        self._force = torch.tensor(
-            [body.yield_force.value for body in machine.bodies], dtype=torch.float32, device=device
-        )
-        hinges = np.array([joint.kind == "hinge" for joint in machine.joints])
-        axes = np.array([body.axis for body in machine.bodies])
-        sums = np.tril(np.abs(axes @ axes.T) > 1.0 - 1e-6) & hinges & hinges[:, None]
-        signs = np.sign(axes @ axes.T)
-        self._sums = torch.as_tensor((sums * signs).T, dtype=torch.float32, device=device)
-        at = (
-            torch.rand(256, machine.num_joints, generator=torch.Generator().manual_seed(0)).to(
-                device
-            )
-            * (upper - lower)
-            + lower
-        )
-        truth = self._gravity.load(at) / self._force
-        found = torch.linalg.lstsq(self._waves(at).double().cpu(), truth.double().cpu()).solution
-        self._linear = found.float().to(device)
-        self._planar = bool((self._waves(at) @ self._linear - truth).abs().max() < 1e-3)
+        self.weight = build_joint_weight(machine, device) if machine.has_bodies else None
 
     def features(self, q: torch.Tensor) -> torch.Tensor:
         """Return the features of each joint at positions `q` `(N, J)`, shape `(N, J, M)`."""
-        place = ((q - self._middle) / self._half).clamp(-BEYOND, BEYOND)
-        place = place[:, None, :].expand(-1, q.shape[1], -1)
-        if not self._weighs:
+        place = self.place(q)[:, None, :].expand(-1, q.shape[1], -1)
+        if self.weight is None:
             return place
-        weight = self._weight(q)[..., None]
+        weight = self.weight.weigh(q)[..., None]
         return torch.cat((weight, weight.square(), place), 2)
 
-    def _weight(self, q: torch.Tensor) -> torch.Tensor:
-        return (
-            self._waves(q) @ self._linear if self._planar else self._gravity.load(q) / self._force
-        )
+    def place(self, q: torch.Tensor) -> torch.Tensor:
+        """Return positions from the middle of the travel, in halves of it, `(N, J)`."""
+        return ((q - self._middle) / self._half).clamp(-BEYOND, BEYOND)
 
-    def _waves(self, q: torch.Tensor) -> torch.Tensor:
-        angle = q @ self._sums
-        return torch.cat((angle.cos(), angle.sin(), torch.ones_like(angle[:, :1])), 1)
+
+class PoseFactor:
+    """Factor of the pose on the speed: 1 plus `PoseFeatures` times slopes of the side, not below 0.
+
+    Positions, weight, and what is linear in it are one product of matrices.
+
+    Args:
+        pose: The features.
+        slopes: Of the positive and the negative side, `(2, J, M)`.
+    """
+
+    def __init__(self, pose: PoseFeatures, slopes: torch.Tensor) -> None:
+        self._pose, joints = pose, slopes.shape[1]
+        place = slopes[..., -joints:].transpose(1, 2)  # (2, J, J)
+        self._one, self._bends = torch.ones(2 * joints, device=slopes.device), None
+        self._product = torch.cat((place[0], place[1]), 1)
+        if pose.weight is None:
+            return
+        self._bends = slopes[..., 1].contiguous()
+        weight, eye = pose.weight, torch.eye(joints, device=slopes.device)
+        # Columns: both sides, then the weight itself. Rows: positions, then waves or the weight.
+        linear, constant = weight.linear, weight.constant
+        if not weight.is_planar:
+            linear, constant = eye, torch.zeros_like(constant)
+        rows = torch.cat((linear * slopes[0, :, 0], linear * slopes[1, :, 0], linear), 1)
+        blank = torch.zeros_like(eye)
+        self._product = torch.cat((torch.cat((self._product, blank), 1), rows), 0)
+        parts = (1.0 + constant * slopes[0, :, 0], 1.0 + constant * slopes[1, :, 0], constant)
+        self._one = torch.cat(parts)
+
+    def at(self, q: torch.Tensor, extends: torch.Tensor) -> torch.Tensor:
+        """Return the factor at positions `q` where `extends` is the side, `(N, J)`."""
+        columns, weight, joints = self._pose.place(q), self._pose.weight, q.shape[1]
+        if weight is not None:
+            more = weight.build_waves(q) if weight.is_planar else weight.weigh(q)
+            columns = torch.cat((columns, more), 1)
+        found = torch.addmm(self._one, columns, self._product)
+        factor = torch.where(extends, found[:, :joints], found[:, joints : 2 * joints])
+        if self._bends is not None:
+            bend = torch.where(extends, self._bends[0], self._bends[1])
+            factor = torch.addcmul(factor, bend, found[:, 2 * joints :].square())
+        return factor.clamp(min=0.0)
 
 
 class ValveModel:
@@ -194,19 +208,13 @@ class ValveModel:
         full = tensor(np.maximum(np.stack([curve[:, -1] for curve in curves]), 1e-3))
         self._full_extend, self._full_retract = full[0], full[1]
         self._row = torch.arange(machine.num_joints, device=device) * (CELLS + 1)
-        self._pose = (
-            PoseFeatures(machine, device) if config.pose_extend or config.pose_retract else None
-        )
-        if self._pose:
-            names = ("pose_extend", "pose_retract")
-            self._slopes = [
-                tensor(
-                    _expand_rows(
-                        getattr(config, n) or {}, machine, self._pose.size, f"actuator.{n}"
-                    )
-                )
-                for n in names
-            ]
+        self._pose = None
+        if config.pose_extend or config.pose_retract:
+            pose, sides = PoseFeatures(machine, device), []
+            for name in ("pose_extend", "pose_retract"):
+                rows = getattr(config, name) or {}
+                sides.append(_expand_rows(rows, machine, pose.size, f"actuator.{name}"))
+            self._pose = PoseFactor(pose, tensor(np.stack(sides)))
         shape = (num_envs, machine.num_joints)
         self._state = {
             name: torch.zeros(shape, device=device) for name in ("pilot", "spool", "step")
@@ -237,34 +245,114 @@ class ValveModel:
         spool = torch.lerp(
             pilot, torch.where(fresh, earlier, state["spool"]), _compute_decay(dt, value["spool_s"])
         )
-        flow = self._flow(spool)
-        full = torch.where(spool > 0, self._full_extend, self._full_retract)
-        asked = (value["demand"] * (flow / full).abs()).sum(1, keepdim=True)
-        wanted = flow * self._full_step / asked.clamp(min=1.0)
-        if self._pose:
-            features = self._pose.features(q)
-            slopes = [(features * slope).sum(2) for slope in self._slopes]
-            wanted = wanted * (1.0 + torch.where(spool > 0, *slopes)).clamp(min=0.0)
         before = torch.where(fresh, q - history.q[:, -2], state["step"])
-        step = torch.lerp(wanted, before, _compute_decay(dt, value["speed_s"]))
-        moved = q + step
-        held = torch.minimum(
-            torch.maximum(moved, torch.minimum(self._lower, q)), torch.maximum(self._upper, q)
-        )
-        for name, now in (
-            ("pilot", pilot),
-            ("spool", spool),
-            ("step", step.masked_fill(held != moved, 0.0)),
-        ):
+        kept = _compute_decay(dt, value["speed_s"])
+        held, step = self.move(q, self._want(spool), spool > 0, before, kept)
+        for name, now in (("pilot", pilot), ("spool", spool), ("step", step)):
             state[name].copy_(now)
         self._fresh.fill_(False)
         return held
+
+    @property
+    def delay_s(self) -> torch.Tensor:
+        """Dead time, `(N, J)`."""
+        return self.parameters["dead_time_s"]
+
+    def plan_run(
+        self, u: torch.Tensor, first: int, drive: "ValveDrive | None" = None
+    ) -> "ValveRun":
+        """See `brokk_rl.contracts.actuator.PlannedModel`; `drive`: that of the commands, if known."""
+        kept = _compute_decay(self._period_s, self.parameters["speed_s"])
+        return ValveRun(self, self.drive(u, first) if drive is None else drive, kept, first)
+
+    def drive(self, u: torch.Tensor, first: int) -> "ValveDrive":
+        """Return the demand of the commands of a run `(T, N, J)`, whatever the positions are."""
+        value = self.parameters
+        earlier, later, part = split_run_commands(u, value["dead_time_s"] / self._period_s, first)
+        commands, before = torch.lerp(later, earlier, part), earlier[0]
+        play, kept = 0.5 * value["play"], _compute_decay(self._period_s, value["spool_s"])
+        low, high = commands - play, commands + play
+        spool, pilot, now = torch.empty_like(commands), before, before
+        for k in range(len(commands)):
+            pilot = pilot.clamp(low[k], high[k])
+            now = torch.lerp(pilot, now, kept, out=spool[k])
+        wanted = torch.empty_like(spool)
+        for part in range(0, len(spool), STEPS_AT_ONCE):
+            rows = slice(part, part + STEPS_AT_ONCE)
+            wanted[rows] = self._want(spool[rows])
+        return ValveDrive(wanted, spool > 0)
+
+    def move(
+        self,
+        q: torch.Tensor,
+        wanted: torch.Tensor,
+        extends: torch.Tensor,
+        before: torch.Tensor,
+        kept: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the next positions, and the motion that the next period begins with, each `(N, J)`.
+
+        Args:
+            q: Positions.
+            wanted: Motion in a period that the valve asks for in the mean pose.
+            extends: Whether it opens to the positive side.
+            before: Motion in the period before.
+            kept: Part of it that is left after a period.
+        """
+        if self._pose:
+            wanted = wanted * self._pose.at(q, extends)
+        step = torch.lerp(wanted, before, kept)
+        moved = q + step
+        held = moved.clamp(torch.minimum(self._lower, q), torch.maximum(self._upper, q))
+        return held, step.masked_fill(held != moved, 0.0)
+
+    def _want(self, spool: torch.Tensor) -> torch.Tensor:
+        """Return the motion in a period that spools `(…, N, J)` ask for in the mean pose."""
+        flow = self._flow(spool)
+        full = torch.where(spool > 0, self._full_extend, self._full_retract)
+        asked = (self.parameters["demand"] * (flow / full).abs()).sum(-1, keepdim=True)
+        return flow * self._full_step / asked.clamp(min=1.0)
 
     def _flow(self, spool: torch.Tensor) -> torch.Tensor:
         place = (spool.clamp(-1.0, 1.0) + 1.0) * (CELLS / 2)
         cell = place.floor().clamp(max=CELLS - 1)
         at = cell.to(torch.int64) + self._row
         return torch.lerp(self._table[at], self._table[at + 1], place - cell)
+
+
+@dataclass(frozen=True, eq=False)
+class ValveDrive:
+    """Demand of commands on a valve in each step of a run.
+
+    Attributes:
+        wanted: Motion in a period in the mean pose, `(K, N, J)`.
+        extends: Whether the valve opens to the positive side, `(K, N, J)`.
+    """
+
+    wanted: torch.Tensor
+    extends: torch.Tensor
+
+    def repeat(self, count: int) -> "ValveDrive":
+        """Return that of all environments, `count` times one after the other."""
+        return ValveDrive(self.wanted.repeat(1, count, 1), self.extends.repeat(1, count, 1))
+
+
+class ValveRun:
+    """A run of a `ValveModel`; see `brokk_rl.contracts.actuator.PlannedRun`."""
+
+    def __init__(
+        self, model: ValveModel, drive: ValveDrive, kept: torch.Tensor, first: int
+    ) -> None:
+        self._model, self._drive, self._kept, self._first = model, drive, kept, first
+        self._before: torch.Tensor | None = None
+
+    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
+        """Return positions `k`, `(N, J)`."""
+        place = k - self._first
+        before = q[k - 1] - q[k - 2] if self._before is None else self._before
+        wanted, extends = self._drive.wanted[place], self._drive.extends[place]
+        held, self._before = self._model.move(q[k - 1], wanted, extends, before, self._kept)
+        return held
 
 
 def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.ndarray:

@@ -49,6 +49,40 @@ class ActuatorModel(Protocol):
         ...
 
 
+class PlannedRun(Protocol):
+    """A run of a model whose commands are all known beforehand."""
+
+    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
+        """Return positions `k`, `(N, J)`, from those before in `q`, `(T + 1, N, J)`.
+
+        It is called once for each `k`, rising from `first` of `PlannedModel.plan_run` on.
+        """
+        ...
+
+
+class PlannedModel(ActuatorModel, Protocol):
+    """An actuator model that computes what depends on commands alone for a whole run at once.
+
+    It looks at the newest position only, and at the two newest in its first step.
+    """
+
+    @property
+    def delay_s(self) -> torch.Tensor:
+        """Time until a command begins to act, `(N, J)`, s."""
+        ...
+
+    def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun | None:
+        """Return the run that begins after a `reset` of all environments; `None`: `step` through it.
+
+        The positions are those of `step`. The state stays as it was.
+
+        Args:
+            u: Commands of the run, `(T, N, J)`; position `k` follows command `k - 1`.
+            first: Number of the first position that is asked for: the length of the history.
+        """
+        ...
+
+
 class SensingModel(ActuatorModel, Protocol):
     """An actuator model with sensors and geometry: effects around a model fulfil this.
 
@@ -173,6 +207,7 @@ class FittedCurve:
         draws: Bootstrap of both, `(1 + B, C + 4)`; the first row is the fit itself.
         information: Information of the recordings on the curve, `(C, C)`.
         points: Stroke and speed of single increments, `(I, 2)`.
+        sides: Whether each side, positive first, was commanded often enough for its numbers.
     """
 
     curve: np.ndarray
@@ -180,6 +215,7 @@ class FittedCurve:
     draws: np.ndarray
     information: np.ndarray
     points: np.ndarray
+    sides: tuple[bool, bool]
 
 
 class CurveFit(Protocol):

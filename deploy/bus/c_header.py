@@ -27,9 +27,9 @@ from deploy.bus.protection import (
 )
 
 PREFIX = "BROKK"
-"""Of all names."""
+"""Prefix of every name in the header."""
 ROW_BYTES = 16
-"""Of the CRC table in a row."""
+"""Bytes of the CRC table in a row of the header."""
 TENTHS = 10
 """Tenths of a ms in a ms: the rate is counted in them, without fractions."""
 

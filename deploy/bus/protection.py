@@ -44,7 +44,7 @@ in its queue. Longer than the `gap_s` after which the queue is dropped (0.2 s), 
 RATE_SLACK = 1.1
 """By which a sender may be faster than its cycle time, for clocks that differ. Chosen by hand."""
 ROUNDING_S = 1e-9
-"""Of sums of cycle times."""
+"""Rounding error that a sum of cycle times may have, s."""
 MASK = (1 << WINDOW) - 1
 
 

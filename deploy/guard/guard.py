@@ -15,7 +15,7 @@ Pure: no clock, no bus, no file, no tensor; the caller hands in everything.
 
 Away from zero a command grows by no more than `max_rate_1_s`; towards zero it may fall at once. A
 joint that has changed its direction `max_reversals_1_s` times within a second gets zero instead of a
-further change.
+further change. The envelope withholds what brings the arm too near to an obstacle.
 Nothing is ever sent that the guard has not checked in the same cycle.
 """
 
@@ -26,6 +26,7 @@ from collections import deque
 from dataclasses import dataclass
 from enum import Enum
 
+from deploy.guard.envelope import Envelope
 from deploy.guard.limits import GuardLimits, JointBounds, Numbers
 
 
@@ -65,6 +66,7 @@ class GuardTrip(Enum):
     REQUEST_INVALID = "command is no number, or beyond full"
     REQUEST_EXCLUSIVE = "exclusive joint together with others"
     NOT_ARMED = "not armed"
+    ENVELOPE = "arm too near to ground, machine or a stay-out box"
 
 
 @dataclass(frozen=True)
@@ -112,10 +114,13 @@ class CommandRequest:
     Attributes:
         u: Commands, `(J,)`.
         age_s: Since it was made.
+        face_in_base_m: A point of the work surface, the rim of the borehole; `None` where none is
+            known.
     """
 
     u: Numbers
     age_s: float
+    face_in_base_m: Numbers | None
 
 
 @dataclass(frozen=True)
@@ -125,7 +130,7 @@ class GuardDecision:
     Attributes:
         state: See the module.
         u: Command to send, `(J,)`; all zero unless ACTIVE.
-        trip: Why the requested command is not sent now.
+        trip: Why the requested command is not sent now; `ENVELOPE` alone leaves the guard ACTIVE.
         cause: Why the guard latched last.
     """
 
@@ -146,10 +151,11 @@ class Guard:
     Args:
         limits: Limits on commands, ages and positions.
         bounds: The machine.
+        envelope: Of the arm; `None`: there is none.
     """
 
-    def __init__(self, limits: GuardLimits, bounds: JointBounds) -> None:
-        self._limits, self._bounds = limits, bounds
+    def __init__(self, limits: GuardLimits, bounds: JointBounds, envelope: Envelope | None) -> None:
+        self._limits, self._bounds, self._envelope = limits, bounds, envelope
         self._still = (0.0,) * len(bounds.lower)
         self._state, self._cause = GuardState.SILENT, GuardTrip.NONE
         # NaN stands for never: no comparison with it holds
@@ -200,7 +206,12 @@ class Guard:
             self._state, self._cause = GuardState.ACTIVE, GuardTrip.NONE
             return self._conclude(self._still, GuardTrip.NONE)
         assert request is not None
-        return self._conclude(self._limit_command(request.u, seen.q, elapsed_s), GuardTrip.NONE)
+        limited = self._limit_command(request.u, seen.q, elapsed_s)
+        if self._envelope is None:
+            return self._conclude(limited, GuardTrip.NONE)
+        face = request.face_in_base_m
+        inside, held = self._envelope.limit_command(now_s, limited, seen.q, face)
+        return self._conclude(inside, GuardTrip.ENVELOPE if held else GuardTrip.NONE)
 
     def stops(self, seen: GuardInput) -> bool:
         """Return whether the motion must end: then the caller decides at once, not next cycle."""
@@ -282,4 +293,6 @@ class Guard:
 
     def _conclude(self, u: Numbers, trip: GuardTrip) -> GuardDecision:
         self._sent = u
+        if self._envelope is not None:
+            self._envelope.note_sent(self._before_s, u)
         return GuardDecision(self._state, u, trip, self._cause)

@@ -10,6 +10,75 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 
 Numbers = tuple[float, ...]
+ROUNDING = 1e-6
+"""Difference from length 1 that counts as rounding of a file."""
+
+
+@spec
+class StayOutBox:
+    """A box that the arm stays out of, along the axes of the base frame.
+
+    Attributes:
+        lower_m: Its corner of smallest coordinates, `(x, y, z)`.
+        upper_m: Its corner of largest coordinates.
+    """
+
+    lower_m: tuple[float, float, float]
+    upper_m: tuple[float, float, float]
+
+    def check(self) -> None:
+        if not all(low < high for low, high in zip(self.lower_m, self.upper_m, strict=True)):
+            raise ConfigError(
+                f"guard.envelope.stay_out: expected lower_m below upper_m, got {self.lower_m} and {self.upper_m}"
+            )
+
+
+@spec
+class EnvelopeLimits:
+    """Limits of the envelope; see `deploy.guard.envelope`.
+
+    Attributes:
+        margin_m: Distance to obstacles below which the arm is brought no nearer.
+        release_m: Further distance that it must have before a withheld command passes again.
+        speed_margin: Speed over the machine's fastest that the look ahead assumes.
+        coast_s: Time after the dead time until a joint rests.
+        reaction_s: Time for which a command acts before the guard can take it back.
+        ground_m: Height of the ground in the base frame; `null`: there is none.
+        stay_out: Boxes to stay out of, by name.
+        face_normal: Unit vector out of the work surface, in the base frame. The surface goes
+            through the rim of the chosen borehole.
+        face_near_m: Distance to the work surface below which the tip is slowed.
+        face_radius_m: Distance from the borehole, along the surface, up to which that holds.
+        face_speed_m_s: Largest speed of the tip there.
+    """
+
+    margin_m: float
+    release_m: float
+    speed_margin: float
+    coast_s: float
+    reaction_s: float
+    ground_m: float | None
+    stay_out: dict[str, StayOutBox]
+    face_normal: tuple[float, float, float]
+    face_near_m: float
+    face_radius_m: float
+    face_speed_m_s: float
+
+    def check(self) -> None:
+        names = ("margin_m", "release_m", "coast_s", "reaction_s", "face_near_m", "face_radius_m")
+        for name in (*names, "face_speed_m_s"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise ConfigError(
+                    f"guard.envelope.{name}: expected more than 0, got {getattr(self, name)}"
+                )
+        if self.speed_margin < 1:
+            raise ConfigError(
+                f"guard.envelope.speed_margin: expected 1 or more, got {self.speed_margin}"
+            )
+        if abs(math.hypot(*self.face_normal) - 1.0) > ROUNDING:
+            raise ConfigError(
+                f"guard.envelope.face_normal: expected a unit vector, got {self.face_normal}"
+            )
 
 
 @spec
@@ -39,6 +108,8 @@ class GuardLimits:
         range_slack: Distance beyond the joint limits (rad or m) at which a position is still
             believed.
         num_jumps: Jumps in a row after which positions are not plausible.
+        envelope: Limits of the arm in space; `null`: none. Without the machine's geometry there
+            is none either.
     """
 
     max_command: float
@@ -59,6 +130,7 @@ class GuardLimits:
     jump_slack: float
     range_slack: float
     num_jumps: int
+    envelope: EnvelopeLimits | None
 
     def check(self) -> None:
         if not 0 < self.max_command <= 1:

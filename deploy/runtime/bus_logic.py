@@ -19,6 +19,7 @@ from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import STAMP, BusDescription
 from deploy.bus.protection import MessageFault
+from deploy.guard.envelope import Envelope
 from deploy.guard.guard import CommandRequest, Guard, GuardDecision, GuardState
 from deploy.guard.limits import GuardLimits
 from deploy.runtime.operator_state import (
@@ -32,7 +33,7 @@ from deploy.runtime.receiver import BusReceiver
 CYCLE_S = 0.01
 """Half the cycle time of valve commands in the example DBC (20 ms)."""
 LARGEST_OVERRUNS = 4095
-"""Of the 12-bit signal `Overruns`."""
+"""Largest value of the signal `Overruns`, which has 12 bits."""
 LAST_ZEROS = 5
 """Zero commands before silence: 100 ms of the example bus, longer than the 70 ms after which the
 gateway misses commands. One of them would do; the others are for a bus that loses some."""
@@ -50,11 +51,13 @@ class BusInputs:
         controls: Switches on the operator's side.
         stop: The operator's stop.
         request: Command to be sent.
+        face_in_base_m: Rim of the chosen borehole, a point of the work surface.
     """
 
     controls: OperatorControls | None
     stop: StopRequest | None
     request: RequestedCommand | None
+    face_in_base_m: tuple[float, ...] | None
 
 
 class BusLogic:
@@ -64,6 +67,7 @@ class BusLogic:
         description: The bus.
         machine: The machine.
         limits: Of the guard.
+        envelope: Of the arm; `None`: there is none.
         commands: Whether anything is ever sent.
 
     Attributes:
@@ -72,11 +76,16 @@ class BusLogic:
     """
 
     def __init__(
-        self, description: BusDescription, machine: Machine, limits: GuardLimits, commands: bool
+        self,
+        description: BusDescription,
+        machine: Machine,
+        limits: GuardLimits,
+        envelope: Envelope | None,
+        commands: bool,
     ) -> None:
         self._description, self._machine, self._commands = description, machine, commands
         self.receiver = BusReceiver(description, machine, limits)
-        self._guard = Guard(limits, self.receiver.bounds)
+        self._guard = Guard(limits, self.receiver.bounds, envelope)
         self.decision: GuardDecision | None = None
         self._zeros_left = 0
         self._controls_age_s = math.inf
@@ -109,7 +118,8 @@ class BusLogic:
         seen = self.receiver.build_guard_input(now_s, bus_up, self._controls_age_s)
         request = None
         if requested is not None:
-            request = CommandRequest(tuple(requested.u.tolist()), now_s - requested.t_s)
+            u, age_s = tuple(requested.u.tolist()), now_s - requested.t_s
+            request = CommandRequest(u, age_s, inputs.face_in_base_m)
         before = self.decision
         armed = self._commands and is_armed(controls, inputs.stop)
         self.decision = self._guard.decide(now_s, armed, seen, request)

@@ -18,8 +18,10 @@ from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import BusReplay, CanBus, CanFrame, OpenBusReplay, OpenCanBus
 from deploy.bus.description import BusDescription
+from deploy.guard.envelope import Envelope
 from deploy.guard.guard import GuardDecision
 from deploy.guard.limits import GuardLimits
+from deploy.guard.shapes import read_machine_shapes
 from deploy.runtime.bus_logic import CYCLE_S, BusInputs, BusLogic
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -66,7 +68,8 @@ class BusProcess:
         self._wire, self._memory = config.wire, memory
         description = BusDescription(config.dbc, config.machine)
         commands = memory.request is not None
-        self._logic = BusLogic(description, config.machine, config.limits, commands)
+        envelope = build_envelope(config.limits, config.machine)
+        self._logic = BusLogic(description, config.machine, config.limits, envelope, commands)
         self._gap_s = config.limits.gap_s
         self._bus: OpenCanBus | OpenBusReplay | None = None
         self._was_down, self._reopen_s = False, 0.0
@@ -118,7 +121,9 @@ class BusProcess:
         """Decide, send and publish."""
         now_s, memory, logic = time.monotonic(), self._memory, self._logic
         request = None if memory.request is None else memory.request.read()
-        inputs = BusInputs(memory.controls.read(), memory.stop.read(), request)
+        target = memory.target.read()
+        face = None if target is None else tuple(target["center_in_base_m"].tolist())
+        inputs = BusInputs(memory.controls.read(), memory.stop.read(), request, face)
         before = logic.decision
         frames = logic.decide(now_s, self._bus is not None, inputs, self._timer.missed)
         self._send(frames, now_s)
@@ -184,3 +189,18 @@ class BusProcess:
     def _log_text(self, topic: str, now_s: float, values: Mapping[str, object]) -> None:
         text = json.dumps({"topic": topic, "t_s": now_s, **values})
         self._memory.bus_log.put(TEXT + text.encode())
+
+
+def build_envelope(limits: GuardLimits, machine: Machine) -> Envelope | None:
+    """Return the envelope of the arm; `None` where it is switched off or no geometry is known.
+
+    Raises:
+        ConfigError: the machine's shapes cannot be read.
+    """
+    if limits.envelope is None:
+        return None
+    shapes = read_machine_shapes(machine)
+    if shapes is None:
+        log.warning("machine %s has no geometry: there is no envelope of its arm", machine.name)
+        return None
+    return Envelope(limits.envelope, machine, shapes)

@@ -25,8 +25,8 @@ log = logging.getLogger(__name__)
 PATIENCE_S = 3.0
 """Time that a process gets to end before it is killed. Chosen by hand."""
 BUS_PRIORITY, POLICY_PRIORITY = 55, 50
-"""Of SCHED_FIFO, 1 to 99. Chosen by hand: the bus before the policy, and both before twin (45) and
-commander (40)."""
+"""Priorities under SCHED_FIFO, 1 to 99. Chosen by hand: the bus before the policy, and both before
+twin (45) and commander (40)."""
 OPTIONAL = {
     "page": "nothing is shown any more",
     "terminal": "nothing is shown here any more",

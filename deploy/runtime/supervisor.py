@@ -38,8 +38,9 @@ PROCESSES, TIMING = "processes.json", "timing.json"
 WATCH_S = 0.05
 """Between looks at requests and processes. Chosen by hand: quick for a person."""
 SUPERVISOR_PRIORITY = 30
-"""Of SCHED_FIFO, below all that depend on it. The guard latches when the supervisor's switches are
-older than 0.2 s, so it must not wait for other work. Its children do not inherit it."""
+"""Priority of the supervisor under SCHED_FIFO, below all that depend on it. The guard latches when
+the supervisor's switches are older than 0.2 s, so it must not wait for other work. Its children do
+not inherit it."""
 
 
 @spec

@@ -30,9 +30,9 @@ REMOTE_S = 0.13
 ROUND_TRIP_S = 0.15
 """Age of the stamp in a command above which it is refused: the 150 ms that are promised for delay."""
 ROUNDING_S = 1e-6
-"""Of differences of times."""
+"""Rounding error that a difference of times may have, s."""
 LARGEST_ROUND_TRIP_S = 0.51
-"""Of the signal `RoundTrip` in the example DBC; stands for "not measured" too."""
+"""Largest value of the signal `RoundTrip` in the example DBC; "not measured" is sent as this too."""
 FORGET_S = 1.0
 """Silence of the PC after which its next command counts as heard anew. Chosen by hand."""
 IDLE_FRAMES = 3

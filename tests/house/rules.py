@@ -49,6 +49,7 @@ CLOSED = {
     "deploy.guard.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.guard.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.guard.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.guard.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
 }
 """What a package must not import, whatever its floor: the machine's own computer has neither
 simulator nor trainer."""

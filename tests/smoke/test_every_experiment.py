@@ -44,7 +44,7 @@ def read_options(group: str) -> dict[str, dict[str, Any]]:
 
 
 def changes_behaviour(key: str) -> bool:
-    """Says whether a swept key belongs to the task's behaviour, or brings a part of it."""
+    """Return whether a swept key belongs to the task's behaviour, or brings a part of it."""
     fields = tuple(f"task.{name}" for name in BoreholeInsertion.behaviour)
     return key.startswith("follower.") or key.startswith(fields)
 

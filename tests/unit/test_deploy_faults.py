@@ -253,7 +253,7 @@ BRIDGE: list[tuple[str, dict[str, Any], float]] = [
     ("foreign commands", {"foreign": {"Command_q3": 0.5, "CommandMode": 1}}, UNTRUSTED),
     ("growing delay", {"delay_s": {"to_pc": lambda since_s: 0.1 * since_s}}, 1.5 + 0.02),
 ]  # fmt: skip
-"""What a bridge between gateway and PC can do, and the time within which the motion ends."""
+"""Faults of a bridge between gateway and PC: name, settings, longest time until the motion ends, s."""
 
 
 def build_bridge(stage: Stage, faults: dict[str, Any]) -> None:

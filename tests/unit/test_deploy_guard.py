@@ -29,7 +29,7 @@ BODY = build_joint_bounds([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [
 LIMITS = GuardLimits(
     max_command=0.8, max_rate_1_s=5.0, max_reversals_1_s=3, overrun=0.001, neutral=0.05, stop_margin=0.1, joints_s=0.15,
     levers_s=0.16, status_s=0.17, request_s=0.18, ignored_s=0.3, controls_s=0.19, round_trip_s=0.14, gap_s=0.2, jump_margin=3.0,
-    jump_slack=0.01, range_slack=0.2, num_jumps=3,
+    jump_slack=0.01, range_slack=0.2, num_jumps=3, envelope=None,
 )  # fmt: skip
 WELL = GuardInput(
     q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
@@ -44,7 +44,7 @@ class Hand:
     """A guard whose clock goes on by `DT` with each decision."""
 
     def __init__(self, limits: GuardLimits = LIMITS) -> None:
-        self.guard, self.now_s = Guard(limits, BODY), 100.0
+        self.guard, self.now_s = Guard(limits, BODY, None), 100.0
 
     def decide(
         self,
@@ -55,7 +55,7 @@ class Hand:
     ) -> GuardDecision:
         self.now_s += change.pop("dt", DT)
         age_s = change.pop("age_s", 0.0)
-        request = None if u is None else CommandRequest(u, age_s)
+        request = None if u is None else CommandRequest(u, age_s, None)
         return self.guard.decide(self.now_s, armed, replace(seen, **change), request)
 
     def active(self) -> Hand:

@@ -15,6 +15,7 @@ from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.bus.protection import MessageFault
+from deploy.guard.envelope import Envelope
 from deploy.guard.guard import GuardState, GuardTrip
 from deploy.runtime.bus_logic import LAST_ZEROS, BusInputs, BusLogic, is_armed
 from deploy.runtime.operator_state import OperatorControls, RequestedCommand, StopRequest
@@ -29,10 +30,13 @@ def build_controls(t_s: float, armed: bool = True, armed_t_s: float = 0.0) -> Op
 class Loop:
     """Logic, gateway and remote on one clock; requests, switches and stop as they are set."""
 
-    def __init__(self, commands: bool = True, bus: BusDescription = BUS) -> None:
+    def __init__(
+        self, commands: bool = True, bus: BusDescription = BUS, envelope: Envelope | None = None
+    ) -> None:
+        self.envelope, self.face_in_base_m = envelope, None
         self.sender = Sender(bus)
         self.bus = bus
-        self.logic = BusLogic(bus, MACHINE, LIMITS, commands)
+        self.logic = BusLogic(bus, MACHINE, LIMITS, self.envelope, commands)
         self.sender.receiver = self.logic.receiver
         self.armed, self.armed_s, self.stop_s = True, 0.0, None
         self.u: np.ndarray | None = U
@@ -57,6 +61,7 @@ class Loop:
             request=None
             if self.u is None
             else RequestedCommand(now_s - self.request_age_s, self.u),
+            face_in_base_m=self.face_in_base_m,
         )
         frames = self.logic.decide(now_s, self.bus_up, inputs, self.missed)
         self.note(frames)
@@ -270,7 +275,7 @@ def test_who_is_armed(
 def test_without_switches_nothing_is_ever_sent() -> None:
     loop = Loop()
     loop.sender.go(0.3)
-    inputs = BusInputs(None, None, RequestedCommand(loop.now_s, U))
+    inputs = BusInputs(None, None, RequestedCommand(loop.now_s, U), None)
     assert loop.logic.decide(loop.now_s, True, inputs, 0) == []
     assert loop.state is GuardState.SILENT and loop.logic.end(loop.now_s, 0) == []
 

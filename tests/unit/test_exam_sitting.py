@@ -1,4 +1,4 @@
-"""What surrounds a sitting: registration, interruption, the examiner's own simulation, noise-aware baselines."""
+"""Registration, interruption and scoring of an exam, the examiner's simulation, and the baselines."""
 
 from __future__ import annotations
 

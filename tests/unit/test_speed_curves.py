@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from axis import PLANT, driven, make_axis
@@ -10,7 +12,7 @@ from composed import option
 from actuators.effects.command import DeadBand, Saturation
 from actuators.effects.speed import Asymmetry, FlowGain, Lag
 from brokk_rl.contracts.actuator import Effect
-from brokk_rl.machine import Machine
+from brokk_rl.machine import Dimension, Machine
 from diagnosis import effect_library
 from diagnosis.baseline import compare_simulator
 from diagnosis.responses import choose_rays
@@ -69,6 +71,34 @@ def test_dead_band_saturation_and_gains_are_read_off_with_their_intervals(axis: 
         assert estimate.mean == pytest.approx(value, rel=0.1), name
         low, high = estimate.ci95
         assert low - 0.02 < value < high + 0.02 and high - low < 0.5 * value, name
+
+
+def _far(value_rad: float) -> Dimension:
+    return Dimension(value=value_rad, source="of this test", confidence="high")
+
+
+@pytest.fixture(scope="module")
+def wide(axis: Machine) -> Machine:
+    """The axis with travel for minutes of motion one way."""
+    joint = dataclasses.replace(axis.joints[0], lower=_far(-200.0), upper=_far(200.0))
+    return dataclasses.replace(axis, joints=(joint,))
+
+
+@pytest.mark.parametrize("returns_s", [0.0, 25.0])
+def test_a_side_that_is_hardly_commanded_shows_no_effect(wide: Machine, returns_s: float) -> None:
+    """Nothing holds the curve of such a side, in the sample or in the draws that lack its only block."""
+    put: dict[str, Effect] = {"dead_band": DeadBand(joints="all", extend=0.3, retract=0.3)}
+    recordings = driven(wide, put, 3, 120.0, 5, least=0.0)
+    if returns_s:
+        recordings += driven(wide, put, 1, returns_s, 6)
+    field = compare_simulator(PLANT, [(one, 0.0) for one in recordings], wide, 0)
+    curves = measure_curves(field, [], wide, option("curve_fit", "valve"), np.random.default_rng(0))
+    found = curves.joints["q3"].estimates()
+    assert found["dead_band_retract"] is None and found["retract_gain"] is None
+    extend = found["dead_band_extend"]
+    assert extend is not None and extend.mean == pytest.approx(0.3, abs=0.03)
+    (shown,) = propose_effects(curves, effect_library.load_effects(wide), wide)
+    assert shown["dead_band"]["retract"] == 0.0
 
 
 def test_a_curve_that_did_not_change_shows_no_effect(axis: Machine, unchanged: SpeedCurves) -> None:

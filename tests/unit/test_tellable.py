@@ -41,7 +41,7 @@ PLANT = FirstOrderLag(
     spread={},
 )
 NOISY = ExpectedError(sensor=0.03, change=0.0, wander=0.02, memory=17.0, reading=0.0)
-"""So much noise that no smallest size is below the least one that is ever named."""
+"""Noise that keeps every smallest size above the least size that is ever named."""
 EFFECTS = ("backlash", "dead_band", "flow_gain", "lag", "saturation")
 
 

@@ -19,6 +19,7 @@ const DE = {
   "operator's switches missing": "Bedienseite der Steuerung still", "way to the gateway and back unknown or too long": "Weg zum Steuergerät unbekannt oder zu lang",
   "somebody else sends commands": "Ein anderer sendet Befehle", "operator moves a lever": "Bediener bewegt Hebel", "no fresh command": "Kein frischer Befehl",
   "command is no number, or beyond full": "Befehl ungültig", "exclusive joint together with others": "Gelenk darf nur allein fahren", "not armed": "nicht scharf", "the gateway does not follow": "Steuergerät folgt nicht",
+  "arm too near to ground, machine or a stay-out box": "Arm zu nah an Boden, Maschine oder Sperrbereich",
   "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
   "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
   "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",

@@ -1,0 +1,396 @@
+"""Hydraulic circuits against worked numbers and a stiff solution of the same equations."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+from scipy.integrate import solve_ivp
+
+from actuators.models.circuit import (
+    DEAD_VOLUME,
+    LAMINAR,
+    CircuitModel,
+    HydraulicCircuit,
+    compute_cylinder_length,
+)
+from brokk_rl.errors import ConfigError
+from brokk_rl.gravity import GRAVITY_M_S2, Gravity
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+
+CPU = torch.device("cpu")
+CIRCUITS = ("load_sensing", "post_compensated", "open_center")
+Q3 = 2
+
+
+def circuit(name: str = "load_sensing", **changes: Any) -> HydraulicCircuit:
+    return dataclasses.replace(option("actuator", name), **changes)
+
+
+def frictionless(name: str = "load_sensing", **changes: Any) -> HydraulicCircuit:
+    """A circuit whose equations are smooth but for its valves: what a stiff solver can integrate."""
+    smooth = {"coulomb": 0.0, "breakaway": 0.0, "hysteresis": 0.0, "transport_s": 0.0}
+    return circuit(name, **(smooth | {"viscous": 0.2} | changes))
+
+
+class Run:
+    """A free run of one environment from rest; rows of `q` and of the states after each period."""
+
+    def __init__(
+        self,
+        config: HydraulicCircuit,
+        machine: Machine,
+        levels: dict[str, float],
+        periods: int,
+        q: np.ndarray | None = None,
+        blocked: tuple[str, ...] = (),
+    ) -> None:
+        self.model = CircuitModel(config, machine, 1, CPU)
+        at = torch.tensor(machine.home if q is None else q, dtype=torch.float32)[None]
+        shape = (1, machine.num_history, machine.num_joints)
+        history = History(q=torch.zeros(shape), u=torch.zeros(shape))
+        history.reset(torch.ones(1, dtype=torch.bool), at)
+        u = torch.zeros(1, machine.num_joints)
+        for name, level in levels.items():
+            u[0, machine.joint_names.index(name)] = level
+        held = [machine.joint_names.index(name) for name in blocked]
+        self.q, self.state = [at[0].numpy().astype(float)], []
+        for _ in range(periods):
+            history.push_u(u)
+            q_next = self.model.step(history).clone()
+            q_next[:, held] = at[:, held]
+            history.push_q(q_next)
+            self.q.append(q_next[0].numpy().astype(float))
+            self.state.append({k: v[0].numpy().copy() for k, v in self.model.state.items()})
+        self.q = np.array(self.q)
+
+    def get(self, name: str, joint: int = 0) -> np.ndarray:
+        """Return a state over time."""
+        return np.array([row[name][joint] for row in self.state])
+
+    def speed(self, joint: int, periods: int, machine: Machine) -> float:
+        """Return the mean speed over the last periods, of full speed."""
+        moved = self.q[-1, joint] - self.q[-1 - periods, joint]
+        return moved / (periods * machine.period_s * machine.max_speed[joint])
+
+
+def solve_one_joint(
+    config: HydraulicCircuit, machine: Machine, joint: int, u: float, t_s: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return position and supply of one joint that moves alone in the positive direction.
+
+    Written from the equations, with scipy's stiff solver; the linkage follows the joint.
+    """
+    name = machine.joint_names[joint]
+
+    def number(field: str) -> float:
+        value = getattr(config, field)
+        return value.get(name, value.get("other")) if isinstance(value, dict) else value
+
+    body, full = machine.bodies[joint], machine.max_speed[joint]
+    k, torque = body.stiffness.value, number("supply_ratio") * body.yield_force.value
+    inertia = k / (2 * np.pi * number("mode_hz")) ** 2
+    alpha, omega = number("rod_area"), 2 * np.pi * number("spool_hz")
+    lower, upper = machine.lower[joint], machine.upper[joint]
+    low, high = number("linkage_lower_rad"), number("linkage_upper_rad")
+    r, share = number("linkage_sides"), number("flow_share") / number("speed_scale")
+    gravity, home = Gravity(machine, CPU), np.array(machine.home)
+    setting = number("counterbalance_setting")
+
+    def length(angle: float) -> float:
+        return math.sqrt(1 + r * r - 2 * r * math.cos(angle))
+
+    def arm(angle: float) -> float:
+        return r * math.sin(angle) / length(angle)
+
+    def slopes(_: float, y: np.ndarray) -> list[float]:
+        q, w, bore, rod, spool, rate, poppet, supply = y
+        at = home.copy()
+        at[joint] = q
+        load = float(gravity.load(torch.tensor(at[None], dtype=torch.float32))[0, joint]) / torque
+        angle = low + (q - lower) / (upper - lower) * (high - low)
+        lever = arm(angle) / arm(0.5 * (low + high))
+        stroke = (length(angle) - length(low)) / (length(high) - length(low))
+        o = number("overlap_extend")
+        area = max(spool - o, 0.0) / (1 - o)
+        area = area * (1 - number("notch") + number("notch") * area)
+        drop = max(supply - bore, 0.0)
+        if config.compensation != "none":
+            drop = min(drop, config.margin)
+        flow = number("speed_scale") * area * drop / math.sqrt((drop + LAMINAR) * config.margin)
+        edge = number("speed_scale") * area * alpha / math.sqrt(number("outlet"))
+        wanted = number("counterbalance_ratio") * bore + rod - setting
+        wanted = min(max(wanted / number("counterbalance_range"), 0.0), 1.0) * (area > 0)
+        if setting > 0:
+            edge *= poppet / math.sqrt(poppet**2 + area**2 + 1e-9)
+        out = edge * max(rod, 0.0) / math.sqrt(max(rod, 0.0) + LAMINAR)
+        column = k * full / (torque * (1 + alpha)) * (DEAD_VOLUME + 0.5)
+        d_bore = column / (DEAD_VOLUME + stroke) * (flow - number("leak") * bore - lever * w)
+        d_rod = column / alpha / (DEAD_VOLUME + 1 - stroke)
+        d_rod *= -out - number("leak") * rod + alpha * lever * w
+        d_w = torque / (inertia * full)
+        d_w *= lever * (bore - alpha * rod) + load - number("viscous") * w
+        spare = min(1.0, config.power / supply) - share * flow
+        if config.compensation == "none":
+            left = max(1 - abs(spool) / config.bypass_stroke, 0.0) ** 2
+            d_supply = spare - left / math.sqrt(config.standby) * supply / math.sqrt(
+                supply + LAMINAR
+            )
+            d_supply /= config.line
+        else:
+            aim = min(max((bore if area > 0 else 0.0) + config.margin, config.standby), 1.0)
+            d_supply = min((aim - supply) / config.pump_s, spare / config.line)
+        # chambers draw oil from the return line below 0; relief valves open above 1
+        d_bore, d_rod, d_supply = (
+            0.0 if (p <= 0 and rate_p < 0) or (p >= 1 and rate_p > 0) else rate_p
+            for p, rate_p in ((bore, d_bore), (rod, d_rod), (supply, d_supply))
+        )
+        return [
+            full * w,
+            d_w,
+            d_bore,
+            d_rod,
+            rate,
+            omega * (omega * (u - spool) - 2 * number("spool_damping") * rate),
+            (wanted - poppet) / number("counterbalance_s"),
+            d_supply,
+        ]
+
+    start = CircuitModel(config, machine, 1, CPU)
+    shape = (1, machine.num_history, machine.num_joints)
+    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
+    history.reset(
+        torch.ones(1, dtype=torch.bool), torch.tensor(machine.home, dtype=torch.float32)[None]
+    )
+    lever, _ = start._follow_linkage(history.q[:, -1])
+    force = start.parameters["supply_ratio"] * start._yield_force
+    begun = start._begin(history, torch.zeros(1, machine.num_joints), lever, force)
+    first = [
+        home[joint],
+        0.0,
+        float(begun["bore"][0, joint]),
+        float(begun["rod"][0, joint]),
+        0.0,
+        0.0,
+        0.0,
+        config.standby,
+    ]
+    found = solve_ivp(
+        slopes, (0, t_s[-1]), first, "LSODA", t_s, rtol=1e-5, atol=1e-7, max_step=0.002
+    )
+    return found.y[0], found.y[7]
+
+
+@pytest.mark.parametrize("name", CIRCUITS)
+@pytest.mark.parametrize("u", [0.4, 1.0])
+def test_a_moving_joint_agrees_with_a_stiff_solver(name: str, u: float, machine: Machine) -> None:
+    config, periods = frictionless(name), 24
+    t_s = np.arange(periods + 1) * machine.period_s
+    q, supply = solve_one_joint(config, machine, Q3, u, t_s)
+    travelled = abs(q[-1] - q[0])
+    assert travelled > 0.03
+    fine = Run(dataclasses.replace(config, substep_s=0.00125), machine, {"q3": u}, periods)
+    np.testing.assert_allclose(fine.q[:, Q3], q, atol=0.015 * travelled)
+    assert fine.get("supply")[-1] == pytest.approx(supply[-1], abs=0.01)
+    shipped = Run(config, machine, {"q3": u}, periods)
+    np.testing.assert_allclose(shipped.q[:, Q3], q, atol=0.06 * travelled)
+
+
+def test_the_lever_arm_is_the_slope_of_the_cylinders_length(machine: Machine) -> None:
+    model = circuit().build(machine, 1, CPU)
+    low, high = machine.lower[Q3], machine.upper[Q3]
+    steps = torch.linspace(0.0, 1.0, 401)
+    q = torch.tensor(machine.home, dtype=torch.float32).repeat(401, 1)
+    q[:, Q3] = low + steps * (high - low)
+    model.parameters = {k: v.expand(401, -1) for k, v in model.parameters.items()}
+    lever, stroke = (value[:, Q3].numpy() for value in model._follow_linkage(q))
+    # the work of a cylinder: force times d(length) = torque times d(angle)
+    slope = np.gradient(stroke)
+    np.testing.assert_allclose(lever[1:-1] / lever[200], slope[1:-1] / slope[200], rtol=2e-2)
+    assert stroke[0] == pytest.approx(0.0, abs=1e-6)
+    assert stroke[-1] == pytest.approx(1.0, abs=1e-6)
+    # a triangle with sides 1 and 0.3: sin(a) / length at 0.35 and at the middle, 1.475 rad
+    assert lever[0] == pytest.approx((0.34290 / 0.72537) / (0.99541 / 1.01646), rel=1e-3)
+    assert float(compute_cylinder_length(torch.tensor(math.pi / 2), torch.tensor(0.75))) == 1.25
+
+
+@pytest.mark.parametrize("name", CIRCUITS)
+def test_speed_at_the_same_command_varies_with_the_pose(name: str, machine: Machine) -> None:
+    config = circuit(name)
+    model = config.build(machine, 1, CPU)
+    found = []
+    for share in (0.02, 0.25, 0.5, 0.75, 0.98):
+        q = torch.tensor(machine.lower + share * (machine.upper - machine.lower)).float()[None]
+        found.append(model._follow_linkage(q)[0][0, 1:].numpy())
+    most = np.max(found, 0) / np.min(found, 0)
+    assert most.max() > 2.0
+    assert (most < 3.5).all()
+    assert (most > 1.2).all()
+
+
+def test_compensated_speed_is_free_of_the_load_and_a_throttles_is_not(machine: Machine) -> None:
+    # q3 lifts: upwards is negative; alone, so that the pump has oil to spare
+    def lift(name: str, scale: float) -> float:
+        plain = {"outlet": 0.01, "counterbalance_setting": 0.0, "margin": 0.08, "power": 1.0}
+        plain |= {"linkage_lower_rad": 1.57, "linkage_upper_rad": 1.57, "bypass_stroke": 0.3}
+        config = frictionless(name, **plain, supply_ratio=scale)
+        return -Run(config, machine, {"q3": -0.6}, 30).speed(Q3, 10, machine)
+
+    # twice the cylinder carries the same weight at half the pressure
+    assert lift("load_sensing", 1.5) == pytest.approx(lift("load_sensing", 3.0), rel=0.02)
+    assert lift("open_center", 1.5) < 0.97 * lift("open_center", 3.0)
+
+
+def test_a_saturated_pump_slows_all_joints_alike_only_behind_post_compensators(
+    machine: Machine,
+) -> None:
+    # q1 has no load; q3 lifts: a pre-compensated valve loses the heavy joint first
+    def share(name: str) -> tuple[float, float]:
+        config = circuit(name, flow_share=0.9, power=2.0)
+        alone = [
+            Run(config, machine, {joint: level}, 40).speed(j, 10, machine)
+            for j, joint, level in ((0, "q1", 1.0), (Q3, "q3", -1.0))
+        ]
+        both = Run(config, machine, {"q1": 1.0, "q3": -1.0}, 40)
+        return both.speed(0, 10, machine) / alone[0], both.speed(Q3, 10, machine) / alone[1]
+
+    light, heavy = share("post_compensated")
+    assert light < 0.8
+    assert heavy == pytest.approx(light, abs=0.12)
+    light, heavy = share("load_sensing")
+    assert heavy < light - 0.2
+
+
+def test_pump_stays_within_its_power(machine: Machine) -> None:
+    limited, free = (
+        Run(circuit(power=power), machine, {"q3": -1.0, "q4": -1.0, "q5": -1.0}, 40)
+        for power in (0.15, 2.0)
+    )
+    model = limited.model
+    used = []
+    for row in limited.state[20:]:
+        # oil that left the pump is that which moved the rods (alpha of the bore's)
+        p = {name: value[0].numpy() for name, value in model.parameters.items()}
+        q = torch.tensor(limited.q[20], dtype=torch.float32)[None]
+        lever = model._follow_linkage(q)[0][0].numpy()
+        taken = p["flow_share"] / p["speed_scale"] * p["rod_area"] * lever * np.abs(row["speed"])
+        used.append(float(row["supply"][0] * taken.sum()))
+    assert np.mean(used) < 0.15 * 1.15
+    assert abs(limited.speed(Q3, 10, machine)) < 0.8 * abs(free.speed(Q3, 10, machine))
+
+
+def test_pump_keeps_its_margin_above_the_highest_load(machine: Machine) -> None:
+    run = Run(circuit(), machine, {"q3": -0.5}, 30)
+    assert run.get("supply")[-1] == pytest.approx(run.get("rod", Q3)[-1] + 0.08, abs=0.01)
+    idle = Run(circuit(), machine, {}, 30)
+    assert idle.get("supply")[-1] == pytest.approx(0.08, abs=1e-3)
+
+
+def test_a_counterbalance_valve_makes_the_pump_push_a_falling_load(machine: Machine) -> None:
+    """Lowering with the valve takes inlet pressure: ratio * inlet + outlet = setting + opening."""
+    held, free = (
+        Run(circuit(counterbalance_setting=setting), machine, {"q3": 0.5}, 40)
+        for setting in (0.8, 0.0)
+    )
+    bore, rod, poppet = (held.get(name, Q3)[20:].mean() for name in ("bore", "rod", "poppet"))
+    assert 3.0 * bore + rod == pytest.approx(0.8 + 0.5 * poppet, abs=0.03)
+    assert bore > 0.05
+    assert free.get("bore", Q3)[-1] < 0.01
+    assert held.speed(Q3, 10, machine) <= free.speed(Q3, 10, machine) + 1e-3
+
+
+@pytest.mark.parametrize("name", CIRCUITS)
+def test_closed_valves_hold_the_arm_but_for_the_leak(name: str, machine: Machine) -> None:
+    config = circuit(name)
+    run = Run(config, machine, {}, 200)
+    sunk = np.abs(run.q[-1] - run.q[20]) / (machine.max_speed * 180 * machine.period_s)
+    assert (sunk <= config.leak * 3.0).all()
+    leaking = Run(circuit(name, leak=0.05), machine, {}, 200)
+    assert leaking.q[-1, Q3] - leaking.q[20, Q3] > 0.005
+
+
+@pytest.mark.parametrize("name", CIRCUITS)
+def test_contact_raises_the_pressure_and_slows_the_others(name: str, machine: Machine) -> None:
+    config = circuit(name, power=0.3) if name != "open_center" else circuit(name)
+    levels, periods = {"q3": 0.8, "q5": 0.8}, 40
+    free = Run(config, machine, levels, periods)
+    blocked = Run(config, machine, levels, periods, blocked=("q3",))
+    assert blocked.get("bore", Q3)[-1] > free.get("bore", Q3)[-1] + 0.2
+    # the plant presses with more than the drive's yield force
+    body = machine.bodies[Q3]
+    assert -blocked.get("pressed", Q3)[-1] * body.stiffness.value > body.yield_force.value
+    if name != "open_center":
+        assert blocked.get("supply")[-1] > free.get("supply")[-1] + 0.1
+        assert blocked.speed(4, 10, machine) < free.speed(4, 10, machine) + 0.02
+
+
+def test_effects_around_a_circuit_are_not_taken_for_contact(machine: Machine) -> None:
+    effect = dataclasses.replace(option("effect", "flow_gain"), gain=0.8)
+    inner = circuit().build(machine, 1, CPU)
+    model = effect.wrap(inner, machine, 1, CPU)
+    shape = (1, machine.num_history, machine.num_joints)
+    history = History(q=torch.zeros(shape), u=torch.zeros(shape))
+    history.reset(
+        torch.ones(1, dtype=torch.bool), torch.tensor(machine.home, dtype=torch.float32)[None]
+    )
+    for _ in range(30):
+        u = torch.zeros(1, machine.num_joints)
+        u[0, Q3] = -0.7
+        history.push_u(u)
+        history.push_q(model.step(history))
+    assert float(inner.state["pressed"].abs().max()) < 1e-5
+
+
+def test_outriggers_tilt_the_machine_by_the_moment_of_its_arm(machine: Machine) -> None:
+    stiffness = 2.0e6
+    model = circuit(outrigger_nm_rad=stiffness).build(machine, 1, CPU)
+    # the arm stretched straight ahead: every centre of mass lies on one line at its link's height
+    q = torch.zeros(1, machine.num_joints)
+    x_m, moment_nm = 0.0, 0.0
+    for body in machine.bodies:
+        x_m += body.origin_m[0].value
+        moment_nm += body.mass_kg.value * GRAVITY_M_S2 * (x_m + body.com_m[0])
+    overturn = Gravity(machine, CPU).overturn(q)[0].numpy()
+    np.testing.assert_allclose(overturn, [0.0, moment_nm, 0.0], rtol=1e-5, atol=1e-2)
+    home_nm = float(
+        Gravity(machine, CPU).overturn(torch.tensor(np.array(machine.home)[None]).float())[0, 1]
+    )
+    tilt_rad = (moment_nm - home_nm) / stiffness
+    reach_m = x_m + machine.tip_m[0]
+    height_m = sum(body.origin_m[2].value for body in machine.bodies)
+    # the front goes down and, as the tip is above the ground, forward
+    expected = [tilt_rad * height_m, 0.0, -tilt_rad * reach_m]
+    np.testing.assert_allclose(model.misplacement(q)[0].numpy(), expected, rtol=1e-4, atol=1e-6)
+    assert 0.001 < tilt_rad < 0.012
+    assert model.sides == {"kinematics"}
+    rigid = circuit(outrigger_nm_rad=0.0).build(machine, 1, CPU)
+    assert rigid.sides == frozenset()
+    assert float(rigid.misplacement(q).abs().max()) == 0.0
+    home = torch.tensor(np.array(machine.home)[None]).float()
+    assert float(model.misplacement(home).abs().max()) == pytest.approx(0.0, abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"substep_s": 0.02}, "substep_s"),
+        ({"margin": 0.0}, "margin"),
+        ({"compensation": "both"}, "compensation"),
+        ({"outrigger_nm_rad": float("nan")}, "outrigger_nm_rad"),
+        ({"linkage_lower_rad": 0.0}, "linkage_lower_rad"),
+        ({"rod_area": 1.5}, "rod_area"),
+        ({"breakaway": 0.0}, "breakaway"),
+        ({"transport_s": 0.9}, "transport_s"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(
+    changes: dict[str, Any], words: str, machine: Machine
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        circuit(**changes).build(machine, 1, CPU)

@@ -1,0 +1,488 @@
+"""Envelope of the arm: distances against MuJoCo's own, and what the guard does with them."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+from composed import option
+
+import brokk_rl.sim
+from brokk_rl.errors import ConfigError
+from deploy.guard.envelope import Envelope, measure_segment_to_box
+from deploy.guard.limits import StayOutBox
+from deploy.guard.shapes import RoundedBox, fit_capsules, read_machine_shapes
+
+MACHINE = option("machine", "brokk170")
+LIMITS = option("guard", "default").envelope
+SHAPES = read_machine_shapes(MACHINE)
+assert SHAPES is not None
+MJCF = Path(brokk_rl.sim.__file__).parent / "assets" / "brokk170.xml"
+BODIES = ("undercarriage", *(f"{name}_link" for name in MACHINE.joint_names))
+WALL = StayOutBox(lower_m=(1.0, 1.4, 0.2), upper_m=(4.0, 1.6, 2.5))
+HOME = np.array(MACHINE.home)
+STILL = (0.0,) * 5
+DT_S = 0.025
+SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
+
+
+def build_envelope(**change: object) -> Envelope:
+    assert SHAPES is not None
+    return Envelope(replace(LIMITS, **change), MACHINE, SHAPES)
+
+
+def draw_poses(count: int, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(MACHINE.lower, MACHINE.upper, (count, 5))
+
+
+def find_distance_m(
+    model: mujoco.MjModel, q: np.ndarray, arm: list[int], other: list[int]
+) -> float:
+    """Least distance of two sets of geoms, link by link as the envelope checks them."""
+    data = mujoco.MjData(model)
+    data.qpos[:5] = q
+    mujoco.mj_kinematics(model, data)
+    link = {model.body(name).id: number - 1 for number, name in enumerate(BODIES)} | {0: -1}
+    least = math.inf
+    for a in arm:
+        for b in other:
+            if link[int(model.geom_bodyid[a])] - link[int(model.geom_bodyid[b])] >= 2:
+                least = min(least, mujoco.mj_geomDistance(model, data, a, b, 20.0, None))
+    return least
+
+
+def read_spec() -> mujoco.MjSpec:
+    """The MJCF with the axes of the machine's file; it holds none of its own."""
+    spec = mujoco.MjSpec.from_file(str(MJCF))
+    for joint in MACHINE.joints:
+        assert joint.body is not None
+        spec.joint(joint.name).axis = joint.body.axis
+    return spec
+
+
+def add_ground_and_wall(spec: mujoco.MjSpec) -> None:
+    lower, upper = np.array(WALL.lower_m), np.array(WALL.upper_m)
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    spec.worldbody.add_geom(name="ground", type=box, size=[30, 30, 5], pos=[0, 0, -5])
+    spec.worldbody.add_geom(
+        name="wall", type=box, size=(upper - lower) / 2, pos=(lower + upper) / 2
+    )
+
+
+def build_own_model() -> tuple[mujoco.MjModel, list[int], list[int]]:
+    """The envelope's own shapes as a MuJoCo model, its arm and its obstacles."""
+    spec = read_spec()
+    for geom in list(spec.geoms):
+        spec.delete(geom)
+    add_ground_and_wall(spec)
+    assert SHAPES is not None
+    kinds = mujoco.mjtGeom
+    for number, one in enumerate(SHAPES.arm):
+        body = spec.body(BODIES[one.link + 1])
+        ends = [*one.begin_m, *one.end_m]
+        body.add_geom(
+            name=f"arm{number}", type=kinds.mjGEOM_CAPSULE, size=[one.radius_m, 0, 0], fromto=ends
+        )
+    for number, one in enumerate(SHAPES.body):
+        quat = np.zeros(4)
+        mujoco.mju_mat2Quat(quat, one.rotation.flatten())
+        values = {"name": f"body{number}", "pos": one.center_m, "quat": quat}
+        if one.radius_m:
+            size, kind = [one.radius_m, one.half_m[2], 0], kinds.mjGEOM_CAPSULE
+            if not one.half_m.any():
+                size, kind = [one.radius_m, 0, 0], kinds.mjGEOM_SPHERE
+        else:
+            size, kind = one.half_m, kinds.mjGEOM_BOX
+        spec.body(BODIES[one.link + 1]).add_geom(type=kind, size=size, **values)
+    model = spec.compile()
+    names = [model.geom(number).name for number in range(model.ngeom)]
+    arm = [number for number, name in enumerate(names) if name.startswith("arm")]
+    return model, arm, [number for number in range(model.ngeom) if number not in arm]
+
+
+def test_distances_are_those_of_mujoco() -> None:
+    model, arm, other = build_own_model()
+    envelope = build_envelope(stay_out={"wall": WALL})
+    poses = draw_poses(40)
+    found = envelope.measure_clearance(poses)
+    expected = np.array([find_distance_m(model, q, arm, other) for q in poses])
+    clear = expected > 1e-3
+    assert clear.sum() >= 15 and (~clear).sum() >= 5
+    assert found[clear] == pytest.approx(expected[clear], abs=2e-5)
+    assert (found[~clear] < 1.1e-3).all()
+    near = envelope.measure_clearance(poses, 0.3)
+    assert near[expected < 0.3] == pytest.approx(found[expected < 0.3])
+    assert (near <= found + 1e-12).all() and (near[expected > 0.3] > 0.29).all()
+
+
+def test_shapes_enclose_what_mujoco_draws_and_little_more() -> None:
+    spec = read_spec()
+    add_ground_and_wall(spec)
+    model = spec.compile()
+    bodies = model.geom_bodyid.tolist()
+    arm = [number for number, body in enumerate(bodies) if body > model.body("q1_link").id]
+    other = [number for number in range(model.ngeom) if number not in arm]
+    envelope = build_envelope(stay_out={"wall": WALL})
+    poses = draw_poses(25, seed=1)
+    found = envelope.measure_clearance(poses)
+    expected = np.array([find_distance_m(model, q, arm, other) for q in poses])
+    assert (found <= expected.clip(0.0) + 2e-5).all()
+    # The widest link has its cylinders 0.2 m beside its axis.
+    clear = expected > 0.02
+    assert clear.sum() >= 8 and (expected[clear] - found[clear]).max() < 0.25
+
+
+def test_the_tip_is_where_mujoco_has_it() -> None:
+    model = read_spec().compile()
+    data, poses = mujoco.MjData(model), draw_poses(5)
+    for q, tip in zip(poses, build_envelope().locate_tip(poses), strict=True):
+        data.qpos[:5] = q
+        mujoco.mj_kinematics(model, data)
+        assert tip == pytest.approx(data.site("tip").xpos, abs=1e-9)
+
+
+def test_distance_of_a_segment_to_a_box_is_the_least_of_all_its_points() -> None:
+    draw = np.random.default_rng(2)
+    begin, end = draw.uniform(-2, 2, (2, 300, 3))
+    # Along a side, a point, and within the box, too.
+    begin[:20, 0] = end[:20, 0]
+    begin[20:30] = end[20:30]
+    begin[30:40], end[30:40] = 0.1 * begin[30:40], 0.1 * end[30:40]
+    half = draw.uniform(0.3, 1.0, (300, 3))
+    t = np.linspace(0.0, 1.0, 4001)[:, None, None]
+    points = begin + t * (end - begin)
+    beyond = np.maximum(np.abs(points) - half, 0.0)
+    expected = np.linalg.norm(beyond, axis=-1).min(0)
+    found = measure_segment_to_box(begin, end, half)
+    assert found == pytest.approx(expected, abs=2e-3) and (found <= expected + 1e-9).all()
+    assert (found[30:40] == 0.0).all()
+
+
+def test_worked_distances() -> None:
+    half = np.array([1.0, 1.0, 1.0])
+    for begin, end, expected in (
+        ((3.0, 0.0, 0.0), (5.0, 0.0, 0.0), 2.0),  # beside it, pointing away
+        ((5.0, 0.0, 0.0), (3.0, 0.0, 0.0), 2.0),  # pointing at it
+        ((-5.0, 0.0, 3.0), (5.0, 0.0, 3.0), 2.0),  # passing above
+        ((0.0, 4.0, 2.0), (0.0, 2.0, 4.0), 4.0 / math.sqrt(2)),  # around an edge
+        ((-5.0, 0.0, 0.0), (5.0, 0.0, 0.0), 0.0),  # through it
+    ):
+        found = measure_segment_to_box(np.array(begin), np.array(end), half)
+        assert found == pytest.approx(expected)
+
+
+def test_capsules_enclose_boxes_and_balls() -> None:
+    draw = np.random.default_rng(3)
+    boxes = []
+    for number in range(6):
+        rotation = np.linalg.qr(draw.normal(size=(3, 3)))[0]
+        radius_m = 0.1 if number % 2 else 0.0
+        half = draw.uniform(0.01, 0.2, 3)
+        boxes.append(
+            RoundedBox(
+                1, draw.uniform(-0.3, 0.3, 3) + np.array([number, 0, 0]), rotation, half, radius_m
+            )
+        )
+    capsules = fit_capsules(boxes, np.array([2.0, 0.0, 0.0]))
+    assert 1 <= len(capsules) <= 2
+    for box in boxes:
+        inside = []
+        for one in capsules:
+            along = one.end_m - one.begin_m
+            t = ((box.corners_m - one.begin_m) @ along / (along @ along)).clip(0, 1)
+            off = np.linalg.norm(box.corners_m - one.begin_m - t[:, None] * along, axis=1)
+            inside.append((off + box.radius_m <= one.radius_m + 1e-9).all())
+        assert any(inside)
+    # One ball alone: the capsule is the ball.
+    ball = RoundedBox(2, np.array([0.3, 0.1, -0.2]), np.eye(3), np.zeros(3), 0.25)
+    (one,) = fit_capsules([ball], np.array([1.0, 0.0, 0.0]))
+    assert one.radius_m == pytest.approx(0.25) and one.link == 2
+    for end_m in (one.begin_m, one.end_m):
+        assert end_m == pytest.approx(ball.center_m)
+    # A breaker with a chisel: two capsules, the thin one over the chisel.
+    housing = RoundedBox(2, np.array([0.3, 0, 0]), np.eye(3), np.array([0.3, 0.1, 0.1]), 0.0)
+    chisel = RoundedBox(2, np.array([1.0, 0, 0]), np.eye(3), np.array([0.4, 0, 0]), 0.04)
+    thick, thin = fit_capsules([chisel, housing], np.array([1.4, 0.0, 0.0]))
+    assert thin.radius_m == pytest.approx(0.04) and thick.radius_m == pytest.approx(
+        math.hypot(0.1, 0.1)
+    )
+    assert sorted([thin.begin_m[0], thin.end_m[0]]) == pytest.approx([0.6, 1.4])
+
+
+def test_links_are_stretched_as_the_simulator_stretches_them() -> None:
+    joints = list(MACHINE.joints)
+    body = joints[3].body
+    assert body is not None and SHAPES is not None
+    longer = replace(body.origin_m[0], value=2.5)
+    joints[3] = replace(joints[3], body=replace(body, origin_m=(longer, *body.origin_m[1:])))
+    shapes = read_machine_shapes(replace(MACHINE, joints=tuple(joints)))
+    assert shapes is not None
+    for link, factor in ((1, 1.0), (2, 2.0), (3, 1.0)):
+        ends = [
+            max(one.end_m[0] + one.radius_m for one in found.arm if one.link == link)
+            for found in (SHAPES, shapes)
+        ]
+        # Radii stay; the ends of the boxes move with the link.
+        assert ends[1] == pytest.approx(factor * ends[0], rel=0.12)
+
+
+class Arm:
+    """An ideal arm with the machine's dead time, faster than its file says, behind an envelope."""
+
+    def __init__(self, envelope: Envelope, q: np.ndarray, faster: float = 1.25) -> None:
+        self.envelope, self.q, self.now_s = envelope, q.copy(), 50.0
+        self.speed = faster * SPEED
+        self.waiting = deque([np.zeros(5)] * round(MACHINE.dead_time_s / DT_S))
+        self.held, self.least_m = 0, math.inf
+
+    def go(
+        self, u: tuple[float, ...], seconds: float, face: tuple[float, ...] | None = None
+    ) -> tuple[float, ...]:
+        sent = STILL
+        for number in range(round(seconds / DT_S)):
+            sent, held = self.envelope.limit_command(self.now_s, u, tuple(self.q), face)
+            self.envelope.note_sent(self.now_s, sent)
+            self.held += held
+            self.waiting.append(np.array(sent))
+            step = self.waiting.popleft() * self.speed * DT_S
+            self.q = np.clip(self.q + step, MACHINE.lower, MACHINE.upper)
+            self.now_s += DT_S
+            if number % 5:
+                continue
+            clear_m = float(self.envelope.measure_clearance(self.q[None])[0])
+            self.least_m = min(self.least_m, clear_m)
+        return sent
+
+
+def test_the_arm_stops_before_the_ground_and_may_leave_it() -> None:
+    arm = Arm(build_envelope(), HOME)
+    down = (0.0, 0.0, 1.0, 0.0, 0.0)
+    arm.go(down, 8.0)
+    assert arm.held > 0
+    stopped_m = float(arm.envelope.measure_clearance(arm.q[None])[0])
+    assert 0.0 < arm.least_m <= stopped_m < LIMITS.margin_m + 0.1
+    held = arm.held
+    up = (0.0, 0.0, -1.0, 0.0, 0.0)
+    assert arm.go(up, 2.0) == up and arm.held == held
+    assert float(arm.envelope.measure_clearance(arm.q[None])[0]) > stopped_m + 0.02
+
+
+def test_without_ground_nothing_is_withheld() -> None:
+    arm = Arm(build_envelope(ground_m=None), HOME)
+    arm.go((0.0, 0.0, 1.0, 0.0, 0.0), 3.0)
+    assert arm.held == 0 and build_envelope(ground_m=None).measure_clearance(HOME[None]) > 0
+    # The boom's foot is always as near to the undercarriage, whatever the height of the ground.
+    higher = build_envelope(ground_m=0.9).measure_clearance(HOME[None])[0]
+    assert higher == pytest.approx(
+        build_envelope(ground_m=0.8).measure_clearance(HOME[None])[0] - 0.1
+    )
+
+
+def test_a_stay_out_box_holds_the_slew() -> None:
+    arm = Arm(build_envelope(stay_out={"wall": WALL}), HOME)
+    arm.go((1.0, 0.0, 0.0, 0.0, 0.0), 6.0)
+    assert arm.held > 0 and arm.least_m > 0.0
+    free = Arm(build_envelope(), HOME)
+    free.go((1.0, 0.0, 0.0, 0.0, 0.0), 6.0)
+    assert free.held == 0 and free.q[0] > arm.q[0] + 0.3
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_whatever_is_asked_the_arm_touches_nothing(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    arm = Arm(build_envelope(stay_out={"wall": WALL}), HOME)
+    for _ in range(10):
+        arm.go(tuple(draw.uniform(-1, 1, 5).tolist()), 1.2)
+    assert arm.held > 0 and arm.least_m > 0.0
+
+
+def test_a_withheld_command_passes_again_only_with_more_room() -> None:
+    envelope = build_envelope()
+    down, at = (0.0, 0.0, 0.02, 0.0, 0.0), HOME.copy()
+
+    def find_angle(clear_m: float) -> float:
+        low, high = HOME[2], MACHINE.upper[2]
+        for _ in range(40):
+            middle = (low + high) / 2
+            at[2] = middle
+            low, high = (
+                (middle, high)
+                if envelope.measure_clearance(at[None])[0] > clear_m
+                else (low, middle)
+            )
+        return low
+
+    begin = find_angle(LIMITS.margin_m - 0.01)
+    between = find_angle(LIMITS.margin_m + LIMITS.release_m / 2)
+    outside = find_angle(LIMITS.margin_m + LIMITS.release_m + 0.01)
+    found = []
+    for angle, u in (
+        (between, down),
+        (begin, down),
+        (between, down),
+        (outside, down),
+        (between, down),
+    ):
+        at[2] = angle
+        found.append(envelope.limit_command(1.0, u, tuple(at), None)[1])
+    assert found == [False, True, True, False, False]
+    at[2] = begin
+    assert envelope.limit_command(1.0, down, tuple(at), None)[1]
+    # Letting go of the levers forgets it.
+    assert envelope.limit_command(1.0, STILL, tuple(at), None) == (STILL, False)
+    at[2] = between
+    assert not envelope.limit_command(1.0, down, tuple(at), None)[1]
+
+
+def test_commands_under_way_count_until_they_have_come_to_rest() -> None:
+    horizon_s = MACHINE.dead_time_s + LIMITS.coast_s
+    envelope = build_envelope()
+    envelope.note_sent(10.0, (1.0, 0, 0, 0, 0))
+    envelope.note_sent(10.1, (0.5, 0, 0, 0, 0))
+    envelope.note_sent(10.3, STILL)
+    total = envelope._integrate_sent(10.5)
+    assert total == pytest.approx([0.1 * 1.0 + 0.2 * 0.5, 0, 0, 0, 0])
+    for now_s, expected in (
+        (10.0 + horizon_s + 0.05, 0.05 + 0.1),
+        (10.2 + horizon_s, 0.05),
+        (10.4 + horizon_s, 0.0),
+    ):
+        assert envelope._integrate_sent(now_s)[0] == pytest.approx(expected)
+        envelope.note_sent(now_s, STILL)
+        assert envelope._integrate_sent(now_s)[0] == pytest.approx(expected)
+
+
+def test_near_the_work_surface_the_tip_is_slow() -> None:
+    envelope = build_envelope(ground_m=None)
+    q = np.array([0.0, -0.9, 0.8, 0.9, 0.77])
+    tip = envelope.locate_tip(q[None])[0]
+    u = (0.3, 0.0, 1.0, -0.5, 0.2)
+
+    def measure_speed(sent: tuple[float, ...]) -> float:
+        step = 1e-4 * SPEED * np.array(sent)
+        ends = envelope.locate_tip(np.stack([q - step, q + step]))
+        return float(np.linalg.norm(ends[1] - ends[0])) / 2e-4
+
+    assert measure_speed(u) > 2 * LIMITS.face_speed_m_s
+    beside = np.array([1.0, 0.0, 0.0])
+    near_m, wide_m = LIMITS.face_near_m, LIMITS.face_radius_m
+    for face, is_slow in (
+        (tip, True),
+        (tip + np.array([0.3, 0.2, -near_m + 0.01]), True),
+        (tip + np.array([0.0, 0.0, near_m - 0.01]), True),
+        (tip + np.array([0.0, 0.0, near_m + 0.01]), False),
+        (tip - np.array([0.0, 0.0, near_m + 0.01]), False),
+        (tip + (wide_m - 0.01) * beside, True),
+        (tip + (wide_m + 0.01) * beside, False),
+    ):
+        sent, held = envelope.limit_command(1.0, u, tuple(q), tuple(face))
+        assert not held
+        if is_slow:
+            assert measure_speed(sent) == pytest.approx(LIMITS.face_speed_m_s, rel=0.01)
+            assert np.array(sent) == pytest.approx(np.array(u) * (sent[2] / u[2]))
+        else:
+            assert sent == u
+    slow = tuple(0.05 * one for one in u)
+    assert envelope.limit_command(1.0, slow, tuple(q), tuple(tip))[0] == pytest.approx(slow)
+    assert envelope.limit_command(1.0, u, tuple(q), None) == (u, False)
+
+
+def test_the_tip_is_slow_when_it_arrives_not_only_when_it_is_there() -> None:
+    envelope = build_envelope(ground_m=None)
+    arm = Arm(envelope, np.array([0.0, -0.9, 0.4, 0.9, 0.77]), faster=1.0)
+    face = tuple(envelope.locate_tip(arm.q[None])[0] - [0.0, 0.0, 0.7])
+    before, fastest, near = envelope.locate_tip(arm.q[None])[0], [], []
+    for _ in range(360):
+        arm.go((0.0, 0.0, 1.0, 0.0, 0.0), DT_S, face)
+        tip = envelope.locate_tip(arm.q[None])[0]
+        speed = float(np.linalg.norm(tip - before)) / DT_S
+        before = tip
+        height = tip[2] - face[2]
+        (near if abs(height) < LIMITS.face_near_m else fastest).append(speed)
+    assert max(fastest) > 0.5 and near and max(near) < 1.1 * LIMITS.face_speed_m_s
+
+
+def test_a_machine_without_geometry_has_no_shapes() -> None:
+    assert read_machine_shapes(option("machine", "mini_excavator")) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ('<geom type="mesh" mesh="boom"/>', r"expected geoms of sphere.*got mesh"),
+        ('<geom type="box" size="1 1 1" zaxis="0 1 0"/>', r"expected quat or euler.*got zaxis"),
+    ],
+)
+def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str, expected: str) -> None:
+    path = tmp_path / "machine.xml"
+    path.write_text(MJCF.read_text().replace('<body name="q2_link"', f'{text}<body name="q2_link"'))
+    with pytest.raises(ConfigError, match=expected):
+        read_machine_shapes(replace(MACHINE, mjcf=str(path)))
+    with pytest.raises(ConfigError, match="cannot be read from"):
+        read_machine_shapes(replace(MACHINE, mjcf=str(tmp_path / "none.xml")))
+
+
+def test_degrees_quaternions_classes_and_nested_bodies_are_read_as_mujoco_reads_them(
+    tmp_path: Path,
+) -> None:
+    text = """<mujoco><compiler autolimits="true"/>
+      <default><geom type="box"/><default class="rod"><geom type="capsule" size="0.05 0.3"/>
+        <default class="thick"><geom size="0.2 0.3"/></default></default></default>
+      <worldbody><geom type="plane" size="1 1 1"/><body name="base" childclass="rod">
+        <geom name="a" pos="1 2 3" euler="30 40 50"/><geom name="b" class="thick" quat="0.5 0.1 0.2 0.3"/>
+        <body pos="0.1 0.2 0.3" euler="0 90 20"><geom name="c" type="box" size="1 2 3" euler="10 0 0"/>
+          <geom name="d" fromto="0 0 0 1 1 0"/><geom name="e" type="cylinder" size="0.1 0.4"/>
+          <geom name="f" type="sphere" size="0.3"/></body>
+        LINKS</body></worldbody></mujoco>"""
+    links = "".join(
+        f'<body name="{name}_link" pos="1 0 0"><joint name="{name}"/><geom type="sphere" size="0.1"/>'
+        for name in MACHINE.joint_names
+    )
+    path = tmp_path / "machine.xml"
+    path.write_text(text.replace("LINKS", links + "</body>" * 5))
+    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
+    assert shapes is not None
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    found = [box for box in shapes.body if box.link == -1]
+    assert len(found) == 6
+    for name, box in zip("abcdef", found, strict=True):
+        geom = data.geom(name)
+        assert box.center_m == pytest.approx(geom.xpos, abs=1e-9)
+        turn = geom.xmat.reshape(3, 3)
+        size = model.geom(name).size
+        if name == "c" or name == "e":
+            expected = size if name == "c" else np.array([size[0], size[0], size[1]])
+            assert box.half_m == pytest.approx(expected) and box.radius_m == 0.0
+            assert box.rotation == pytest.approx(turn, abs=1e-9)
+        else:
+            length = 0.0 if name == "f" else size[1]
+            assert box.half_m == pytest.approx([0, 0, length]) and box.radius_m == pytest.approx(
+                size[0]
+            )
+            if name != "f":
+                assert np.abs(box.rotation[:, 2] @ turn[:, 2]) == pytest.approx(1.0)
+    assert np.linalg.det(found[3].rotation) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"margin_m": 0.0}, {"release_m": 0.0}, {"coast_s": 0.0}, {"reaction_s": math.inf}, {"face_near_m": -1.0},
+        {"face_radius_m": 0.0}, {"face_speed_m_s": 0.0}, {"speed_margin": 0.9}, {"face_normal": (0.0, 0.0, 2.0)},
+    ],
+)  # fmt: skip
+def test_limits_that_make_no_sense_are_refused(change: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match=r"guard\.envelope"):
+        replace(LIMITS, **change)
+
+
+def test_a_stay_out_box_upside_down_is_refused() -> None:
+    with pytest.raises(ConfigError, match="lower_m below upper_m"):
+        StayOutBox(lower_m=(0.0, 0.0, 1.0), upper_m=(1.0, 1.0, 1.0))

@@ -1,0 +1,181 @@
+"""A planned run takes the same positions as steps do, for every effect that can be planned."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from actuators.effects.effect import EffectSpec
+from brokk_rl.gravity import Gravity, build_joint_weight
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.open_loop import FreeRunWindows, count_samples_before
+from diagnosis.effect_library import EffectSimulator, load_effects
+from diagnosis.residuals import ErrorCovariance, Residuals, build_rays
+
+CPU = torch.device("cpu")
+NUM_ENVS, STEPS = 6, 50
+PLANNED = [
+    "asymmetry", "backlash", "clock_offset", "compliance", "creep", "dead_band", "dead_time", "flow_gain",
+    "flow_sharing", "frame_loss", "lag", "load_dependence", "rate_limit", "saturation", "stiction", "thermal_drift",
+]  # fmt: skip
+
+
+@cache
+def bases(machine: Machine) -> dict[str, Any]:
+    """Returns a lag, and a valve with play, pump and pose."""
+    rng = np.random.default_rng(0)
+    knots = (0.0, 0.1, 0.3, 1.0)
+    names, size = machine.joint_names, machine.num_joints + 2
+
+    def rows() -> dict[str, tuple[float, ...]]:
+        return {name: tuple(0.1 * rng.standard_normal(size)) for name in names}
+
+    valve = replace(
+        option("actuator", "valve"), dead_time_s=0.13, play=0.04, spool_s=0.05, speed_s=0.08, demand=0.7, knots=knots,
+        curve_extend=(0.0, 0.02, 0.3, 1.0), curve_retract=(0.0, 0.05, 0.2, 0.8), pose_extend=rows(), pose_retract=rows(),
+    )  # fmt: skip
+    return {"lag": replace(option("actuator", "lag"), dead_time_s=0.13), "valve": valve}
+
+
+def effect(name: str, size: float) -> EffectSpec:
+    """Returns an effect at a multiple of its typical size."""
+    spec = option("effect", name)
+    values = {}
+    for key, number in spec.numbers.items():
+        none = number.typical if number.none is None else number.none
+        values[key] = none if number.masses is False else none + size * (number.typical - none)
+    return replace(spec, **values)
+
+
+def build(base: str, effects: list[tuple[str, float]], machine: Machine) -> Any:
+    torch.manual_seed(0)
+    model: Any = bases(machine)[base].build(machine, NUM_ENVS, CPU)
+    for name, size in effects:
+        model = effect(name, size).wrap(model, machine, NUM_ENVS, CPU)
+    model.reset(torch.ones(NUM_ENVS, dtype=torch.bool))
+    return model
+
+
+def draw_motion(machine: Machine) -> tuple[torch.Tensor, torch.Tensor]:
+    """Returns commands `(T, N, J)` that hold for five periods, and positions `(T + 1, N, J)` of which the first are known."""
+    generator, size = torch.Generator().manual_seed(1), machine.num_history
+    drawn = torch.rand(STEPS // 5 + 4, NUM_ENVS, machine.num_joints, generator=generator) * 3 - 1.5
+    u = (drawn.clamp(-1, 1) * (drawn.abs() > 0.06)).repeat_interleave(5, 0)[: size + STEPS]
+    middle = torch.as_tensor((machine.lower + machine.upper) / 2, dtype=torch.float32)
+    q = torch.zeros(len(u) + 1, NUM_ENVS, machine.num_joints) + middle
+    drift = torch.rand(NUM_ENVS, machine.num_joints, generator=generator) - 0.5
+    q[:size] += 0.002 * torch.arange(size)[:, None, None] * drift
+    # One environment begins just before its stops, so that it runs into them.
+    q[:size, 0] += torch.as_tensor(machine.upper, dtype=torch.float32) - q[size - 1, 0] - 1e-4
+    return u, q
+
+
+def step_through(model: Any, u: torch.Tensor, q: torch.Tensor, size: int) -> torch.Tensor:
+    q = q.clone()
+    for k in range(size, len(q)):
+        past = slice(k - size, k)
+        q[k] = model.step(History(q=q[past].transpose(0, 1), u=u[past].transpose(0, 1)))
+    return q
+
+
+def run_planned(model: Any, u: torch.Tensor, q: torch.Tensor, size: int) -> torch.Tensor:
+    q, run = q.clone(), model.plan_run(u, size)
+    assert run is not None, "it was to be planned"
+    for k in range(size, len(q)):
+        q[k] = run.step(k, q)
+    return q
+
+
+def compare(base: str, effects: list[tuple[str, float]], machine: Machine) -> None:
+    u, q = draw_motion(machine)
+    with torch.inference_mode():
+        stepped = step_through(build(base, effects, machine), u, q, machine.num_history)
+        planned = run_planned(build(base, effects, machine), u, q, machine.num_history)
+        plain = run_planned(build(base, [], machine), u, q, machine.num_history)
+    assert (stepped - planned).abs().max() < 1e-5
+    moved = stepped[machine.num_history :]
+    assert (moved - moved[0]).abs().max() > 0.01, "the test moves nothing"
+    if effects:
+        assert (planned - plain).abs().max() > 1e-4, "the effect does nothing here"
+
+
+@pytest.mark.parametrize("base", ["lag", "valve"])
+def test_a_planned_model_moves_as_its_steps_do(base: str, machine: Machine) -> None:
+    compare(base, [], machine)
+
+
+@pytest.mark.parametrize("name", PLANNED)
+@pytest.mark.parametrize("base", ["lag", "valve"])
+def test_a_planned_effect_moves_as_its_steps_do(base: str, name: str, machine: Machine) -> None:
+    # Frames are lost seldom, and a pump shows where joints ask for more than it has.
+    compare(base, [(name, {"frame_loss": 10.0, "flow_sharing": 3.0}.get(name, 1.0))], machine)
+
+
+def test_planned_effects_inside_each_other_move_as_their_steps_do(machine: Machine) -> None:
+    compare("valve", [("flow_sharing", 1.0), ("lag", 0.5), ("stiction", 1.0), ("dead_time", 0.4)], machine)  # fmt: skip
+    compare("lag", [("backlash", 2.0), ("dead_band", 2.0), ("saturation", 1.5)], machine)
+
+
+def test_a_clock_ahead_shows_no_command_before_it_is_given(machine: Machine) -> None:
+    """-0.25 s at a dead time of 0.15 s: as in steps, the newest command acts at once."""
+    u, q = draw_motion(machine)
+    base = replace(bases(machine)["lag"], dead_time_s=0.15)
+    found = []
+    for run in (step_through, run_planned):
+        inner = base.build(machine, NUM_ENVS, CPU)
+        model = effect("clock_offset", -5.0).wrap(inner, machine, NUM_ENVS, CPU)
+        model.reset(torch.ones(NUM_ENVS, dtype=torch.bool))
+        with torch.inference_mode():
+            found.append(run(model, u, q, machine.num_history))
+    assert (found[0] - found[1]).abs().max() < 1e-5
+    assert (found[0] - q).abs().max() > 0.01
+
+
+def test_effects_that_draw_together_and_the_library_are_stepped(machine: Machine) -> None:
+    for name in ("library", "delay_jitter"):
+        model = option("effect", name).wrap(
+            bases(machine)["lag"].build(machine, NUM_ENVS, CPU), machine, NUM_ENVS, CPU
+        )
+        assert model.plan_run(torch.zeros(20, NUM_ENVS, machine.num_joints), 13) is None
+
+
+@pytest.mark.parametrize("base", ["lag", "valve"])
+def test_responses_of_rays_together_are_those_of_each_alone(base: str, machine: Machine) -> None:
+    rng, before, windows = np.random.default_rng(2), count_samples_before(machine), 3
+    u = np.repeat(rng.uniform(-1, 1, (windows, 20, machine.num_joints)), 5, 1)
+    u = u[:, : before - 1 + 40].astype(np.float32)
+    middle = (machine.lower + machine.upper) / 2
+    q = np.tile(middle, (windows, before + 40, 1)).astype(np.float32)
+    cut = FreeRunWindows(u, q, np.array(["a", "a", "b"]), machine.num_history, before)
+    simulator = EffectSimulator(bases(machine)[base], machine, cut, np.zeros(windows), 0)
+    noise = [ErrorCovariance(1e-3, 0.01, 0.01, 10.0)] * machine.num_joints
+    mask = np.ones((windows, machine.num_joints), dtype=bool)
+    residuals = Residuals(simulator, noise, mask)
+    for kind in load_effects(machine, ["asymmetry", "compliance", "dead_band"]):
+        rays = build_rays(kind)
+        shape = {name: np.full(machine.num_joints, 1.5) for name in kind.shaping}
+        rays += [replace(ray, shape=shape) for ray in rays] if shape else []
+        for ray, found in zip(rays, residuals.list_responses(rays), strict=True):
+            assert np.abs(found).max() > 0.1
+            np.testing.assert_allclose(found, residuals.response(ray), atol=1e-3 * np.abs(found).max())  # fmt: skip
+
+
+def test_the_weight_of_a_planar_arm_is_that_of_its_mechanics(machine: Machine) -> None:
+    weight = build_joint_weight(machine, CPU)
+    generator = torch.Generator().manual_seed(7)
+    lower, upper = (
+        torch.as_tensor(side, dtype=torch.float32) for side in (machine.lower, machine.upper)
+    )
+    q = torch.rand(100, machine.num_joints, generator=generator) * (upper - lower) + lower
+    force = torch.tensor([body.yield_force.value for body in machine.bodies])
+    truth = Gravity(machine, CPU).load(q) / force
+    assert weight.is_planar
+    assert truth.abs().max() > 0.1
+    torch.testing.assert_close(weight.weigh(q), truth, atol=2e-5, rtol=0.0)
