@@ -21,10 +21,12 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
+from tasks.classical import ClassicalController
 from tasks.control import DeployedPolicy, ToolPoseControl
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm, ToolState
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
+from tasks.starts import bring_near
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
 """Endings of an episode; where several hold in one step, the first of them counts."""
@@ -184,7 +186,33 @@ class ToolPoseProcess:
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draw valid starts; see `TaskProcess.starts`."""
-        start = self.goal.starts(count, seed)
+        return self._judge_starts(self.goal.starts(count, seed))
+
+    def bring_near(
+        self,
+        start: dict[str, torch.Tensor],
+        share: float,
+        height_m: tuple[float, float],
+        seed: int,
+    ) -> dict[str, torch.Tensor]:
+        """Return starts of which the first part begins upright above its target, on the CPU.
+
+        Args:
+            start: Starts, as `starts` returns them.
+            share: Part of the starts that are brought near.
+            height_m: Heights of the tool point above the target, (lowest, highest).
+            seed: The same seed gives the same heights.
+        """
+        options, cpu = self.options, torch.device("cpu")
+        controller = ClassicalController(options.classical, self._machine, cpu)
+        start = {name: value.cpu() for name, value in start.items()}
+        return self._judge_starts(
+            bring_near(
+                start, share, height_m, seed, self._machine, controller, options.switch.reach_m
+            )
+        )
+
+    def _judge_starts(self, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         pose = Kinematics(self._machine, "cpu").pose(start["q"])
         verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)
         return start | {"closeness": verdict["closeness"]}

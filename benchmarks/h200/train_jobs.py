@@ -145,6 +145,8 @@ def train(spec: Train, folder: Path, options: argparse.Namespace) -> tuple[Any, 
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     loop = build(spec, spec.rl.num_envs, spec.rl.num_starts, options.start_seed, options.folder)
+    if spec.rl.near_starts:
+        loop.bring_near(spec.rl.near_starts, options.start_seed)
     loop.capture(spec.rl.fuse)
     ready_s = time.time()
     (options.folder / "taken" / "first_loop").touch()

@@ -117,6 +117,23 @@ class Teacher:
 
 
 @spec
+class NearStarts:
+    """Starts of a training that begin near the target.
+
+    Attributes:
+        share: Part of the starts that are moved there, the tool upright above its target.
+        height_m: Heights above the target, (lowest, highest).
+    """
+
+    share: float
+    height_m: tuple[float, float]
+
+    def check(self) -> None:
+        require_number("rl.near_starts.share", self.share, above=0, most=1)
+        require_range("rl.near_starts.height_m", self.height_m)
+
+
+@spec
 class TrainingConfig:
     """Numbers of a training with rsl-rl's PPO.
 
@@ -134,6 +151,7 @@ class TrainingConfig:
             distribution. The actor's distribution must be
             `brokk_rl.rl.exploration:FlooredGaussian`.
         teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
+        near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
@@ -153,6 +171,7 @@ class TrainingConfig:
     settling: float
     exploration: Exploration | None
     teacher: Teacher | None
+    near_starts: NearStarts | None
     max_fault_rate: float
     fuse: bool
     random_episode_lengths: bool
