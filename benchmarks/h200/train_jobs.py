@@ -63,9 +63,9 @@ COLUMNS = {
 """Columns of `progress.csv` that a learning curve keeps, and their names there."""
 NUM_POINTS = 80
 """Points of a learning curve."""
-SETTING_UP_S = 30.0
+SETTING_UP_S = 15.0
 """Time kept free for the set-up and the evaluations of a job."""
-LEAST_S = 30.0
+LEAST_S = 15.0
 """A training for which less time is left is not begun."""
 
 
@@ -97,23 +97,22 @@ def main() -> None:
 
 
 def take_jobs(jobs: list[dict], folder: Path, end_s: float) -> Iterator[dict]:
-    """Yield jobs that no other process has taken; those that wait for another one last."""
-    waiting = jobs
-    while waiting and time.time() + SETTING_UP_S + LEAST_S < end_s:
-        remaining = []
-        for job in waiting:
-            if time.time() + SETTING_UP_S + LEAST_S > end_s:
-                return
+    """Yield the first job that no other process has taken and that waits for none, and again."""
+    while time.time() + SETTING_UP_S + LEAST_S < end_s:
+        left = [job for job in jobs if not (folder / "taken" / job["name"]).exists()]
+        if not left:
+            return
+        for job in left:
             if "after" in job and not (folder / job["after"] / "policy.json").exists():
-                remaining.append(job)
                 continue
             try:
                 os.close(os.open(folder / "taken" / job["name"], os.O_CREAT | os.O_EXCL))
             except FileExistsError:
                 continue
             yield job
-        waiting = remaining
-        time.sleep(1.0)
+            break
+        else:
+            time.sleep(1.0)
 
 
 def run_job(job: dict, words: list[str], options: argparse.Namespace) -> dict[str, Any]:

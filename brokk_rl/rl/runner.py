@@ -15,7 +15,7 @@ from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.errors import CheckpointError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
-from brokk_rl.rl.exploration import FlooredGaussian
+from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.policy import TrainedPolicy
 from brokk_rl.rl.ppo import DevicePPO
@@ -97,10 +97,10 @@ class TrainingRunner(OnPolicyRunner):
                 self.checkpoint()
 
     def _follow_schedules(self, share_spent: float) -> None:
-        """Set the floor of the exploration noise and the teacher's weight, where there are any."""
+        """Set the cap of the exploration noise and the teacher's weight, where there are any."""
         distribution, teacher = self.alg.actor.distribution, self.training.teacher
-        if self.training.exploration and isinstance(distribution, FlooredGaussian):
-            distribution.set_floor(self.training.exploration.floor_at(share_spent))
+        if self.training.exploration and isinstance(distribution, CappedGaussian):
+            distribution.set_cap(self.training.exploration.cap_at(share_spent))
         if teacher and isinstance(self.alg, DevicePPO):
             self.alg.set_imitation(teacher.weight_at(share_spent))
 

@@ -15,8 +15,8 @@ from brokk_rl.spec import spec
 SETTLED_PART = 0.9
 """Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
 `TrainingConfig.settling`."""
-FLOORED = "brokk_rl.rl.exploration:FlooredGaussian"
-"""The distribution whose floor `Exploration` moves."""
+CAPPED = "brokk_rl.rl.exploration:CappedGaussian"
+"""The distribution whose cap `Exploration` moves."""
 RUNNER_BOUNDS: dict[str, dict[str, Any]] = {
     "num_steps_per_env": {"least": 1, "whole": True},
     "algorithm.num_learning_epochs": {"least": 1, "whole": True},
@@ -68,25 +68,28 @@ class TrainingBudget:
 
 @spec
 class Exploration:
-    """Schedule of the floor of the exploration noise over the budget.
+    """Schedule of the cap of the exploration noise over the budget.
+
+    A policy that learned with much noise may need it: without noise, valves rest in their dead
+    bands, and a tool rests on the rim.
 
     Attributes:
-        floor: Smallest standard deviation of the actions, (at the beginning, at the end).
+        cap: Largest standard deviation of the actions, (at the beginning, at the end).
         over: Shares of the budget between which it falls; in equal ratios.
     """
 
-    floor: tuple[float, float]
+    cap: tuple[float, float]
     over: tuple[float, float]
 
     def check(self) -> None:
-        for value in self.floor:
-            require_number("rl.exploration.floor", value, above=0)
+        for value in self.cap:
+            require_number("rl.exploration.cap", value, above=0)
         require_range("rl.exploration.over", self.over, least=0)
         require_number("rl.exploration.over", self.over[1], most=1)
 
-    def floor_at(self, share_spent: float) -> float:
-        """Return the floor when this share of the budget is spent."""
-        (first, last), (begin, end) = self.floor, self.over
+    def cap_at(self, share_spent: float) -> float:
+        """Return the cap when this share of the budget is spent."""
+        (first, last), (begin, end) = self.cap, self.over
         done = float(share_spent >= end)
         if end > begin:
             done = min(1.0, max(0.0, (share_spent - begin) / (end - begin)))
@@ -147,9 +150,9 @@ class TrainingConfig:
         keep_checkpoints: Newest checkpoints kept.
         settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
             learn fast, small ones keep it.
-        exploration: Schedule of the floor of the exploration noise; `null` for that of the
+        exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
-            `brokk_rl.rl.exploration:FlooredGaussian`.
+            `brokk_rl.rl.exploration:CappedGaussian`.
         teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
@@ -185,9 +188,9 @@ class TrainingConfig:
             require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
         self._check_runner()
         distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}
-        if self.exploration and distribution.get("class_name") != FLOORED:
+        if self.exploration and distribution.get("class_name") != CAPPED:
             raise ConfigError(
-                f"rl.exploration: expected the distribution {FLOORED} "
+                f"rl.exploration: expected the distribution {CAPPED} "
                 "(rl.runner.actor.distribution_cfg.class_name), got "
                 f"{distribution.get('class_name')}"
             )
