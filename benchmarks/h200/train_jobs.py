@@ -4,7 +4,7 @@
 
 A line of the jobs: `{"name": …, "words": […], "evaluate": [[…], …], "after": …, "seconds": …}`.
 `words` are those of `brokk mode=train`. `evaluate` holds further words for one evaluation each
-beside that of the training itself. `after` names a job whose bundle this one needs, in
+beside that under the conditions of the training, or under those of the words `evaluated_as`. `after` names a job whose bundle this one needs, in
 `{folder}/<name>`. `seconds` bounds the training. With `"classical": true` nothing is trained, and
 the classical controller is evaluated.
 
@@ -124,8 +124,9 @@ def run_job(job: dict, words: list[str], options: argparse.Namespace) -> dict[st
     if not job.get("classical"):
         actor, facts = train(spec, options.folder / job["name"], options)
         line |= facts
+    seen = job.get("evaluated_as", own)
     for more in ([], *job.get("evaluate", [])):
-        there = compose([*own, *words, *more])
+        there = compose([*seen, *words, *more])
         line["results"][" ".join(more) or "own"] = evaluate(there, actor, options)
     return line
 
