@@ -92,6 +92,7 @@ class JointWeight:
 
     Attributes:
         is_planar: Whether the linear form holds.
+        sums: Sums of angles as columns, `(J, J)`.
         linear: Weight per wave, `(2 J, J)`.
         constant: Weight without any wave, `(J,)`.
     """
@@ -104,7 +105,7 @@ class JointWeight:
         axes = np.array([body.axis for body in machine.bodies])
         sums = np.tril(np.abs(axes @ axes.T) > 1.0 - 1e-6) & hinges & hinges[:, None]
         signs = np.sign(axes @ axes.T)
-        self._sums = torch.as_tensor((sums * signs).T, dtype=torch.float32, device=device)
+        self.sums = torch.as_tensor((sums * signs).T, dtype=torch.float32, device=device)
         lower, upper = (
             torch.as_tensor(side, dtype=torch.float32, device=device)
             for side in (machine.lower, machine.upper)
@@ -122,7 +123,7 @@ class JointWeight:
 
     def build_waves(self, q: torch.Tensor) -> torch.Tensor:
         """Return cosines and sines of the sums of angles at `q` `(N, J)`, `(N, 2 J)`."""
-        angle = q @ self._sums
+        angle = q @ self.sums
         return torch.cat((angle.cos(), angle.sin()), 1)
 
     def weigh(self, q: torch.Tensor) -> torch.Tensor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -133,7 +134,9 @@ class CanLink:
     def __enter__(self) -> Self:
         can, machine = self._can, self._machine
         self._memory = LoopMemory.new(machine.num_joints, commands=True)
-        config = BusProcessConfig(can.wire, can.dbc, machine, can.limits)
+        # Recordings are made before there is a model of this machine: no observer yet.
+        limits = replace(can.limits, observer=None)
+        config = BusProcessConfig(can.wire, can.dbc, machine, limits)
         arguments, files = (config, self._memory), self._memory.files
         priority = BUS_PRIORITY if can.realtime else None
         target = "deploy.runtime.bus_process:run"

@@ -93,6 +93,8 @@ class Desk:
         self.machine, self.wire, self.port = machine, wire(), free_port()
         self.memory = LoopMemory.new(machine.num_joints, commands)
         self._description = BusDescription(DBC, machine)
+        # The observer's file is of the hydraulic plant, not of the nominal machine of this desk.
+        limits = replace(limits, observer=None)
         self._setting = BusProcessConfig(self.wire, DBC, machine, limits)
         twin = Twin(
             wire=self.wire,

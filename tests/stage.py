@@ -180,6 +180,19 @@ class Bridge:
             stage.twin.hear(frame, stage.now_s)
 
 
+def write_nominal_observer(machine: Machine, folder: Path) -> Path:
+    """Writes the file of an observer that expects the nominal machine: dead time, speed times command."""
+    ones = [1.0] * machine.num_joints
+    none, line = [0.0] * machine.num_joints, [[0.0, 1.0]] * machine.num_joints
+    model = {"dead_time_s": [machine.dead_time_s] * machine.num_joints}
+    model |= dict.fromkeys(("demand", "play", "spool_s", "speed_s"), none)
+    model |= {"knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line, "pose": None}
+    content = {"schema": 1, "machine": machine.name, "fingerprint": machine.fingerprint()}
+    path = folder / "nominal_observer.json"
+    path.write_text(json.dumps(content | {"model": model, "scores": [[] for _ in ones]}))
+    return path
+
+
 class Stage:
     """The parts together.
 
@@ -188,10 +201,16 @@ class Stage:
         mode: Who commands.
         folder: Where a session may write.
         again_s: When the operator who is not followed presses the dead-man again.
+        watched: Whether the guard has its envelope and its observer.
     """
 
     def __init__(
-        self, machine: Machine, mode: Mode, folder: Path, again_s: float | None = None
+        self,
+        machine: Machine,
+        mode: Mode,
+        folder: Path,
+        again_s: float | None = None,
+        watched: bool = True,
     ) -> None:
         self.machine, self.mode, self.ms = machine, mode, 0
         self.memory = LoopMemory.new(machine.num_joints, commands=mode != "listen")
@@ -215,6 +234,13 @@ class Stage:
             )
             self.twin = RunningTwin(twin, machine, link, Gateway(self), FaultPort(None))
             limits, wire = option("guard", "default"), self.air
+            if hasattr(limits, "observer"):
+                observer = replace(
+                    limits.observer, path=str(write_nominal_observer(machine, folder))
+                )
+                limits = replace(limits, observer=observer)
+                if not watched:
+                    limits = replace(limits, observer=None, envelope=None)
             self.bus_process = BusProcess(BusProcessConfig(wire, DBC, machine, limits), self.memory)  # type: ignore[arg-type]
             policy = "tasks:policies/borehole_insertion"
             counsel = PolicyProcessConfig(

@@ -16,7 +16,7 @@ cylinder are in the pose.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -96,6 +96,28 @@ class ValveActuator:
         """
         return ValveModel(self, machine, num_envs, device)
 
+    def export_tables(self, machine: Machine) -> dict[str, Any]:
+        """Return all numbers by joint, as plain data, for a computer without torch.
+
+        Raises:
+            ConfigError: as `build`, or the weight on the joints is no sum of sines and cosines.
+        """
+        model = self.build(machine, 1, torch.device("cpu"))
+        found: dict[str, Any] = {name: model.parameters[name][0].tolist() for name in NUMBERS}
+        found["knots"] = list(self.knots)
+        for name, value in _list_curves(self):
+            rows = _expand_rows(value, machine, len(self.knots), f"actuator.{name}")
+            found[name] = rows.tolist()
+        found["pose"] = None
+        if self.pose_extend or self.pose_retract:
+            pose = PoseFeatures(machine, torch.device("cpu"))
+            found["pose"] = pose.export_weight()
+            for name in ("extend", "retract"):
+                slopes = getattr(self, f"pose_{name}") or {}
+                rows = _expand_rows(slopes, machine, pose.size, f"actuator.pose_{name}")
+                found["pose"][name] = rows.tolist()
+        return found
+
 
 class PoseFeatures:
     """Features of the speed besides the command: load, its square, and all positions."""
@@ -116,6 +138,23 @@ class PoseFeatures:
             return place
         weight = self.weight.weigh(q)[..., None]
         return torch.cat((weight, weight.square(), place), 2)
+
+    def export_weight(self) -> dict[str, Any]:
+        """Return the sums of angles and the coefficients of the weight; empty without masses.
+
+        Raises:
+            ConfigError: the weight is no sum of sines and cosines.
+        """
+        weight = self.weight
+        if weight is None:
+            return {"sums": [], "linear": []}
+        if not weight.is_planar:
+            raise ConfigError(
+                "actuator: expected an arm whose weight is a sum of sines and cosines of its angles; "
+                "leave out pose_extend and pose_retract"
+            )
+        linear = torch.cat((weight.linear, weight.constant[None]))
+        return {"sums": weight.sums.tolist(), "linear": linear.tolist()}
 
     def place(self, q: torch.Tensor) -> torch.Tensor:
         """Return positions from the middle of the travel, in halves of it, `(N, J)`."""

@@ -9,8 +9,10 @@ they still move at the end of the time watched.
 from __future__ import annotations
 
 import json
+import math
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +23,7 @@ import numpy as np  # noqa: E402
 from composed import option  # noqa: E402
 from stage import Stage  # noqa: E402
 
+from brokk_rl.kinematics import compute_tool_kinematics  # noqa: E402
 from deploy.guard.guard import GuardState  # noqa: E402
 
 LATCHED = GuardState.LATCHED
@@ -71,6 +74,14 @@ def hang_supervisor(stage: Stage, trial: int) -> None:
     stage.supervised = False
 
 
+def break_sensor(fault: str, text: str) -> Callable[[Stage, int], None]:
+    def inject(stage: Stage, trial: int) -> None:
+        stage.fault(fault)
+
+    inject.__doc__ = text
+    return inject
+
+
 def corrupt_half(message: str) -> Callable[[Stage, int], None]:
     def inject(stage: Stage, trial: int) -> None:
         stage.bridge.half = message
@@ -96,6 +107,11 @@ def answer(value: float) -> Callable[[Stage, int], None]:
     return inject
 
 
+SENSORS = [
+    break_sensor("stuck", "The position sensors stand still."),
+    break_sensor("drift", "The first joint's sensor drifts by 0.1 rad/s."),
+    break_sensor("mirrored", "The position sensors count backwards from now on."),
+]
 SHORT: dict[str, list[Callable[[Stage, int], None]]] = {
     "collect": [
         start_second_remote,
@@ -105,6 +121,7 @@ SHORT: dict[str, list[Callable[[Stage, int], None]]] = {
         send_foreign_commands,
         stop_beside_hung_supervisor,
         hang_supervisor,
+        *SENSORS,
         *(corrupt_half(name) for name in MESSAGES),
         *(delay(name) for name in MESSAGES if name != "ValveFeedback"),
     ],
@@ -214,6 +231,39 @@ def measure_reversals(stage: Stage) -> dict[str, object]:
     return {"reversals": int((directions[1:] != directions[:-1]).sum())}
 
 
+def measure_ground(stage: Stage) -> dict[str, object]:
+    """The third joint is driven down for 12 s: least height of arm and tool over the ground."""
+    stage.get_going()
+    stage.wanted, least_m = (0.0, 0.0, 1.0, 0.0, 0.0), [math.inf]
+
+    def note() -> bool:
+        q = np.asarray(stage.twin._q)
+        least_m[0] = min(
+            least_m[0], float(compute_tool_kinematics(stage.machine, q).tip_in_base_m[2])
+        )
+        return False
+
+    stage.go(12.0, note)
+    return {"least_height_of_the_tip_m": round(least_m[0], 3)}
+
+
+def measure_row(
+    stage: Stage, inject: Callable[[Stage, int], None], trials: int
+) -> dict[str, object]:
+    """Return the row of an injection."""
+    found, causes = [], Counter[str]()
+    for trial in range(trials):
+        found.append(measure_stop(stage, inject, trial))
+        state = stage.view.state
+        joint = f"joint {state.observed_joint}: " if state.observed_joint else ""
+        causes[joint + state.cause.value] += 1
+    stopped = sorted(1e3 * one for one in found if one is not None)
+    row: dict[str, object] = {"trials": trials, "moves": found.count(None)}
+    if stopped:
+        row |= {"median_ms": round(stopped[len(stopped) // 2]), "worst_ms": round(stopped[-1])}
+    return row | {"causes": dict(causes)}
+
+
 def main(path: Path, trials: int) -> None:
     table: dict[str, object] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -221,19 +271,16 @@ def main(path: Path, trials: int) -> None:
         for mode, injections in SHORT.items():
             stage = Stage(machine, mode, Path(folder))  # type: ignore[arg-type]
             for inject in injections:
-                found = [measure_stop(stage, inject, trial) for trial in range(trials)]
-                stopped = sorted(1e3 * one for one in found if one is not None)
-                row: dict[str, object] = {"trials": trials, "moves": found.count(None)}
-                if stopped:
-                    row |= {
-                        "median_ms": round(stopped[len(stopped) // 2]),
-                        "worst_ms": round(stopped[-1]),
-                    }
-                table[f"{mode}: {inject.__doc__}"] = row
-                sys.stdout.write(f"{mode}: {inject.__doc__} {row}\n")
+                table[f"{mode}: {inject.__doc__}"] = measure_row(stage, inject, trials)
             stage.close()
+        # As before there was an observer and an envelope.
+        stage = Stage(machine, "collect", Path(folder), watched=False)
+        for inject in SENSORS:
+            table[f"unwatched: {inject.__doc__}"] = measure_row(stage, inject, trials)
+        table[f"unwatched: {measure_ground.__doc__}"] = measure_ground(stage)
+        stage.close()
         stage = Stage(machine, "collect", Path(folder))
-        for measure in (measure_constant_delay, measure_drift):
+        for measure in (measure_ground, measure_constant_delay, measure_drift):
             table[str(measure.__doc__)] = measure(stage)
         table[str(measure_start_delay.__doc__)] = measure_start_delay(Path(folder))
         table[str(measure_random_corruption.__doc__)] = measure_random_corruption(stage, 10)

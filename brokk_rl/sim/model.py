@@ -41,6 +41,7 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
     if not visual:
         _remove_visuals(spec)
     model = spec.compile()
+    _check_touch(model, machine)
     add_drive(spec, machine, _compute_joint_inertia(model, machine))
     return spec.compile()
 
@@ -83,11 +84,35 @@ def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
             f"({', '.join(machine.joint_names)}); missing: {', '.join(missing) or 'none'}, "
             f"unknown: {', '.join(extra) or 'none'}"
         )
+    if spec.actuators:
+        raise ConfigError(
+            f"machine {machine.name}: {path.name} has actuators "
+            f"({', '.join(actuator.name or 'without a name' for actuator in spec.actuators)}), but the "
+            "drive of each joint follows from the machine's YAML; remove <actuator> from the MJCF"
+        )
     if spec.site("tip") is None:
         raise ConfigError(
             f"machine {machine.name}: {path.name} has no site 'tip' for the tool point"
         )
     return spec
+
+
+def _check_touch(model: mujoco.MjModel, machine: Machine) -> None:
+    """Raise a `ConfigError` where a link can touch something and no touch sensor would feel it."""
+    is_touch = model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH
+    felt = {int(model.site_bodyid[site]) for site in model.sensor_objid[is_touch]}
+    can_touch = (model.geom_contype | model.geom_conaffinity) != 0
+    moving = {
+        int(body)
+        for body in model.geom_bodyid[can_touch]
+        if model.body_dofnum[model.body_weldid[body]]
+    }
+    if missing := sorted(moving - felt):
+        raise ConfigError(
+            f"machine {machine.name}: geoms of {', '.join(model.body(i).name for i in missing)} can touch "
+            "the block, but no touch sensor feels it; add a site around them and a <touch> sensor to "
+            'the MJCF, or give these geoms contype="0" conaffinity="0"'
+        )
 
 
 def _write_machine(spec: mujoco.MjSpec, machine: Machine) -> None:

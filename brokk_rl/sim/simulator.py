@@ -6,6 +6,7 @@ and a bad number is refused before.
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 from brokk_rl.errors import ConfigError, DeviceError
@@ -15,8 +16,9 @@ from brokk_rl.spec import spec
 if TYPE_CHECKING:
     import torch
 
-    from brokk_rl.contracts.world import World
+    from brokk_rl.contracts.world import Property, World
     from brokk_rl.sim.native_world import NativeWorld
+    from brokk_rl.sim.parity import ParityResult
     from brokk_rl.sim.warp_world import WarpWorld
 
 
@@ -42,9 +44,15 @@ class NativeSimulator:
             )
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> NativeWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
+
+        `varied` names properties of the machine that differ from world to world.
 
         Raises:
             DeviceError: `device` is not the CPU.
@@ -57,7 +65,7 @@ class NativeSimulator:
         from brokk_rl.sim.native_world import NativeWorld
 
         return NativeWorld(
-            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads
+            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads, varied
         )
 
 
@@ -79,6 +87,8 @@ class WarpSimulator:
             `warp_solver`): 18 launches a substep instead of 60, and none instead of ten per solver
             iteration. The physics is the same. Tests compare it with MuJoCo C on the CPU and on a
             GPU; `benchmarks/h200` holds its rates.
+        parity_worlds: Worlds in which each machine is compared with MuJoCo C before it is used
+            (`brokk_rl.sim.parity`); 0 for no comparison.
     """
 
     num_worlds: int
@@ -89,6 +99,7 @@ class WarpSimulator:
     linesearch_iterations: int
     tolerance: float
     fused: bool
+    parity_worlds: int
 
     def check(self) -> None:
         counts = (
@@ -104,16 +115,26 @@ class WarpSimulator:
                 "sim: expected counts of 1 or more and a positive tolerance, "
                 f"got {counts} and {self.tolerance}"
             )
+        if self.parity_worlds < 0:
+            raise ConfigError(f"sim.parity_worlds: expected 0 or more, got {self.parity_worlds}")
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> WarpWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
+
+        `varied` names properties of the machine that differ from world to world.
 
         On a CPU this is slow and meant for tests.
 
         Raises:
             DeviceError: A GPU was asked for and there is none.
+            ConfigError: The machine's MJCF has parts that are not simulated, or the simulator
+                differs from MuJoCo C on this machine.
         """
         import torch
 
@@ -125,12 +146,23 @@ class WarpSimulator:
             )
         if device.type == "cuda" and device.index is None:
             device = torch.device("cuda", torch.cuda.current_device())
+        if self.parity_worlds:
+            _check_parity(self, machine, device)
+        return self._make_world(machine, device, _choose(num_worlds, self.num_worlds), varied)
+
+    def _make_world(
+        self,
+        machine: Machine,
+        device: torch.device,
+        num_worlds: int,
+        varied: tuple[Property, ...] = (),
+    ) -> WarpWorld:
         from brokk_rl.sim.warp_world import WarpWorld
 
         return WarpWorld(
             machine,
             device,
-            num_worlds=_choose(num_worlds, self.num_worlds),
+            num_worlds=num_worlds,
             substeps=self.substeps,
             num_contacts=self.num_contacts,
             num_constraints=self.num_constraints,
@@ -138,6 +170,7 @@ class WarpSimulator:
             linesearch_iterations=self.linesearch_iterations,
             tolerance=self.tolerance,
             fused=self.fused,
+            varied=varied,
         )
 
 
@@ -154,11 +187,24 @@ class AutoSimulator:
     warp: WarpSimulator
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> World:
         """Return the worlds on `device`; `num_worlds` overrides the configured number."""
         chosen = self.native if _is_cpu(device) else self.warp
-        return chosen.build(machine, device, num_worlds)
+        return chosen.build(machine, device, num_worlds, varied)
+
+
+@functools.lru_cache(maxsize=8)
+def _check_parity(simulator: WarpSimulator, machine: Machine, device: torch.device) -> ParityResult:
+    """Compare a simulator with MuJoCo C on a machine, once in a process."""
+    from brokk_rl.sim.parity import check_parity
+
+    world = simulator._make_world(machine, device, simulator.parity_worlds)
+    return check_parity(world, machine, simulator.substeps)
 
 
 def _is_cpu(device: torch.device | str) -> bool:

@@ -14,16 +14,17 @@ from collections.abc import Callable, Iterator
 
 import mujoco
 import mujoco_warp as mjw
-import numpy as np
 import torch
 import warp as wp
 
-from brokk_rl.errors import ConfigError
+from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model
+from brokk_rl.sim.model_features import check_simulated
+from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
-from brokk_rl.sim.warp_dynamics import MAX_DOFS, ArmDynamics
+from brokk_rl.sim.warp_dynamics import ArmDynamics
 from brokk_rl.sim.warp_solver import ContactSolver
 
 _CONTACT = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
@@ -52,42 +53,6 @@ def _keep_peak(
         if kind[world, row] >= _CONTACT and first_row[contact[world, row], 0] == row:
             total += force[world, row]
     peak[world] = wp.max(peak[world], total)
-
-
-def check_supported(compiled: mujoco.MjModel, machine: Machine, is_fused: bool) -> None:
-    """Raise a `ConfigError` for parts of a model that the substep does not simulate."""
-    left_out = {
-        "tendons": compiled.ntendon,
-        "equalities": compiled.neq,
-        "deformable bodies": compiled.nflex,
-        "plugins": compiled.nplugin,
-        "friction in joints": compiled.dof_frictionloss.any(),
-    }
-    passive = (
-        compiled.jnt_stiffness,
-        compiled.dof_damping,
-        compiled.body_gravcomp,
-        compiled.opt.density,
-        compiled.opt.viscosity,
-    )
-    too_much = {
-        "actuators": compiled.nu != machine.num_joints,
-        "branches": (compiled.dof_parentid != np.arange(-1, compiled.nv - 1)).any(),
-        "springs, dampers or fluids": any(np.any(values) for values in passive),
-        "torsional friction (condim above 3)": (
-            np.concatenate([compiled.geom_condim, compiled.pair_dim]) > 3
-        ).any(),
-        f"more than {MAX_DOFS} joints": compiled.nv > MAX_DOFS,
-    }
-    if found := [
-        name for name, count in (left_out | (too_much if is_fused else {})).items() if count
-    ]:
-        instead = "sim.fused=false or sim=native" if is_fused else "sim=native"
-        raise ConfigError(
-            f"machine {machine.name}: sim=warp simulates arms that are one chain of links, but "
-            f"its MJCF has {', '.join(found)}; "
-            f"remove them, or choose {instead}"
-        )
 
 
 def make_staged_substep(model: mjw.Model, data: mjw.Data, peak: wp.array) -> Callable[[], None]:
@@ -171,6 +136,7 @@ class WarpWorld:
         linesearch_iterations: Bound on the line search's iterations.
         tolerance: At which the solver stops.
         fused: Use our own kernels for dynamics, contact solver and integration.
+        varied: Properties of the machine that differ from world to world.
     """
 
     def __init__(
@@ -186,18 +152,22 @@ class WarpWorld:
         linesearch_iterations: int,
         tolerance: float,
         fused: bool,
+        varied: tuple[Property, ...] = (),
     ) -> None:
         self.num_worlds, self.device = num_worlds, device
         self.supports_graphs = device.type == "cuda"
         self._substeps = substeps
         self.model = compile_model(machine, machine.period_s / substeps)
-        check_supported(self.model, machine, fused)
+        check_simulated(self.model, machine.name, "fused" if fused else "staged")
         wp.config.log_level = wp.LOG_WARNING
         wp.init()
         self._warp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._warp_device):
             self._model = mjw.put_model(
-                self.model, batch_sizes={"geom_size": num_worlds, "geom_pos": num_worlds}
+                self.model,
+                batch_sizes=dict.fromkeys(
+                    ("geom_size", "geom_pos", *list_fields(varied)), num_worlds
+                ),
             )
             self._data = mjw.make_data(
                 self.model, num_worlds, nconmax=num_contacts, njmax=num_constraints
@@ -229,6 +199,10 @@ class WarpWorld:
             make_fused_substep(self.model, model, data, peak)
             if fused
             else make_staged_substep(model, data, peak)
+        )
+        fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(varied)}
+        self._properties = (
+            WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
         )
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
         self.reset(torch.ones_like(self.faults), home, make_nominal_scenes(num_worlds, device))
@@ -268,6 +242,16 @@ class WarpWorld:
         self.contact_force_n.masked_fill_(mask, 0.0)
         self.faults.masked_fill_(mask, False)
 
+    @property
+    def properties(self) -> dict[str, torch.Tensor]:
+        """Factors by property; see `brokk_rl.contracts.world.VariedWorld`."""
+        return self._properties.factors if self._properties else {}
+
+    def apply_properties(self) -> None:
+        """Make `properties` count; see `brokk_rl.contracts.world.VariedWorld`."""
+        if self._properties:
+            self._properties.apply()
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of everything that must be stored to go on."""
         return {name: tensor.clone() for name, tensor in self._stored().items()}
@@ -285,7 +269,7 @@ class WarpWorld:
         option = self._model.opt
         option.iterations, option.ls_iterations = iterations, linesearch_iterations
         option.tolerance.fill_(tolerance)
-        # `check_supported` has made sure that no joint has friction
+        # `check_simulated` has made sure that no joint has friction
         option.disableflags |= int(mjw.DisableBit.FRICTIONLOSS)
         # overflows are read on the device into `faults`, not printed
         option.warn_overflow = 0

@@ -204,7 +204,6 @@ def measure_segment_to_box(
         Distances, `(…,)`; 0 where they touch.
     """
     along = end_m - begin_m
-    half_m = np.broadcast_to(half_m, begin_m.shape)
     safe = np.where(along == 0.0, 1.0, along)
     corners = np.concatenate([(half_m - begin_m) / safe, (-half_m - begin_m) / safe], -1)
     # A segment along a side never passes it.

@@ -66,6 +66,10 @@ class GuardTrip(Enum):
     REQUEST_INVALID = "command is no number, or beyond full"
     REQUEST_EXCLUSIVE = "exclusive joint together with others"
     NOT_ARMED = "not armed"
+    JOINT_STILL = "a joint stands still: sensor, valve or hose"
+    JOINT_TURNED = "a joint moves the wrong way: sensor or valve turned"
+    JOINT_WEAK = "a joint moves too little: valve, hose or sensor"
+    JOINT_DRIFTS = "a joint moves unasked: sensor drifts, or valve leaks"
     ENVELOPE = "arm too near to ground, machine or a stay-out box"
 
 
@@ -89,6 +93,7 @@ class GuardInput:
         controls_age_s: Age of the switches that arm; they matter only while armed.
         round_trip_s: Time from the gateway to here and back to it, as the gateway measured it on
             our commands; it matters only while armed, since nothing is sent otherwise.
+        observed: Fault of a joint that does not move as commanded, else `GuardTrip.NONE`.
     """
 
     q: Numbers
@@ -105,6 +110,7 @@ class GuardInput:
     followed: bool
     controls_age_s: float
     round_trip_s: float
+    observed: GuardTrip
 
 
 @dataclass(frozen=True)
@@ -231,6 +237,7 @@ class Guard:
             (seen.levers_age_s <= limits.levers_s, GuardTrip.LEVERS_STALE),
             (seen.joints_age_s <= limits.joints_s, GuardTrip.JOINTS_STALE),
             (seen.joints_plausible and all(map(math.isfinite, seen.q)), GuardTrip.JOINTS_INVALID),
+            (seen.observed is GuardTrip.NONE, seen.observed),
             (seen.alone, GuardTrip.SECOND_SENDER),
             (seen.lever <= limits.neutral, GuardTrip.LEVER),
         )

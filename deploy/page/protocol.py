@@ -155,6 +155,9 @@ class PageState:
             "deadman": state.deadman,
             "estop": state.estop,
             "bus_up": state.bus_up,
+            "observed_joint": state.observed_joint,
+            "misfit": state.misfit.value,
+            "misfit_joint": state.misfit_joint,
         }
 
     @property

@@ -15,6 +15,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import STAMP, BusDescription
@@ -22,6 +24,7 @@ from deploy.bus.protection import MessageFault
 from deploy.guard.envelope import Envelope
 from deploy.guard.guard import CommandRequest, Guard, GuardDecision, GuardState
 from deploy.guard.limits import GuardLimits
+from deploy.guard.observer import Observer
 from deploy.runtime.operator_state import (
     OperatorControls,
     OperatorState,
@@ -68,6 +71,7 @@ class BusLogic:
         machine: The machine.
         limits: Of the guard.
         envelope: Of the arm; `None`: there is none.
+        observer: Of the joints' motion; `None`: there is none.
         commands: Whether anything is ever sent.
 
     Attributes:
@@ -81,12 +85,16 @@ class BusLogic:
         machine: Machine,
         limits: GuardLimits,
         envelope: Envelope | None,
+        observer: Observer | None,
         commands: bool,
     ) -> None:
         self._description, self._machine, self._commands = description, machine, commands
         self.receiver = BusReceiver(description, machine, limits)
         self._guard = Guard(limits, self.receiver.bounds, envelope)
         self.decision: GuardDecision | None = None
+        self._observer, self._joints_s = observer, limits.joints_s
+        # Sum and number of valve feedback at the observer's last update.
+        self._flow_sum, self._flow_number = np.zeros(machine.num_joints), 0
         self._zeros_left = 0
         self._controls_age_s = math.inf
         # Counters and due times are kept by message name, since each has its own cycle.
@@ -115,6 +123,8 @@ class BusLogic:
         """
         controls, requested = inputs.controls, inputs.request
         self._controls_age_s = math.inf if controls is None else now_s - controls.t_s
+        if self._observer is not None:
+            self._observe(self._observer, now_s)
         seen = self.receiver.build_guard_input(now_s, bus_up, self._controls_age_s)
         request = None
         if requested is not None:
@@ -132,6 +142,22 @@ class BusLogic:
         stops = before is not None and any(before.u) and not any(self.decision.u)
         silenced = before is not None and before.sends and not self.decision.sends
         return self._build_frames(now_s, at_once=stops or silenced, num_missed=num_missed)
+
+    def _observe(self, observer: Observer, now_s: float) -> None:
+        """Let the observer compare the last control period with its model, where one is over."""
+        known = self.receiver
+        if not known.deadman:
+            observer.clear()
+        oldest_s = min(float(known.q_t_s.min()), known.flow_t_s)
+        if now_s - oldest_s > self._joints_s or not known.plausible:
+            observer.forget()
+        elif observer.is_due(now_s):
+            number = known.flow_number - self._flow_number
+            # Without news the flow stays as it is.
+            flow = (known.flow_sum - self._flow_sum) / number if number else known.flow
+            self._flow_sum, self._flow_number = known.flow_sum, known.flow_number
+            observer.update(now_s, known.q, flow)
+        known.observation = observer.observation
 
     def build_state(self, now_s: float, bus_up: bool, num_missed: int) -> OperatorState:
         """Return the state to publish; call `decide` first."""

@@ -16,12 +16,15 @@ from dataclasses import dataclass
 
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
+from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import BusReplay, CanBus, CanFrame, OpenBusReplay, OpenCanBus
 from deploy.bus.description import BusDescription
 from deploy.guard.envelope import Envelope
 from deploy.guard.guard import GuardDecision
 from deploy.guard.limits import GuardLimits
+from deploy.guard.observer import Observer
 from deploy.guard.shapes import read_machine_shapes
+from deploy.guard.valve_model import load_observer_file
 from deploy.runtime.bus_logic import CYCLE_S, BusInputs, BusLogic
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -68,8 +71,10 @@ class BusProcess:
         self._wire, self._memory = config.wire, memory
         description = BusDescription(config.dbc, config.machine)
         commands = memory.request is not None
-        envelope = build_envelope(config.limits, config.machine)
-        self._logic = BusLogic(description, config.machine, config.limits, envelope, commands)
+        limits, machine = config.limits, config.machine
+        envelope, observer = build_envelope(limits, machine), build_observer(limits, machine)
+        self._logic = BusLogic(description, machine, limits, envelope, observer, commands)
+        self._joint_names, self._misfit_joint = machine.joint_names, -1
         self._gap_s = config.limits.gap_s
         self._bus: OpenCanBus | OpenBusReplay | None = None
         self._was_down, self._reopen_s = False, 0.0
@@ -129,6 +134,7 @@ class BusProcess:
         self._send(frames, now_s)
         assert logic.decision is not None
         self._log_change(before, logic.decision, now_s)
+        self._report_misfit(now_s)
         state = logic.build_state(now_s, self._bus is not None, self._timer.missed)
         memory.state.write(state)
         self._flush_log()
@@ -138,7 +144,20 @@ class BusProcess:
         if before is not None and (after.state, after.trip) == (before.state, before.trip):
             return
         values = {"state": after.state.name, "trip": after.trip.value, "cause": after.cause.value}
+        observed = self._logic.receiver.observation
+        if observed.joint >= 0:
+            values["joint"] = self._joint_names[observed.joint]
         self._log_text("guard", now_s, values)
+
+    def _report_misfit(self, now_s: float) -> None:
+        """Say once that the observer's model no longer fits the machine."""
+        observed = self._logic.receiver.observation
+        if observed.misfit_joint == self._misfit_joint:
+            return
+        self._misfit_joint = observed.misfit_joint
+        joint, effect = self._joint_names[observed.misfit_joint], observed.misfit.value
+        log.warning("the simulator no longer fits %s: diagnose again, probably %s", joint, effect)
+        self._log_text("misfit", now_s, {"joint": joint, "effect": effect})
 
     def _send(self, frames: Sequence[CanFrame], now_s: float) -> None:
         for frame in frames:
@@ -189,6 +208,27 @@ class BusProcess:
     def _log_text(self, topic: str, now_s: float, values: Mapping[str, object]) -> None:
         text = json.dumps({"topic": topic, "t_s": now_s, **values})
         self._memory.bus_log.put(TEXT + text.encode())
+
+
+def build_observer(limits: GuardLimits, machine: Machine) -> Observer | None:
+    """Return the observer; `None` where it is switched off or its file is of another machine.
+
+    Raises:
+        ConfigError: its file cannot be read.
+    """
+    if limits.observer is None:
+        return None
+    content = load_observer_file(resolve_package_path(limits.observer.path))
+    if content["fingerprint"] != machine.fingerprint():
+        log.warning(
+            "%s was made for machine %s, and differs from %s: there is no observer",
+            limits.observer.path,
+            content["machine"],
+            machine.name,
+        )
+        return None
+    # Any seed will do: it decides between equal scores alone.
+    return Observer(limits.observer, content, machine, seed=time.monotonic_ns() % 2**32)
 
 
 def build_envelope(limits: GuardLimits, machine: Machine) -> Envelope | None:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from deploy.guard.drift_watch import Misfit
 from deploy.guard.guard import GuardState, GuardTrip
 from deploy.guidance import LeverPositions
 from deploy.runtime.shared_memory import Axes, Joints, Point
@@ -70,6 +71,10 @@ class OperatorState:
         refused: Messages refused so far.
         lost: Messages lost so far.
         missed: Cycles missed so far.
+        observed_joint: Number, from 1, of the joint that does not move as commanded; 0 while all
+            do.
+        misfit: Why the observer's model no longer fits, by its drift watch.
+        misfit_joint: Number of its joint, from 1; 0 while it fits.
     """
 
     t_s: float
@@ -102,6 +107,9 @@ class OperatorState:
     refused: int
     lost: int
     missed: int
+    observed_joint: int
+    misfit: Misfit
+    misfit_joint: int
 
     @property
     def levers(self) -> LeverPositions:
@@ -266,6 +274,9 @@ class LoopSnapshot:
             "refused": state.refused,
             "lost": state.lost,
             "log_dropped": self.log_dropped,
+            "observed_joint": state.observed_joint,
+            "misfit": state.misfit.value,
+            "misfit_joint": state.misfit_joint,
         }
 
 

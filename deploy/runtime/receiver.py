@@ -27,6 +27,7 @@ from deploy.bus.description import (
 from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel
 from deploy.guard.guard import GuardDecision, GuardInput
 from deploy.guard.limits import GuardLimits, build_joint_bounds
+from deploy.guard.observer import NOTHING_OBSERVED
 from deploy.guard.plausibility import PlausibilityFilter
 from deploy.runtime.operator_state import OperatorState
 
@@ -48,6 +49,7 @@ class BusReceiver:
         description: The bus.
         machine: The machine.
         limits: For plausibility.
+        observation: Newest result of the observer, as the bus process's logic sets it.
     """
 
     description: BusDescription
@@ -79,6 +81,7 @@ class BusReceiver:
             machine.is_exclusive.tolist(),
         )
         self.plausibility = PlausibilityFilter(self.limits, self.bounds)
+        self.observation = NOTHING_OBSERVED
         count = machine.num_joints
         # Ages start at infinity: nothing is known before the first message.
         self.q, self.q_valid = np.zeros(count), np.zeros(count, dtype=bool)
@@ -165,6 +168,7 @@ class BusReceiver:
             alone=self._is_alone(now_s),
             controls_age_s=controls_age_s,
             round_trip_s=self.round_trip_s,
+            observed=self.observation.fault,
         )
 
     def build_state(
@@ -210,6 +214,9 @@ class BusReceiver:
             refused=self.refused,
             lost=sum(channel.lost for channel in self.channels.values()),
             missed=missed,
+            observed_joint=self.observation.joint + 1,
+            misfit=self.observation.misfit,
+            misfit_joint=self.observation.misfit_joint + 1,
         )
 
     @property

@@ -53,6 +53,7 @@ class Analysis:
     Attributes:
         participants: Pseudonyms, `P` of them.
         guided_first: Who was guided in the first period, `(P,)` bool.
+        pairs: Number of the pair in which each participant's sequence was drawn, `(P,)`.
         trials: Every trial that is there.
         means: By measure and condition, one mean a participant, `(P,)`, NaN where there is none.
         loads: NASA-TLX by scale (and `raw`, `weighted`) and condition, `(P,)`.
@@ -66,6 +67,7 @@ class Analysis:
 
     participants: list[str]
     guided_first: np.ndarray
+    pairs: np.ndarray
     trials: list[MeasuredTrial]
     means: dict[str, dict[str, np.ndarray]]
     loads: dict[str, dict[str, np.ndarray]]
@@ -90,6 +92,10 @@ def analyse(data: StudyData, machine: Machine, progress: Callable[[list], Any] =
     found = Analysis(
         participants=names,
         guided_first=np.array([plan[name][0] == "guided" for name in names], bool),
+        # Sequences were drawn in pairs of the plan; who was erased leaves the partner alone.
+        pairs=np.array(
+            [number // 2 for number, name in enumerate(plan) if name not in erased], int
+        ),
         trials=[],
         means={},
         loads={},
@@ -133,7 +139,7 @@ def _estimate_effects(found: Analysis) -> None:
     ):
         if name not in GUIDED_ONLY:
             found.effects[name] = estimate_effect(
-                by_condition["guided"], by_condition["unguided"], found.guided_first
+                by_condition["guided"], by_condition["unguided"], found.guided_first, found.pairs
             )
     secondary = []
     for each in MEASURES:

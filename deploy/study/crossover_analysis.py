@@ -75,7 +75,7 @@ class GuidanceEffect:
 
 
 def estimate_effect(
-    guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray
+    guided: np.ndarray, unguided: np.ndarray, guided_first: np.ndarray, pairs: np.ndarray
 ) -> GuidanceEffect:
     """Return the effect of guidance on one measure.
 
@@ -83,6 +83,7 @@ def estimate_effect(
         guided: One figure a person, `(P,)`; NaN where there is none.
         unguided: Likewise.
         guided_first: Who was guided in the first period, `(P,)` bool.
+        pairs: Number of the pair in which each person's sequence was drawn, `(P,)`.
     """
     # A person with one condition only tells nothing about the difference.
     both = ~(np.isnan(guided) | np.isnan(unguided))
@@ -101,6 +102,7 @@ def estimate_effect(
             np.where(first, guided - unguided, unguided - guided),
             guided + unguided,
             first,
+            np.asarray(pairs)[both],
         )
     return GuidanceEffect(num_persons=num, num_guided_first=num_first, **facts)
 
@@ -125,7 +127,9 @@ def _test_pairs(difference: np.ndarray) -> dict:
     return facts
 
 
-def _adjust_for_period(period_difference: np.ndarray, total: np.ndarray, first: np.ndarray) -> dict:
+def _adjust_for_period(
+    period_difference: np.ndarray, total: np.ndarray, first: np.ndarray, pairs: np.ndarray
+) -> dict:
     # Half the difference of the sequences is guidance, half their sum the period (see the
     # module).
     before, after = period_difference[first].mean(), period_difference[~first].mean()
@@ -138,7 +142,7 @@ def _adjust_for_period(period_difference: np.ndarray, total: np.ndarray, first: 
     facts: dict = {
         "adjusted": guidance,
         "adjusted_ci95": (guidance - half, guidance + half),
-        "p": float(permutation_tests.compute_sequence_p(period_difference, first)),
+        "p": float(permutation_tests.compute_sequence_p(period_difference, first, pairs)),
         "period": period,
     }
     if std > 0:

@@ -1,17 +1,17 @@
 """Exact permutation tests: the observed statistic among all assignments of the design.
 
 No distribution is assumed. Two kinds of assignment are possible: exchange of a person's two
-conditions (`flips`, the paired test), and the choice of persons who begin guided (`sequences`).
-The second keeps the effect of practice, which stays with the period. scipy's permutation test
+conditions (`flips`, the paired test), and the draw of the sequences as `deploy.study.design` makes
+it: one coin for each pair of persons, whose second gets the other sequence. A person whose partner
+dropped out keeps the coin. The second test keeps the effect of practice, which stays with the
+period. scipy's permutation test
 handles one study at a time; here thousands of simulated studies share one table of assignments.
 Axes: `S` studies at once, `P` persons, `M` assignments.
 """
 
 from __future__ import annotations
 
-import math
 from functools import lru_cache
-from itertools import combinations
 
 import numpy as np
 from scipy import stats
@@ -32,9 +32,9 @@ def count_flips(num_persons: int) -> int:
     return 2**num_persons
 
 
-def count_sequences(num_guided_first: int, num_persons: int) -> int:
-    """Return the number of draws of `num_guided_first` out of `num_persons`."""
-    return math.comb(num_persons, num_guided_first)
+def count_sequences(num_pairs: int) -> int:
+    """Return the number of draws of the sequences of `num_pairs` pairs, whole or not."""
+    return 2**num_pairs
 
 
 def get_smallest_paired_p(num_persons: int) -> float:
@@ -42,13 +42,13 @@ def get_smallest_paired_p(num_persons: int) -> float:
     return min(1.0, 2.0 / count_flips(num_persons)) if num_persons else 1.0
 
 
-def get_smallest_sequence_p(num_guided_first: int, num_persons: int) -> float:
-    """Return the smallest two-sided p of the test over sequences.
+def get_smallest_sequence_p(num_pairs: int) -> float:
+    """Return the smallest two-sided p of the test over sequences: the extreme draw and its mirror.
 
-    It counts the most extreme draw, and its mirror where both sequences are equally large.
+    Args:
+        num_pairs: Pairs of which at least one person is left.
     """
-    ways = count_sequences(num_guided_first, num_persons)
-    return min(1.0, (2.0 if 2 * num_guided_first == num_persons else 1.0) / ways)
+    return min(1.0, 2.0 / count_sequences(num_pairs))
 
 
 def compute_paired_p(difference: np.ndarray) -> np.ndarray:
@@ -73,22 +73,32 @@ def compute_wilcoxon_p(difference: np.ndarray) -> float:
     return float(compute_paired_p(np.sign(difference) * stats.rankdata(np.abs(difference))))
 
 
-def compute_sequence_p(period_difference: np.ndarray, guided_first: np.ndarray) -> np.ndarray:
+def compute_sequence_p(
+    period_difference: np.ndarray, guided_first: np.ndarray, pairs: np.ndarray
+) -> np.ndarray:
     """Return the two-sided p of guidance with the period in the model.
 
-    `period_difference`, `(…, P)`, is the first period minus the second. The statistic is the
-    difference of the two sequences' means. Practice shifts both alike and cancels. The permutation
+    The statistic is the difference of the two sequences' means. Practice shifts both alike and
+    cancels; a draw that leaves one sequence empty counts as no difference. The permutation
     counterpart of Hills and Armitage, Br. J. Clin. Pharmacol. 8 (1979) 7-20, equation for the
     treatment effect.
+
+    Args:
+        period_difference: First period minus the second, `(…, P)`.
+        guided_first: Who was guided in the first period, `(P,)` bool.
+        pairs: Number of the pair in which each person's sequence was drawn, `(P,)`.
+
+    Raises:
+        ValueError: only one sequence occurs.
     """
     first = np.asarray(guided_first, bool)
-    num, num_first = len(first), int(first.sum())
-    if not 0 < num_first < num:
+    if first.all() or not first.any():
         raise ValueError(
             "both sequences must occur: with one alone guidance and order cannot be told apart"
         )
-    weights = np.where(_list_draws(num, num_first), 1.0 / num_first, -1.0 / (num - num_first))
-    own = np.where(first, 1.0 / num_first, -1.0 / (num - num_first))
+    numbers = np.unique(np.asarray(pairs), return_inverse=True)[1]
+    weights = _list_draws(tuple(first.tolist()), tuple(numbers.tolist()))
+    own = _weigh_sequences(first[None])[0]
     return _count_two_sided(np.asarray(period_difference, float), weights, own)
 
 
@@ -138,11 +148,21 @@ def _list_flips(num: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def _list_draws(num: int, num_first: int) -> np.ndarray:
-    """Return the persons who begin guided in each assignment, `(M, P)` bool."""
-    if count_sequences(num_first, num) > MOST_WAYS:
-        return np.random.default_rng(0).random((MANY_WAYS, num)).argsort(1) < num_first
-    chosen = np.array(list(combinations(range(num), num_first)))
-    drawn = np.zeros((len(chosen), num), bool)
-    drawn[np.arange(len(chosen))[:, None], chosen] = True
-    return drawn
+def _list_draws(guided_first: tuple[bool, ...], pairs: tuple[int, ...]) -> np.ndarray:
+    """Return the weights of the persons in each draw of the sequences, `(M, P)`."""
+    num_pairs = max(pairs) + 1
+    if count_sequences(num_pairs) > MOST_WAYS:
+        coins = np.random.default_rng(0).integers(0, 2, (MANY_WAYS, num_pairs))
+    else:
+        coins = (np.arange(count_sequences(num_pairs))[:, None] >> np.arange(num_pairs)) & 1
+    # The coin of a pair turns the sequences of both of it.
+    return _weigh_sequences(coins[:, list(pairs)].astype(bool) ^ np.array(guided_first))
+
+
+def _weigh_sequences(first: np.ndarray) -> np.ndarray:
+    """Return weights whose products with values are the difference of the sequences' means, `(M, P)`."""
+    num_first = first.sum(1, keepdims=True)
+    num_second = first.shape[1] - num_first
+    both = (num_first > 0) & (num_second > 0)
+    weights = np.where(first, 1.0 / np.maximum(num_first, 1), -1.0 / np.maximum(num_second, 1))
+    return np.where(both, weights, 0.0)

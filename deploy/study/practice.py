@@ -146,14 +146,16 @@ def share_significant(
         fixed: Guidance first for all, and the paired test, as there is no other; else
             counterbalanced, period in the model.
     """
-    first = np.ones(num_persons, bool) if fixed else np.arange(num_persons) < (num_persons + 1) // 2
+    first = np.ones(num_persons, bool) if fixed else np.arange(num_persons) % 2 == 0
     effect = practice.effect_of(dz, num_trials, practised, limit_s) if dz else 0.0
     guided, unguided = practice.draw(first, num_trials, practised, limit_s, effect, seed, studies)
     if fixed:
         p = permutation_tests.compute_paired_p(guided - unguided)
     else:
         p = permutation_tests.compute_sequence_p(
-            np.where(first, guided - unguided, unguided - guided), first
+            np.where(first, guided - unguided, unguided - guided),
+            first,
+            np.arange(num_persons) // 2,
         )
     hits = int((p <= alpha).sum())
     return {

@@ -114,7 +114,7 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
     # Both tests bound the attainable p: with few people no result can be significant.
     least = max(
         get_smallest_paired_p(num),
-        get_smallest_sequence_p(num_first, num) if 0 < num_first < num else 1.0,
+        get_smallest_sequence_p(len(set(found.pairs.tolist()))) if 0 < num_first < num else 1.0,
     )
     if least > found.alpha:
         page.add_text(

@@ -44,10 +44,11 @@ def tabulate_sizes(alpha: float, sizes: Sequence[int] = SIZES) -> list[SampleSiz
 @cache
 def evaluate_size(num: int, alpha: float) -> SampleSize:
     """Return smallest p and power of `num` participants."""
-    num_first = (num + 1) // 2
-    first = np.arange(num) < num_first
-    smallest = permutation_tests.get_smallest_sequence_p(num_first, num)
-    ways = permutation_tests.count_sequences(num_first, num)
+    # In each pair one of the two begins guided; a last one alone has a coin too.
+    first, pairs = np.arange(num) % 2 == 0, np.arange(num) // 2
+    num_pairs = (num + 1) // 2
+    smallest = permutation_tests.get_smallest_sequence_p(num_pairs)
+    ways = permutation_tests.count_sequences(num_pairs)
     # Fewer studies where a test counts many ways, so that the time stays bounded.
     studies = min(STUDIES, MOST_COUNTED // ways) if ways <= permutation_tests.MOST_WAYS else STUDIES
     # Seeded by the size: the table is the same each time.
@@ -57,7 +58,9 @@ def evaluate_size(num: int, alpha: float) -> SampleSize:
         power.append(
             float(
                 (
-                    permutation_tests.compute_sequence_p(chance + np.where(first, dz, -dz), first)
+                    permutation_tests.compute_sequence_p(
+                        chance + np.where(first, dz, -dz), first, pairs
+                    )
                     <= alpha
                 ).mean()
             )
@@ -84,6 +87,6 @@ def find_smallest_sizes(alpha: float) -> tuple[int, int]:
     while permutation_tests.get_smallest_paired_p(paired) > alpha:
         paired += 1
     sequence = 2
-    while permutation_tests.get_smallest_sequence_p((sequence + 1) // 2, sequence) > alpha:
+    while permutation_tests.get_smallest_sequence_p((sequence + 1) // 2) > alpha:
         sequence += 1
     return paired, sequence

@@ -33,9 +33,10 @@ FRAME_FAULTS = (
 """Faults of messages on their way: not sent, one in ten not sent, sent twice, swapped with the
 next, sent 0.2 s late, one bit wrong, cut short, under another identifier, with a counter that
 stands still, with the CRC of another message."""
-SIGNAL_FAULTS = ("stuck", "jump", "drift", "out_of_range", "sign", "invalid")
+SIGNAL_FAULTS = ("stuck", "jump", "drift", "out_of_range", "sign", "mirrored", "invalid")
 """Faults of the measured position of the first joint: stands still, one jump, drifts, beyond its
-limits, wrong sign, called invalid."""
+limits, wrong sign, wrong sign from here on without a jump, called invalid. A stuck, mirrored or turned
+sensor is that of all joints."""
 MACHINE_FAULTS = (
     "estop",
     "deadman_released",

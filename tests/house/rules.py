@@ -50,6 +50,8 @@ CLOSED = {
     "deploy.guard.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.guard.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.guard.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.guard.observer": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.guard.drift_watch": ("torch", "os", "pathlib", "socket", "io", "time"),
 }
 """What a package must not import, whatever its floor: the machine's own computer has neither
 simulator nor trainer."""

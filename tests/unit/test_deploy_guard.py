@@ -29,11 +29,12 @@ BODY = build_joint_bounds([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [
 LIMITS = GuardLimits(
     max_command=0.8, max_rate_1_s=5.0, max_reversals_1_s=3, overrun=0.001, neutral=0.05, stop_margin=0.1, joints_s=0.15,
     levers_s=0.16, status_s=0.17, request_s=0.18, ignored_s=0.3, controls_s=0.19, round_trip_s=0.14, gap_s=0.2, jump_margin=3.0,
-    jump_slack=0.01, range_slack=0.2, num_jumps=3, envelope=None,
+    jump_slack=0.01, range_slack=0.2, num_jumps=3, envelope=None, observer=None,
 )  # fmt: skip
 WELL = GuardInput(
     q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
     status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True, controls_age_s=0.01, round_trip_s=0.03,
+    observed=GuardTrip.NONE,
 )  # fmt: skip
 RELEASED = replace(WELL, deadman=False)
 STILL = (0.0, 0.0, 0.0)
@@ -127,6 +128,8 @@ WRONG = [
     ({"dt": -0.001}, GuardTrip.TIME_GAP),
     ({"estop": True}, GuardTrip.ESTOP),
     ({"trusted": False}, GuardTrip.CHANNEL_INVALID),
+    ({"observed": GuardTrip.JOINT_TURNED}, GuardTrip.JOINT_TURNED),
+    ({"observed": GuardTrip.JOINT_STILL}, GuardTrip.JOINT_STILL),
     ({"status_age_s": LIMITS.status_s + 0.001}, GuardTrip.STATUS_STALE),
     ({"status_age_s": math.inf}, GuardTrip.STATUS_STALE),
     ({"levers_age_s": LIMITS.levers_s + 0.001}, GuardTrip.LEVERS_STALE),

@@ -15,8 +15,10 @@ from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
 from deploy.bus.protection import MessageFault
+from deploy.guard.drift_watch import Misfit
 from deploy.guard.envelope import Envelope
 from deploy.guard.guard import GuardState, GuardTrip
+from deploy.guard.observer import NOTHING_OBSERVED, Observation, Observer
 from deploy.runtime.bus_logic import LAST_ZEROS, BusInputs, BusLogic, is_armed
 from deploy.runtime.operator_state import OperatorControls, RequestedCommand, StopRequest
 
@@ -31,12 +33,17 @@ class Loop:
     """Logic, gateway and remote on one clock; requests, switches and stop as they are set."""
 
     def __init__(
-        self, commands: bool = True, bus: BusDescription = BUS, envelope: Envelope | None = None
+        self,
+        commands: bool = True,
+        bus: BusDescription = BUS,
+        envelope: Envelope | None = None,
+        observer: Observer | None = None,
     ) -> None:
-        self.envelope, self.face_in_base_m = envelope, None
+        self.envelope = envelope
+        self.face_in_base_m: tuple[float, ...] | None = None
         self.sender = Sender(bus)
         self.bus = bus
-        self.logic = BusLogic(bus, MACHINE, LIMITS, self.envelope, commands)
+        self.logic = BusLogic(bus, MACHINE, LIMITS, self.envelope, observer, commands)
         self.sender.receiver = self.logic.receiver
         self.armed, self.armed_s, self.stop_s = True, 0.0, None
         self.u: np.ndarray | None = U
@@ -357,3 +364,113 @@ def test_a_bus_without_a_heartbeat_gets_none(tmp_path: Any) -> None:
     loop = Loop(bus=BusDescription(str(path), MACHINE)).get_active()
     loop.go(0.3)
     assert {name for _, name, _ in loop.sent} == {"ValveCmd"}
+
+
+class Probe:
+    """Notes what an observer is given, and finds what it is told to."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[float, list[float], list[float]]] = []
+        self.observation, self.due, self.forgotten, self.cleared = NOTHING_OBSERVED, True, 0, 0
+
+    def is_due(self, now_s: float) -> bool:
+        return self.due
+
+    def update(self, now_s: float, q: np.ndarray, u: np.ndarray) -> None:
+        self.seen.append((now_s, q.tolist(), u.tolist()))
+
+    def forget(self) -> None:
+        self.forgotten += 1
+
+    def clear(self) -> None:
+        self.cleared += 1
+
+
+def test_the_observer_gets_positions_and_the_mean_flow_of_its_period() -> None:
+    probe = Probe()
+    loop = Loop(observer=probe).get_active()  # type: ignore[arg-type]
+    probe.due = False
+    loop.sender.values["Flow_q1"] = 0.2
+    loop.go(0.2)
+    probe.due = True
+    loop.cycle()
+    probe.due = False
+    probe.seen.clear()
+    before, number = loop.logic.receiver.flow_sum.copy(), loop.logic.receiver.flow_number
+    for flow in (0.4, 0.8):
+        loop.sender.values["Flow_q1"] = flow
+        loop.go(0.1)
+    mean = (loop.logic.receiver.flow_sum - before) / (loop.logic.receiver.flow_number - number)
+    assert not probe.seen and 0.5 < mean[0] < 0.7
+    probe.due = True
+    loop.decide()
+    ((now_s, q, u),) = probe.seen
+    assert now_s == loop.now_s and q == pytest.approx(MACHINE.home, abs=1e-3)
+    assert u == pytest.approx(mean.tolist())
+    # Without news in between the flow is the newest.
+    loop.decide()
+    assert probe.seen[-1][2][0] == pytest.approx(0.8, abs=0.01)
+
+
+def test_an_observed_fault_latches_with_its_joint_and_a_released_dead_man_clears_it() -> None:
+    probe = Probe()
+    loop = Loop(observer=probe).get_active()  # type: ignore[arg-type]
+    cleared = probe.cleared
+    loop.cycle()
+    assert probe.cleared == cleared
+    probe.observation = Observation(GuardTrip.JOINT_STILL, 3, Misfit.CREEP, 1)
+    loop.cycle()
+    assert loop.state is GuardState.LATCHED and loop.trip is GuardTrip.JOINT_STILL
+    state = loop.logic.build_state(loop.now_s, True, 0)
+    assert (state.observed_joint, state.misfit, state.misfit_joint) == (4, Misfit.CREEP, 2)
+    probe.observation = NOTHING_OBSERVED
+    loop.sender.values["DeadMan"] = 0
+    loop.go(0.05)
+    assert probe.cleared > cleared and loop.state is GuardState.READY
+    state = loop.logic.build_state(loop.now_s, True, 0)
+    assert (state.observed_joint, state.misfit_joint) == (0, 0)
+
+
+@pytest.mark.parametrize("missing", ["JointPos1", "ValveFeedback"])
+def test_the_observer_begins_anew_where_its_values_are_missing(missing: str) -> None:
+    probe = Probe()
+    loop = Loop(observer=probe).get_active()  # type: ignore[arg-type]
+    probe.forgotten = 0
+    loop.go(LIMITS.joints_s - 0.03, missing)
+    assert probe.forgotten == 0
+    loop.go(0.06, missing)
+    count = len(probe.seen)
+    assert probe.forgotten > 0
+    loop.go(0.05, missing)
+    assert len(probe.seen) == count
+
+
+def test_the_observer_begins_anew_where_positions_are_not_plausible() -> None:
+    probe = Probe()
+    loop = Loop(observer=probe).get_active()  # type: ignore[arg-type]
+    probe.forgotten = 0
+    loop.cycle()
+    assert probe.forgotten == 0
+    loop.sender.values["Valid_q1"] = 0
+    loop.go(0.03)
+    assert probe.forgotten > 0
+
+
+def test_the_envelope_knows_the_face_and_withholds() -> None:
+    class Wall:
+        """Withholds whatever comes, and notes the face."""
+
+        def limit_command(self, now_s: float, u: Any, q: Any, face: Any) -> Any:
+            self.face = face
+            return (0.0,) * 5, True
+
+        def note_sent(self, now_s: float, u: Any) -> None: ...
+
+    wall = Wall()
+    loop = Loop(envelope=wall)  # type: ignore[arg-type]
+    loop.face_in_base_m = (1.0, 2.0, 3.0)
+    loop.get_active()
+    loop.cycle()
+    assert wall.face == (1.0, 2.0, 3.0)
+    assert loop.state is GuardState.ACTIVE and loop.trip is GuardTrip.ENVELOPE
+    assert loop.commands()[-1][1]["Command_q1"] == 0.0

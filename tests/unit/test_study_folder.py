@@ -93,19 +93,19 @@ def said(data: Any) -> str:
 
 
 def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) -> None:
-    study(tmp_path, machine, count=8)
+    study(tmp_path, machine, count=12)
     data = study_folder.read_study(tmp_path)
     found = analysis.analyse(data, machine)
     effect = found.effects["time_s"]
-    assert not found.remarks and len(found.trials) == 8 * 8  # practice is there, too …
-    assert sum(trial.counts for trial in found.trials) == 8 * 6  # … and does not count
+    assert not found.remarks and len(found.trials) == 12 * 8  # practice is there, too …
+    assert sum(trial.counts for trial in found.trials) == 12 * 6  # … and does not count
     assert effect.adjusted == pytest.approx(-4.0, abs=0.06) and effect.period == pytest.approx(
         -1.0, abs=0.06
     )
-    assert effect.p == pytest.approx(2 / 70)
+    assert effect.p == pytest.approx(2 / 64)
     assert found.effects["tlx_raw"].adjusted == pytest.approx(-20.0)
-    assert found.loads["weighted"]["guided"].tolist() == [30.0] * 8
-    assert found.holm["tlx_mental"] == pytest.approx(6 * 2 / 70)
+    assert found.loads["weighted"]["guided"].tolist() == [30.0] * 12
+    assert found.holm["tlx_mental"] == pytest.approx(6 * 2 / 64)
     assert "time_s" not in found.holm  # the primary measure stands alone
     path = report.write_report(tmp_path / "out", data, found)
     page = path.read_text()
@@ -113,7 +113,7 @@ def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) ->
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {
         "report.html", "report.json", "trials.csv", "means.csv", "effects.csv", "paths.png", "tlx.png", "pairs.png", "effects.png",
     }  # fmt: skip
-    assert (tmp_path / "out" / "means.csv").read_text().count("\n") == 1 + 16
+    assert (tmp_path / "out" / "means.csv").read_text().count("\n") == 1 + 24
     json.loads((tmp_path / "out" / "report.json").read_text())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from deploy.study.crossover_analysis import (
     estimate_effect,
     estimate_hodges_lehmann,
 )
+from deploy.study.design import Design, Hole, Success, draw_sequences
 from deploy.study.practice import Practice, share_significant
 
 DARWIN = np.array([49, -67, 8, 16, 6, 23, 28, 41, 14, 29, 56, 24, 75, 60, -48], float)
@@ -36,7 +38,7 @@ def test_the_paired_test_counts_what_fisher_counted() -> None:
 
 def test_tests_agree_with_scipys_permutations() -> None:
     rng = np.random.default_rng(3)
-    difference, first = rng.normal(0.6, 1.0, 9), np.arange(9) < 4
+    difference = rng.normal(0.6, 1.0, 9)
     paired = stats.permutation_test(
         (difference,),
         lambda x, axis: x.mean(axis),
@@ -44,17 +46,7 @@ def test_tests_agree_with_scipys_permutations() -> None:
         n_resamples=np.inf,
         vectorized=True,
     )
-    sequences = stats.permutation_test(
-        (difference[first], difference[~first]),
-        lambda x, y, axis: np.abs(x.mean(axis) - y.mean(axis)),
-        alternative="greater",
-        n_resamples=np.inf,
-        vectorized=True,
-    )
     assert permutation_tests.compute_paired_p(difference) == pytest.approx(paired.pvalue)
-    assert permutation_tests.compute_sequence_p(difference, first) == pytest.approx(
-        sequences.pvalue
-    )
     assert permutation_tests.compute_wilcoxon_p(difference) == pytest.approx(
         stats.wilcoxon(difference, method="exact").pvalue
     )
@@ -74,26 +66,96 @@ def test_five_persons_cannot_reach_five_percent_and_six_can() -> None:
         == permutation_tests.compute_paired_p(np.arange(1.0, 6.0))
     )
     assert permutation_tests.get_smallest_paired_p(6) == 0.03125
+    pairs = np.arange(8) // 2
+    first = np.arange(8) % 2 == 0
+    extreme = np.where(first, 1.0, -1.0) + 0.01 * np.arange(8)
     assert (
-        permutation_tests.get_smallest_sequence_p(4, 8)
-        == pytest.approx(2 / 70)
-        == permutation_tests.compute_sequence_p(np.arange(8.0), np.arange(8) < 4)
+        permutation_tests.get_smallest_sequence_p(4)
+        == 0.125
+        == permutation_tests.compute_sequence_p(extreme, first, pairs)
     )
-    assert permutation_tests.get_smallest_sequence_p(4, 7) == pytest.approx(1 / 35)
-    assert sample_size.find_smallest_sizes(0.05) == (6, 7)
+    assert permutation_tests.get_smallest_sequence_p(6) == 2 / 64
+    assert sample_size.find_smallest_sizes(0.05) == (6, 11)
+
+
+def build_design(num_participants: int) -> Design:
+    holes = {name: Hole(center_in_base_m=(2.5, 0.0, 0.75), radius_m=0.05) for name in "ab"}
+    return Design(
+        num_participants=num_participants, order="counterbalanced", holes=holes, starts={"a": (), "b": ()}, practice_trials=0,
+        practice_minutes=1.0, limit_s=150.0, success=Success(depth_m=0.1, clearance_m=0.01), primary="time_s", alpha=0.05,
+    )  # fmt: skip
+
+
+class Coins:
+    """Gives the coins of a draw, one after the other."""
+
+    def __init__(self, coins: tuple[int, ...]) -> None:
+        self._left = list(coins)
+
+    def integers(self, end: int) -> int:
+        return self._left.pop(0)
+
+
+def list_first(design: Design, left: list[int]) -> list[np.ndarray]:
+    """Who begins guided in each draw that the plan could have made, of those who are left."""
+    found = []
+    for coins in product((0, 1), repeat=(design.num_participants + 1) // 2):
+        drawn = draw_sequences(design, Coins(coins))  # type: ignore[arg-type]
+        first = np.array([one[0] == "guided" for one in drawn.values()])
+        found.append(first[left])
+    return found
+
+
+def compare_sequences(values: np.ndarray, first: np.ndarray) -> float:
+    """Difference of the means; 0 where a sequence is empty."""
+    if first.all() or not first.any():
+        return 0.0
+    return abs(float(values[first].mean() - values[~first].mean()))
+
+
+@pytest.mark.parametrize(
+    ("num", "dropped"),
+    [(8, ()), (9, ()), (8, (3,)), (10, (0, 1)), (10, (0, 3, 4, 8)), (7, (6,)), (5, (1, 3))],
+)
+def test_sequences_are_permuted_as_the_plan_draws_them(num: int, dropped: tuple[int, ...]) -> None:
+    design = build_design(num)
+    left = [one for one in range(num) if one not in dropped]
+    draws = list_first(design, left)
+    pairs = np.array(left) // 2
+    values = np.random.default_rng(num).normal(size=len(left)) + 3.0
+    found = []
+    for first in draws:
+        if first.all() or not first.any():
+            continue
+        observed = compare_sequences(values, first)
+        expected = np.mean([compare_sequences(values, one) >= observed - 1e-9 for one in draws])
+        p = permutation_tests.compute_sequence_p(values, first, pairs)
+        assert p == pytest.approx(expected)
+        found.append(float(p))
+    least = permutation_tests.get_smallest_sequence_p(len(set(pairs.tolist())))
+    assert min(found) == pytest.approx(least)
+    # Without an effect the values stay and the draw varies: no level is exceeded.
+    for level in sorted(set(found)):
+        assert sum(p <= level + 1e-12 for p in found) / len(draws) <= level + 1e-12
 
 
 def test_many_studies_at_once_are_those_one_by_one() -> None:
     rows, first = np.random.default_rng(0).normal(size=(4, 8)), np.arange(8) % 2 == 0
-    assert permutation_tests.compute_sequence_p(rows, first).tolist() == [
-        float(permutation_tests.compute_sequence_p(row, first)) for row in rows
+    pairs = np.arange(8) // 2
+    assert permutation_tests.compute_sequence_p(rows, first, pairs).tolist() == [
+        float(permutation_tests.compute_sequence_p(row, first, pairs)) for row in rows
     ]
     with pytest.raises(ValueError, match="both sequences"):
-        permutation_tests.compute_sequence_p(rows, np.ones(8, bool))
+        permutation_tests.compute_sequence_p(rows, np.ones(8, bool), pairs)
 
 
 def test_more_ways_than_can_be_counted_are_drawn() -> None:
     difference = np.random.default_rng(1).normal(0.3, 1.0, 30)
+    many = np.random.default_rng(2).normal(0.2, 1.0, 50)
+    first = np.arange(50) % 2 == 0
+    # Normal differences and many pairs: close to the paired t test over pairs.
+    found = permutation_tests.compute_sequence_p(many, first, np.arange(50) // 2)
+    assert found == pytest.approx(stats.ttest_rel(many[::2], many[1::2]).pvalue, abs=0.02)
     assert permutation_tests.compute_paired_p(difference) == pytest.approx(
         stats.ttest_1samp(difference, 0.0).pvalue, abs=0.02
     )
@@ -135,7 +197,7 @@ def test_guidance_and_period_come_apart() -> None:
     own = np.array([-1.0, 0.0, 1.0, 2.0, 0.0, -2.0])
     guided = 50.0 - 5.0 - 8.0 * ~first + own
     unguided = 50.0 - 8.0 * first
-    found = estimate_effect(guided, unguided, first)
+    found = estimate_effect(guided, unguided, first, np.array([0, 1, 2, 0, 1, 2]))
     assert found.adjusted == pytest.approx(-5.0) and found.period == pytest.approx(-8.0)
     assert found.difference == pytest.approx(
         -5.0
@@ -144,7 +206,7 @@ def test_guidance_and_period_come_apart() -> None:
     assert found.dz == pytest.approx(-5.0 / math.sqrt((2 + 8) / 4)) and abs(found.paired_dz) < abs(
         found.dz
     )  # … not in the spread
-    assert found.p == pytest.approx(2 / 20) and found.adjusted_ci95 is not None
+    assert found.p == pytest.approx(2 / 8) and found.adjusted_ci95 is not None
     half = stats.t.ppf(0.975, 4) * math.sqrt(2.5) / 2 * math.sqrt(2 / 3)
     assert found.adjusted_ci95 == pytest.approx((-5 - half, -5 + half))
     test = stats.ttest_ind((guided - unguided)[first], (unguided - guided)[~first])
@@ -154,9 +216,14 @@ def test_guidance_and_period_come_apart() -> None:
 
 
 def test_with_one_sequence_nothing_is_said_about_guidance_apart_from_order() -> None:
-    found = estimate_effect(np.arange(6.0), np.arange(6.0) ** 2, np.ones(6, bool))
+    found = estimate_effect(
+        np.arange(6.0), np.arange(6.0) ** 2, np.ones(6, bool), np.arange(6) // 2
+    )
     assert found.p is None and found.adjusted is None and found.paired_p is not None
-    assert estimate_effect(np.full(3, np.nan), np.ones(3), np.ones(3, bool)).difference is None
+    assert (
+        estimate_effect(np.full(3, np.nan), np.ones(3), np.ones(3, bool), np.arange(3)).difference
+        is None
+    )
 
 
 def test_without_effect_a_counterbalanced_study_errs_as_often_as_it_says_and_one_of_fixed_order_nearly_always() -> (
@@ -171,7 +238,6 @@ def test_without_effect_a_counterbalanced_study_errs_as_often_as_it_says_and_one
 def test_a_large_effect_is_found_by_sixteen() -> None:
     found = share_significant(PEOPLE, 16, 5, 4, 150.0, 0.8, 0.05, 500, seed=5)
     assert found["share"] >= 0.8
-    power = stats.nct.sf(
-        stats.t.ppf(0.975, 14), 14, 3.2
-    )  # of the t test with the period in the model
+    # Of the t test over the eight pairs: their differences have mean 2 dz and variance 2.
+    power = stats.nct.sf(stats.t.ppf(0.975, 7), 7, 2 * 0.8 / math.sqrt(2) * math.sqrt(8))
     assert sample_size.evaluate_size(16, 0.05).power[1] == pytest.approx(power, abs=0.04)

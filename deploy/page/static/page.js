@@ -80,7 +80,7 @@ function drawSafety(shown, lost, known) {
     const state = safety.state === "SILENT" && !safety.commands ? "listens only" : safety.state;
     const wrong = safety.estop ? "emergency stop" : safety.trip;
     const calm = safety.commands ? wrong === "nothing" : !safety.estop && safety.bus_up;
-    const why = safety.commands || safety.estop || !safety.bus_up ? ` – ${say(safety.bus_up ? wrong : "bus down")}` : "";
+    const why = safety.commands || safety.estop || !safety.bus_up ? ` – ${wrong.startsWith("a joint ") && safety.observed_joint ? `${setup.joints?.[safety.observed_joint - 1] ?? safety.observed_joint}: ` : ""}${say(safety.bus_up ? wrong : "bus down")}` : "";
     const kind = lost || safety.estop || safety.state === "LATCHED" || !safety.bus_up ? "bad" : safety.state === "ACTIVE" ? "careful" : calm ? "good" : "careful";
     put($("safety"), say(state) + why, kind);
   } else put($("safety"), say("nothing from the bus"), "bad");

@@ -1,0 +1,412 @@
+"""Observer and drift watch: the numpy model against torch's, faults by name, and alarms that keep their rate."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from deploy.guard import drift_watch
+from deploy.guard.drift_watch import ConformalMartingale, DriftWatch, Misfit
+from deploy.guard.guard import GuardTrip
+from deploy.guard.observer import NOTHING_OBSERVED, Observer, classify_fault
+from deploy.guard.valve_model import ValvePredictor, load_observer_file
+
+MACHINE = option("machine", "brokk170")
+LIMITS = option("guard", "default").observer
+SHIPPED = Path(__file__).parents[2] / "deploy" / "observers" / "brokk170.json"
+SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
+PERIOD_S = MACHINE.period_s
+HOME = np.array(MACHINE.home)
+
+
+def build_tables(**change: Any) -> dict[str, Any]:
+    """Tables of a plain machine: a dead time of 0.2 s, speed times command."""
+    ones = [1.0] * 5
+    none = [0.0] * 5
+    tables: dict[str, Any] = {
+        "dead_time_s": [0.2] * 5,
+        "play": none,
+        "spool_s": none,
+        "speed_s": none,
+    }
+    tables |= {"demand": none, "knots": [0.0, 1.0], "curve_extend": [[0.0, one] for one in ones]}
+    return tables | {"curve_retract": [[0.0, one] for one in ones], "pose": None} | change
+
+
+def draw_commands(count: int, seed: int) -> np.ndarray:
+    """Steps, ramps and rest, as recordings have them."""
+    draw = np.random.default_rng(seed)
+    marks = np.sort(draw.choice(np.arange(1, count), count // 20, replace=False))
+    levels = draw.uniform(-1, 1, (len(marks) + 1, 5)) * (draw.random((len(marks) + 1, 5)) < 0.7)
+    steps = levels[np.searchsorted(marks, np.arange(count), side="right")]
+    return 0.5 * steps + 0.5 * np.roll(steps, 3, axis=0)
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_the_numpy_model_is_the_torch_model(fitted: bool) -> None:
+    config = option("actuator", "valve")
+    draw = np.random.default_rng(5)
+    joints = MACHINE.joint_names
+    if fitted:
+        knots = (0.0, 0.1, 0.4, 1.0)
+
+        def draw_curves() -> dict[str, tuple[float, ...]]:
+            return {
+                name: (0.0, 0.0, *np.sort(draw.uniform(0.1, 1.2, 2)).tolist()) for name in joints
+            }
+
+        config = replace(
+            config, knots=knots, curve_extend=draw_curves(), curve_retract=draw_curves(), play=0.1, spool_s=0.06,
+            speed_s=0.09, demand=0.7, dead_time_s=dict(zip(joints, (0.5, 0.52, 0.13, 0.2, 0.3), strict=True)),
+            pose_extend={name: tuple(draw.uniform(-0.3, 0.3, 7).tolist()) for name in joints},
+            pose_retract={name: tuple(draw.uniform(-0.3, 0.3, 7).tolist()) for name in joints},
+        )  # fmt: skip
+    model = config.build(MACHINE, 1, torch.device("cpu"))
+    predictor = ValvePredictor(json.loads(json.dumps(config.export_tables(MACHINE))), MACHINE)
+    length = MACHINE.num_history
+    u_past, q_past = np.zeros((length, 5)), np.tile(HOME, (length, 1))
+    # One joint begins beyond its stop, one runs into it.
+    q_past[:, 3] = MACHINE.upper[3] + 0.05
+    largest = 0.0
+    for u in draw_commands(500, 1):
+        u_past, before = np.concatenate([u_past[1:], u[None]]), q_past[-1]
+        history = History(
+            u=torch.as_tensor(u_past[None], dtype=torch.float32),
+            q=torch.as_tensor(q_past[None], dtype=torch.float32),
+        )
+        after = model.step(history)[0].numpy().astype(float)
+        moved = predictor.predict(u, before.astype(np.float32).astype(float))
+        assert moved == pytest.approx(after - before, abs=3e-5)
+        largest = max(largest, float(np.abs(moved).max()))
+        q_past = np.concatenate([q_past[1:], after[None]])
+    assert largest > 0.01
+
+
+class Joints:
+    """A plain machine behind an observer; a fault changes what its sensors say."""
+
+    def __init__(
+        self, limits: Any = LIMITS, scores: list[list[float]] | None = None, **change: Any
+    ):
+        content = {"model": build_tables(**change), "scores": scores or [[]] * 5}
+        self.observer = Observer(limits, content, MACHINE, 0)
+        self.q, self.now_s, self.waiting = HOME.copy(), 20.0, [np.zeros(5)] * 4
+        self.offset, self.drift, self.gain = np.zeros(5), np.zeros(5), np.ones(5)
+
+    @property
+    def fault(self) -> GuardTrip:
+        return self.observer.observation.fault
+
+    def go(self, u: tuple[float, ...], seconds: float) -> float:
+        """Time until a fault is named, or all of it."""
+        for number in range(round(seconds / PERIOD_S)):
+            self.waiting.append(np.array(u))
+            step = self.waiting.pop(0) * SPEED * PERIOD_S
+            self.q = self.q + step
+            self.offset = self.offset + (self.gain - 1.0) * step + self.drift * PERIOD_S
+            self.now_s += PERIOD_S
+            self.observer.update(self.now_s, self.q + self.offset, np.array(u))
+            if self.fault is not GuardTrip.NONE:
+                return (number + 1) * PERIOD_S
+        return seconds
+
+
+SLOWLY = (0.3, 0.0, -0.3, 0.0, 0.2)
+
+
+def test_a_healthy_machine_has_no_fault() -> None:
+    joints = Joints()
+    for u in (SLOWLY, (0.0,) * 5, tuple(-one for one in SLOWLY)):
+        assert joints.go(u, 2.0) == 2.0
+    assert joints.observer.observation == NOTHING_OBSERVED
+
+
+@pytest.mark.parametrize(
+    ("gain", "drift", "fault"),
+    [
+        (0.0, 0.0, GuardTrip.JOINT_STILL),
+        (-1.0, 0.0, GuardTrip.JOINT_TURNED),
+        (0.4, 0.0, GuardTrip.JOINT_WEAK),
+        (1.6, 0.0, GuardTrip.JOINT_DRIFTS),
+        (1.0, -0.1, GuardTrip.JOINT_DRIFTS),
+    ],
+)
+@pytest.mark.parametrize("joint", [0, 2, 4])
+def test_a_fault_is_named_with_its_joint_within_a_second_of_motion(
+    gain: float, drift: float, fault: GuardTrip, joint: int
+) -> None:
+    joints = Joints()
+    joints.go(SLOWLY, 3.0)
+    joints.gain[joint] = gain
+    joints.drift[joint] = drift * (1.0 if SLOWLY[joint] < 0 else -1.0)
+    assert joints.go(SLOWLY, 1.0) < 1.0
+    found = joints.observer.observation
+    assert (found.fault, found.joint) == (fault, joint)
+
+
+def test_a_sensor_that_drifts_at_rest_is_named() -> None:
+    joints = Joints()
+    joints.go((0.0,) * 5, 2.0)
+    joints.drift[1] = 0.1
+    seconds = joints.go((0.0,) * 5, 1.0)
+    # The limit is what so much time at full speed would give.
+    assert seconds == pytest.approx(LIMITS.slack_s * SPEED[1] / 0.1, abs=PERIOD_S)
+    assert joints.observer.observation.joint == 1 and joints.fault is GuardTrip.JOINT_DRIFTS
+
+
+def test_slow_drift_and_small_errors_of_the_model_pass() -> None:
+    joints = Joints()
+    joints.drift[0], joints.gain[:] = 0.01, 1.2
+    assert joints.go(SLOWLY, 4.0) == 4.0
+
+
+def test_the_limit_is_slack_and_share_of_the_way() -> None:
+    for gain, is_fault in ((1.0 - LIMITS.share * 0.98, False), (1.0 - 1.5 * LIMITS.share, True)):
+        joints = Joints(replace(LIMITS, slack_s=1e-4))
+        joints.go((0.5, 0.0, 0.0, 0.0, 0.0), 3.0)
+        joints.gain[0] = gain
+        joints.go((0.5, 0.0, 0.0, 0.0, 0.0), 3.0)
+        assert (joints.fault is not GuardTrip.NONE) is is_fault
+
+
+def test_a_fault_stays_until_it_is_cleared_and_comes_again() -> None:
+    joints = Joints()
+    joints.gain[0] = 0.0
+    joints.go(SLOWLY, 3.0)
+    assert joints.fault is GuardTrip.JOINT_STILL
+    joints.gain[0] = 1.0
+    joints.waiting = [np.array(SLOWLY)] * 4
+    for _ in range(40):
+        joints.go(SLOWLY, PERIOD_S)
+    assert joints.fault is GuardTrip.JOINT_STILL
+    joints.observer.clear()
+    assert joints.observer.observation == NOTHING_OBSERVED and joints.go(SLOWLY, 2.0) == 2.0
+    joints.observer.clear()
+    joints.gain[0] = 0.0
+    assert joints.go(SLOWLY, 2.0) < 1.0
+
+
+def test_nothing_is_judged_before_the_first_look_can_know() -> None:
+    joints = Joints()
+    # In motion from before: commands of the dead time are unknown.
+    joints.waiting = [np.array(SLOWLY)] * 4
+    joints.go(SLOWLY, 3.0)
+    assert joints.fault is GuardTrip.NONE
+    # A gap, or positions that were missing, begin anew; each time the arm has moved on unseen.
+    for begin in ("gap", "forget"):
+        joints.q = joints.q - 0.3 * np.sign(SLOWLY)
+        if begin == "gap":
+            joints.now_s += 0.06
+        else:
+            joints.observer.forget()
+        joints.go(SLOWLY, 3.0)
+        assert joints.fault is GuardTrip.NONE
+    joints.q = joints.q - 0.3
+    joints.go(SLOWLY, 0.1)
+    assert joints.fault is not GuardTrip.NONE
+
+
+def test_a_period_is_due_when_it_is_over() -> None:
+    observer = Joints().observer
+    assert observer.is_due(0.0)
+    observer.update(10.0, HOME, np.zeros(5))
+    assert not observer.is_due(10.0 + 0.85 * PERIOD_S) and observer.is_due(10.0 + 0.95 * PERIOD_S)
+    observer.forget()
+    assert observer.is_due(10.0)
+
+
+def test_classes_of_faults() -> None:
+    for moved, wanted, way, fault in (
+        (0.0, 0.1, 0.1, GuardTrip.JOINT_STILL),
+        (0.02, -0.1, 0.1, GuardTrip.JOINT_STILL),
+        (-0.1, 0.1, 0.1, GuardTrip.JOINT_TURNED),
+        (0.1, -0.1, 0.1, GuardTrip.JOINT_TURNED),
+        (-0.05, -0.1, 0.1, GuardTrip.JOINT_WEAK),
+        (0.2, 0.1, 0.1, GuardTrip.JOINT_DRIFTS),
+        (0.1, 0.0, 0.0, GuardTrip.JOINT_DRIFTS),
+        (-0.1, 0.02, 0.02, GuardTrip.JOINT_DRIFTS),
+        (0.0, 0.04, 0.1, GuardTrip.JOINT_DRIFTS),  # to and fro
+    ):
+        assert classify_fault(moved, wanted, way) is fault, (moved, wanted, way)
+
+
+def test_the_martingale_is_fair_worked_by_hand() -> None:
+    martingale = ConformalMartingale([0.1, 0.2, 0.3, 0.4], seed=1)
+    # 0.35: one larger of five, itself among them. p lies between 1/5 and 2/5.
+    p = martingale.update(0.35)
+    assert 0.2 < p <= 0.4
+    bets = [power * p ** (power - 1.0) for power in drift_watch.POWERS]
+    assert martingale.log_wealth == pytest.approx(math.log(sum(bets) / len(bets)))
+    # The score has joined the others: of six, itself among them, two are as large or larger.
+    q = martingale.update(0.38)
+    assert 1 / 6 < q <= 2 / 6
+    both = [
+        one * power * q ** (power - 1.0)
+        for one, power in zip(bets, drift_watch.POWERS, strict=True)
+    ]
+    assert martingale.log_wealth == pytest.approx(math.log(sum(both) / len(both)))
+    # Beyond all: at most one of all of them, and never nothing.
+    assert 0.0 < martingale.update(9.0) <= 1 / 7
+
+
+def test_p_values_are_uniform_with_ties_too() -> None:
+    draw = np.random.default_rng(0)
+    for scale in (1000, 3):
+        found = []
+        for seed in range(1500):
+            scores = np.round(draw.random(9) * scale).tolist()
+            found.append(ConformalMartingale(scores[:8], seed).update(scores[8]))
+        # Kolmogorov: 1.95 over the root of 1500 is passed with a chance of 0.1 %.
+        steps = np.arange(1, 1501) / 1500
+        assert np.abs(np.sort(found) - steps).max() < 1.95 / math.sqrt(1500)
+
+
+@pytest.mark.parametrize("alpha", [0.05, 0.3])
+def test_on_exchangeable_scores_alarms_keep_their_rate(alpha: float) -> None:
+    """2000 shifts of 40 scores on each of two joints: alarms stay within the stated rate."""
+    draw, alarms, shifts = np.random.default_rng(4), 0, 2000
+    two = replace(
+        MACHINE, joints=MACHINE.joints[:2], exclusive=(), levers=(), tool_m=None, mjcf=None
+    )
+    for seed in range(shifts):
+        # Heavy tails and ties; scores of a shift come from where those of the file come from.
+        scores = np.round(np.exp(draw.normal(size=(2, 100))), 1)
+        watch = DriftWatch(scores[:, :60].tolist(), alpha, two, seed)
+        for row in scores[:, 60:].T:
+            for joint, score in enumerate(row):
+                watch._bet(joint, float(score))
+        alarms += watch.joint >= 0
+    # Three standard deviations of a binomial.
+    assert alarms / shifts <= alpha + 3 * math.sqrt(alpha * (1 - alpha) / shifts)
+    # And it does bet: without any alarm the property would hold of itself.
+    assert alarms > 0
+
+
+def make_watch(false_alarms: float = 0.005) -> tuple[DriftWatch, np.random.Generator]:
+    """A watch of the machine whose scores are those of a model with 2 % of error."""
+    draw = np.random.default_rng(7)
+    collector = DriftWatch([[]] * 5, false_alarms, MACHINE, 0)
+    scores: list[float] = []
+    for measured, predicted in play(draw, 5000):
+        found = collector.update(measured, predicted, 0.06 * SPEED)
+        scores += [score for score in found if score is not None]
+    # All joints are alike here, so that each may have the scores of all.
+    assert len(scores) >= 50 and collector.joint == -1
+    return DriftWatch([scores] * 5, false_alarms, MACHINE, 1), draw
+
+
+def play(draw: np.random.Generator, count: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Motions of work: some joints, for a second or two each, measured with 2 % of error."""
+    motions, speed, errors = [], np.zeros(5), np.zeros(5)
+    for number in range(count):
+        if number % 30 == 0:
+            speed = draw.uniform(-1, 1, 5) * (draw.random(5) < 0.6)
+            errors = 0.02 * draw.normal(size=5)
+        predicted = np.round(speed, 2) * SPEED * PERIOD_S
+        motions.append((predicted * (1 + errors) + 2e-4 * draw.normal(size=5), predicted))
+    return motions
+
+
+def test_an_unchanged_machine_raises_no_alarm() -> None:
+    watch, draw = make_watch()
+    for measured, predicted in play(draw, 6000):
+        watch.update(measured, predicted, 0.06 * SPEED)
+    assert (watch.misfit, watch.joint) == (Misfit.NONE, -1)
+
+
+@pytest.mark.parametrize("effect", [one for one in Misfit if one is not Misfit.NONE])
+def test_a_changed_joint_is_named_with_its_probable_effect(effect: Misfit) -> None:
+    watch, draw = make_watch()
+    before, count = 0.0, 0
+    for measured, predicted in play(draw, 8000):
+        count += 1
+        own, error = float(predicted[3]), float(measured[3] - predicted[3])
+        slow = 0.0 < abs(own) < SPEED[3] * PERIOD_S / 2
+        change = {
+            Misfit.FLOW_GAIN: -0.2 * own,
+            Misfit.ASYMMETRY: -0.3 * max(own, 0.0),
+            Misfit.DEAD_TIME: 3.0 * (before - own),
+            Misfit.CREEP: 0.1 * SPEED[3] * PERIOD_S * (own == 0.0),
+            Misfit.DEAD_BAND: -0.1 * math.copysign(SPEED[3] * PERIOD_S, own) * slow,
+        }[effect]
+        before = own
+        measured = measured.copy()
+        measured[3] = own + error + change
+        watch.update(measured, predicted, 0.06 * SPEED)
+        if watch.joint >= 0:
+            break
+    assert (watch.misfit, watch.joint) == (effect, 3)
+    assert count < 8000
+
+
+def test_the_first_alarm_stays() -> None:
+    watch, _ = make_watch(0.5)
+    for _ in range(5):
+        watch._bet(2, 9.0)
+    assert watch.joint == 2
+    for _ in range(9):
+        watch._bet(4, 99.0)
+    assert watch.joint == 2
+
+
+def test_a_gap_begins_a_block_anew() -> None:
+    watch = DriftWatch([[]] * 5, 0.5, MACHINE, 0)
+    moving = SPEED * PERIOD_S
+
+    def count_scores(periods: int) -> int:
+        found = 0
+        for _ in range(periods):
+            found += sum(one is not None for one in watch.update(moving, moving, 0.06 * SPEED))
+        return found
+
+    assert count_scores(199) == 0 and count_scores(1) == 5
+    assert count_scores(150) == 0
+    watch.interrupt()
+    assert count_scores(199) == 0 and count_scores(1) == 5
+
+
+def test_a_score_is_residual_over_way() -> None:
+    watch = DriftWatch([[]] * 5, 0.5, MACHINE, 0)
+    moving, slack = SPEED * PERIOD_S, 0.06 * SPEED
+    score: float | None = None
+    for number in range(200):
+        # The second joint is too fast by a tenth, to and fro by turns of half a second.
+        sign = 1.0 if (number // 10) % 2 == 0 else -1.0
+        score = watch.update(1.1 * sign * moving, sign * moving, slack)[1]
+    assert score == pytest.approx(0.1 * 10.0 / (10.0 + 0.06))
+
+
+def test_the_shipped_file_is_that_of_the_machine() -> None:
+    content = load_observer_file(SHIPPED)
+    assert content["fingerprint"] == MACHINE.fingerprint() and content["machine"] == "brokk170"
+    assert min(len(own) for own in content["scores"]) >= 100
+    assert Observer(LIMITS, content, MACHINE, 0).observation == NOTHING_OBSERVED
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"schema": 2}', "{"])
+def test_a_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "observer.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="mode=observe"):
+        load_observer_file(path)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_observer_file(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"window_s": 0.0}, {"slack_s": 0.0}, {"share": 0.0}, {"share": 1.0}, {"false_alarms": 1.0}],
+)
+def test_limits_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=r"guard\.observer"):
+        replace(LIMITS, **change)

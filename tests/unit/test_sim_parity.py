@@ -1,0 +1,200 @@
+"""Parts of an MJCF are refused by name, or simulated as MuJoCo C does."""
+
+import dataclasses
+
+import mujoco
+import pytest
+import torch
+from composed import option
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.sim import model_features
+from brokk_rl.sim.model import ASSETS, compile_model
+from brokk_rl.sim.model_features import list_left_out
+from brokk_rl.sim.native_world import NativeWorld
+from brokk_rl.sim.parity import POSITION_TOLERANCE, check_parity, measure_parity
+
+SUBSTEPS = 5
+NUM_WORLDS = 32
+JOINT, TOOL = '<joint name="q3"', '<geom name="chisel" class="chisel_contact"'
+OPTIONS = '<compiler angle="radian" autolimits="true"/>'
+
+CHANGES: dict[str, tuple[str, str]] = {
+    "effort limit": (JOINT, '<joint actuatorfrcrange="-4000 4000" name="q3"'),
+    "damping": (JOINT, '<joint damping="90000" name="q3"'),
+    "polynomial damping": (JOINT, '<joint damping="0 300000 0" name="q3"'),
+    "stiffness": (JOINT, '<joint stiffness="500000" name="q3"'),
+    "polynomial stiffness": (JOINT, '<joint stiffness="0 500000 0" name="q3"'),
+    "friction": (JOINT, '<joint frictionloss="9000" name="q3"'),
+    "armature": (JOINT, '<joint armature="900" name="q3"'),
+    "reference": (JOINT, '<joint ref="0.4" name="q3"'),
+    "soft limits": (JOINT, '<joint solreflimit="0.2 1" margin="0.05" name="q3"'),
+    "adhesion": (TOOL, '<geom adhesion="9000" name="chisel" class="chisel_contact"'),
+    "surface velocity": (TOOL, '<geom surfacevel="0.9 0.4 0" name="chisel" class="chisel_contact"'),
+    "torsional friction": (TOOL, '<geom condim="4" name="chisel" class="chisel_contact"'),
+    "no friction": (TOOL, '<geom condim="1" priority="1" name="chisel" class="chisel_contact"'),
+    "soft contact": (
+        TOOL,
+        '<geom solref="0.2 1" priority="1" name="chisel" class="chisel_contact"',
+    ),
+    "margin": (TOOL, '<geom margin="0.03" name="chisel" class="chisel_contact"'),
+    "no actuation": (OPTIONS, f'{OPTIONS}<option><flag actuation="disable"/></option>'),
+    "no contact": (OPTIONS, f'{OPTIONS}<option><flag contact="disable"/></option>'),
+    "no limits": (OPTIONS, f'{OPTIONS}<option><flag limit="disable"/></option>'),
+    "no sensors": (OPTIONS, f'{OPTIONS}<option><flag sensor="disable"/></option>'),
+    "water": (OPTIONS, f'{OPTIONS}<option density="9000" viscosity="90"/>'),
+    "friction cone": (OPTIONS, f'{OPTIONS}<option impratio="20"/>'),
+    "fixed length": (
+        "<sensor>",
+        '<tendon><fixed name="t" stiffness="900000"><joint joint="q3" coef="1"/></fixed></tendon><sensor>',
+    ),
+    "coupled joints": (
+        "<sensor>",
+        '<equality><joint joint1="q3" joint2="q4" polycoef="0 1 0 0 0"/></equality><sensor>',
+    ),
+}
+"""Parts that an MJCF may have: the text of the shipped one, and what stands there instead."""
+WITHOUT_EFFECT_HERE = {"no friction"}
+"""Those that need not move the joints differently within a few control periods."""
+
+
+def change_mjcf(machine: Machine, folder, change: tuple[str, str]) -> Machine:
+    """Return the machine with a changed MJCF."""
+    text = (ASSETS / machine.mjcf).read_text()
+    assert change[0] in text
+    (folder / "changed.xml").write_text(text.replace(*change))
+    return dataclasses.replace(machine, mjcf=str(folder / "changed.xml"))
+
+
+def make_warp(machine: Machine, is_fused: bool):
+    """Return worlds of `sim=warp` on the CPU, not yet compared, with a solver that goes to its end."""
+    simulator = dataclasses.replace(
+        option("sim", "warp"),
+        fused=is_fused,
+        parity_worlds=0,
+        iterations=50,
+        linesearch_iterations=50,
+    )
+    return simulator.build(machine, "cpu", NUM_WORLDS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_fused", [False, True], ids=["staged", "fused"])
+@pytest.mark.parametrize("name", CHANGES)
+def test_each_part_is_refused_by_name_or_simulated_as_mujoco_c_does(
+    machine, tmp_path, name, is_fused
+):
+    changed = change_mjcf(machine, tmp_path, CHANGES[name])
+    backend = "fused" if is_fused else "staged"
+    if list_left_out(compile_model(changed, 0.01), backend):
+        with pytest.raises(ConfigError, match="remove that from the MJCF"):
+            make_warp(changed, is_fused)
+        return
+    result = measure_parity(make_warp(changed, is_fused), changed, SUBSTEPS)
+    assert result.is_alike, result.describe()
+
+
+@pytest.mark.parametrize("name", [name for name in CHANGES if name != "no sensors"])
+def test_each_part_matters_so_that_leaving_it_out_would_be_seen(machine, tmp_path, name):
+    """MuJoCo C with the part in place of the simulator, and without it as the reference."""
+    changed = change_mjcf(machine, tmp_path, CHANGES[name])
+    try:
+        world = NativeWorld(changed, NUM_WORLDS, SUBSTEPS, 0)
+    except ConfigError:
+        return
+    result = measure_parity(world, machine, SUBSTEPS)
+    if name not in WITHOUT_EFFECT_HERE:
+        assert not result.is_alike, result.describe()
+
+
+@pytest.mark.slow
+def test_the_shipped_machine_is_alike_in_all_worlds(machine):
+    for is_fused in (False, True):
+        result = check_parity(make_warp(machine, is_fused), machine, SUBSTEPS)
+        assert result.num_different == 0 and result.num_touching >= 10
+        assert result.position_error.max() < POSITION_TOLERANCE / 5
+
+
+class Spoiled:
+    """A native world of which one thing is wrong."""
+
+    def __init__(self, machine: Machine, fault: str) -> None:
+        self._world, self._fault = NativeWorld(machine, NUM_WORLDS, SUBSTEPS, 0), fault
+        self.num_worlds, self.device, self.faults = (
+            NUM_WORLDS,
+            torch.device("cpu"),
+            self._world.faults,
+        )
+
+    @property
+    def q(self) -> torch.Tensor:
+        return self._world.q
+
+    @property
+    def contact_force_n(self) -> torch.Tensor:
+        return self._world.contact_force_n * (0.9 if self._fault == "force" else 1.0)
+
+    def reset(self, *state: torch.Tensor) -> None:
+        self._world.reset(*state)
+
+    def step(self, increment: torch.Tensor) -> None:
+        self._world.step(increment * (1.02 if self._fault == "motion" else 1.0))
+        if self._fault == "nan":
+            self._world.q[0:4] = torch.nan
+        if self._fault == "fault":
+            self.faults = self._world.faults | (torch.arange(NUM_WORLDS) < 4)
+
+
+@pytest.mark.parametrize("fault", ["motion", "force", "nan", "fault"])
+def test_a_simulator_that_is_wrong_is_refused_with_figures(machine, fault):
+    with pytest.raises(ConfigError, match=r"as MuJoCo C does: 32 random states"):
+        check_parity(Spoiled(machine, fault), machine, SUBSTEPS)
+
+
+def test_one_that_is_right_is_not(machine):
+    result = check_parity(Spoiled(machine, ""), machine, SUBSTEPS)
+    assert result.num_different == 0 and result.position_error.max() == 0.0
+
+
+def test_every_field_of_this_mujoco_is_in_a_list(machine):
+    assert model_features.list_unknown_fields(compile_model(machine, 0.01)) == []
+
+
+def test_a_field_that_no_list_knows_is_refused_by_name_where_it_is_used(
+    machine, tmp_path, monkeypatch
+):
+    kept = tuple(one for one in model_features.FEATURES if one.name != "adhesion")
+    monkeypatch.setattr(model_features, "FEATURES", kept)
+    model_features.check_simulated(compile_model(machine, 0.01), "brokk170", "fused")
+    changed = compile_model(change_mjcf(machine, tmp_path, CHANGES["adhesion"]), 0.01)
+    with pytest.raises(ConfigError, match=r"'geom_adhesion', which is new in MuJoCo .* sim=native"):
+        model_features.check_simulated(changed, "brokk170", "fused")
+
+
+def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
+    def refuse(name: str) -> str:
+        model = compile_model(change_mjcf(machine, tmp_path, CHANGES[name]), 0.01)
+        with pytest.raises(ConfigError) as refusal:
+            model_features.check_simulated(model, "brokk170", "fused")
+        return str(refusal.value)
+
+    assert refuse("damping").endswith("choose sim=native or sim.fused=false")
+    assert refuse("friction").endswith("choose sim=native")
+    assert refuse("no actuation").endswith("from the MJCF")
+
+
+def test_actuators_in_an_mjcf_and_links_without_touch_are_refused(machine, tmp_path):
+    own = ("<sensor>", '<actuator><motor name="winch" joint="q3"/></actuator><sensor>')
+    with pytest.raises(ConfigError, match=r"has actuators \(winch\)"):
+        compile_model(change_mjcf(machine, tmp_path, own), 0.01)
+    deaf = ('<touch name="q5_force" site="q5_touch"/>', "")
+    with pytest.raises(ConfigError, match=r"geoms of q5_link can touch the block"):
+        compile_model(change_mjcf(machine, tmp_path, deaf), 0.01)
+
+
+def test_mujoco_c_itself_refuses_what_the_drive_cannot_do(machine, tmp_path):
+    changed = change_mjcf(machine, tmp_path, CHANGES["no actuation"])
+    assert compile_model(changed, 0.01).opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION
+    with pytest.raises(ConfigError, match="actuation=disable"):
+        NativeWorld(changed, 1, SUBSTEPS, 1)
