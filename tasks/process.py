@@ -26,7 +26,7 @@ from tasks.control import DeployedPolicy, ToolPoseControl
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm, ToolState
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
-from tasks.starts import bring_near
+from tasks.starts import move_starts_near
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
 """Endings of an episode; where several hold in one step, the first of them counts."""
@@ -189,11 +189,7 @@ class ToolPoseProcess:
         return self._judge_starts(self.goal.starts(count, seed))
 
     def bring_near(
-        self,
-        start: dict[str, torch.Tensor],
-        share: float,
-        height_m: tuple[float, float],
-        seed: int,
+        self, start: dict[str, torch.Tensor], share: float, height_m: tuple[float, float], seed: int
     ) -> dict[str, torch.Tensor]:
         """Return starts of which the first part begins upright above its target, on the CPU.
 
@@ -207,7 +203,7 @@ class ToolPoseProcess:
         controller = ClassicalController(options.classical, self._machine, cpu)
         start = {name: value.cpu() for name, value in start.items()}
         return self._judge_starts(
-            bring_near(
+            move_starts_near(
                 start, share, height_m, seed, self._machine, controller, options.switch.reach_m
             )
         )

@@ -194,7 +194,7 @@ class _DrawTally:
         )
 
 
-def bring_near(
+def move_starts_near(
     start: dict[str, torch.Tensor],
     share: float,
     height_m: tuple[float, float],

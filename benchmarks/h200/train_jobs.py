@@ -201,6 +201,7 @@ def build(spec: Train, num_envs: int | None, pool: int, seed: int, folder: Path)
         actuator=spec.actuator,
         effects=spec.effect,
         follower=spec.follower,
+        events=spec.event,
     )
     starts = draw_starts(spec, pool, seed, folder)
     device = spec.session.torch_device()

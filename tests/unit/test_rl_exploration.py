@@ -63,9 +63,7 @@ def test_the_noise_lies_between_bound_and_cap(std: float, cap: float, expected: 
     assert noise.std[0].tolist() == pytest.approx([expected] * 2)
 
 
-def test_training_moves_the_cap_and_a_checkpoint_keeps_it(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_training_moves_the_cap_and_a_checkpoint_keeps_it(machine: Machine, tmp_path: Path) -> None:
     training = capped(small(max_env_steps=16 * 4 * 40, save_interval=10))
     runner = train(machine, tmp_path, training)
     cap = runner.alg.actor.distribution.log_cap

@@ -86,6 +86,7 @@ def draw_trajectories(words: list[str], bundle: Path, picture: Path) -> None:
         actuator=spec.actuator,
         effects=spec.effect,
         follower=spec.follower,
+        events=spec.event,
     )
     torch.manual_seed(spec.evaluation.seed)
     loop = config.build(torch.device("cpu"), NUM_PATHS, NUM_PATHS, spec.evaluation.seed)
