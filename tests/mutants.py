@@ -38,7 +38,7 @@ CORE = {
     "deploy.guard.shapes": ["test_deploy_envelope.py"],
     "deploy.guard.valve_model": ["test_deploy_observer.py"],
     "deploy.guard.observer": ["test_deploy_observer.py"],
-    "deploy.guard.drift_watch": ["test_deploy_observer.py"],
+    "deploy.guard.drift_watch": ["test_deploy_drift_watch.py"],
     "deploy.runtime.receiver": ["test_deploy_receiver.py"],
     "deploy.runtime.bus_logic": ["test_deploy_logic.py"],
     "deploy.twin.gateway": ["test_deploy_gateway.py"],
