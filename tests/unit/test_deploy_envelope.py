@@ -141,7 +141,11 @@ def test_shapes_enclose_what_mujoco_draws_and_little_more() -> None:
 def test_distances_beyond_interest_may_be_bounds_but_no_near_one_is_missed() -> None:
     assert SHAPES is not None
     # Without the undercarriage, near whose turntable the boom always is.
-    limits = replace(LIMITS, stay_out={"wall": WALL}, ground_m=None)
+    posts = {}
+    for number, (x, y) in enumerate(((1.5, 0.3), (2.0, -0.8), (2.6, 0.9), (1.2, 1.6))):
+        low = (x, y, 1.0)
+        posts[str(number)] = StayOutBox(lower_m=low, upper_m=(x + 0.05, y + 0.05, 1.05))
+    limits = replace(LIMITS, stay_out=posts, ground_m=None)
     envelope = Envelope(limits, MACHINE, replace(SHAPES, body=()))
     poses = draw_poses(1500, seed=4)
     exact = envelope.measure_clearance(poses)
@@ -151,7 +155,7 @@ def test_distances_beyond_interest_may_be_bounds_but_no_near_one_is_missed() -> 
             [float(envelope.measure_clearance(q[None], near_m)[0]) for q in poses[:400]]
         )
         near = exact[:400] <= near_m
-        assert near.sum() > 15 and found[near] == pytest.approx(exact[:400][near], abs=1e-12)
+        assert near.sum() > 9 and found[near] == pytest.approx(exact[:400][near], abs=1e-12)
         far = ~near
         assert (found[far] > near_m).all() and (found[far] <= exact[:400][far] + 1e-12).all()
     nothing = Envelope(replace(LIMITS, ground_m=None), MACHINE, replace(SHAPES, body=()))
