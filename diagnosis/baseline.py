@@ -24,6 +24,7 @@ from brokk_rl import open_loop
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
 from brokk_rl.scales import choose_horizon_s, scale_time
 from diagnosis import residual_model
@@ -38,6 +39,7 @@ from diagnosis.residuals import (
     build_rays,
     compute_loss,
     fit_noise,
+    join_windows,
     weigh_residuals,
 )
 from diagnosis.responses import (
@@ -123,21 +125,21 @@ def _linearise_parameters(
     varied = np.repeat(now[None], count + 1, 0)  # (P + 1, P, J)
     for p in range(count):
         varied[p + 1, p] += size[p]
-    errors, slopes = [], []
+    values = {name: varied[:, p] for p, name in enumerate(names)}
+
+    def whiten(part: Residuals) -> np.ndarray:
+        return part.whiten(part.compute_error(part.simulator.simulate([], count + 1, values)))
+
     for part in parts:
-        values = {name: varied[:, p] for p, name in enumerate(names)}
-        paths = part.simulator.simulate([], count + 1, values)
-        z = part.whiten(part.compute_error(paths))
-        errors.append(z[:, 0])
-        slopes.append(z[:, :1] - z[:, 1:])
-    return np.concatenate(errors, 1), np.concatenate(slopes, 2)
+        part.z  # noqa: B018  # made once, before other processes need it
+    every = map_parallel(whiten, parts)
+    slopes = [z[:, :1] - z[:, 1:] for z in every]
+    return np.concatenate([z[:, 0] for z in every], 1), np.concatenate(slopes, 2)
 
 
 # Chosen by hand; not searched.
 FOLDS = 4
 """Cross-validation folds of the reference; a fit takes time for each."""
-COVARIANCE_WINDOWS = 3
-"""Windows in a row on which the noise is fitted."""
 
 
 @dataclass(frozen=True)
@@ -322,10 +324,12 @@ def _cross_validate(
     left_out = []
     if refit:
         actuator = fit.fit(machine, recordings, [], folder, seed, device)
-        for part in np.unique(fold):
-            rest = [r for r, f in zip(pieces, fold, strict=True) if f != part]
-            left = [one for one, f in zip(begun, fold, strict=True) if f == part]
-            left_out.append(compare_simulator(refit(actuator, machine, rest), left, machine, seed))
+        parts = [fold == part for part in np.unique(fold)]
+        rests = [[r for r, out in zip(pieces, part, strict=True) if not out] for part in parts]
+        refits = map_parallel(lambda rest: refit(actuator, machine, rest), rests)
+        for part, one in zip(parts, refits, strict=True):
+            left = [piece for piece, out in zip(begun, part, strict=True) if out]
+            left_out.append(compare_simulator(one, left, machine, seed))
     else:
         last = fold == fold.max()
         rest = [r for r, out in zip(pieces, last, strict=True) if not out]
@@ -350,18 +354,14 @@ def fit_covariances(
     left_out: Sequence[SimulatorComparison], machine: Machine
 ) -> list[ErrorCovariance]:
     """Return the noise of each joint from a simulator's errors on recordings that it was not fitted to."""
-    found = []
-    for j in range(machine.num_joints):
-        error = [_join_windows(one.residuals.error[..., j]) for one in left_out]
-        increments = [_join_windows(one.residuals.increments[..., j]) for one in left_out]
-        found.append(fit_noise(np.concatenate(error), np.concatenate(increments)))
-    return found
+    pairs = [(one.residuals.error, one.residuals.increments) for one in left_out]
 
+    def fit(j: int) -> ErrorCovariance:
+        error = [join_windows(one[..., j]) for one, _ in pairs]
+        moved = [join_windows(one[..., j]) for _, one in pairs]
+        return fit_noise(np.concatenate(error), np.concatenate(moved))
 
-def _join_windows(values: np.ndarray) -> np.ndarray:
-    """Return increments `(W, I)` with several windows in a row, `(W / N, N I)`."""
-    together = min(COVARIANCE_WINDOWS, len(values))
-    return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
+    return map_parallel(fit, range(machine.num_joints))
 
 
 def _find_known_windows(case: GapCase, field: SimulatorComparison) -> np.ndarray:

@@ -6,11 +6,12 @@ Axes: `J` joints, `E` entries (increments of all windows, over the simulator's n
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from brokk_rl.parallel import map_parallel
 from brokk_rl.spec import spec
 from diagnosis import (
     effect_library,
@@ -30,18 +31,22 @@ from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import (
     REFERENCE_GRID,
     Response,
-    add_responses,
     choose_rays,
     fit_joint_faults,
+    scale_responses,
+    simulate_effect,
 )
 from diagnosis.search import (
     MAX_EFFECTS,
     EffectSet,
     PenaltyFunction,
+    ReferencePenalty,
     ReferenceScores,
+    SubsetScore,
     SubsetTable,
     bind_shared_sizes,
     choose_set,
+    list_promising_subsets,
 )
 from diagnosis.speed_curves import SpeedCurves
 
@@ -180,7 +185,7 @@ class EffectSearch:
     def run(self) -> DetectionResult:
         """Return the chosen set, its fit and the remaining residuals."""
         penalties = self.penalties
-        self.tell("sensors", 0.32)
+        self.tell("sensors", 0.4)
         on_sensors = sensors.find_sensor_effects(
             self.case, self.kinds, penalties.joint, penalties.name
         )
@@ -193,7 +198,7 @@ class EffectSearch:
         effects = self._simulate_effects(residuals)
         price = self._build_price(effects)
         search = self._choose(effects, price, np.ones(self.case.machine.num_joints))
-        self.tell("what the speed curves show", 0.71)
+        self.tell("what the speed curves show", 0.66)
         shown = []
         if self.curves is not None:
             proposed = shown_effects.propose_effects(self.curves, self.kinds, self.case.machine)
@@ -205,7 +210,7 @@ class EffectSearch:
             residuals, search.fitted, _sum_scores(search.tables, search.chosen)
         ):
             search = self._refit_beside(search, [search.fitted], price)
-        self.tell("frames", 0.8)
+        self.tell("frames", 0.9)
         error = residuals.compute_error(search.fitted.after if search.fitted else residuals.base)
         late, search = self._detect_late_frames(search, error)
         z = search.effects.residuals.whiten(error[None])[:, 0]
@@ -234,9 +239,8 @@ class EffectSearch:
         """Residuals on each part of the reference, left out of the fit."""
         return [one.residuals for one in self.base.left_out]
 
-    def _build_price(self, effects: CandidateEffects) -> PenaltyFunction:
+    def _build_price(self, effects: CandidateEffects) -> ReferencePenalty:
         """Return the penalty of a subset on a joint, with its gain on the reference."""
-        penalties, shared = self.penalties, self.shared
         known = ReferenceScores(
             self._left_out,
             self.base.field.residuals.z.shape[1],
@@ -247,36 +251,37 @@ class EffectSearch:
             effects.rays,
             fit_joint_faults(effects.residuals),
             effects.shapes,
-            shared,
+            self.shared,
         )
-
-        def price(j: int, subset: frozenset[str]) -> float:
-            known_there = max(
-                penalties.reference * known.earned(j, subset), known.repeated(j, subset)
-            )
-            return penalties.joint * len(subset - shared) + known_there
-
-        return price
+        return ReferencePenalty(known, self.penalties.joint, self.penalties.reference)
 
     def _simulate_effects(self, residuals: Residuals) -> CandidateEffects:
         """Return the effects that free runs can show, with their responses on each joint."""
         tracked = geometry.is_tracked(self.case.field, self.case.machine)
         rays: dict[str, list[ParameterRay]] = {}
         shapes: list[dict[str, list[Response]]] = [{} for _ in range(residuals.increments.shape[2])]
-        for number, kind in enumerate(self.kinds):
-            # `geometry` finds encoder errors from tool points, and `sensors` noise and steps: no
-            # simulation is needed.
+        simulated = []
+        for kind in self.kinds:
+            # `geometry` finds encoder errors from tool points, `sensors` finds noise and steps.
             measured = kind.target.side == "measurement" and (tracked or not kind.target.smooth)
-            if kind.target.stochastic or kind.target.side == "kinematics" or measured:
-                continue
-            self.tell(f"simulating {kind.name}", 0.35 + 0.2 * number / len(self.kinds))
-            rays[kind.name] = add_responses(shapes, kind.name, choose_rays(kind), residuals)
+            if not (kind.target.stochastic or kind.target.side == "kinematics" or measured):
+                simulated.append(kind)
+        residuals.z  # noqa: B018  # made once, before other processes need it
+        every = map_parallel(
+            lambda kind: simulate_effect(choose_rays(kind), residuals),
+            simulated,
+            lambda kind, done: self.tell(f"simulating {kind.name}", 0.45 + 0.07 * done),
+        )
+        for kind, (shape, own) in zip(simulated, every, strict=True):
+            rays[kind.name] = [replace(ray, shape=shape) for ray in choose_rays(kind)]
+            for mine, added in zip(shapes, own, strict=True):
+                mine.update(added)
         return CandidateEffects(residuals, rays, shapes)
 
     def _choose(
         self,
         effects: CandidateEffects,
-        price: PenaltyFunction,
+        price: ReferencePenalty,
         scatter: np.ndarray,
         wide: nonadditive_refit.WideResponses | None = None,
     ) -> SearchState:
@@ -292,7 +297,8 @@ class EffectSearch:
         if wide:
             effects = CandidateEffects(residuals, wide.rays, wide.shapes)
         tables = self._score_subsets(effects, scatter, z)
-        self.tell("the same on the reference", 0.7)
+        self.tell("the same on the reference", 0.56)
+        price.prepare(self._list_promising(tables))
         chosen = choose_by_penalties(tables, price, self.penalties, self.shared)
         tied = effects
         # Joints first size a shared effect separately; it is bound where responses still add up.
@@ -302,6 +308,7 @@ class EffectSearch:
                 residuals, *bind_shared_sizes(common, tables, effects.rays, effects.shapes)
             )
             tables = self._score_subsets(tied, scatter, z)
+            price.prepare(self._list_promising(tables))
             chosen = choose_by_penalties(tables, price, self.penalties, self.shared)
         fitted = _fit_chosen_set(tied, tables, chosen)
         if fitted:
@@ -312,6 +319,11 @@ class EffectSearch:
                 fitted = _fit_chosen_set(tied, tables, chosen)
         return SearchState(effects, wide, tables, chosen, fitted)
 
+    def _list_promising(self, tables: Sequence[SubsetTable]) -> list[list[frozenset[str]]]:
+        """Return the subsets of each joint whose penalty `choose_set` asks for."""
+        least, share = self.penalties.joint, self.penalties.share
+        return [list_promising_subsets(table, least, share, self.shared) for table in tables]
+
     def _score_subsets(
         self, effects: CandidateEffects, scatter: np.ndarray, z: np.ndarray | None
     ) -> list[SubsetTable]:
@@ -321,21 +333,29 @@ class EffectSearch:
         tables = []
         joints = fit_joint_faults(residuals, scatter, z)
         for j, (mine, joint) in enumerate(zip(shapes, joints, strict=True)):
-            self.tell(f"trying sets on joint {j + 1}", 0.55 + 0.1 * j / len(shapes))
-            scaled = _scale_responses(mine, 1.0 / np.sqrt(scatter[j]))
+            scaled = scale_responses(mine, 1.0 / np.sqrt(scatter[j]))
             tables.append(SubsetTable(joint, scaled, residuals.block))
-            tables[-1].explore(flat, 3 if z is None else MAX_EFFECTS)
-        return tables
+
+        def explore(j: int) -> dict[frozenset[str], SubsetScore]:
+            tables[j].explore(flat, 3 if z is None else MAX_EFFECTS)
+            return tables[j].scores
+
+        every = map_parallel(
+            explore,
+            range(len(tables)),
+            lambda j, done: self.tell(f"trying sets on joint {j + 1}", 0.52 + 0.04 * done),
+        )
+        return [replace(table, scores=scores) for table, scores in zip(tables, every, strict=True)]
 
     def _refit_beside(
-        self, search: SearchState, known: Sequence[FittedSet], price: PenaltyFunction
+        self, search: SearchState, known: Sequence[FittedSet], price: ReferencePenalty
     ) -> SearchState:
         """Continue from sets whose responses do not add up: simulate all effects beside the first, fit sizes together."""
         effects, residuals = search.effects, search.effects.residuals
         tried, scatter = list(known), np.ones(self.case.machine.num_joints)
         wide = nonadditive_refit.simulate_beside(residuals, effects.rays, known[0])
         for turn in range(MAX_REFITS):
-            self.tell("simulating around what was found", 0.72 + 0.04 * turn)
+            self.tell("simulating around what was found", 0.75 + 0.08 * turn)
             before, search = search, self._choose(effects, price, scatter, wide)
             now = search.fitted
             if now is None:
@@ -356,7 +376,7 @@ class EffectSearch:
         return self._drop_unneeded(effects, best, price)
 
     def _drop_unneeded(
-        self, effects: CandidateEffects, best: FittedSet, price: PenaltyFunction
+        self, effects: CandidateEffects, best: FittedSet, price: ReferencePenalty
     ) -> SearchState:
         """Return the set `best` without effects that add less than they cost beside the others."""
         residuals, scatter = effects.residuals, np.ones(self.case.machine.num_joints)
@@ -461,15 +481,6 @@ def _add_mean_delay(search: SearchState, late: DetectedEffect) -> SearchState:
     if search.wide and fitted:
         wide = nonadditive_refit.simulate_beside(residuals, effects.rays, fitted)
     return replace(search, effects=replace(effects, residuals=residuals), wide=wide)
-
-
-def _scale_responses(
-    responses: Mapping[str, list[Response]], by: float
-) -> dict[str, list[Response]]:
-    scaled = {}
-    for name, own in responses.items():
-        scaled[name] = [Response(one.sizes, one.change * by) for one in own]
-    return scaled
 
 
 def _rewhiten_effects(effects: CandidateEffects, noisy: Residuals) -> CandidateEffects:

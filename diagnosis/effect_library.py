@@ -25,6 +25,8 @@ from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import FreeRunWindows
+from brokk_rl.parallel import map_parallel
+from brokk_rl.scales import scale_time
 from diagnosis.answer import Estimate
 
 log = logging.getLogger(__name__)
@@ -262,6 +264,10 @@ def estimate_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float,
 BATCH_ROWS = 1536
 """Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
 
+TIME_FAULT_S, NUMBER_FAULT = 0.004, 0.01
+"""What a simulator gets wrong from day to day, and what is no effect: times in s on the reference of
+`brokk_rl.scales`, other numbers."""
+
 EffectValues = Mapping[str, np.ndarray]
 """Numbers of an effect by name, each `(C, J)`, or `(C, 1)` for one that joints do not have."""
 
@@ -309,9 +315,14 @@ class EffectSimulator:
         effects = sorted([*effects, *fixed], key=lambda one: one[0].order)
         found = np.empty((count, *self.cut.measured.shape), dtype=np.float32)
         at_once = max(1, BATCH_ROWS // len(self.cut.q))
-        for start in range(0, count, at_once):
-            part = np.arange(start, min(start + at_once, count))
-            found[part] = self._run(effects, own, part)
+        batches = [
+            np.arange(start, min(start + at_once, count)) for start in range(0, count, at_once)
+        ]
+        if len(batches) > 1:
+            self._drive  # noqa: B018  # known before other processes need it
+        runs = map_parallel(lambda batch: self._run(effects, own, batch), batches)
+        for batch, paths in zip(batches, runs, strict=True):
+            found[batch] = paths
         if not np.isfinite(found).all():
             names = ", ".join(kind.name for kind, _ in effects) or "no effect"
             raise BrokkError(
@@ -331,9 +342,9 @@ class EffectSimulator:
         count, rows = len(candidates) * windows, np.repeat(candidates, windows)
         u = self._commands.repeat(1, len(candidates), 1)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(
-                self.seed + int(candidates[0])
-            )  # rows of other batches draw other numbers
+            # Rows of other batches draw other numbers. `torch.manual_seed` would also prepare the
+            # seeds of GPUs that nothing here uses, which takes longer than a step.
+            torch.default_generator.manual_seed(self.seed + int(candidates[0]))
             model: Any = self.base.build(self.machine, count, device)
             for name, value in own.items():
                 model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))
@@ -367,6 +378,27 @@ class EffectSimulator:
                     q[k] = position
                     seen[k - before] = measure(position) if measure else position
         return seen.numpy().swapaxes(0, 1).reshape(len(candidates), windows, *seen.shape[::2])
+
+    @cached_property
+    def plain_runs(self) -> np.ndarray:
+        """Free runs without any effect but the fixed ones, `(W, K, J)`."""
+        return self.simulate([])[0]
+
+    @cached_property
+    def fault_runs(self) -> np.ndarray:
+        """The same with a small fault of each of the base's own numbers, `(P, W, K, J)`."""
+        model: Any = self.base.build(self.machine, 1, torch.device("cpu"))
+        own = {
+            name: value.numpy()
+            for name, value in (getattr(model, "parameters", None) or {}).items()
+        }
+        if not own:
+            return np.empty((0, *self.cut.measured.shape), dtype=np.float32)
+        varied = {name: np.repeat(value, len(own), 0) for name, value in own.items()}
+        time_fault_s = scale_time(self.machine, TIME_FAULT_S)
+        for number, name in enumerate(own):
+            varied[name][number] += time_fault_s if name.endswith("_s") else NUMBER_FAULT
+        return self.simulate([], len(own), varied)
 
     @cached_property
     def _commands(self) -> torch.Tensor:

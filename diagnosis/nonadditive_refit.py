@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from brokk_rl.parallel import map_parallel
 from diagnosis.refine import (
     FittedSet,
     drop_windows,
@@ -100,7 +101,10 @@ def simulate_beside(
         # As close as before: an effect that rings is out of step on a coarser grid.
         grid = sorted({*WIDE_GRID, *ways[0].sizes[ways[0].sizes > 0.0].tolist()})
         wide[name] = [replace(ray, shape=ways[0].shape) for ray in build_rays(ways[0].kind, grid)]
-        responses = _simulate_responses(residuals, wide[name], fitted)
+    every = map_parallel(
+        lambda name: _simulate_responses(residuals, wide[name], fitted), list(wide)
+    )
+    for name, responses in zip(wide, every, strict=True):
         for j in range(joints):
             if max(np.abs(response[j]).max() for response in responses) >= MIN_RESPONSE:
                 pairs = zip(wide[name], responses, strict=True)

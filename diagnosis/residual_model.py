@@ -17,6 +17,7 @@ from functools import cached_property
 import numpy as np
 from scipy.signal import lfilter
 
+from brokk_rl.parallel import map_parallel
 from diagnosis.refine import FittedSet
 from diagnosis.residuals import (
     INCREMENT_SAMPLES,
@@ -103,7 +104,10 @@ def learn_discrepancy(
     of_field = np.zeros_like(field.increments)
     if len(parts) < 2:
         return found, of_field
-    for j in range(of_field.shape[2]):
+    for part in parts:
+        part.z  # noqa: B018  # made once, before other processes need it
+
+    def learn(j: int) -> list[np.ndarray] | None:
         raw = [build_features(part, j) for part in parts]
         white = [part.whiten_joint(columns, j) for part, columns in zip(parts, raw, strict=True)]
         size = np.sqrt(np.mean(np.square(np.concatenate(white)), 0))
@@ -123,13 +127,17 @@ def learn_discrepancy(
             if total < lowest:
                 best, lowest = (pull, betas), total
         if best is None:
-            continue
+            return None
         pull, betas = best
-        for bias, columns, beta in zip(found, raw, betas, strict=True):
-            bias[..., j] = columns @ (beta * by)
-        of_field[..., j] = build_features(field, j) @ (
-            fit_ridge(np.concatenate(x), np.concatenate(z), pull) * by
-        )
+        biases = [columns @ (beta * by) for columns, beta in zip(raw, betas, strict=True)]
+        whole = fit_ridge(np.concatenate(x), np.concatenate(z), pull)
+        return [*biases, build_features(field, j) @ (whole * by)]
+
+    field.increments  # noqa: B018  # made once, before other processes need it
+    for j, learned in enumerate(map_parallel(learn, range(of_field.shape[2]))):
+        if learned:
+            for bias, mine in zip([*found, of_field], learned, strict=True):
+                bias[..., j] = mine
     return found, of_field
 
 
@@ -340,18 +348,20 @@ FORMS = (STARTS, CURVE)
 
 def score_clues(residuals: Residuals, z: np.ndarray) -> np.ndarray:
     """Return the log-likelihood gain of each clue on whitened residuals `z` `(J, E)`, `(clues, J)`."""
-    found = np.zeros((len(CLUES), len(z)))
     order = [*FORMS, *(name for name in CLUES if name not in FORMS)]
-    for j, errors in enumerate(z):
-        motion = SimulatedMotion(residuals, j)
+
+    def score(j: int) -> np.ndarray:
+        motion, errors, found = SimulatedMotion(residuals, j), z[j], np.zeros(len(CLUES))
         for name in order:
             x = residuals.whiten_joint(np.stack(CLUES[name](motion), -1), j)
             size = np.sqrt(np.mean(np.square(x), 0))
-            found[list(CLUES).index(name), j], left = _score_ridge(
-                x / np.where(size > 1e-9, size, np.inf), errors
-            )
+            gain, left = _score_ridge(x / np.where(size > 1e-9, size, np.inf), errors)
+            found[list(CLUES).index(name)] = gain
             errors = left if name in FORMS else errors
-    return found
+        return found
+
+    residuals.z  # noqa: B018  # made once, before other processes need it
+    return np.stack(map_parallel(score, range(len(z))), 1)
 
 
 def scale_reference_gains(

@@ -15,13 +15,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-import torch
 from scipy.optimize import minimize
 
-from brokk_rl.scales import scale_time
 from diagnosis.effect_library import EffectSimulator, EffectType
 
 INCREMENT_SAMPLES = 5
@@ -32,6 +29,8 @@ MAX_BLOCK_INCREMENTS = 80
 """Increments in a block."""
 NO_BORDER = 1e300
 """Last element of a bordered covariance: so large that the matrix stays positive definite."""
+COVARIANCE_WINDOWS = 3
+"""Windows in a row on which the noise is fitted."""
 MIN_TYPICAL_ERROR = 0.1
 """Smallest typical error, over the root of the mean square."""
 
@@ -109,6 +108,12 @@ def _count_between(size: int) -> np.ndarray:
     return np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
 
 
+def join_windows(values: np.ndarray) -> np.ndarray:
+    """Return increments `(W, I)` with `COVARIANCE_WINDOWS` in a row, `(W / N, N I)`."""
+    together = min(COVARIANCE_WINDOWS, len(values))
+    return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
+
+
 def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
     """Return the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
     # a joint that stands still most of the time, read by a coarse sensor, has a median error of 0
@@ -157,9 +162,9 @@ SIZE_GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)
 """Sizes, over the typical one, at which an effect is simulated; in between its doing is
 interpolated."""
 
-GAIN_FAULT, TIME_FAULT_S, NUMBER_FAULT = 0.01, 0.004, 0.01
-"""What a simulator gets wrong from day to day, and what is no effect: speeds by a percent, times in
-s on the reference of `brokk_rl.scales`, other numbers."""
+GAIN_FAULT = 0.01
+"""What a simulator gets wrong from day to day, and what is no effect: speeds by a percent. For its
+own numbers see `EffectSimulator.fault_runs`."""
 
 MEAN_FORM_ERROR = 0.5
 """What effects of chance change on average is known up to so much of it: their forms differ."""
@@ -251,7 +256,7 @@ class Residuals:
     @cached_property
     def base(self) -> np.ndarray:
         """Positions without any effect, `(W, K, J)`."""
-        return self.simulator.simulate([])[0] if self.runs is None else self.runs
+        return self.simulator.plain_runs if self.runs is None else self.runs
 
     @cached_property
     def start(self) -> np.ndarray:
@@ -373,16 +378,9 @@ class Residuals:
             self.whiten((self.increments * GAIN_FAULT * side)[None])
             for side in (self.increments > 0, self.increments < 0)
         ]
-        simulator = self.simulator
-        model: Any = simulator.base.build(simulator.machine, 1, torch.device("cpu"))
-        for name, value in (getattr(model, "parameters", None) or {}).items():
-            time_fault_s = scale_time(simulator.machine, TIME_FAULT_S)
-            by = time_fault_s if name.endswith("_s") else NUMBER_FAULT
-            moved = (
-                to_increments(simulator.simulate([], 1, {name: value.numpy() + by})[0], self.start)
-                - self.increments
-            )
-            found.append(self.whiten(moved[None]))
+        found.append(
+            self.whiten(to_increments(self.simulator.fault_runs, self.start) - self.increments)
+        )
         lines = np.concatenate(found, 1)
         lines = lines if self.widths is None else lines * self.widths[:, None]
         if self.mean is None:

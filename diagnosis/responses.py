@@ -11,9 +11,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
+from brokk_rl.parallel import map_parallel
 from diagnosis.effect_library import EffectType, list_shared_effects
 from diagnosis.residuals import (
     SIZE_GRID,
@@ -302,6 +304,25 @@ def add_responses(
     return [replace(ray, shape=shape) for ray in ways]
 
 
+def scale_responses(
+    responses: Mapping[str, list[Response]], by: float
+) -> dict[str, list[Response]]:
+    """Return responses `by` times as large."""
+    scaled = {}
+    for name, own in responses.items():
+        scaled[name] = [Response(one.sizes, one.change * by) for one in own]
+    return scaled
+
+
+def simulate_effect(
+    ways: Sequence[ParameterRay], residuals: Residuals
+) -> tuple[Mapping[str, np.ndarray], list[dict[str, list[Response]]]]:
+    """Return the shape of an effect that suits each joint best, and its responses by joint and name."""
+    own: list[dict[str, list[Response]]] = [{} for _ in range(residuals.increments.shape[2])]
+    found = add_responses(own, ways[0].kind.name, ways, residuals)
+    return found[0].shape, own
+
+
 def simulate_trials(
     parts: Sequence[Residuals], ways: Mapping[str, Sequence[ParameterRay]]
 ) -> dict[str, list[list[np.ndarray]]]:
@@ -309,13 +330,20 @@ def simulate_trials(
     by_kind: dict[str, list[str]] = {}
     for key, way in ways.items():
         by_kind.setdefault(way[0].kind.name, []).append(key)
+    rays = {name: [ray for key in keys for ray in ways[key]] for name, keys in by_kind.items()}
+    for part in parts:
+        part.z  # noqa: B018  # made once, before other processes need it
+    todo = list(product(by_kind, range(len(parts))))
+    every = map_parallel(lambda one: parts[one[1]].list_responses(rays[one[0]]), todo)
+    known = dict(zip(todo, every, strict=True))
     found: dict[str, list[list[np.ndarray]]] = {}
-    for keys in by_kind.values():
-        rays = [ray for key in keys for ray in ways[key]]
-        by_part = [part.list_responses(rays) for part in parts]
-        by_ray = iter([list(one) for one in zip(*by_part, strict=True)])
+    for name, keys in by_kind.items():
+        place = 0
         for key in keys:
-            found[key] = [next(by_ray) for _ in ways[key]]
+            found[key] = []
+            for _ in ways[key]:
+                found[key].append([known[name, p][place] for p in range(len(parts))])
+                place += 1
     return found
 
 

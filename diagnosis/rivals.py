@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.open_loop import FreeRunWindows
+from brokk_rl.parallel import map_parallel
 from diagnosis.bootstrap import BLOCK_WINDOWS
 from diagnosis.residuals import INCREMENT_SAMPLES, to_increments
 
@@ -80,10 +81,11 @@ def run_arx(cut: FreeRunWindows) -> ArxRuns:
 
     The pull of a fold is the one that predicts the other folds best.
     """
-    fold, found = assign_folds(len(cut.q)), np.empty_like(cut.measured, dtype=float)
+    fold = assign_folds(len(cut.q))
     folds = np.unique(fold)
-    for j in range(cut.q.shape[2]):
-        model = _ArxJoint.build(cut, j)
+
+    def run(j: int) -> np.ndarray:
+        model, found = _ArxJoint.build(cut, j), np.empty(cut.measured.shape[:2])
         trials = np.empty((len(RIDGES), *cut.measured.shape[:2]))
         for out in folds:
             for number, beta in enumerate(model.fit(fold != out)):
@@ -91,8 +93,10 @@ def run_arx(cut: FreeRunWindows) -> ArxRuns:
         errors = np.square(trials - cut.measured[..., j]).mean(2)
         for out in folds:
             best = errors[:, fold != out].mean(1).argmin()
-            found[fold == out, :, j] = trials[best][fold == out]
-    return ArxRuns(found, fold)
+            found[fold == out] = trials[best][fold == out]
+        return found
+
+    return ArxRuns(np.stack(map_parallel(run, range(cut.q.shape[2])), -1), fold)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,9 +183,10 @@ def run_boosting(cut: FreeRunWindows, arx: ArxRuns) -> np.ndarray | None:
     start = cut.q[:, cut.num_before - 1].astype(float)
     way, target = to_increments(arx.paths, start), to_increments(cut.measured, start)
     shared = _collect_features(cut, way)
-    found = way.copy()
-    with threadpool_limits(1):
-        for j in range(way.shape[2]):
+
+    def correct(j: int) -> np.ndarray:
+        found = way[..., j].copy()
+        with threadpool_limits(1):
             place = start[:, None, j] + np.cumsum(way[..., j], 1)
             x = np.concatenate([shared, place[..., None]], -1)
             left = target[..., j] - way[..., j]
@@ -191,8 +196,10 @@ def run_boosting(cut: FreeRunWindows, arx: ArxRuns) -> np.ndarray | None:
                 used, rest = arx.fold != out, arx.fold == out
                 model.fit(x[used].reshape(-1, x.shape[-1]), left[used].ravel() / size)
                 more = model.predict(x[rest].reshape(-1, x.shape[-1])) * size
-                found[rest, :, j] += more.reshape(int(rest.sum()), -1)
-    return found
+                found[rest] += more.reshape(int(rest.sum()), -1)
+        return found
+
+    return np.stack(map_parallel(correct, range(way.shape[2])), -1)
 
 
 def _collect_features(cut: FreeRunWindows, way: np.ndarray) -> np.ndarray:

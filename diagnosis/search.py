@@ -12,19 +12,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
+from brokk_rl.parallel import map_parallel
 from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import (
     JointResiduals,
     Response,
-    add_responses,
     fit_faults,
     fit_joint_faults,
     fit_single_size,
     score_responses,
+    simulate_effect,
     sum_responses,
 )
 
@@ -364,23 +365,33 @@ class ReferenceScores:
 
     def _scored(self, j: int, subset: frozenset[str]) -> list[tuple[SubsetScore, float]]:
         """Return the gain of the subset on joint `j` in each part of the reference, and the length of the field over the part's."""
-        if not self.tables:
-            for part in self.parts:
-                joints = fit_joint_faults(part)
-                self.tables.append([SubsetTable(joint, {}, part.block) for joint in joints])
-        for name in subset - self.known:
-            # The field chose the values of numbers that only shape the effect.
-            shape = self.grown[name][0].shape
-            ways = [replace(ray, shape=shape) for ray in self.rays[name]]
-            for tables, part in zip(self.tables, self.parts, strict=True):
-                add_responses([table.shapes for table in tables], name, ways, part)
-            self.known.add(name)
+        self.simulate(subset)
         found = []
         for tables in self.tables:
             mine = tables[j]
             usable = frozenset(subset & mine.shapes.keys())
             found.append((mine.score(usable), self.num_entries / len(mine.joint.z)))
         return found
+
+    def simulate(self, names: Subset) -> None:
+        """Simulate effects on all parts, unless they are known."""
+        if not self.tables:
+            for part in self.parts:
+                joints = fit_joint_faults(part)
+                self.tables.append([SubsetTable(joint, {}, part.block) for joint in joints])
+        todo = list(product(sorted(names - self.known), range(len(self.parts))))
+
+        def respond(one: tuple[str, int]) -> list[dict[str, list[Response]]]:
+            name, number = one
+            # The field chose the values of numbers that only shape the effect.
+            shape = self.grown[name][0].shape
+            ways = [replace(ray, shape=shape) for ray in self.rays[name]]
+            return simulate_effect(ways, self.parts[number])[1]
+
+        for (_, number), own in zip(todo, map_parallel(respond, todo), strict=True):
+            for table, added in zip(self.tables[number], own, strict=True):
+                table.shapes.update(added)
+        self.known |= names
 
     def earned(self, j: int, subset: frozenset[str]) -> float:
         """Return the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
@@ -402,6 +413,43 @@ class ReferenceScores:
                 change = change + sum_responses(self.shapes[j][name], np.mean(sizes, 0))
         left = fit_faults(joint.z - change, joint.faults)
         return max(0.0, float(joint.loss.sum() - left.loss.sum()) + joint.price - left.price)
+
+
+@dataclass
+class ReferencePenalty:
+    """Penalty of a subset of effects on a joint, with its gain on reference recordings.
+
+    Attributes:
+        known: Gains on the reference.
+        joint: Penalty of each effect on each joint, unless one cause is behind it on all, nats.
+        factor: On the gain on the reference.
+        values: Penalties by joint and subset.
+    """
+
+    known: ReferenceScores
+    joint: float
+    factor: float
+    values: dict[tuple[int, Subset], float] = field(default_factory=dict)
+
+    def __call__(self, j: int, subset: Subset) -> float:
+        """Return the penalty, nats."""
+        if (j, subset) not in self.values:
+            earned = self.factor * self.known.earned(j, subset)
+            there = max(earned, self.known.repeated(j, subset))
+            self.values[j, subset] = self.joint * len(subset - self.known.shared) + there
+        return self.values[j, subset]
+
+    def prepare(self, subsets: Sequence[Sequence[Subset]]) -> None:
+        """Compute the penalties of the subsets of each joint."""
+        self.known.simulate(frozenset().union(*(one for joint in subsets for one in joint)))
+
+        def compute(j: int) -> list[float]:
+            return [self(j, subset) for subset in subsets[j]]
+
+        joints = range(len(subsets))
+        for j, values in zip(joints, map_parallel(compute, joints), strict=True):
+            for subset, value in zip(subsets[j], values, strict=True):
+                self.values[j, subset] = value
 
 
 SHARED_PLAY = 0.3

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
 from diagnosis.answer import Estimate
 from diagnosis.case import GapCase, split_recordings
@@ -98,14 +99,19 @@ def find_sensor_effects(
     reference, machine = split_recordings(case.reference, case.machine), case.machine
     if len(reference) < 2:
         return []
-    fits = []
     seen = _compute_mean(_stack_statistics(case.field, machine))
     plain = _stack_statistics(reference, machine)  # (P, J, F)
+    tried = []
     for kind in kinds:
         if kind.target.side == "measurement" and (kind.target.stochastic or not kind.target.smooth):
-            fits.append(_fit_sensor(kind, seen, plain, reference, machine))
-    if not fits:
+            tried.append(kind)
+    if not tried:
         return []
+    found_by_kind = map_parallel(
+        lambda kind: _fit_sensor(kind, seen, plain, reference, machine), tried
+    )
+    # A process returns copies: the effects themselves are those of the library.
+    fits = [replace(fit, kind=kind) for fit, kind in zip(found_by_kind, tried, strict=True)]
     none = _compute_likelihood(seen, plain, plain)
     highest = np.stack([fit.likelihood.max(0) for fit in fits])  # (kinds, J)
     gain = np.minimum(highest - none, MAX_GAIN)

@@ -77,7 +77,7 @@ class ClassicalController:
         for i, e in enumerate(machine.is_exclusive):
             if e:
                 exclusive.append(i)
-        self._reach_joint = min(exclusive[-1] + 1, machine.num_joints - 1) if exclusive else 0
+        self.reach_joint = min(exclusive[-1] + 1, machine.num_joints - 1) if exclusive else 0
         age = torch.arange(machine.num_history - 1, -1, -1, dtype=torch.float32, device=device)
         self._period_s = machine.period_s
         self._in_flight = (config.in_flight_samples - age).clamp(0.0, 1.0)[
@@ -221,7 +221,7 @@ class ClassicalController:
         The slope is that of the first row. Order: reach, slope, distance.
         """
         origins = pose.joints_in_base_m
-        joint = origins[:, :, self._reach_joint]
+        joint = origins[:, :, self.reach_joint]
         radius = joint[..., :2].norm(dim=-1).clamp(min=MIN_RADIUS_M)
         out = target_m[:, :2].norm(dim=1) - radius
         up = target_m[:, 2] - joint[..., 2]

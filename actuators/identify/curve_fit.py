@@ -14,10 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from actuators.identify.speed_data import WIDTH, SpeedData
-from actuators.identify.valve_fit import fit_dynamics
+from actuators.identify.valve_fit import NUM_DYNAMICS, fit_all_dynamics
 from brokk_rl.contracts.actuator import FittedCurve
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
 from brokk_rl.spec import spec
 
@@ -28,8 +29,8 @@ BLOCK_S = 30.0
 """Length of the blocks that are drawn, s: the speed of a machine wanders over some seconds."""
 TIME_STEP, PLAY_STEP = 0.02, 0.02
 """Finite differences of times, s, and of the play, of full command."""
-PLAY, NUM_DYNAMICS = 1, 4
-"""Place of the play among the numbers of the dynamics, and how many these are."""
+PLAY = 1
+"""Place of the play among the numbers of the dynamics."""
 RIDGE = 1e-9
 """Least stiffness of every number, over the trace: the bend penalty leaves the straight line of a side
 free that is never commanded. `SpeedData.curve` has the same."""
@@ -78,15 +79,20 @@ class ValveCurveFit:
         blocks = _number_blocks(data, machine)
         draws = _draw_blocks(blocks, generator)
         moving = np.all([one.moves for one in every[: len(motions)]], 0)
-        fits = [self._fit_dynamics(one, moving) for one in every[: len(motions)]]
+        fits = map_parallel(lambda one: self._fit_dynamics(one, moving), every[: len(motions)])
         # Further motions are those of the last simulator with a part left out: only curves differ.
         fits += [fits[-1]] * len(further)
-        found: list[list[FittedCurve]] = []
-        for j in range(machine.num_joints):
-            found.append([])
-            if moving[j]:
-                for one, (dynamics, factors) in zip(every, fits, strict=True):
-                    found[j].append(_fit_curve(one, j, dynamics[j], factors[j], blocks, draws))
+
+        def fit(j: int) -> list[FittedCurve]:
+            curves = []
+            for one, (dynamics, factors) in zip(every, fits, strict=True):
+                curves.append(_fit_curve(one, j, dynamics[j], factors[j], blocks, draws))
+            return curves
+
+        joints = np.flatnonzero(moving).tolist()
+        found: list[list[FittedCurve]] = [[] for _ in moving]
+        for j, curves in zip(joints, map_parallel(fit, joints), strict=True):
+            found[j] = curves
         return found
 
     def _fit_dynamics(
@@ -94,13 +100,10 @@ class ValveCurveFit:
     ) -> tuple[np.ndarray, list[list[np.ndarray]]]:
         """Return the dynamics of all joints, `(J, 4)`, and the factors of pose and pump."""
         limits = (self.longest_lag_s, self.iterations)
-        dynamics = np.zeros((data.machine.num_joints, NUM_DYNAMICS))
-        for j in np.flatnonzero(moving).tolist():
-            dynamics[j] = fit_dynamics(data, j, None, None, *limits)
+        joints = np.flatnonzero(moving).tolist()
+        dynamics = fit_all_dynamics(data, None, None, *limits, joints)
         factors = data.factors(data.statics(dynamics, self.sweeps), dynamics)
-        for j in np.flatnonzero(moving).tolist():
-            dynamics[j] = fit_dynamics(data, j, factors[j], dynamics[j], *limits)
-        return dynamics, factors
+        return fit_all_dynamics(data, factors, dynamics, *limits, joints), factors
 
 
 def _number_blocks(data: SpeedData, machine: Machine) -> np.ndarray:

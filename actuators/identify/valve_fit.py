@@ -20,11 +20,15 @@ from actuators.identify.speed_data import PLAYS, SpeedData
 from actuators.models.valve import ValveActuator
 from brokk_rl.errors import ConfigError, StorageError
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
 from brokk_rl.session import write_text
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
+
+NUM_DYNAMICS = 4
+"""Dead time, play, lag of the valve, lag of the speed."""
 
 
 @spec
@@ -69,21 +73,16 @@ class ValveFit:
         del seed, device  # deterministic, numpy
         data = SpeedData([*train, *validation], machine, np.array(self.actuator.knots))
         data.check_motion()
-        dynamics = np.zeros((machine.num_joints, 4))
+        dynamics = np.zeros((machine.num_joints, NUM_DYNAMICS))
         with Progress(transient=True) as progress:
-            rounds = [(turn, j) for turn in range(2) for j in range(machine.num_joints)]
+            task = progress.add_task(f"{self.name}: dead times and lags", total=2)
             known: list[list[np.ndarray]] | None = None
-            for turn, j in progress.track(rounds, description=f"{self.name}: dead times and lags"):
-                if turn and known is None:
+            limits = (self.longest_lag_s, self.iterations)
+            for turn in range(2):
+                if turn:
                     known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
-                dynamics[j] = fit_dynamics(
-                    data,
-                    j,
-                    known[j] if known else None,
-                    dynamics[j] if turn else None,
-                    self.longest_lag_s,
-                    self.iterations,
-                )
+                dynamics = fit_all_dynamics(data, known, dynamics if turn else None, *limits)
+                progress.advance(task)
         fitted = self._spec(data, dynamics)
         # through JSON, which makes lists of tuples as YAML wants them
         facts = json.loads(json.dumps(dataclasses.asdict(fitted)))  # pyright: ignore[reportArgumentType]
@@ -147,6 +146,27 @@ class ValveFit:
             pose_extend=rows(found.pose[:, 0]),
             pose_retract=rows(found.pose[:, 1]),
         )
+
+
+def fit_all_dynamics(
+    data: SpeedData,
+    known: Sequence[Sequence[np.ndarray]] | None,
+    start: np.ndarray | None,
+    longest_lag_s: float,
+    iterations: int,
+    joints: Sequence[int] | None = None,
+) -> np.ndarray:
+    """Return the dynamics of all `joints`, 0 for others, `(J, 4)`; arguments as in `fit_dynamics`."""
+    joints = range(data.machine.num_joints) if joints is None else joints
+    found = np.zeros((data.machine.num_joints, NUM_DYNAMICS))
+
+    def fit(j: int) -> np.ndarray:
+        factors, begin = known[j] if known else None, None if start is None else start[j]
+        return fit_dynamics(data, j, factors, begin, longest_lag_s, iterations)
+
+    for j, row in zip(joints, map_parallel(fit, joints), strict=True):
+        found[j] = row
+    return found
 
 
 def fit_dynamics(

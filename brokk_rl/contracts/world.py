@@ -8,12 +8,16 @@ a target.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol
 
 if TYPE_CHECKING:
     import torch
 
     from brokk_rl.machine import Machine
+
+Property = Literal["mass", "friction", "stiffness", "yield_force"]
+PROPERTIES: tuple[Property, ...] = ("mass", "friction", "stiffness", "yield_force")
+"""Properties of the machine that a `VariedWorld` can change from world to world."""
 
 
 class World(Protocol):
@@ -63,8 +67,24 @@ class World(Protocol):
         ...
 
 
+class VariedWorld(World, Protocol):
+    """A world whose machines differ; optional, for events (`brokk_rl.sim.events`)."""
+
+    properties: dict[str, torch.Tensor]
+    """Factors on the nominal properties that vary, `(N, J)`, friction `(N, 1)`; written in place by
+    the caller."""
+
+    def apply_properties(self) -> None:
+        """Make `properties` count from the next step on; in place, without a host synchronisation."""
+        ...
+
+
 class Simulator(Protocol):
-    """A spec in `conf/sim`: builds a world."""
+    """A spec in `conf/sim`: builds a world.
+
+    `build` may take one more argument, `varied: tuple[Property, ...]`; it then returns a
+    `VariedWorld`, and events can be used with it.
+    """
 
     def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:
         """Return a world on `device`; `num_worlds` overrides the configured number."""

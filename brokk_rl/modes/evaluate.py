@@ -20,6 +20,7 @@ from brokk_rl.rl.policy import TrainedPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.session import Session, write_json
+from brokk_rl.sim.events import Event
 from brokk_rl.sim.video import render_video
 from brokk_rl.spec import name_spec, spec
 from brokk_rl.task_description import describe_task
@@ -46,6 +47,7 @@ class Evaluate:
         task: The task.
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
+        event: Changes of the simulated machine, by name.
         follower: Who stands between policy and machine.
         policy: The policy in question.
         rivals: Policies beside it, by name.
@@ -60,6 +62,7 @@ class Evaluate:
     task: Task
     actuator: Actuator
     effect: dict[str, Effect]
+    event: dict[str, Event]
     follower: Follower
     policy: PolicySpec
     rivals: dict[str, PolicySpec]
@@ -74,6 +77,7 @@ class Evaluate:
             task=self.task,
             actuator=self.actuator,
             effects=self.effect,
+            events=self.event,
             follower=self.follower,
         )
         policies = {name_spec(self.policy): self.policy} | self.rivals

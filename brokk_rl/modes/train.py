@@ -31,6 +31,7 @@ from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.tracking import NoTracking, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session
+from brokk_rl.sim.events import Event
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -47,6 +48,7 @@ class Train:
         task: The task.
         actuator: How commands become motion.
         effect: Effects around the actuator model, by name.
+        event: Changes of the simulated machine, by name.
         follower: Who stands between policy and machine.
         rl: How to train.
         tracking: Where figures go beside the run folder.
@@ -62,6 +64,7 @@ class Train:
     task: Task
     actuator: Actuator
     effect: dict[str, Effect]
+    event: dict[str, Event]
     follower: Follower
     rl: TrainingConfig
     tracking: Tracking
@@ -87,6 +90,7 @@ class Train:
             task=self.task,
             actuator=self.actuator,
             effects=self.effect,
+            events=self.event,
             follower=self.follower,
         )
         loop = config.build(

@@ -32,6 +32,14 @@ RUNNER_BOUNDS: dict[str, dict[str, Any]] = {
 """Bounds of rsl-rl's numbers, which it does not check itself: outside of them it divides by zero,
 climbs instead of descends, or trains nothing."""
 
+REFUSED_CLASSES = {
+    "RNNModel": "recurrent networks are neither exported nor deployed; task.memory gives a history",
+    "CNNModel": "observations are vectors, not pictures",
+    "Distillation": "train with PPO",
+    "StudentTeacher": "train with PPO",
+}
+"""Classes of rsl-rl that would fail after the whole budget, and the reason or another way."""
+
 
 @spec
 class TrainingBudget:
@@ -109,7 +117,18 @@ class TrainingConfig:
         self._check_runner()
 
     def _check_runner(self) -> None:
-        """Refuse numbers that rsl-rl would take without a word."""
+        """Refuse numbers that rsl-rl would take without a word, and parts of it that fail later."""
+        for name in ("algorithm", "actor", "critic"):
+            class_name = str(self.runner.get(name, {}).get("class_name", ""))
+            if reason := REFUSED_CLASSES.get(class_name.replace(":", ".").rpartition(".")[2]):
+                raise ConfigError(
+                    f"rl.runner.{name}.class_name: {class_name} of rsl-rl is not supported: {reason}"
+                )
+        if self.runner.get("algorithm", {}).get("rnd_cfg") is not None:
+            raise ConfigError(
+                "rl.runner.algorithm.rnd_cfg: random network distillation is not supported; "
+                "more exploration comes from rl.runner.actor.distribution_cfg.std_range"
+            )
         for path, bounds in RUNNER_BOUNDS.items():
             value: Any = self.runner
             for part in path.split("."):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import torch
@@ -29,6 +29,7 @@ from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
+from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.task_description import TaskDescription, describe_task
 
 Starts = dict[str, torch.Tensor]
@@ -45,6 +46,7 @@ class ControlLoopConfig:
         actuator: Builds the actuator model.
         effects: Effects around the actuator model, by name.
         follower: Who stands between policy and machine.
+        events: Changes of the simulated machine, by name.
     """
 
     machine: Machine
@@ -53,6 +55,7 @@ class ControlLoopConfig:
     actuator: Actuator
     effects: dict[str, Effect]
     follower: Follower
+    events: dict[str, Event] = field(default_factory=dict)
 
     def build(
         self,
@@ -72,7 +75,10 @@ class ControlLoopConfig:
             seed: Seed of the starts.
             starts: Starts of another control loop, in the place of drawn ones.
         """
-        world = self.sim.build(self.machine, device, num_envs)
+        if self.events:
+            world: World = build_varied_world(self.sim, self.events, self.machine, device, num_envs)
+        else:
+            world = self.sim.build(self.machine, device, num_envs)
         num = world.num_worlds
         model = self.actuator.build(self.machine, num, device)
         for effect in self.effects.values():

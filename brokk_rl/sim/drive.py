@@ -79,6 +79,19 @@ class DriveReferences:
             np.array([body.yield_force.value for body in machine.bodies]) / stiffness
         )
 
+    def set_servos(
+        self, stiffness: torch.Tensor, damping: torch.Tensor, yield_force: torch.Tensor
+    ) -> None:
+        """Give each world servos of its own, each argument `(N, J)` or `(J,)`.
+
+        The first call makes room for them, later ones write in place.
+        """
+        if self._lead.dim() == 1:
+            self._lead = self._lead.expand_as(self.reference).clone()
+            self._leash = self._leash.expand_as(self.reference).clone()
+        self._lead.copy_(damping / stiffness)
+        self._leash.copy_(yield_force / stiffness)
+
     def step(
         self, q: torch.Tensor, increment: torch.Tensor, act: torch.Tensor, ctrl: torch.Tensor
     ) -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import torch
 from mujoco.batch import Batch, SimulationError
 
+from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model, mask_contact_sensors
 from brokk_rl.sim.model_features import check_simulated
+from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
 
@@ -22,11 +24,19 @@ class NativeWorld:
         num_worlds: `N`.
         substeps: Physics steps per control period.
         num_threads: Threads; 0 takes all cores.
+        varied: Properties of the machine that differ from world to world.
     """
 
     supports_graphs = False
 
-    def __init__(self, machine: Machine, num_worlds: int, substeps: int, num_threads: int) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        num_worlds: int,
+        substeps: int,
+        num_threads: int,
+        varied: tuple[Property, ...] = (),
+    ) -> None:
         self.num_worlds, self.device = num_worlds, torch.device("cpu")
         self.model = compile_model(machine, machine.period_s / substeps)
         check_simulated(self.model, machine.name, "native")
@@ -49,6 +59,12 @@ class NativeWorld:
         self._first_state = self._state[0].clone()
         self._placement = ScenePlacement(self.model, self.device, torch.float64)
         self._drive = DriveReferences(self.model, machine, num_worlds, self.device, torch.float64)
+        fields = {}
+        for name in list_fields(varied):
+            fields[name] = torch.from_numpy(self._batch.expand(name))
+        self._properties = (
+            WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
+        )
         # touch sensors measure in every substep; recording them all catches a peak between two
         # control steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
@@ -72,6 +88,16 @@ class NativeWorld:
         self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(
             self._warning.flatten(1).any(1)
         )
+
+    @property
+    def properties(self) -> dict[str, torch.Tensor]:
+        """Factors by property; see `brokk_rl.contracts.world.VariedWorld`."""
+        return self._properties.factors if self._properties else {}
+
+    def apply_properties(self) -> None:
+        """Make `properties` count; see `brokk_rl.contracts.world.VariedWorld`."""
+        if self._properties:
+            self._properties.apply()
 
     def bare_step(self) -> None:
         """Run the substeps of `mujoco.batch` alone, without drive and read-out.

@@ -16,7 +16,7 @@ from brokk_rl.spec import spec
 if TYPE_CHECKING:
     import torch
 
-    from brokk_rl.contracts.world import World
+    from brokk_rl.contracts.world import Property, World
     from brokk_rl.sim.native_world import NativeWorld
     from brokk_rl.sim.parity import ParityResult
     from brokk_rl.sim.warp_world import WarpWorld
@@ -44,9 +44,15 @@ class NativeSimulator:
             )
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> NativeWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
+
+        `varied` names properties of the machine that differ from world to world.
 
         Raises:
             DeviceError: `device` is not the CPU.
@@ -59,7 +65,7 @@ class NativeSimulator:
         from brokk_rl.sim.native_world import NativeWorld
 
         return NativeWorld(
-            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads
+            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads, varied
         )
 
 
@@ -113,9 +119,15 @@ class WarpSimulator:
             raise ConfigError(f"sim.parity_worlds: expected 0 or more, got {self.parity_worlds}")
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> WarpWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
+
+        `varied` names properties of the machine that differ from world to world.
 
         On a CPU this is slow and meant for tests.
 
@@ -136,9 +148,15 @@ class WarpSimulator:
             device = torch.device("cuda", torch.cuda.current_device())
         if self.parity_worlds:
             _check_parity(self, machine, device)
-        return self._make_world(machine, device, _choose(num_worlds, self.num_worlds))
+        return self._make_world(machine, device, _choose(num_worlds, self.num_worlds), varied)
 
-    def _make_world(self, machine: Machine, device: torch.device, num_worlds: int) -> WarpWorld:
+    def _make_world(
+        self,
+        machine: Machine,
+        device: torch.device,
+        num_worlds: int,
+        varied: tuple[Property, ...] = (),
+    ) -> WarpWorld:
         from brokk_rl.sim.warp_world import WarpWorld
 
         return WarpWorld(
@@ -152,6 +170,7 @@ class WarpSimulator:
             linesearch_iterations=self.linesearch_iterations,
             tolerance=self.tolerance,
             fused=self.fused,
+            varied=varied,
         )
 
 
@@ -168,11 +187,15 @@ class AutoSimulator:
     warp: WarpSimulator
 
     def build(
-        self, machine: Machine, device: torch.device | str, num_worlds: int | None = None
+        self,
+        machine: Machine,
+        device: torch.device | str,
+        num_worlds: int | None = None,
+        varied: tuple[Property, ...] = (),
     ) -> World:
         """Return the worlds on `device`; `num_worlds` overrides the configured number."""
         chosen = self.native if _is_cpu(device) else self.warp
-        return chosen.build(machine, device, num_worlds)
+        return chosen.build(machine, device, num_worlds, varied)
 
 
 @functools.lru_cache(maxsize=8)

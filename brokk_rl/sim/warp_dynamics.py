@@ -96,9 +96,9 @@ class _Arm:
 
     joint_kind: wp.array[int]
     armature: wp.array2d[float]
-    stiffness: wp.array[float]
-    damping: wp.array[float]
-    yield_force: wp.array[wp.vec2]
+    stiffness: wp.array2d[float]
+    speed_gain: wp.array2d[float]
+    yield_force: wp.array2d[wp.vec2]
     bodies: wp.array[int]
     first_body: wp.array[int]
     mass: wp.array2d[float]
@@ -193,11 +193,10 @@ def _compile_kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
                 if element[i, j] >= 0:
                     own = wp.where(i == j, arm.armature[world % arm.armature.shape[0], i], 0.0)
                     elements[world, element[i, j]] = inertia[i, j] + own
-            bound = arm.yield_force[i]
-            pull = (
-                arm.stiffness[i] * (act[world, i] - qpos[world, i])
-                - arm.damping[i] * qvel[world, i]
-            )
+            bound = arm.yield_force[world % arm.yield_force.shape[0], i]
+            stiffness = arm.stiffness[world % arm.stiffness.shape[0], i]
+            speed_gain = arm.speed_gain[world % arm.speed_gain.shape[0], i]
+            pull = stiffness * (act[world, i] - qpos[world, i]) + speed_gain * qvel[world, i]
             servo[world, i] = wp.clamp(pull, bound[0], bound[1])
             smooth[world, i] = servo[world, i] - bias[i]
 
@@ -227,9 +226,10 @@ def _compile_kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
         h = timestep[world % timestep.shape[0]]
         system, right = inertia_at(elements, element, world), Vector()
         for i in range(n):
-            bound = arm.yield_force[i]
+            bound = arm.yield_force[world % arm.yield_force.shape[0], i]
             if servo[world, i] > bound[0] and servo[world, i] < bound[1]:
-                system[i, i] = system[i, i] + h * arm.damping[i]
+                speed_gain = arm.speed_gain[world % arm.speed_gain.shape[0], i]
+                system[i, i] = system[i, i] - h * speed_gain
             right[i] = inertial_force[world, i]
         change = solved(system, right)
         for i in range(n):
@@ -277,9 +277,9 @@ class ArmDynamics:
             model.body_inertia,
         )
         device = data.qpos.device
-        arm.stiffness = wp.array(mujoco_model.actuator_gainprm[:, 0], dtype=float, device=device)
-        arm.damping = wp.array(-mujoco_model.actuator_biasprm[:, 2], dtype=float, device=device)
-        arm.yield_force = wp.array(mujoco_model.actuator_forcerange, dtype=wp.vec2, device=device)
+        arm.stiffness = _view_parameter(model.actuator_gainprm, 0)
+        arm.speed_gain = _view_parameter(model.actuator_biasprm, 2)  # minus damping
+        arm.yield_force = model.actuator_forcerange
         arm.bodies = wp.array(bodies, dtype=int, device=device)
         first = np.searchsorted(last_dof[bodies], np.arange(mujoco_model.nv + 1))
         arm.first_body = wp.array(first, dtype=int, device=device)
@@ -317,6 +317,19 @@ class ArmDynamics:
     def after_contacts(self) -> None:
         """Advance the state by a substep with the accelerations found."""
         wp.launch(self._kernels[1], self._num_worlds, self._after, block_dim=_BLOCK)
+
+
+def _view_parameter(parameters: wp.array, index: int) -> wp.array:
+    """Return one number of each vector of an array `(N, J)` of vectors, without a copy."""
+    assert parameters.ptr is not None
+    size = wp.types.type_size_in_bytes(wp.float32)
+    return wp.array(
+        ptr=parameters.ptr + index * size,
+        dtype=wp.float32,
+        shape=parameters.shape,
+        strides=parameters.strides,
+        device=parameters.device,
+    )
 
 
 def _find_last_dof(model: mujoco.MjModel, body: int) -> int:

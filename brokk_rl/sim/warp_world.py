@@ -17,10 +17,12 @@ import mujoco_warp as mjw
 import torch
 import warp as wp
 
+from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.model_features import check_simulated
+from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 from brokk_rl.sim.warp_dynamics import ArmDynamics
 from brokk_rl.sim.warp_solver import ContactSolver
@@ -134,6 +136,7 @@ class WarpWorld:
         linesearch_iterations: Bound on the line search's iterations.
         tolerance: At which the solver stops.
         fused: Use our own kernels for dynamics, contact solver and integration.
+        varied: Properties of the machine that differ from world to world.
     """
 
     def __init__(
@@ -149,6 +152,7 @@ class WarpWorld:
         linesearch_iterations: int,
         tolerance: float,
         fused: bool,
+        varied: tuple[Property, ...] = (),
     ) -> None:
         self.num_worlds, self.device = num_worlds, device
         self.supports_graphs = device.type == "cuda"
@@ -160,7 +164,10 @@ class WarpWorld:
         self._warp_device = wp.device_from_torch(device)
         with wp.ScopedDevice(self._warp_device):
             self._model = mjw.put_model(
-                self.model, batch_sizes={"geom_size": num_worlds, "geom_pos": num_worlds}
+                self.model,
+                batch_sizes=dict.fromkeys(
+                    ("geom_size", "geom_pos", *list_fields(varied)), num_worlds
+                ),
             )
             self._data = mjw.make_data(
                 self.model, num_worlds, nconmax=num_contacts, njmax=num_constraints
@@ -192,6 +199,10 @@ class WarpWorld:
             make_fused_substep(self.model, model, data, peak)
             if fused
             else make_staged_substep(model, data, peak)
+        )
+        fields = {name: wp.to_torch(getattr(model, name)) for name in list_fields(varied)}
+        self._properties = (
+            WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
         )
         home = torch.tensor(machine.home, dtype=torch.float32, device=device).expand(num_worlds, -1)
         self.reset(torch.ones_like(self.faults), home, make_nominal_scenes(num_worlds, device))
@@ -230,6 +241,16 @@ class WarpWorld:
         torch.where(rows, q, self.q, out=self.q)
         self.contact_force_n.masked_fill_(mask, 0.0)
         self.faults.masked_fill_(mask, False)
+
+    @property
+    def properties(self) -> dict[str, torch.Tensor]:
+        """Factors by property; see `brokk_rl.contracts.world.VariedWorld`."""
+        return self._properties.factors if self._properties else {}
+
+    def apply_properties(self) -> None:
+        """Make `properties` count; see `brokk_rl.contracts.world.VariedWorld`."""
+        if self._properties:
+            self._properties.apply()
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of everything that must be stored to go on."""

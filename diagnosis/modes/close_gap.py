@@ -181,7 +181,7 @@ class CloseGap:
         log.info("retraining with %s", ", ".join(self.found))
         Train(
             session=replace(self.session, out=str(place)), machine=self.machine, sim=self.sim, task=plant.task,
-            actuator=plant.actuator, effect=plant.effects, follower=self.follower, rl=self.rl, tracking=self.tracking,
+            actuator=plant.actuator, effect=plant.effects, event={}, follower=self.follower, rl=self.rl, tracking=self.tracking,
             evaluation=self.evaluation, start_from=self.policy.folder if self.warm else None,
             resume=str(place) if self.resume else None,
         ).run()  # fmt: skip

@@ -16,6 +16,7 @@ from brokk_rl.contracts.actuator import Actuator, ActuatorFit, CurveFit, Excitat
 from brokk_rl.errors import ConfigError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
+from brokk_rl.parallel import use_workers
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis import answer, baseline, case, effect_library, pipeline, report, report_checks
@@ -23,7 +24,7 @@ from diagnosis.answer import Answer
 from diagnosis.baseline import Baseline
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
-from diagnosis.detection import Penalties
+from diagnosis.detection import Penalties, ProgressCallback
 from diagnosis.effect_library import EffectType
 from diagnosis.pipeline import DiagnosisPipeline
 
@@ -41,6 +42,7 @@ class DiagnosisSubject:
         unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
             fitted: how far the effects carry.
         effects: Names of the effects to choose among; `null`: all that are registered.
+        workers: Processes that share the work; 1 where the system has no safe fork.
         prices: Penalties of effects.
         certainty: Calibration of the probabilities.
     """
@@ -49,10 +51,13 @@ class DiagnosisSubject:
     field: str | tuple[str, ...] | None
     unseen: str | tuple[str, ...] | None
     effects: tuple[str, ...] | None
+    workers: int
     prices: Penalties
     certainty: ProbabilityModel
 
     def check(self) -> None:
+        if self.workers < 1:
+            raise ConfigError(f"diagnosis.workers: expected 1 or more, got {self.workers}")
         if (self.case is None) == (self.field is None):
             raise ConfigError(
                 "diagnosis: give either case=<folder with reference/ and field/>, or field=<glob> and actuator=<simulator>"
@@ -97,9 +102,15 @@ class Diagnose:
         given = self._case()
         kinds = effect_library.load_effects(self.machine, self.diagnosis.effects)
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
-        with Progress(transient=True) as progress:
-            task = progress.add_task("simulator", total=1.0)
-            base = self._base(given, kinds)
+        with Progress(transient=True) as progress, use_workers(self.diagnosis.workers):
+            task, reached = progress.add_task("fitting the simulator", total=1.0), 0.0
+
+            def tell(doing: str, done: float) -> None:
+                nonlocal reached
+                reached = max(reached, done)  # a step may be repeated
+                progress.update(task, description=doing, completed=reached)
+
+            base = self._base(given, kinds, tell)
             generator = self.session.generator("diagnosis")
             prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
             work = DiagnosisPipeline(
@@ -113,13 +124,12 @@ class Diagnose:
                 self.curve_fit,
                 generator,
             )
-            outcome = work.run(
-                lambda doing, done: progress.update(task, description=doing, completed=done)
-            )
+            outcome = work.run(tell)
         folder = self.session.folder
         outcome.save(folder)
         pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
-        report.write_report(outcome, folder, self.machine)
+        with use_workers(self.diagnosis.workers):
+            report.write_report(outcome, folder, self.machine)
         _print_answer(outcome.answer, folder)
 
     def _case(self) -> GapCase:
@@ -134,21 +144,21 @@ class Diagnose:
             )
         return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine), unseen)
 
-    def _base(self, given: GapCase, kinds: Sequence[EffectType]) -> Baseline:
+    def _base(
+        self, given: GapCase, kinds: Sequence[EffectType], tell: ProgressCallback
+    ) -> Baseline:
         seed, device, folder = (
             self.session.stream("base"),
             self.session.torch_device(),
             self.session.folder,
         )
+
+        def refine(base: Baseline) -> Baseline:
+            tell("what the reference shows", 0.15)
+            return baseline.add_reference_effects(base, kinds, self.machine)
+
         if given.reference:
-            return baseline.fit_baseline(
-                given,
-                self.fit,
-                folder / "base",
-                seed,
-                device,
-                lambda base: baseline.add_reference_effects(base, kinds, self.machine),
-            )
+            return baseline.fit_baseline(given, self.fit, folder / "base", seed, device, refine)
         assert self.actuator is not None, "there is one where there is no reference"
         return baseline.accept_simulator(
             given, self.actuator, self.fit, folder / "flexible", seed, device

@@ -20,6 +20,7 @@ from actuators.models import checkpoint
 from actuators.models.network import JointNetworks
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from brokk_rl.rl.execution import capture_graph
 
 pytestmark = pytest.mark.gpu
 
@@ -50,7 +51,7 @@ def test_a_captured_update_is_the_update(
     for captured in (True, False):
         with monkeypatch.context() as patch:
             if not captured:
-                patch.setattr(network_fit, "capture", as_it_is)
+                patch.setattr(network_fit, capture_graph.__name__, as_it_is)
             networks = JointNetworks(5, 13, 32, coupled, torch.Generator().manual_seed(0))
             networks.increment_scale.fill_(0.01)
             at_work = FreeRunOptimizer(networks.cuda(), machine, 3)

@@ -60,15 +60,16 @@ class Run:
         for name, level in levels.items():
             u[0, machine.joint_names.index(name)] = level
         held = [machine.joint_names.index(name) for name in blocked]
-        self.q, self.state = [at[0].numpy().astype(float)], []
+        path = [at[0].numpy().astype(float)]
+        self.state: list[dict[str, np.ndarray]] = []
         for _ in range(periods):
             history.push_u(u)
             q_next = self.model.step(history).clone()
             q_next[:, held] = at[:, held]
             history.push_q(q_next)
-            self.q.append(q_next[0].numpy().astype(float))
+            path.append(q_next[0].numpy().astype(float))
             self.state.append({k: v[0].numpy().copy() for k, v in self.model.state.items()})
-        self.q = np.array(self.q)
+        self.q = np.array(path)
 
     def get(self, name: str, joint: int = 0) -> np.ndarray:
         """Return a state over time."""
@@ -91,7 +92,7 @@ def solve_one_joint(
 
     def number(field: str) -> float:
         value = getattr(config, field)
-        return value.get(name, value.get("other")) if isinstance(value, dict) else value
+        return float(value.get(name, value.get("other")) if isinstance(value, dict) else value)
 
     body, full = machine.bodies[joint], machine.max_speed[joint]
     k, torque = body.stiffness.value, number("supply_ratio") * body.yield_force.value
@@ -310,6 +311,7 @@ def test_closed_valves_hold_the_arm_but_for_the_leak(name: str, machine: Machine
     config = circuit(name)
     run = Run(config, machine, {}, 200)
     sunk = np.abs(run.q[-1] - run.q[20]) / (machine.max_speed * 180 * machine.period_s)
+    assert isinstance(config.leak, float)
     assert (sunk <= config.leak * 3.0).all()
     leaking = Run(circuit(name, leak=0.05), machine, {}, 200)
     assert leaking.q[-1, Q3] - leaking.q[20, Q3] > 0.005

@@ -109,7 +109,7 @@ def test_the_approach_moves_the_tool_straight_to_the_target(machine: Machine) ->
 
 def test_the_valve_map_is_inverted_where_it_moves_anything(machine: Machine) -> None:
     classical = controller(machine)
-    share = torch.linspace(0.06, 1.0, 20)[:, None].repeat(1, 5)  # creep is 0.06
+    share = torch.linspace(0.06, 1.0, 20)[:, None].repeat(1, 5)  # more than creep
     share[1::2] *= -1
     torch.testing.assert_close(
         classical.rate(classical.valve(share)) / classical.speed, share, rtol=0, atol=1e-6
@@ -117,9 +117,8 @@ def test_the_valve_map_is_inverted_where_it_moves_anything(machine: Machine) -> 
 
 
 def test_small_speeds_become_pulses_of_creep_and_tiny_ones_nothing(machine: Machine) -> None:
-    classical = controller(
-        machine
-    )  # dead band 0.08, creep 0.06, rest 0.004: the smallest command is 0.08 + 0.92 x 0.06 = 0.1352
+    # the smallest command is 0.08 + 0.92 x 0.06 = 0.1352
+    classical = controller(machine, dead_band=0.08, creep=0.06, rest=0.004)
     found = classical.valve(torch.tensor([0.003, -0.003, 0.005, -0.02, 3.0]))
     assert found.tolist() == pytest.approx([0.0, 0.0, 0.1352, -0.1352, 1.0])
 

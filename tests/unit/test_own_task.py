@@ -278,8 +278,9 @@ def test_an_old_policy_is_read_with_what_is_assumed(
 ) -> None:
     policy = TrainedPolicy(folder=str(old))
     assert policy.choose_task(insertion(), machine, ["task.memory"]) == insertion()
+    own = TrainedPolicy(folder=str(SHIPPED)).choose_task(insertion(), machine, ())
     with caplog.at_level(logging.WARNING):
-        policy.build(runs.plant(machine, insertion()).build(CPU, 2, 8, 0), 0)
+        policy.build(runs.plant(machine, own).build(CPU, 2, 8, 0), 0)
         PolicyBundle(str(old), machine)
     assert "does not say which task" in caplog.text and "task.memory=13" in caplog.text
     assert (

@@ -144,6 +144,7 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
     train = Train(
         **parts,
         effect={},
+        event={},
         tracking=NoTracking(),
         evaluation=evaluation,
         start_from=None,

@@ -1,0 +1,112 @@
+"""Properties of the machine that differ from world to world: nominal numbers times factors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import mujoco
+import numpy as np
+import torch
+
+from brokk_rl.contracts.world import PROPERTIES, Property
+from brokk_rl.machine import Machine
+from brokk_rl.sim.drive import DriveReferences
+
+FIELDS: dict[Property, tuple[str, ...]] = {
+    "mass": ("body_mass", "body_inertia", "body_subtreemass"),
+    "friction": ("geom_friction",),
+    "stiffness": ("actuator_gainprm", "actuator_biasprm"),
+    "yield_force": ("actuator_forcerange",),
+}
+"""Fields of MuJoCo's model that follow from each property. What MuJoCo derives from them for the
+softness of contacts (`body_invweight0`, `dof_invweight0`) stays nominal."""
+
+
+def list_fields(varied: Iterable[Property]) -> tuple[str, ...]:
+    """Return the fields of the model that differ from world to world.
+
+    Raises:
+        KeyError: There is no such property.
+    """
+    found: list[str] = []
+    for name in varied:
+        found.extend(FIELDS[name])
+    return tuple(found)
+
+
+class WorldProperties:
+    """Factors on the machine's properties, and the model's fields that follow from them.
+
+    Args:
+        model: Gives the nominal numbers.
+        machine: Gives joints and links.
+        drive: Its lead and leash follow from stiffness and yield force.
+        fields: The model's fields of all worlds by name, `(N, …)`, written in place.
+        varied: Properties that vary.
+
+    Attributes:
+        factors: By property, `(N, J)`, friction `(N, 1)`; 1 at first.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        machine: Machine,
+        drive: DriveReferences,
+        fields: dict[str, torch.Tensor],
+        varied: tuple[Property, ...],
+    ) -> None:
+        self._fields, self._drive = fields, drive
+        some = next(iter(fields.values()))
+        num, device, dtype = len(some), some.device, some.dtype
+
+        def constant(values: np.ndarray) -> torch.Tensor:
+            return torch.tensor(values, dtype=dtype, device=device)
+
+        self._nominal = {name: constant(getattr(model, name)) for name in fields}
+        self.factors: dict[str, torch.Tensor] = {}
+        for name in PROPERTIES:
+            if name in varied:
+                width = 1 if name == "friction" else machine.num_joints
+                self.factors[name] = torch.ones(num, width, dtype=dtype, device=device)
+        links = [int(model.joint(name).bodyid[0]) for name in machine.joint_names]
+        self._links = torch.tensor(links, device=device)
+        carried = np.zeros((model.nbody, model.nbody))
+        for body in range(model.nbody):
+            above = body
+            while True:
+                carried[body, above] = 1.0
+                if above == 0:
+                    break
+                above = model.body_parentid[above]
+        self._carried = constant(carried)
+        self._stiffness = constant(model.actuator_gainprm[:, 0])
+        self._damping = constant(-model.actuator_biasprm[:, 2])
+        self._yield_force = constant(model.actuator_forcerange[:, 1])
+
+    def apply(self) -> None:
+        """Write the fields that follow from `factors`; everything is in place."""
+        fields, nominal, factors = self._fields, self._nominal, self.factors
+        if "mass" in factors:
+            factor = factors["mass"]
+            for name in ("body_mass", "body_inertia"):
+                usual = nominal[name][self._links]
+                scaled = usual * factor.reshape(*factor.shape, *[1] * (usual.dim() - 1))
+                fields[name].index_copy_(1, self._links, scaled)
+            fields["body_subtreemass"].copy_(fields["body_mass"] @ self._carried)
+        if "friction" in factors:
+            scaled = nominal["geom_friction"] * factors["friction"][..., None]
+            fields["geom_friction"].copy_(scaled)
+        ones = torch.ones_like(self._stiffness)
+        stiff = factors.get("stiffness", ones)
+        stiffness, damping = self._stiffness * stiff, self._damping * stiff.sqrt()
+        if "stiffness" in factors:
+            fields["actuator_gainprm"][..., 0].copy_(stiffness)
+            fields["actuator_biasprm"][..., 1].copy_(-stiffness)
+            fields["actuator_biasprm"][..., 2].copy_(-damping)
+        bound = self._yield_force * factors.get("yield_force", ones)
+        if "yield_force" in factors:
+            fields["actuator_forcerange"][..., 0].copy_(-bound)
+            fields["actuator_forcerange"][..., 1].copy_(bound)
+        if "stiffness" in factors or "yield_force" in factors:
+            self._drive.set_servos(stiffness, damping, bound)

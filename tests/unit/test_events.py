@@ -1,0 +1,201 @@
+"""Properties that differ from world to world, and the events that draw them."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import every, option
+
+from brokk_rl.checks import check_world
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.sim.events import Event, EventWorld, build_varied_world
+from brokk_rl.sim.model import compile_model
+from brokk_rl.sim.native_world import NativeWorld
+from brokk_rl.sim.scene import make_nominal_scenes
+from brokk_rl.sim.simulator import NativeSimulator
+
+NUM = 4
+ALL = ("mass", "friction", "stiffness", "yield_force")
+CPU = torch.device("cpu")
+NATIVE = NativeSimulator(num_worlds=NUM, substeps=5, num_threads=1)
+FACTORS = {
+    "mass": torch.tensor([[1.0] * 5, [2.0] * 5, [1.0, 0.5, 1.5, 2.0, 0.7], [1.0] * 5]),
+    "friction": torch.tensor([[1.0], [0.5], [1.0], [2.0]]),
+    "stiffness": torch.tensor([[1.0] * 5, [0.5] * 5, [1.0, 2.0, 0.7, 1.0, 1.4], [1.0] * 5]),
+    "yield_force": torch.tensor([[1.0] * 5, [1.0] * 5, [0.8] * 5, [0.3] * 5]),
+}
+
+
+def event(name: str, **changes: Any) -> Event:
+    return dataclasses.replace(option("event", name), **changes)
+
+
+def vary(world: Any) -> Any:
+    for name, factor in FACTORS.items():
+        world.properties[name].copy_(factor)
+    world.apply_properties()
+    return world
+
+
+def drive_into_the_ground(machine: Machine, worlds: list[Any]) -> list[list[np.ndarray]]:
+    """Returns positions and forces of every world over time."""
+    increment = torch.zeros(NUM, machine.num_joints)
+    increment[:, 1], increment[:, 0] = 0.006, 0.01
+    found: list[list[np.ndarray]] = [[] for _ in worlds]
+    for step in range(50):
+        for path, world in zip(found, worlds, strict=True):
+            world.step(increment if step > 5 else torch.zeros_like(increment))
+            force = world.contact_force_n[:, None] / 1e6
+            path.append(torch.cat((world.q, force), 1).numpy().copy())
+    return found
+
+
+def test_each_world_is_plain_mujoco_with_edited_numbers(machine: Machine) -> None:
+    world: Any = vary(NATIVE.build(machine, "cpu", None, varied=ALL))
+    world.reset(
+        torch.ones(NUM, dtype=torch.bool),
+        torch.tensor(machine.home).float().repeat(NUM, 1),
+        make_nominal_scenes(NUM),
+    )
+    for i in range(NUM):
+        edited = compile_model(machine, 0.01)
+        for j, name in enumerate(machine.joint_names):
+            body = edited.joint(name).bodyid[0]
+            edited.body_mass[body] *= float(FACTORS["mass"][i, j])
+            edited.body_inertia[body] *= float(FACTORS["mass"][i, j])
+            stiff = float(FACTORS["stiffness"][i, j])
+            edited.actuator_gainprm[j, 0] *= stiff
+            edited.actuator_biasprm[j, 1] *= stiff
+            edited.actuator_biasprm[j, 2] *= np.sqrt(stiff)
+            edited.actuator_forcerange[j] *= float(FACTORS["yield_force"][i, j])
+        edited.geom_friction[:] *= float(FACTORS["friction"][i, 0])
+        used = world._batch.get_model(i)
+        for field in ("body_mass", "body_inertia", "geom_friction", "actuator_gainprm"):
+            np.testing.assert_allclose(getattr(used, field), getattr(edited, field), rtol=1e-6)
+        for field in ("actuator_biasprm", "actuator_forcerange"):
+            np.testing.assert_allclose(getattr(used, field), getattr(edited, field), rtol=1e-6)
+        np.testing.assert_allclose(used.body_subtreemass[0], edited.body_mass.sum(), rtol=1e-6)
+
+
+def test_factors_of_one_change_nothing(machine: Machine) -> None:
+    plain = NATIVE.build(machine, "cpu")
+    varied: Any = NATIVE.build(machine, "cpu", None, varied=ALL)
+    varied.apply_properties()
+    paths = drive_into_the_ground(machine, [plain, varied])
+    np.testing.assert_allclose(paths[0], paths[1], atol=1e-7)
+
+
+def test_a_saturated_drive_accelerates_by_yield_force_over_mass(machine: Machine) -> None:
+    world: Any = NATIVE.build(machine, "cpu", None, varied=("yield_force", "mass"))
+    world.properties["yield_force"][:] = torch.tensor([[1.0], [0.5], [0.25], [1.0]]).expand(-1, 5)
+    world.properties["mass"][:] = torch.tensor([[1.0], [1.0], [1.0], [2.0]]).expand(-1, 5)
+    world.apply_properties()
+    before = world.q.clone()
+    turn = torch.zeros(NUM, machine.num_joints)
+    turn[:, 0] = 0.05  # rad in a period: far more than any relief valve lets the slew do
+    world.step(turn)
+    moved = (world.q - before)[:, 0]
+    assert 0.001 < moved[0] < 0.03
+    np.testing.assert_allclose(moved / moved[0], [1.0, 0.5, 0.25, 0.5], rtol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fused", [False, True], ids=["staged", "fused"])
+def test_warp_worlds_with_the_same_factors_agree_with_the_native_ones(
+    machine: Machine, fused: bool
+) -> None:
+    sim = dataclasses.replace(option("sim", "warp"), num_worlds=NUM, fused=fused)
+    worlds = [vary(spec.build(machine, "cpu", NUM, varied=ALL)) for spec in (NATIVE, sim)]
+    native, warp = (np.array(path) for path in drive_into_the_ground(machine, worlds))
+    assert native[..., -1].max() > 0
+    free = native[:12]
+    np.testing.assert_allclose(warp[:12], free, atol=2e-5)
+    np.testing.assert_allclose(warp[..., :-1], native[..., :-1], atol=2e-3)
+    # the factors show: heavy, soft or yielding arms go other ways
+    assert np.abs(native[-1, 1:, :-1] - native[-1, 0, :-1]).max() > 5e-4
+
+
+@every("event")
+def test_every_event_keeps_a_world_a_world(name: str, machine: Machine) -> None:
+    class Varied:
+        def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any:
+            return build_varied_world(
+                NATIVE, {name: option("event", name)}, machine, CPU, num_worlds
+            )
+
+    check_world(Varied(), machine, make_nominal_scenes(8), "cpu")
+
+
+def test_an_event_draws_when_it_says(machine: Machine) -> None:
+    def build(**changes: Any) -> EventWorld:
+        events = {"mass": event("mass", **changes)}
+        return build_varied_world(NATIVE, events, machine, CPU, NUM)
+
+    def look(world: EventWorld) -> torch.Tensor:
+        return world._world.properties["mass"].clone()
+
+    still = torch.zeros(NUM, machine.num_joints)
+    home = torch.tensor(machine.home).float().repeat(NUM, 1)
+    first = torch.tensor([True, False, False, False])
+    torch.manual_seed(1)
+    startup, reset = build(when="startup"), build(when="reset")
+    for world, changed in ((startup, False), (reset, True)):
+        before = look(world)
+        assert ((before >= 0.8) & (before <= 1.2)).all()
+        assert before.std() > 0.02
+        world.step(still)
+        assert torch.equal(look(world), before)
+        world.reset(first, home, make_nominal_scenes(NUM))
+        assert (look(world)[0] != before[0]).all() == changed
+        assert torch.equal(look(world)[1:], before[1:])
+    interval = build(when="interval", interval_s=(0.2, 0.2), joints_alike=True)
+    seen = []
+    for _ in range(12):
+        interval.step(still)
+        seen.append(float(look(interval)[0, 0]))
+    # 0.2 s are four periods
+    assert len(set(seen)) == 3
+    assert (look(interval) == look(interval)[:, :1]).all()
+
+
+def test_a_restored_state_keeps_its_properties(machine: Machine) -> None:
+    events = {"mass": event("mass"), "yield_force": event("yield_force")}
+    world = build_varied_world(NATIVE, events, machine, CPU, NUM)
+    state = world.state_dict()
+    kept = world._world.properties["mass"].clone()
+    home = torch.tensor(machine.home).float().repeat(NUM, 1)
+    world.reset(torch.ones(NUM, dtype=torch.bool), home, make_nominal_scenes(NUM))
+    assert not torch.equal(world._world.properties["mass"], kept)
+    world.load_state_dict(state)
+    assert torch.equal(world._world.properties["mass"], kept)
+
+
+def test_what_cannot_be_varied_is_refused_by_name(machine: Machine) -> None:
+    class Plain:
+        def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any:
+            return NativeWorld(machine, 1, 5, 1)
+
+    with pytest.raises(ConfigError, match=r"event=mass: sim=.*cannot vary"):
+        build_varied_world(Plain(), {"mass": event("mass")}, machine, CPU, 1)
+    twice = {"mass": event("mass"), "heavy": event("mass")}
+    with pytest.raises(ConfigError, match="two of mass, heavy change mass"):
+        build_varied_world(NATIVE, twice, machine, CPU, 1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"factor": (0.0, 1.0)}, "factor"),
+        ({"factor": (1.2, 0.8)}, "factor"),
+        ({"when": "sometimes"}, "when"),
+        ({"when": "interval", "interval_s": None}, "interval_s"),
+    ],
+)
+def test_numbers_that_make_no_sense_are_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        event("mass", **changes)
