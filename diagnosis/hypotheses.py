@@ -212,7 +212,7 @@ def choose_hypothesis(known: Sequence[Hypothesis], weights: ProbabilityModel) ->
     return Choice(known, odds, max(mass, key=mass.__getitem__), best)
 
 
-def adopt_choice(
+def apply_choice(
     result: DetectionResult, choice: Choice, penalties: Penalties, weights: ProbabilityModel
 ) -> DetectionResult:
     """Return the findings with the chosen effect, and with further ones of the search that are probable beside it.
@@ -235,7 +235,7 @@ def adopt_choice(
         return replace(result, chosen=empty, fitted=None, detected=detected)
     alone = result.alone or result.tables
     gain = sum(alone[j].score(frozenset({best.name})).total for j in best.joints)
-    if best.name in searched.chosen.names or _explains_more(searched, gain):
+    if best.name in searched.chosen.names or _has_much_more_gain(searched, gain):
         return replace(searched, detected=detected)
     subsets = [frozenset[str]() for _ in alone]
     start: list[dict[str, np.ndarray]] = [{} for _ in alone]
@@ -251,7 +251,7 @@ def adopt_choice(
     )
 
 
-def _explains_more(searched: DetectionResult, gain: float) -> bool:
+def _has_much_more_gain(searched: DetectionResult, gain: float) -> bool:
     """Return whether a set of the search explains much more than `gain`: no effect alone explains a large gap."""
     if searched.fitted is None or len(searched.chosen.names) < 2:
         return False

@@ -169,7 +169,7 @@ class DiagnosisPipeline:
         tried = 0
         while True:
             choice = hypotheses.choose_hypothesis(known, self.calibration)
-            found = hypotheses.adopt_choice(result, choice, self.penalties, self.calibration)
+            found = hypotheses.apply_choice(result, choice, self.penalties, self.calibration)
             unknown = hypotheses.is_unknown(choice, found)
             seen = verdict.judge_findings(
                 found, self.case, self.base, rivals, self.thresholds, self.generator, unknown

@@ -163,7 +163,7 @@ def fit_set(
     )
 
 
-def hold_set(
+def build_held_set(
     residuals: Residuals,
     rays: Mapping[str, Sequence[ParameterRay]],
     sizes_by_joint: Sequence[Mapping[str, np.ndarray]],
@@ -435,7 +435,7 @@ def drop_effects(
         sizes[j] = {
             name: size for name, size in list_sizes(fitted)[j].items() if name in subsets[j]
         }
-    return hold_set(residuals, ways, sizes, found, fitted.held)
+    return build_held_set(residuals, ways, sizes, found, fitted.held)
 
 
 def list_sizes(fitted: FittedSet) -> list[dict[str, np.ndarray]]:

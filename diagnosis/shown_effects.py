@@ -13,7 +13,7 @@ import numpy as np
 from brokk_rl.machine import Machine
 from diagnosis.effect_library import EffectType
 from diagnosis.nonadditive_refit import combine_best
-from diagnosis.refine import FittedSet, fit_set, hold_set, list_sizes, list_subsets
+from diagnosis.refine import FittedSet, build_held_set, fit_set, list_sizes, list_subsets
 from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import Response
 from diagnosis.search import PenaltyFunction
@@ -98,14 +98,14 @@ def keep_shown_numbers(
         return None
     known = list_sizes(found) if found else [{} for _ in shown]
     measured = residuals.simulator.cut.measured
-    fixed = hold_set(residuals, rays, shown)
+    fixed = build_held_set(residuals, rays, shown)
     paths = [residuals.base, found.after if found else residuals.base, fixed.after]
     errors = np.sqrt([np.square(one - measured).mean((0, 1)) for one in paths])
     better = errors[1] - errors[2] > LEAST_BETTER * errors[0]
     if not better.any():
         return None
     sizes = [shown[j] if has else known[j] for j, has in enumerate(better)]
-    return hold_set(residuals, rays, sizes, found, frozenset(np.flatnonzero(better).tolist()))
+    return build_held_set(residuals, rays, sizes, found, frozenset(np.flatnonzero(better).tolist()))
 
 
 def compute_sizes(

@@ -128,7 +128,7 @@ def answer_case(
     known = hypotheses.read_hypotheses(item.told["hypotheses"])
     choice = hypotheses.choose_hypothesis(known, weights)
     restored = decision.restore_result(item.told, prices, kinds)
-    found = hypotheses.adopt_choice(restored, choice, prices, weights)
+    found = hypotheses.apply_choice(restored, choice, prices, weights)
     unknown = hypotheses.is_unknown(choice, found)
     selected: list[Selected] = []
     signs: list[tuple[str, dict[str, float]]] = []

@@ -141,7 +141,7 @@ def choice_of(verdict: str, name: str) -> Choice:
 @pytest.mark.parametrize("verdict", ["none", "unknown"])
 def test_no_effect_is_kept_beside_another_verdict(weights: ProbabilityModel, verdict: str) -> None:
     prices: Penalties = option("prices", "default")
-    kept = hypotheses.adopt_choice(
+    kept = hypotheses.apply_choice(
         findings(0.5, ("lag",)), choice_of(verdict, "lag"), prices, weights
     )
     assert not kept.chosen.names and kept.fitted is None
@@ -158,7 +158,7 @@ def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
     monkeypatch.setattr(hypotheses.calibration, "compute_probability", lambda *_: shown)
     monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
     choice = choice_of("unknown", "lag")
-    kept = hypotheses.adopt_choice(result, choice, prices, weights)
+    kept = hypotheses.apply_choice(result, choice, prices, weights)
     assert hypotheses.is_unknown(choice, kept) is unknown and not kept.chosen.names
 
 
@@ -168,11 +168,11 @@ def test_the_searched_set_stays_where_it_holds_the_likeliest_effect(
     prices: Penalties = option("prices", "default")
     searched = dataclasses.replace(findings(0.5, ("lag",)), fitted=cast(Any, "searched"))
     monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
-    kept = hypotheses.adopt_choice(searched, choice_of("effects", "lag"), prices, weights)
+    kept = hypotheses.apply_choice(searched, choice_of("effects", "lag"), prices, weights)
     assert kept.fitted == "searched"
     fits: list[Any] = []
     monkeypatch.setattr(hypotheses, "fit_set", lambda *given: fits.append(given) or "anew")
-    other = hypotheses.adopt_choice(searched, choice_of("effects", "dead_band"), prices, weights)
+    other = hypotheses.apply_choice(searched, choice_of("effects", "dead_band"), prices, weights)
     assert other.fitted == "anew" and other.chosen.subsets == (
         frozenset({"dead_band"}),
         frozenset(),
@@ -196,5 +196,5 @@ def test_a_set_that_explains_half_as_much_again_is_told(
     )
     monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
     monkeypatch.setattr(hypotheses, "fit_set", lambda *_: "anew")
-    found = hypotheses.adopt_choice(result, choice_of("effects", "dead_band"), prices, weights)
+    found = hypotheses.apply_choice(result, choice_of("effects", "dead_band"), prices, weights)
     assert (found.fitted is result.fitted) is kept

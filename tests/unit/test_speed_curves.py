@@ -15,7 +15,7 @@ from brokk_rl.contracts.actuator import Effect
 from brokk_rl.machine import Dimension, Machine
 from diagnosis import effect_library
 from diagnosis.baseline import compare_simulator, fit_covariances
-from diagnosis.refine import drop_effects, hold_set, list_subsets
+from diagnosis.refine import build_held_set, drop_effects, list_subsets
 from diagnosis.residuals import Residuals
 from diagnosis.responses import choose_rays
 from diagnosis.shown_effects import compute_sizes, keep_shown_numbers, propose_effects
@@ -177,7 +177,7 @@ def test_held_joints_keep_their_sizes_when_an_effect_goes(axis: Machine, banded:
     kinds = {one.name: one for one in effect_library.load_effects(axis, ["dead_band", "lag"])}
     rays = {name: choose_rays(kind) for name, kind in kinds.items()}
     sizes = [{"dead_band": np.array([1.0, 2.0]), "lag": np.array([0.5])}]
-    fitted = hold_set(banded, rays, sizes, None, frozenset({0}))
+    fitted = build_held_set(banded, rays, sizes, None, frozenset({0}))
     kept = drop_effects(banded, rays, fitted, [frozenset({"dead_band"})])
     assert kept.sizes[:, 0] == pytest.approx([1.0, 2.0]) and kept.held == {0}
     free = drop_effects(
