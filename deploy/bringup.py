@@ -16,7 +16,7 @@ import logging
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -32,6 +32,7 @@ from deploy.recorder.capture_reader import read_capture
 from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.process_group import BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.supervisor import CompanionProcess
 from deploy.runtime.target import TargetSelector
 
 log = logging.getLogger(__name__)
@@ -176,7 +177,11 @@ class BringupChecklist(BusAndPolicySettings):
                 )
 
     def run(
-        self, machine: Machine, session: Session, say: Callable[[str], None]
+        self,
+        machine: Machine,
+        session: Session,
+        say: Callable[[str], None],
+        companions: Sequence[CompanionProcess],
     ) -> list[BringupResult]:
         """Run the checks in order; write `bringup.json` and the capture.
 
@@ -184,6 +189,7 @@ class BringupChecklist(BusAndPolicySettings):
             machine: The machine.
             session: Where to write.
             say: Shows the operator a task, or a result.
+            companions: Further processes: twin and scripted person of a rehearsal.
 
         Raises:
             LinkError: nothing is heard at all, or one of the processes has died.
@@ -194,6 +200,8 @@ class BringupChecklist(BusAndPolicySettings):
         # The bring-up never commands: without `commands` there is no request slot at all.
         group = ProcessGroup(memory, self.realtime)
         try:
+            for one in companions:
+                group.start(one.name, one.target, one.arguments, one.realtime)
             self.start_processes(group, machine, target_s=math.inf, pitch_rad=None)
             facts = {"source": "bring-up"}
             capture = CaptureConfig(session.folder, self.dbc, machine, facts, pictures_hz=0.0)

@@ -342,9 +342,9 @@ class EffectSimulator:
         count, rows = len(candidates) * windows, np.repeat(candidates, windows)
         u = self._commands.repeat(1, len(candidates), 1)
         with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(
-                self.seed + int(candidates[0])
-            )  # rows of other batches draw other numbers
+            # Rows of other batches draw other numbers. `torch.manual_seed` would also prepare the
+            # seeds of GPUs that nothing here uses, which takes longer than a step.
+            torch.default_generator.manual_seed(self.seed + int(candidates[0]))
             model: Any = self.base.build(self.machine, count, device)
             for name, value in own.items():
                 model.parameters[name].copy_(torch.as_tensor(value[rows], dtype=torch.float32))

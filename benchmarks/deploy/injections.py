@@ -264,6 +264,18 @@ def measure_row(
     return row | {"causes": dict(causes)}
 
 
+def measure_unwatched(
+    folder: Path, inject: Callable[[Stage, int], None], trials: int
+) -> dict[str, object]:
+    """Return the row of an injection without observer and envelope, each trial from the start."""
+    moves = 0
+    for trial in range(trials):
+        stage = Stage(option("machine", "brokk170"), "collect", folder, watched=False)
+        moves += measure_stop(stage, inject, trial) is None
+        stage.close()
+    return {"trials": trials, "moves": moves}
+
+
 def main(path: Path, trials: int) -> None:
     table: dict[str, object] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -274,9 +286,10 @@ def main(path: Path, trials: int) -> None:
                 table[f"{mode}: {inject.__doc__}"] = measure_row(stage, inject, trials)
             stage.close()
         # As before there was an observer and an envelope.
-        stage = Stage(machine, "collect", Path(folder), watched=False)
         for inject in SENSORS:
-            table[f"unwatched: {inject.__doc__}"] = measure_row(stage, inject, trials)
+            row = measure_unwatched(Path(folder), inject, trials)
+            table[f"unwatched: {inject.__doc__}"] = row
+        stage = Stage(machine, "collect", Path(folder), watched=False)
         table[f"unwatched: {measure_ground.__doc__}"] = measure_ground(stage)
         stage.close()
         stage = Stage(machine, "collect", Path(folder))

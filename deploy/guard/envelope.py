@@ -52,7 +52,7 @@ class Envelope:
             for k, box in enumerate(boxes):
                 if capsule.link - box.link >= APART:
                     pairs.append((c, k))
-        self._capsule, self._box = np.array(pairs).reshape(-1, 2).T
+        self._capsule, self._box = np.array(pairs, int).reshape(-1, 2).T
         self._arm = [capsule.link + 1 for capsule in shapes.arm]
         self._ends_m = np.array([[one.begin_m, one.end_m] for one in shapes.arm]).reshape(-1, 2, 3)
         self._fixed = [box.link + 1 for box in boxes]

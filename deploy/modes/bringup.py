@@ -9,6 +9,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.bringup import REPORT, BringupChecklist
+from deploy.runtime.supervisor import BenchSpec
 
 
 @spec
@@ -18,6 +19,7 @@ class BringupMode:
     session: Session
     machine: Machine
     bringup: BringupChecklist
+    bench: BenchSpec | None
 
     def run(self) -> float:
         """Write `bringup.json` and the capture; return 0.
@@ -30,7 +32,8 @@ class BringupMode:
         def say(text: str) -> None:
             console.print(text, highlight=False)
 
-        results = self.bringup.run(self.machine, self.session, say)
+        companions = self.bench.companions(self.machine, self.session) if self.bench else ()
+        results = self.bringup.run(self.machine, self.session, say, companions)
         failed = [one.check for one in results if not one.passed]
         if failed:
             raise LinkError(

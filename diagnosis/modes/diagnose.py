@@ -128,7 +128,8 @@ class Diagnose:
         folder = self.session.folder
         outcome.save(folder)
         pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
-        report.write_report(outcome, folder, self.machine)
+        with use_workers(self.diagnosis.workers):
+            report.write_report(outcome, folder, self.machine)
         _print_answer(outcome.answer, folder)
 
     def _case(self) -> GapCase:

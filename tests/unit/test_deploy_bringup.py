@@ -7,15 +7,17 @@ import json
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from composed import option
 from desk import DBC, free_port
 
 from actuators.excite.player import NominalMachine
-from brokk_rl.errors import LinkError
+from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.bringup import BringupResult, measure_joint_response
@@ -23,7 +25,8 @@ from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
 from deploy.modes.bringup import BringupMode
 from deploy.runtime.process import ChildProcess, CycleTimer
-from deploy.twin.faults import request_fault
+from deploy.twin.faults import ActiveFaults, request_fault
+from deploy.twin.rehearsal import CHECKS, ROUND_S, RehearsalBench, ScriptedPerson
 from deploy.twin.remote import RadioRemote
 from deploy.twin.twin import Twin
 
@@ -135,7 +138,7 @@ def test_a_check_that_fails_is_an_error_of_the_command(tmp_path: Path, passed: b
     ]
 
     class Checklist:
-        def run(self, machine: Any, session: Any, say: Any) -> list[BringupResult]:
+        def run(self, machine: Any, session: Any, say: Any, companions: Any) -> list[BringupResult]:
             return results
 
     mode = object.__new__(BringupMode)
@@ -143,6 +146,7 @@ def test_a_check_that_fails_is_an_error_of_the_command(tmp_path: Path, passed: b
         ("session", Session(out=str(tmp_path), seed=0, device="cpu")),
         ("machine", None),
         ("bringup", Checklist()),
+        ("bench", None),
     ):
         object.__setattr__(mode, name, value)
     if passed:
@@ -160,3 +164,79 @@ def test_a_twin_says_what_it_does(brokk: Callable[..., Any], tmp_path: Path) -> 
         "session.out=twin",
     )  # fmt: skip
     assert done.code == 0 and "twin of brokk170 on udp_multicast" in done.err
+
+
+def sample_person(fails: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A round of the scripted person: commands, dead-man and emergency stop every 20 ms."""
+    person = ScriptedPerson(option("machine", "brokk170"), fails)
+    times = np.arange(0.0, ROUND_S, 0.02)
+    held = [[person.holds(name, t_s) for t_s in times] for name in ("dead-man", "e-stop")]
+    return np.array([person.command(t_s) for t_s in times]), *map(np.array, held)
+
+
+def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
+    commands, deadman, estop = sample_person(None)
+    assert (commands.max(0) > 0.5).all() and (commands.min(0) < -0.5).all()
+    # q2 moves alone, and nothing moves while a switch is pressed.
+    moves = commands != 0
+    assert not (moves[:, 1] & moves[:, [0, 2, 3, 4]].any(1)).any()
+    assert deadman.any() and estop.any() and not (deadman | estop)[moves.any(1)].any()
+    # At rest for a second before each motion, as long as the slowest answer.
+    begins = np.flatnonzero(moves.any(1)[1:] & ~moves.any(1)[:-1]) + 1
+    for begin in begins:
+        assert not moves[begin - 50 : begin].any()
+    person = ScriptedPerson(option("machine", "brokk170"), None)
+    assert not person.command(-1.0).any() and not person.holds("dead-man", -ROUND_S + 0.5)
+    remote = RadioRemote(BusDescription(DBC, option("machine", "brokk170")))
+    person.move(remote, 2.2 + 1.2)
+    assert max(remote.levers) == pytest.approx(0.6) and not remote.button_right
+    person.move(remote, 2.2 + 4.8 + 1.2)
+    assert remote.button_right and sum(one != 0 for one in remote.levers) == 1
+    person.move(remote, 0.5)
+    assert remote.deadman and not any(remote.levers)
+
+
+@pytest.mark.parametrize("fails", CHECKS)
+def test_a_scripted_person_fails_the_chosen_check_alone(fails: str) -> None:
+    sound, chosen = sample_person(None), sample_person(fails)
+    person = ScriptedPerson(option("machine", "brokk170"), fails)
+    late_s = 4 * ROUND_S
+    assert chosen[1].any() == (fails != "dead-man") and chosen[2].any() == (fails != "e-stop")
+    same = np.array_equal(sound[0], chosen[0])
+    assert same == (fails != "joints") and np.array_equal(sound[0][:, :4], chosen[0][:, :4])
+    early, late = person.spoil(0.0, 8.0), person.spoil(late_s, 8.0)
+    assert (early is not None) == (fails in ("bus", "positions"))
+    assert (late is not None) == (fails in ("bus", "positions", "shadow"))
+    for fault in (early, late):
+        if fault is not None:
+            ActiveFaults().request(json.dumps(fault).encode(), 0.0)
+
+
+def test_a_rehearsal_without_remote_fault_port_or_check_is_refused() -> None:
+    twin = Twin(
+        wire=CanBus(interface="virtual", channel="x", bitrate=None, port=None, hops=None), dbc=DBC, remote=False, deadman=True,
+        again_s=None, fault_port=43210, seconds=None, realtime=False,
+    )  # fmt: skip
+    bench = RehearsalBench(twin=twin, plant=NominalMachine(), rest_s=1.0, fails=None)  # type: ignore[arg-type]
+    assert [one.name for one in bench.companions(option("machine", "brokk170"), None)] == [
+        "twin",
+        "operator",
+    ]  # type: ignore[arg-type]
+    for change in ({"twin": replace(twin, remote=True)}, {"twin": replace(twin, fault_port=None)}):
+        with pytest.raises(ConfigError, match=r"twin\.remote=false and a twin\.fault_port"):
+            replace(bench, **change)
+    with pytest.raises(ConfigError, match="there is no check 'estop'"):
+        replace(bench, fails="estop")
+
+
+@pytest.mark.slow
+def test_a_rehearsal_that_fails_a_check_ends_with_an_error(
+    brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    done = brokk(
+        "mode=bringup", "bus=udp", "bus.channel=239.74.163.78", f"bus.port={free_port()}", "bench=operator",
+        f"bench.twin.fault_port={free_port()}", "bench.fails=e-stop", "bench.rest_s=3", "link=nominal", "bringup.listen_s=1",
+        "bringup.shadow_s=3", "bringup.patience_s=30", "bringup.quiet=1", "bringup.rate=0.5", "bringup.realtime=false",
+        "session.out=report",
+    )  # fmt: skip
+    assert done.code != 0 and "1 of 6 checks failed: e-stop" in done.err

@@ -14,6 +14,7 @@ from composed import option
 
 import brokk_rl.sim
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
 from deploy.guard.envelope import Envelope, measure_segment_to_box
 from deploy.guard.limits import StayOutBox
 from deploy.guard.shapes import RoundedBox, fit_capsules, read_machine_shapes
@@ -135,6 +136,65 @@ def test_shapes_enclose_what_mujoco_draws_and_little_more() -> None:
     # The widest link has its cylinders 0.2 m beside its axis.
     clear = expected > 0.02
     assert clear.sum() >= 8 and (expected[clear] - found[clear]).max() < 0.25
+
+
+def test_distances_beyond_interest_may_be_bounds_but_no_near_one_is_missed() -> None:
+    assert SHAPES is not None
+    # Without the undercarriage, near whose turntable the boom always is.
+    posts = {}
+    for number, (x, y) in enumerate(((1.5, 0.3), (2.0, -0.8), (2.6, 0.9), (1.2, 1.6))):
+        low = (x, y, 1.0)
+        posts[str(number)] = StayOutBox(lower_m=low, upper_m=(x + 0.05, y + 0.05, 1.05))
+    limits = replace(LIMITS, stay_out=posts, ground_m=None)
+    envelope = Envelope(limits, MACHINE, replace(SHAPES, body=()))
+    poses = draw_poses(1500, seed=4)
+    exact = envelope.measure_clearance(poses)
+    for near_m in (0.05, 0.4):
+        # One by one, as in a cycle: what is left out depends on the pose.
+        found = np.array(
+            [float(envelope.measure_clearance(q[None], near_m)[0]) for q in poses[:400]]
+        )
+        near = exact[:400] <= near_m
+        assert near.sum() > 9 and found[near] == pytest.approx(exact[:400][near], abs=1e-12)
+        far = ~near
+        assert (found[far] > near_m).all() and (found[far] <= exact[:400][far] + 1e-12).all()
+    nothing = Envelope(replace(LIMITS, ground_m=None), MACHINE, replace(SHAPES, body=()))
+    assert np.isinf(nothing.measure_clearance(poses[:3])).all()
+
+
+def test_links_are_placed_as_the_kinematics_place_them_slides_and_slanted_axes_too() -> None:
+    joints = list(MACHINE.joints)
+    slanted = (0.6, 0.64, 0.48)
+    for number, kind in ((1, "hinge"), (2, "slide"), (4, "hinge")):
+        body = joints[number].body
+        assert body is not None
+        joints[number] = replace(joints[number], kind=kind, body=replace(body, axis=slanted))
+    machine = replace(MACHINE, joints=tuple(joints))
+    assert SHAPES is not None
+    envelope, poses = Envelope(LIMITS, machine, SHAPES), draw_poses(5)
+    expected = compute_tool_kinematics(machine, poses).tip_in_base_m
+    assert envelope.locate_tip(poses) == pytest.approx(expected, abs=1e-9)
+
+
+def test_a_fast_arm_that_would_pass_the_surface_is_slowed() -> None:
+    envelope = build_envelope(ground_m=None)
+    q = np.array([0.0, -0.9, 0.2, 0.9, 0.77])
+    rest = q + np.array([0.0, 0.0, 1.2, 0.0, 0.0])
+    here, there = envelope.locate_tip(np.stack([q, rest]))
+    assert here[2] - there[2] > 1.0
+    u = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+    way = q + np.linspace(0.0, 1.0, 5)[:, None] * (rest - q)
+    heights = envelope.locate_tip(way)[:, 2]
+    # Between two of the places, nearer to neither of them than the zone is wide.
+    gap = int(np.argmax(-np.diff(heights)))
+    middle = (heights[gap] + heights[gap + 1]) / 2
+    assert heights[gap] - middle > LIMITS.face_near_m
+    tip = envelope.locate_tip(way)[gap]
+    assert envelope._find_slowdown(u, q, rest, (tip[0], tip[1], middle)) < 0.9
+    assert envelope._find_slowdown(u, q, rest, (tip[0], tip[1] + 3.0, middle)) == 1.0
+    # Beyond the place of rest nothing is slowed.
+    below = float(heights.min()) - LIMITS.face_near_m - 0.02
+    assert envelope._find_slowdown(u, q, rest, (there[0], there[1], below)) == 1.0
 
 
 def test_the_tip_is_where_mujoco_has_it() -> None:
@@ -379,6 +439,7 @@ def test_near_the_work_surface_the_tip_is_slow() -> None:
         (tip - np.array([0.0, 0.0, near_m + 0.01]), False),
         (tip + (wide_m - 0.01) * beside, True),
         (tip + (wide_m + 0.01) * beside, False),
+        (tip + (wide_m - 0.01) * beside + np.array([0.0, 0.0, near_m - 0.01]), True),
     ):
         sent, held = envelope.limit_command(1.0, u, tuple(q), tuple(face))
         assert not held

@@ -1,0 +1,181 @@
+"""Rehearsal of the bring-up: a twin, and a scripted person who does what the checklist asks.
+
+The person leaves the machine at rest while the checklist listens. Then they go round: dead-man,
+emergency stop, each joint both ways. They can fail one chosen check, to see that it is noticed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.contracts.link import Connection
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from deploy.bus.can_bus import CanBus
+from deploy.bus.description import BusDescription
+from deploy.guidance import LeverMap, find_full_angles_rad
+from deploy.runtime.process import CycleTimer, Stop
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.supervisor import CompanionProcess
+from deploy.twin.faults import request_fault
+from deploy.twin.remote import RadioRemote
+from deploy.twin.twin import TWIN_PRIORITY, Twin
+
+CHECKS = ("bus", "positions", "dead-man", "e-stop", "joints", "shadow")
+"""Checks that can be failed."""
+ROUND_S, PART_S = 12.0, 4.8
+"""Length of a round, and of the part of it for joints that move together. Chosen by hand: a joint
+rests for a second before each motion, longer than the dead time."""
+PUSH = 0.6
+"""Deflection of the levers, of full. Chosen by hand: above any dead band."""
+PRESSES_S = {"dead-man": (0.2, 0.8), "e-stop": (1.2, 1.6)}
+"""When in a round a switch is pressed and released. No joint moves meanwhile."""
+JOINTS_S = 2.2
+"""When in a round the first joints are moved."""
+PUSHES_S = ((1.0, 1.6, PUSH), (3.4, 4.0, -PUSH))
+"""Beginning, end and deflection of the motions in a part."""
+SOUND_ROUNDS = 3
+"""Rounds after which a person who fails the shadow run spoils it: the joints have been seen by then."""
+SPOILED_S = 1.0
+"""Time for which messages or positions are spoiled to fail a check that needs it. Chosen by hand."""
+
+
+@spec
+class RehearsalBench:
+    """Twin and scripted person in place of a machine and its operator.
+
+    Attributes:
+        twin: The twin; needs a fault port, for the emergency stop.
+        plant: The simulated machine behind it.
+        rest_s: Time after the first positions for which the person leaves the machine at rest.
+        fails: Check that the person fails; `null`: none.
+    """
+
+    twin: Twin
+    plant: Connection
+    rest_s: float
+    fails: str | None
+
+    def check(self) -> None:
+        if self.twin.remote or self.twin.fault_port is None:
+            raise ConfigError(
+                "bench=operator: expected twin.remote=false and a twin.fault_port, since the person holds the remote "
+                "and presses the emergency stop"
+            )
+        if self.fails is not None and self.fails not in CHECKS:
+            raise ConfigError(
+                f"bench.fails: there is no check '{self.fails}'; {list_choices(self.fails, CHECKS)}"
+            )
+
+    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
+        """Return the processes to run beside the checklist."""
+        twin, port = self.twin, self.twin.fault_port
+        arguments: tuple[Any, ...] = (twin, machine, self.plant, session)
+        found = [CompanionProcess("twin", "deploy.twin.twin:run", arguments, TWIN_PRIORITY)]
+        arguments = (twin.wire, twin.dbc, machine, port, self.rest_s, self.fails)
+        target = "deploy.twin.rehearsal:run_person"
+        return [*found, CompanionProcess("operator", target, arguments, TWIN_PRIORITY)]
+
+
+class ScriptedPerson:
+    """Hands of the person, as a function of the time since they began.
+
+    Args:
+        machine: Its levers and joints.
+        fails: Check that the person fails; `None`: none.
+    """
+
+    def __init__(self, machine: Machine, fails: str | None) -> None:
+        self._machine, self._fails = machine, fails
+        self._map = LeverMap(machine.levers, machine)
+        self._full_rad = find_full_angles_rad(machine.levers)
+
+    def holds(self, switch: str, t_s: float) -> bool:
+        """Return whether a switch of `PRESSES_S` is pressed at `t_s`; before 0 none is."""
+        begin_s, end_s = PRESSES_S[switch]
+        return t_s >= 0 and switch != self._fails and begin_s <= t_s % ROUND_S < end_s
+
+    def command(self, t_s: float) -> np.ndarray:
+        """Return the commands that the levers stand for, `(J,)`."""
+        machine, u = self._machine, np.zeros(self._machine.num_joints)
+        since_s = t_s % ROUND_S - JOINTS_S
+        if t_s < 0 or not 0 <= since_s < 2 * PART_S:
+            return u
+        moved = machine.is_exclusive == (since_s >= PART_S)
+        for begin_s, end_s, push in PUSHES_S:
+            if begin_s <= since_s % PART_S < end_s:
+                u[moved] = push
+        if self._fails == "joints":
+            u[-1] = 0.0
+        return u
+
+    def move(self, remote: RadioRemote, t_s: float) -> None:
+        """Move the remote's levers and hold its dead-man as at `t_s`."""
+        angles_rad, remote.button_right = self._map.levers(self.command(t_s))
+        remote.levers = (angles_rad / self._full_rad).clip(-1.0, 1.0).tolist()
+        remote.deadman = self.holds("dead-man", t_s)
+
+    def spoil(self, t_s: float, rest_s: float) -> dict[str, object] | None:
+        """Return the fault that the person asks the twin for at `t_s`, if any."""
+        if self._fails == "bus":
+            return {"fault": "corrupt", "message": "MachineStatus", "seconds": SPOILED_S}
+        if self._fails == "positions":
+            return {"fault": "drift", "seconds": rest_s}
+        if self._fails == "shadow" and t_s > SOUND_ROUNDS * ROUND_S:
+            return {"fault": "invalid"}
+        return None
+
+
+def run_person(
+    stop: Stop,
+    wire: CanBus,
+    dbc: str,
+    machine: Machine,
+    port: int,
+    rest_s: float,
+    fails: str | None,
+    memory: LoopMemory,
+) -> None:
+    """Run the person: at rest until the loop has listened, then round by round.
+
+    Args:
+        stop: Returns whether to stop.
+        wire: The bus.
+        dbc: Its description.
+        machine: The machine.
+        port: Of the twin's faults.
+        rest_s: Time after the first positions for which the machine is left at rest.
+        fails: Check that the person fails; `None`: none.
+        memory: Tells that the loop has heard positions.
+    """
+    remote, person = RadioRemote(BusDescription(dbc, machine)), ScriptedPerson(machine, fails)
+    begun_s, pressed, spoiled = np.inf, False, False
+    timer = CycleTimer(remote.period_s)
+    with wire.open(remote.frame_ids) as bus:
+        while not stop():
+            while (left_s := timer.next_s - time.monotonic()) > 0:
+                frame = bus.recv(left_s)
+                if frame is not None:
+                    remote.hear(frame, time.monotonic())
+            timer.begin()
+            state, now_s = memory.state.read(), time.monotonic()
+            if state is not None and state.q_t_s > 0 and begun_s == np.inf:
+                begun_s = now_s + rest_s
+            t_s = now_s - begun_s
+            person.move(remote, t_s)
+            bus.send(remote.build_frame())
+            # A busy twin may not answer in time: then the person tries again.
+            with contextlib.suppress(TimeoutError):
+                if person.holds("e-stop", t_s) and not pressed:
+                    begin_s, end_s = PRESSES_S["e-stop"]
+                    request_fault(port, {"fault": "estop", "seconds": end_s - begin_s})
+                pressed = person.holds("e-stop", t_s)
+                if begun_s < np.inf and not spoiled and (fault := person.spoil(t_s, rest_s)):
+                    request_fault(port, fault)
+                    spoiled = True
