@@ -51,6 +51,9 @@ class ObservationNoise:
         filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a
             fixed hole does; `none` each sample.
         q_scale: Scale error of all measured positions (±).
+        q_scale_of: What `q_scale` scales. `position`: each position, as a wrong encoder would.
+            `motion`: the distance of earlier positions from the newest, as a machine does that is
+            faster or slower than its model.
         u_scale: Scale error of all recorded commands (±).
     """
 
@@ -59,6 +62,7 @@ class ObservationNoise:
     target_relative: float
     filter: Literal["none", "mean"]
     q_scale: float
+    q_scale_of: Literal["position", "motion"]
     u_scale: float
 
     def check(self) -> None:
@@ -107,6 +111,7 @@ class MeasuredNoise:
     u_scale: float
 
     target_relative = 0.0
+    q_scale_of = "position"
 
     def check(self) -> None:
         sizes = ("calibration_m", "unmeasured_bias_m", "unmeasured_sample_m", "q_scale", "u_scale")

@@ -21,10 +21,12 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
+from tasks.classical import ClassicalController
 from tasks.control import DeployedPolicy, ToolPoseControl
 from tasks.noise import MeasuredNoise, ObservationNoise
-from tasks.reward import RewardTerm, ToolState
+from tasks.reward import RewardCurriculum, RewardTerm, ToolState
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
+from tasks.starts import move_starts_near
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
 """Endings of an episode; where several hold in one step, the first of them counts."""
@@ -86,6 +88,7 @@ class ToolPoseOptions:
     scaling: TargetScaling
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
+    curriculum: RewardCurriculum | None
 
     @classmethod
     def of(cls, task: object, **fixed: Any) -> Self:
@@ -144,9 +147,10 @@ class ToolPoseProcess:
         self._kinematics = Kinematics(machine, device)
         self._lower = to_constant(machine.lower) + options.limit_margin
         self._upper = to_constant(machine.upper) - options.limit_margin
-        self._terms: list[tuple[Callable[[ToolState], torch.Tensor], float]] = [
-            (resolve_name(term.function), term.weight) for term in options.reward.values()
-        ]
+        self._terms: dict[str, tuple[Callable[[ToolState], torch.Tensor], float]] = {
+            name: (resolve_name(term.function), term.weight)
+            for name, term in options.reward.items()
+        }
         self.state = {
             name: torch.zeros((num_envs, *shape), device=device)
             for name, shape in self._list_state_shapes().items()
@@ -164,6 +168,8 @@ class ToolPoseProcess:
         shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "estimate_m": (3,)}
         shapes |= {"q_scale": (), "u_scale": ()}
         shapes |= {"steps": (), "age": ()}
+        if self.options.curriculum:
+            shapes["succeeded"] = ()
         # the step before
         shapes |= {"u": joints, "u_before": joints, "closeness": (), "contact_force_n": ()}
         # the observation, and what the next command needs of it
@@ -180,7 +186,29 @@ class ToolPoseProcess:
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draw valid starts; see `TaskProcess.starts`."""
-        start = self.goal.starts(count, seed)
+        return self._judge_starts(self.goal.starts(count, seed))
+
+    def bring_near(
+        self, start: dict[str, torch.Tensor], share: float, height_m: tuple[float, float], seed: int
+    ) -> dict[str, torch.Tensor]:
+        """Return starts of which the first part begins upright above its target, on the CPU.
+
+        Args:
+            start: Starts, as `starts` returns them.
+            share: Part of the starts that are brought near.
+            height_m: Heights of the tool point above the target, (lowest, highest).
+            seed: The same seed gives the same heights.
+        """
+        options, cpu = self.options, torch.device("cpu")
+        controller = ClassicalController(options.classical, self._machine, cpu)
+        start = {name: value.cpu() for name, value in start.items()}
+        return self._judge_starts(
+            move_starts_near(
+                start, share, height_m, seed, self._machine, controller, options.switch.reach_m
+            )
+        )
+
+    def _judge_starts(self, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         pose = Kinematics(self._machine, "cpu").pose(start["q"])
         verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, start)
         return start | {"closeness": verdict["closeness"]}
@@ -200,6 +228,7 @@ class ToolPoseProcess:
             "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1),
             "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1),
             "closeness": start["closeness"],
+            "succeeded": self.episode["success_strict"],
         }
         zero = torch.zeros((), device=mask.device)
         for name, value in state.items():
@@ -244,8 +273,7 @@ class ToolPoseProcess:
         force_n = torch.where(fault, 0.0, world.contact_force_n)
         success = verdict["success"] & ~fault & ~touching
         tool = self._make_tool_state(pose, verdict, force_n, success, failed)
-        reward = sum(weight * term(tool) for term, weight in self._terms)
-        reward = torch.where(fault | touching, 0.0, reward)
+        reward = torch.where(fault | touching, 0.0, self._sum_reward(tool))
         timed_out = state["steps"] >= self.max_episode_steps
         ended = failed | touching | fault
         if options.end_on_success:
@@ -259,6 +287,14 @@ class ToolPoseProcess:
             reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason
         )
 
+    def _sum_reward(self, tool: ToolState) -> torch.Tensor:
+        """Return the weighted sum of all terms, `(N,)`."""
+        curriculum, reward = self.options.curriculum, torch.zeros_like(tool.reach_m)
+        scale = curriculum.scale(self.state["succeeded"]) if curriculum else {}
+        for name, (term, weight) in self._terms.items():
+            reward = reward + scale.get(name, 1.0) * weight * term(tool)
+        return reward
+
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
@@ -270,7 +306,7 @@ class ToolPoseProcess:
         estimate_m = self._estimate_target(shift_m)
         seen = self.control.process(
             estimate_m,
-            history.q * state["q_scale"][:, None, None],
+            self._scale_positions(history.q),
             history.u * state["u_scale"][:, None, None],
             state["start.target_pitch_rad"],
             state.get("proposed"),
@@ -395,6 +431,14 @@ class ToolPoseProcess:
             sample = state["estimate_sum_m"] / (state["age"] + 1)[:, None]
         state["estimate_m"].copy_(sample)
         return sample
+
+    def _scale_positions(self, q: torch.Tensor) -> torch.Tensor:
+        """Return measured positions `(N, H, J)` with this episode's scale error."""
+        scale = self.state["q_scale"][:, None, None]
+        if self.options.noise.q_scale_of == "position":
+            return q * scale
+        newest = q[:, -1:]
+        return newest + (q - newest) * scale
 
     def _compute_privileged(self, estimate_m: torch.Tensor) -> torch.Tensor:
         """Return the group that only the critic sees, scaled to about 1.

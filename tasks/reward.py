@@ -7,6 +7,7 @@ names functions of its own there as `package.module:function`. The six terms of 
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
@@ -101,6 +102,50 @@ class RewardTerm:
     def __call__(self, state: ToolState) -> torch.Tensor:
         """Return the weighted term, `(N,)`."""
         return self.weight * resolve_name(self.function)(state)
+
+
+@spec
+class RewardCurriculum:
+    """Reward terms that begin with a part of their weight and get the rest as episodes succeed.
+
+    A beginner that pays in full for moving and touching stops to move. Success is counted over all
+    environments: of each the last episode.
+
+    Attributes:
+        begin: Part of its weight with which each term begins, by its name.
+        success: Share of successes up to which these parts hold, and from which on the full weights
+            do; linear between them.
+    """
+
+    begin: dict[str, float]
+    success: tuple[float, float]
+
+    def check(self) -> None:
+        for name, part in self.begin.items():
+            require_number(f"task.curriculum.begin.{name}", part, least=0)
+        low, high = self.success
+        if not 0.0 <= low < high <= 1.0:
+            raise ConfigError(
+                f"task.curriculum.success: expected 0 <= low < high <= 1, got [{low}, {high}]"
+            )
+
+    def check_names(self, reward: Collection[str]) -> None:
+        """Refuse names that are no terms of `reward`."""
+        if odd := sorted(self.begin.keys() - set(reward)):
+            raise ConfigError(
+                f"task.curriculum.begin: there is no reward term {', '.join(odd)}; expected some "
+                f"of {', '.join(sorted(reward))}"
+            )
+
+    def scale(self, succeeded: torch.Tensor) -> dict[str, torch.Tensor]:
+        """Return the part of its weight of each term, scalars.
+
+        Args:
+            succeeded: Whether the last episode of each environment succeeded, `(N,)`, 0 or 1.
+        """
+        low, high = self.success
+        share = ((succeeded.mean() - low) / (high - low)).clamp(0.0, 1.0)
+        return {name: part + (1.0 - part) * share for name, part in self.begin.items()}
 
 
 # the paper's equation 1

@@ -36,6 +36,8 @@ REACH_STEPS, REACH_MAX_STEP = 40, 0.1
 POSE_STEPS, POSE_STEP_S = 120, 0.2
 """Steps of the classical controller's approach, and the time of each, s. Chosen by hand: 24 s,
 longer than an episode of `borehole_insertion`."""
+NEAR_MARGIN_RAD = 0.08
+"""Distance from joint limits of an arm that is brought near its target; as in the default tasks."""
 POSE_TOLERANCE_M, POSE_TOLERANCE_RAD = 0.01, 0.03
 """Errors up to which a pose counts as reached. Chosen by hand: the clearance of the hole, and a
 fraction of the tolerance of `goal_pose`."""
@@ -192,6 +194,42 @@ class _DrawTally:
         )
 
 
+def move_starts_near(
+    start: dict[str, torch.Tensor],
+    share: float,
+    height_m: tuple[float, float],
+    seed: int,
+    machine: Machine,
+    controller: ClassicalController,
+    reach_m: tuple[float, float],
+) -> dict[str, torch.Tensor]:
+    """Return starts of which the first part begins upright above its target.
+
+    A beginner that never meets the target by chance learns from these what is to be gained there
+    (reverse curriculum, Florensa et al. 2017). Arms that do not get there stay as they are.
+
+    Args:
+        start: Starts, as `draw_starts` returns them.
+        share: Part of the starts that are brought near.
+        height_m: Heights of the tool point above `target_m`, (lowest, highest).
+        seed: The same seed gives the same heights.
+        machine: The machine.
+        controller: Gives kinematics and reach.
+        reach_m: Good working range.
+    """
+    count = round(share * len(start["q"]))
+    generator = torch.Generator().manual_seed(seed)
+    up = height_m[0] + (height_m[1] - height_m[0]) * torch.rand(count, 1, generator=generator)
+    above = start["target_m"][:count] + up * torch.tensor([0.0, 0.0, 1.0])
+    pitch_rad = start["target_pitch_rad"][:count]
+    q, good, reached = move_to_targets(
+        controller, machine, start["q"][:count], above, pitch_rad, reach_m, NEAR_MARGIN_RAD
+    )
+    moved = start["q"].clone()
+    moved[:count] = torch.where((good & reached)[:, None], q, moved[:count])
+    return start | {"q": moved}
+
+
 def draw_arms(
     arms: ArmStarts,
     machine: Machine,
@@ -226,14 +264,35 @@ def try_targets(
     reach_m: tuple[float, float],
     margin_rad: float,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Try to reach target poses from `q`, `(M, J)`, under the masks.
+    """Try to reach target poses from `q`, `(M, J)`; see `move_to_targets`.
+
+    Returns:
+        Whether the target came into the working range, `(M,)` bool, and whether the tool ended at
+        the wanted pose, `(M,)` bool.
+    """
+    _, good, reached = move_to_targets(
+        controller, machine, q, target_m, pitch_rad, reach_m, margin_rad
+    )
+    return good, reached
+
+
+def move_to_targets(
+    controller: ClassicalController,
+    machine: Machine,
+    q: torch.Tensor,
+    target_m: torch.Tensor,
+    pitch_rad: torch.Tensor,
+    reach_m: tuple[float, float],
+    margin_rad: float,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Move to target poses from `q`, `(M, J)`, under the masks.
 
     First the exclusive joints move until the reach lies well inside the good working range, then
     the others by damped least squares.
 
     Returns:
-        Whether the target came into the working range, `(M,)` bool, and whether the tool ended at
-        the wanted pose, `(M,)` bool.
+        The joint positions at the end, `(M, J)`, whether the target came into the working range,
+        `(M,)` bool, and whether the tool ended at the wanted pose, `(M,)` bool.
     """
     exclusive = torch.as_tensor(machine.is_exclusive)
     lower = torch.as_tensor(machine.lower, dtype=torch.float32) + margin_rad
@@ -259,4 +318,4 @@ def try_targets(
         q = (q + POSE_STEP_S * share * controller.speed).clamp(lower, upper)
     pose = controller.kinematics.pose(q)
     near = (target_m - pose.tip_in_base_m).norm(dim=1) < POSE_TOLERANCE_M
-    return good, near & ((pitch_rad - pose.pitch_rad).abs() < POSE_TOLERANCE_RAD)
+    return q, good, near & ((pitch_rad - pose.pitch_rad).abs() < POSE_TOLERANCE_RAD)

@@ -96,6 +96,8 @@ class Train:
         loop = config.build(
             device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts")
         )
+        if self.rl.near_starts:
+            loop.bring_near(self.rl.near_starts, self.session.stream("starts"))
         loop.capture(self.rl.fuse)
         group = TrainingGroup(device)
         _log_setup(loop, group)

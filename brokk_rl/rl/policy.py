@@ -135,7 +135,7 @@ class TrainedPolicy:
             return task
         return apply_behaviour(task, own, asked, f"the policy in {folder}")
 
-    def build(self, loop: ControlLoop, seed: int) -> Policy:
+    def build(self, loop: ControlLoop, seed: int) -> NetworkPolicy:
         """Return the policy.
 
         Raises:

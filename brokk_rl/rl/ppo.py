@@ -18,6 +18,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
@@ -127,6 +128,9 @@ class DevicePPO(PPO):
     """PPO for feed-forward networks.
 
     On a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread.
+
+    It may follow a teacher: the loss then holds the squared distance of the mean action from the
+    teacher's, in the states that the student itself meets (Ross et al. 2011; Schmitt et al. 2018).
     """
 
     _rollout: CapturedRollout | None = None
@@ -141,6 +145,18 @@ class DevicePPO(PPO):
     _wanted: torch.Tensor
     """`desired_kl`, which may change from update to update."""
     _sums: torch.Tensor
+    _teacher: MLPModel | None = None
+    _imitation: torch.Tensor
+    """Weight of the distance from the teacher."""
+
+    def follow(self, teacher: MLPModel) -> None:
+        """Follow a teacher, with weight 0 until `set_imitation`; call it before the first step."""
+        self._teacher = teacher.requires_grad_(False)
+        self._imitation = torch.zeros((), device=self.device)
+
+    def set_imitation(self, weight: float) -> None:
+        """Set the weight of the mean squared distance between the actions of both."""
+        self._imitation.fill_(weight)
 
     def act(self, obs: TensorDict) -> torch.Tensor:
         """Draw actions; see `rsl_rl.algorithms.PPO.act`."""
@@ -214,7 +230,8 @@ class DevicePPO(PPO):
         plain = not (
             self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent
         )
-        return plain and torch.device(self.device).type == "cuda"
+        # rsl-rl's own loss knows no teacher
+        return plain and (torch.device(self.device).type == "cuda" or self._teacher is not None)
 
     def _batch_size(self) -> int:
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
@@ -352,11 +369,21 @@ class DevicePPO(PPO):
                 value_loss = torch.max(value_loss, (near - returns).square())
             value_loss = value_loss.mean()
             loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        if self._teacher is not None:
+            loss = loss + self._imitation * self._measure_distance(self._teacher, observations)
         self._gathered.zero_()
         loss.backward()
         if self._is_adaptive:
             self._gathered[-1] = divergence
         self._sums.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
+
+    def _measure_distance(
+        self, teacher: MLPModel, observations: dict[str, torch.Tensor]
+    ) -> torch.Tensor:
+        """Return the mean squared distance of the mean action from the teacher's command."""
+        with torch.no_grad():
+            wanted = teacher.mlp(teacher.get_latent(observations))  # type: ignore[arg-type]
+        return (self.actor.output_mean - wanted.clamp(-1.0, 1.0)).square().mean()
 
     def _sum_up(self) -> None:
         """Add up gradients and divergence of all processes; the host does not wait for it."""

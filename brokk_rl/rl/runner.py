@@ -15,7 +15,10 @@ from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.errors import CheckpointError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
+from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.policy import TrainedPolicy
+from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.task_description import TaskDescription
@@ -67,6 +70,8 @@ class TrainingRunner(OnPolicyRunner):
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
         self.logger = logger  # type: ignore[assignment]
+        if training.teacher and isinstance(self.alg, DevicePPO):
+            self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)
 
     def run(self) -> None:
         """Train until the budget is spent; save a checkpoint every `save_interval`."""
@@ -78,6 +83,7 @@ class TrainingRunner(OnPolicyRunner):
                     self.training.budget.share_spent(self._book.env_steps, self._book.seconds)
                 )
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
+                self._follow_schedules(share)
             with contextlib.redirect_stdout(io.StringIO()):
                 self.learn(
                     num, init_at_random_ep_len=first and self.training.random_episode_lengths
@@ -89,6 +95,14 @@ class TrainingRunner(OnPolicyRunner):
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
+
+    def _follow_schedules(self, share_spent: float) -> None:
+        """Set the cap of the exploration noise and the teacher's weight, where there are any."""
+        distribution, teacher = self.alg.actor.distribution, self.training.teacher
+        if self.training.exploration and isinstance(distribution, CappedGaussian):
+            distribution.set_cap(self.training.exploration.cap_at(share_spent))
+        if teacher and isinstance(self.alg, DevicePPO):
+            self.alg.set_imitation(teacher.weight_at(share_spent))
 
     @property
     def _book(self) -> TrainingLogger:

@@ -15,6 +15,8 @@ from brokk_rl.spec import spec
 SETTLED_PART = 0.9
 """Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
 `TrainingConfig.settling`."""
+CAPPED = "brokk_rl.rl.exploration:CappedGaussian"
+"""The distribution whose cap `Exploration` moves."""
 RUNNER_BOUNDS: dict[str, dict[str, Any]] = {
     "num_steps_per_env": {"least": 1, "whole": True},
     "algorithm.num_learning_epochs": {"least": 1, "whole": True},
@@ -73,6 +75,76 @@ class TrainingBudget:
 
 
 @spec
+class Exploration:
+    """Schedule of the cap of the exploration noise over the budget.
+
+    A policy that learned with much noise may need it: without noise, valves rest in their dead
+    bands, and a tool rests on the rim.
+
+    Attributes:
+        cap: Largest standard deviation of the actions, (at the beginning, at the end).
+        over: Shares of the budget between which it falls; in equal ratios.
+    """
+
+    cap: tuple[float, float]
+    over: tuple[float, float]
+
+    def check(self) -> None:
+        for value in self.cap:
+            require_number("rl.exploration.cap", value, above=0)
+        require_range("rl.exploration.over", self.over, least=0)
+        require_number("rl.exploration.over", self.over[1], most=1)
+
+    def cap_at(self, share_spent: float) -> float:
+        """Return the cap when this share of the budget is spent."""
+        (first, last), (begin, end) = self.cap, self.over
+        done = float(share_spent >= end)
+        if end > begin:
+            done = min(1.0, max(0.0, (share_spent - begin) / (end - begin)))
+        return first * (last / first) ** done
+
+
+@spec
+class Teacher:
+    """A trained policy that a training follows at its beginning.
+
+    Attributes:
+        folder: Its bundle, as `policy.folder`; its task must act as the one that is trained.
+        weight: Weight of the mean squared distance between the actions of both at the beginning.
+        until: Share of the budget at which the weight has fallen to 0, linearly.
+    """
+
+    folder: str
+    weight: float
+    until: float
+
+    def check(self) -> None:
+        require_number("rl.teacher.weight", self.weight, above=0)
+        require_number("rl.teacher.until", self.until, above=0, most=1)
+
+    def weight_at(self, share_spent: float) -> float:
+        """Return the weight when this share of the budget is spent."""
+        return self.weight * max(0.0, 1.0 - share_spent / self.until)
+
+
+@spec
+class NearStarts:
+    """Starts of a training that begin near the target.
+
+    Attributes:
+        share: Part of the starts that are moved there, the tool upright above its target.
+        height_m: Heights above the target, (lowest, highest).
+    """
+
+    share: float
+    height_m: tuple[float, float]
+
+    def check(self) -> None:
+        require_number("rl.near_starts.share", self.share, above=0, most=1)
+        require_range("rl.near_starts.height_m", self.height_m)
+
+
+@spec
 class TrainingConfig:
     """Numbers of a training with rsl-rl's PPO.
 
@@ -86,6 +158,11 @@ class TrainingConfig:
         keep_checkpoints: Newest checkpoints kept.
         settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
             learn fast, small ones keep it.
+        exploration: Schedule of the cap of the exploration noise; `null` for that of the
+            distribution. The actor's distribution must be
+            `brokk_rl.rl.exploration:CappedGaussian`.
+        teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
+        near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
@@ -103,6 +180,9 @@ class TrainingConfig:
     save_interval: int
     keep_checkpoints: int
     settling: float
+    exploration: Exploration | None
+    teacher: Teacher | None
+    near_starts: NearStarts | None
     max_fault_rate: float
     fuse: bool
     random_episode_lengths: bool
@@ -115,6 +195,13 @@ class TrainingConfig:
         for name in ("settling", "max_fault_rate"):
             require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
         self._check_runner()
+        distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}
+        if self.exploration and distribution.get("class_name") != CAPPED:
+            raise ConfigError(
+                f"rl.exploration: expected the distribution {CAPPED} "
+                "(rl.runner.actor.distribution_cfg.class_name), got "
+                f"{distribution.get('class_name')}"
+            )
 
     def _check_runner(self) -> None:
         """Refuse numbers that rsl-rl would take without a word, and parts of it that fail later."""

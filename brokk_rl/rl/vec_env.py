@@ -26,9 +26,11 @@ from brokk_rl.contracts.actuator import (
 )
 from brokk_rl.contracts.task import FAULT, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, World
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
+from brokk_rl.rl.settings import NearStarts
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.task_description import TaskDescription, describe_task
 
@@ -196,6 +198,22 @@ class ControlLoop(VecEnv):
             self.world.reset(self.done, start["q"], start["scene"])
             self._perceive(start)
             self.done.fill_(False)
+
+    def bring_near(self, near: NearStarts, seed: int) -> None:
+        """Move part of the starts near their targets, before `capture`.
+
+        Raises:
+            ConfigError: The task cannot do that.
+        """
+        move = getattr(self.task, "bring_near", None)
+        if move is None:
+            raise ConfigError(
+                f"rl.near_starts: the task ({type(self.task).__name__}) has no method bring_near; "
+                "give rl.near_starts=null"
+            )
+        moved = move(self.starts, near.share, near.height_m, seed)
+        self.starts = {name: value.to(self.device) for name, value in moved.items()}
+        self.begin()
 
     def capture(self, fuse: bool = False) -> None:
         """Capture the control step in a CUDA graph where device and world allow it.

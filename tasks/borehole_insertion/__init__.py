@@ -14,7 +14,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
 from brokk_rl.spec import spec
 from tasks.noise import MeasuredNoise, ObservationNoise
-from tasks.reward import RewardTerm
+from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.settings import ActionMapping, AdviceConfig, ArmStarts, ClassicalConfig, PhaseSwitch
 
 if TYPE_CHECKING:
@@ -100,6 +100,7 @@ class BoreholeInsertion:
         scaling: Normalisation of the hole position.
         classical: The classical controller, baseline and base of residual actions.
         reward: Reward terms by name.
+        curriculum: Terms whose weights grow with success; `null` for constant weights.
     """
 
     episode_s: float
@@ -117,6 +118,7 @@ class BoreholeInsertion:
     scaling: TargetScaling
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
+    curriculum: RewardCurriculum | None
 
     behaviour: ClassVar[tuple[str, ...]] = (
         "depth_m",
@@ -135,6 +137,8 @@ class BoreholeInsertion:
         require_number("task.memory", self.memory, least=1)
         for name in ("limit_margin", "depth_m"):
             require_number(f"task.{name}", getattr(self, name))
+        if self.curriculum:
+            self.curriculum.check_names(self.reward)
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""

@@ -15,7 +15,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
 from brokk_rl.spec import spec
 from tasks.noise import ObservationNoise
-from tasks.reward import RewardTerm
+from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.settings import ActionMapping, AdviceConfig, ArmStarts, ClassicalConfig, PhaseSwitch
 
 if TYPE_CHECKING:
@@ -85,6 +85,7 @@ class GoalPose:
         scaling: Normalisation of target point and pitch.
         classical: The classical controller, baseline and base of residual actions.
         reward: Reward terms by name.
+        curriculum: Terms whose weights grow with success; `null` for constant weights.
     """
 
     episode_s: float
@@ -101,6 +102,7 @@ class GoalPose:
     scaling: TargetScaling
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
+    curriculum: RewardCurriculum | None
 
     behaviour: ClassVar[tuple[str, ...]] = (
         "memory",
@@ -117,6 +119,8 @@ class GoalPose:
         require_number("task.episode_s", self.episode_s, above=0)
         require_number("task.memory", self.memory, least=1)
         require_number("task.limit_margin", self.limit_margin)
+        if self.curriculum:
+            self.curriculum.check_names(self.reward)
         if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:
             raise ConfigError(
                 "task.scaling.pitch_rad: the wanted pitch differs between episodes, so the "

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from composed import option
 
 from brokk_rl.errors import ConfigError
 from tasks import reward
-from tasks.reward import ToolState
+from tasks.reward import RewardCurriculum, ToolState
 
 YES, NO = torch.tensor([True]), torch.tensor([False])
 
@@ -159,3 +160,42 @@ def test_an_episode_pays_for_its_hardest_blow_once(
         contact_force_n=torch.tensor([float(now_n)]),
     )
     assert reward.peak_contact(blow).item() == pytest.approx(expected)
+
+
+def curriculum(**changes: object) -> RewardCurriculum:
+    parts = {"begin": {"command_change": 0.2, "failure": 0.0}, "success": (0.5, 0.9)} | changes
+    return RewardCurriculum(**parts)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("succeeded", "command_change", "failure"),
+    [(0, 0.2, 0.0), (5, 0.2, 0.0), (6, 0.4, 0.25), (7, 0.6, 0.5), (9, 1.0, 1.0), (10, 1.0, 1.0)],
+)
+def test_a_curriculum_raises_its_terms_between_two_shares_of_successes(
+    succeeded: int, command_change: float, failure: float
+) -> None:
+    outcomes = (torch.arange(10) < succeeded).float()
+    scale = {name: part.item() for name, part in curriculum().scale(outcomes).items()}
+    assert scale == pytest.approx({"command_change": command_change, "failure": failure})
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"success": (0.9, 0.5)}, "success: expected 0 <= low < high <= 1"),
+        ({"success": (0.5, 0.5)}, "success: expected 0 <= low < high <= 1"),
+        ({"success": (0.5, 1.1)}, "success: expected 0 <= low < high <= 1"),
+        ({"begin": {"failure": -0.1}}, "begin.failure: expected a finite number of 0 or more"),
+    ],
+)
+def test_a_curriculum_that_makes_no_sense_is_refused(changes: dict, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        curriculum(**changes)
+
+
+@pytest.mark.parametrize("name", ["borehole_insertion", "goal_pose"])
+def test_a_curriculum_of_a_term_that_the_task_lacks_is_refused(name: str) -> None:
+    task = option("task", name)
+    with pytest.raises(ConfigError, match=r"there is no reward term speed; expected some of .*"):
+        replace(task, curriculum=curriculum(begin={"speed": 0.5}))
+    replace(task, curriculum=curriculum(begin={"failure": 0.5}))

@@ -14,9 +14,11 @@ from composed import option
 from torch._dynamo.exc import BackendCompilerFailed
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import evaluate_policy
 from brokk_rl.rl.policy import ClassicalPolicy, UntrainedPolicy
+from brokk_rl.rl.settings import NearStarts
 from brokk_rl.rl.vec_env import ControlLoop
 
 CPU = torch.device("cpu")
@@ -264,3 +266,29 @@ def test_without_a_compiler_it_says_what_to_do(
     monkeypatch.setattr(loop, "_advance", fail)
     with pytest.raises(ConfigError, match=r"(?s)rl.fuse.*g\+\+"):
         loop.capture(fuse=True)
+
+
+def test_part_of_the_starts_of_a_training_lies_above_the_target(machine: Machine) -> None:
+    loop = make(machine)
+    before = {name: value.clone() for name, value in loop.starts.items()}
+    loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3)), 1)
+    start = loop.starts
+    pose = Kinematics(machine).pose(start["q"][:32])
+    away = pose.tip_in_base_m - start["target_m"][:32]
+    near = away[:, :2].norm(dim=1) < 0.01
+    assert near.float().mean() > 0.9, "few arms cannot get there, and stay"
+    height_m = away[near, 2]
+    assert height_m.min() > 0.04 and height_m.max() < 0.31 and height_m.std() > 0.03
+    assert (pose.pitch_rad[near] - torch.pi / 2).abs().max() < 0.03
+    assert torch.equal(start["q"][32:], before["q"][32:])
+    for name in ("target_m", "scene"):
+        assert torch.equal(start[name], before[name])
+    assert (start["closeness"][:32][near] > before["closeness"][:32][near]).all()
+    assert (loop.world.q[:, None] == start["q"]).all(2).any(1).all(), "the episodes begin there"
+
+
+def test_a_task_that_cannot_bring_its_starts_near_says_so(machine: Machine) -> None:
+    loop = make(machine)
+    loop.task = object()  # type: ignore[assignment]
+    with pytest.raises(ConfigError, match=r"rl\.near_starts: the task \(object\) has no method"):
+        loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3)), 1)

@@ -96,6 +96,41 @@ def test_it_learns_the_same_as_rsl_rls_own(changes: dict) -> None:
     torch.testing.assert_close(ours.actor.obs_normalizer.mean, theirs.actor.obs_normalizer.mean)
 
 
+def _teacher() -> MLPModel:
+    torch.manual_seed(7)
+    seen = TensorDict({"policy": torch.zeros(1, 7)}, batch_size=[1])
+    noise = {"class_name": "GaussianDistribution"}
+    return MLPModel(seen, GROUPS, "actor", 3, (16,), distribution_cfg=noise)
+
+
+def test_a_teacher_of_no_weight_changes_nothing() -> None:
+    alone, taught = _algorithm(DevicePPO), _algorithm(DevicePPO)
+    taught.follow(_teacher())
+    for seed in range(2):
+        _iteration(alone, seed)
+        _iteration(taught, seed)
+    for mine, other in zip(taught.actor.parameters(), alone.actor.parameters(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-6)
+
+
+def test_a_teacher_is_followed_to_its_command() -> None:
+    """Its outputs are clamped: beyond a full stroke there is nothing to imitate."""
+    algorithm, teacher = _algorithm(DevicePPO, schedule="fixed"), _teacher()
+    with torch.no_grad():
+        teacher.mlp[-1].bias.copy_(torch.tensor([0.3, -0.3, 40.0]))
+    before = [p.clone() for p in teacher.parameters()]
+    algorithm.follow(teacher)
+    algorithm.set_imitation(1000.0)
+    for seed in range(60):
+        _iteration(algorithm, seed)
+    seen = TensorDict({"policy": torch.randn(64, 7)}, batch_size=[64])
+    wanted = teacher(seen).clamp(-1.0, 1.0)
+    assert (wanted[:, 2] == 1.0).all()
+    away = (algorithm.actor(seen) - wanted).square().mean().sqrt()
+    assert away < 0.15 and (0.0 - wanted).square().mean().sqrt() > 0.5
+    assert all(torch.equal(p, q) for p, q in zip(teacher.parameters(), before, strict=True))
+
+
 def test_the_learning_rate_moves_both_ways() -> None:
     """Otherwise the comparison above would not see the rule."""
     rates = []

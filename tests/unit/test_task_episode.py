@@ -18,6 +18,7 @@ from brokk_rl.machine import Machine
 from tasks import starts
 from tasks.classical import ClassicalController
 from tasks.process import REASONS
+from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.starts import try_targets
 
 CPU = torch.device("cpu")
@@ -457,6 +458,39 @@ def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Mac
     stage.step()
     stage.process.observe(stage.history)
     assert torch.equal(before, stage.process.state["q_scale"])
+
+
+def test_a_scale_of_the_motion_leaves_the_newest_position_as_it_is(machine: Machine) -> None:
+    torch.manual_seed(0)
+    stage = Stage(machine, num_envs=64, noise=noise(q_scale=0.1, q_scale_of="motion"))
+    stage.history.q.copy_(torch.linspace(0.4, 1.0, 13)[None, :, None].expand(64, 13, 5))
+    _, q, _ = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
+    assert torch.allclose(q[:, -1], torch.ones(64, 5), atol=1e-6)
+    factor = (q[:, -1:] - q[:, :-1]) / (1.0 - stage.history.q[:, :-1])
+    assert (factor - stage.process.state["q_scale"][:, None, None]).abs().max() < 1e-4
+    assert factor.min() < 0.92 and factor.max() > 1.08
+
+
+def test_penalties_grow_with_the_share_of_worlds_whose_last_episode_succeeded(
+    machine: Machine,
+) -> None:
+    """Four worlds. `duration` pays 1 in each step: a quarter of it at first, all of it once all have succeeded."""
+    terms = {"time": RewardTerm(function="tasks.reward:duration", weight=1.0)}
+    rule = RewardCurriculum(begin={"time": 0.25}, success=(0.0, 1.0))
+    stage = Stage(machine, num_envs=4, reward=terms, curriculum=rule)
+    assert stage.step().reward.tolist() == [0.25] * 4
+    process, done = stage.process, torch.tensor([True, True, False, False])
+    process.episode["success_strict"].copy_(torch.tensor([1.0, 0.0, 1.0, 0.0]))
+    assert stage.step().reward.tolist() == [0.25] * 4, "an episode counts once it has ended"
+    process.reset(done, stage.start)
+    assert stage.step().reward.tolist() == [0.25 + 0.75 / 4] * 4
+    process.reset(~done, stage.start)
+    assert stage.step().reward.tolist() == [0.25 + 0.75 / 2] * 4
+    process.episode["success_strict"].fill_(1.0)
+    process.reset(done | ~done, stage.start)
+    assert stage.step().reward.tolist() == [1.0] * 4
+    process.reset(done | ~done, stage.start)
+    assert stage.step().reward.tolist() == [0.25] * 4, "and falls again where they fail"
 
 
 def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
