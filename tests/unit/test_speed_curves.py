@@ -184,3 +184,12 @@ def test_held_joints_keep_their_sizes_when_an_effect_goes(axis: Machine, banded:
         banded, rays, dataclasses.replace(fitted, held=frozenset()), [frozenset({"dead_band"})]
     )
     assert np.abs(free.sizes[:, 0] - [1.0, 2.0]).max() > 0.5, "else sizes are fitted anew"
+
+
+def test_a_simulator_without_numbers_of_its_own_is_wrong_in_its_speeds_only(
+    axis: Machine, banded: Residuals
+) -> None:
+    """`faults` of a servo that follows at once: the speed of either side."""
+    simulator = dataclasses.replace(banded.simulator, base=option("actuator", "ideal"))
+    plain = dataclasses.replace(banded, simulator=simulator)
+    assert plain.faults.shape == (1, 2, plain.z.shape[1])
