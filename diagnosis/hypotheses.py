@@ -184,6 +184,10 @@ class Choice:
         found = [name for name in near if self.probability(name) > least]
         return tuple(sorted(found, key=lambda name: -self.probability(name))[:MAX_SAME])
 
+    def list_class(self) -> tuple[str, ...]:
+        """Return the best effect and those that are nearly as likely; empty without any."""
+        return (self.best.name, *self.list_equivalents()) if self.best else ()
+
     def rank(self, selected: Sequence[Selected], joint_names: Sequence[str]) -> list[Ranked]:
         """Return effects, `none` and `unknown`, the most probable first; those `selected` as they are told."""
         told = {one.effect: Ranked(one.effect, one.joints, one.probability) for one in selected}
@@ -235,7 +239,10 @@ def apply_choice(
         return replace(result, chosen=empty, fitted=None, detected=detected)
     alone = result.alone or result.tables
     gain = sum(alone[j].score(frozenset({best.name})).total for j in best.joints)
-    if best.name in searched.chosen.names or _has_much_more_gain(searched, gain):
+    names = searched.chosen.names
+    # Of effects that cannot be told apart the search names the one that it has simulated.
+    is_alike = bool(names) and names <= {*choice.list_equivalents()}
+    if best.name in names or is_alike or _has_much_more_gain(searched, gain):
         return replace(searched, detected=detected)
     subsets = [frozenset[str]() for _ in alone]
     start: list[dict[str, np.ndarray]] = [{} for _ in alone]

@@ -36,7 +36,7 @@ from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
 from diagnosis.effect_library import DetectedEffect, EffectSimulator, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
-from diagnosis.hypotheses import Choice, Hypothesis
+from diagnosis.hypotheses import MAX_SAME, Choice, Hypothesis
 from diagnosis.refine import FittedSet
 from diagnosis.residual_model import CLUES
 from diagnosis.rivals import Rival
@@ -223,9 +223,10 @@ class DiagnosisPipeline:
                 result, self.penalties, self.calibration, kind.name, swaps, like
             )
             probability = calibration.compute_probability(self.calibration.right, signs)
-            if weighing.best and weighing.best.name == kind.name:
-                like = weighing.list_equivalents() or like
-                probability = weighing.probability(kind.name, *like)
+            alike = weighing.list_class()
+            if kind.name in alike:
+                like = tuple(name for name in alike if name != kind.name)[:MAX_SAME] or like
+                probability = weighing.probability(*alike)
             joints = result.fitted.joints_of(kind)
             decided = next(
                 (how for pair, how in DECIDED_BY.items() if kind.name in pair and pair & set(like)),

@@ -198,3 +198,18 @@ def test_a_set_that_explains_half_as_much_again_is_told(
     monkeypatch.setattr(hypotheses, "fit_set", lambda *_: "anew")
     found = hypotheses.apply_choice(result, choice_of("effects", "dead_band"), prices, weights)
     assert (found.fitted is result.fitted) is kept
+
+
+@pytest.mark.parametrize(("play", "kept"), [(0.5, True), (0.3, False)])
+def test_of_effects_that_cannot_be_told_apart_the_searched_one_is_named(
+    weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch, play: float, kept: bool
+) -> None:
+    prices: Penalties = option("prices", "default")
+    searched = dataclasses.replace(findings(0.5, ("dead_band",)), fitted=cast(Any, "searched"))
+    monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
+    monkeypatch.setattr(hypotheses, "fit_set", lambda *_: "anew")
+    likely, other = Hypothesis("lag", (0,), {}), Hypothesis("dead_band", (0,), {})
+    choice = Choice([likely, other], np.array([1.0, play]), "effects", likely)
+    assert choice.list_class() == (("lag", "dead_band") if kept else ("lag",))
+    found = hypotheses.apply_choice(searched, choice, prices, weights)
+    assert found.fitted == ("searched" if kept else "anew")
