@@ -19,7 +19,14 @@ from diagnosis.residual_model import CLUES, CURVE, FORMS, LATER, STARTS, TIME
 
 OUTSIDE_SIGNS = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
 EFFECT_SIGNS = ("constant", "margin", "adds", "size", "names", "outside")
-NONE_SIGNS = ("constant", "nearest", "outside")
+GAP_SIGNS = (*OUTSIDE_SIGNS, "error", "worst", "gain")
+CHOICE_SIGNS = {
+    "effects": ("gain", "reference", "joints", "size", "shared"),
+    "none": GAP_SIGNS,
+    "unknown": GAP_SIGNS,
+    "stakes": ("effects", "none", "unknown"),
+}
+"""Signs of the hypotheses of each verdict, and the verdicts that have a stake; see `hypotheses`."""
 STAGES = ("timing", "actuation", "sensing", "kinematics", "perception")
 REFERENCE_FACTOR = 1.5
 """Times that a clue must earn what it earns on the reference before it counts."""
@@ -43,36 +50,39 @@ class ProbabilityModel:
         outside: Of the signs that the cause lies outside the library; their weighted sum is the
             logarithm of the odds.
         right: Of the signs that an effect is rightly named.
-        none: Of the signs that there is nothing to find, where nothing was found.
         form: Relative model-form error of the size of an effect, 1 sigma, by stage.
-        temperature: Deficit of net gain, nats, that divides the odds of an effect that was not named by e.
+        choice: Of the signs of hypotheses, by verdict, and the `stakes`: factors on the probability of
+            each verdict when one is told.
     """
 
     outside: dict[str, float]
     right: dict[str, float]
-    none: dict[str, float]
     form: dict[str, float]
-    temperature: float
+    choice: dict[str, dict[str, float]]
 
     def check(self) -> None:
         known = {
             "outside": OUTSIDE_SIGNS,
             "right": EFFECT_SIGNS,
-            "none": NONE_SIGNS,
             "form": STAGES,
+            "choice": tuple(CHOICE_SIGNS),
         }
+        given = {name: getattr(self, name) for name in known}
+        for verdict, signs in CHOICE_SIGNS.items():
+            known[f"choice.{verdict}"] = signs
+            given[f"choice.{verdict}"] = self.choice.get(verdict, {})
         for name, signs in known.items():
-            for sign in getattr(self, name):
+            for sign in given[name]:
                 if sign not in signs:
                     raise ConfigError(
                         f"certainty.{name}: '{sign}' is no sign; {list_choices(sign, signs)}"
                     )
-            if missing := [sign for sign in signs if sign not in getattr(self, name)]:
+            if missing := [sign for sign in signs if sign not in given[name]]:
                 raise ConfigError(
                     f"certainty.{name}: expected a number for {', '.join(missing)} too"
                 )
-        if min(self.form.values()) < 0 or self.temperature <= 0:
-            raise ConfigError("certainty: expected form of 0 or more and temperature above 0")
+        if min(self.form.values()) < 0:
+            raise ConfigError("certainty: expected form of 0 or more")
 
 
 def compute_probability(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:
@@ -141,20 +151,6 @@ def collect_effect_signs(
         "adds": float(np.log(np.clip(adds, 0.01, 1.0))),
         "size": float(np.log(np.clip(size, 0.05, 3.0))),
         "names": names - 1.0,
-        "outside": outside,
-    }
-
-
-def collect_none_signs(nearest: float, outside: float) -> dict[str, float]:
-    """Return the signs that there is nothing to find.
-
-    Args:
-        nearest: Net gain of the best effect, nats; it was not enough.
-        outside: Logarithm of the odds that the cause lies outside.
-    """
-    return {
-        "constant": 1.0,
-        "nearest": float(np.arcsinh(nearest / LITTLE_NATS)),
         "outside": outside,
     }
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from diagnosis import calibration
-from diagnosis.answer import Estimate, Ranked, Selected
+from diagnosis.answer import Estimate, Selected
 from diagnosis.calibration import ProbabilityModel
 from diagnosis.detection import DetectionResult, Penalties, choose_by_penalties
 from diagnosis.effect_library import DetectedEffect, EffectType, list_shared_effects
@@ -100,18 +100,14 @@ def restore_result(
                 )
             )
     residuals = cast(Residuals, SimpleNamespace(z=np.zeros((len(tables), told["entries"]))))
-    arrays = {
-        "clue_gains": np.array(told["left"]),
-        "reference_clue_gains": np.array(told["left_null"]),
-        "scatter": np.array(told["scatter"]),
-        "strays": np.array(told["strays"]),
-    }
     rays = {}
     for joint in told["joints"]:
         rays |= {name: [] for name in joint["felt"]}
     return DetectionResult(
-        residuals, tables, rays, price, chosen, None, others, tool_left=told["tool_left"], **arrays
-    )
+        residuals, tables, rays, price, chosen, None, others,
+        np.array(told["left"]), np.array(told["left_null"]), np.array(told["scatter"]),
+        np.array(told["strays"]), told["tool_left"],
+    )  # fmt: skip
 
 
 def choose_again(
@@ -125,25 +121,17 @@ SAME_SHARE = 0.9
 """An effect that earns so much of what another earns in its place cannot be told from it."""
 SAME_NATS = 3.0
 """Difference in log likelihood that says nothing."""
-MAX_LISTED = 8
-"""Longest ranking. Chosen by hand; not searched."""
 MAX_EQUIVALENTS = 3
 """Longest list of equivalent effects. Chosen by hand; not searched."""
 MIN_NAMED = 0.5
 """Probability from which a further effect is named: one that is missed costs what a wrong one
 does."""
-MIN_UNKNOWN = 0.4
-"""Probability from which an unknown cause is told in the place of effects. On 119 answers from
-practice plants of other making, 0.27 as before names three effects fewer than 0.4 and finds no
-unknown cause more; from 0.5 on unknown causes are lost."""
 MIN_CERTAIN = 0.9
 """Probability from which what sensors, frames or tool points show is told, however probable an
 unknown cause is beside it."""
 MIN_CLUE_NATS = 15.0
 """Evidence of a clue, beyond that on the reference, from which the report says that something is
 left on a joint."""
-TOOL_UNKNOWN = 0.9
-"""Probability of an unknown cause where tool points are off and no effect moves them so."""
 MAX_SCATTER = 1.6
 """Mean square error over that of the reference from which it says the same."""
 
@@ -262,17 +250,6 @@ def read_detected_signs(
     return calibration.collect_effect_signs(found.net_gain, 1.0, 1.0, len(result.names), outside)
 
 
-def read_none_signs(
-    result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
-) -> dict[str, float]:
-    """Return the signs that there is nothing to find."""
-    gains = [_score_alone(result, penalties, name)[0] for name in result.rays]
-    outside = calibration.compute_log_odds(
-        weights.outside, calibration.collect_outside_signs(result)
-    )
-    return calibration.collect_none_signs(max(gains, default=-penalties.name), outside)
-
-
 def estimate_numbers(
     result: DetectionResult, kind: EffectType, machine: Machine, form: float
 ) -> dict[str, dict[str, Estimate]]:
@@ -320,17 +297,6 @@ def find_unexplained_joints(result: DetectionResult) -> np.ndarray:
     )
 
 
-def compute_unknown_probability(
-    result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
-) -> float:
-    """Return the probability that the cause lies outside the library."""
-    found = calibration.compute_probability(
-        weights.outside, calibration.collect_outside_signs(result)
-    )
-    seen = any(one.kind.stage in ("kinematics", "sensing") for one in result.detected)
-    return max(found, TOOL_UNKNOWN) if result.tool_left > penalties.tool and not seen else found
-
-
 def compute_effect_probabilities(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> dict[str, float]:
@@ -347,24 +313,6 @@ def compute_effect_probabilities(
     return found
 
 
-def is_unknown(result: DetectionResult, penalties: Penalties, weights: ProbabilityModel) -> bool:
-    """Return True where the answer is an unknown cause.
-
-    Beside named effects, the probability of an unknown cause must exceed `MIN_UNKNOWN`. Without
-    any, it must exceed that of no effect.
-    Sensors, frames or tool points may show an effect for sure. Any further cause is then a
-    remainder.
-    """
-    named = compute_effect_probabilities(result, penalties, weights)
-    if any(named[one.kind.name] >= MIN_CERTAIN for one in result.detected):
-        return False
-    chances, least = list(named.values()), MIN_UNKNOWN
-    if not chances:
-        signs = read_none_signs(result, penalties, weights)
-        chances, least = [calibration.compute_probability(weights.none, signs)], 0.5
-    return compute_unknown_probability(result, penalties, weights) > min(least, max(chances))
-
-
 def drop_unlikely_effects(
     result: DetectionResult, penalties: Penalties, weights: ProbabilityModel
 ) -> DetectionResult:
@@ -373,8 +321,14 @@ def drop_unlikely_effects(
     The rest is judged again each time: an effect may gain only beside another.
     """
     kept = result
+    held = result.fitted.held if result.fitted else ()
+    # Sizes that carry further than the likelihood's say more than its gain.
+    shown = frozenset[str]().union(*(result.chosen.subsets[j] for j in held))
     while len(chances := compute_effect_probabilities(kept, penalties, weights)) > 1:
-        least = min(chances, key=chances.__getitem__)
+        rest = chances.keys() - shown
+        if not rest:
+            break
+        least = min(rest, key=chances.__getitem__)
         if chances[least] >= MIN_NAMED:
             break
         chosen = EffectSet(
@@ -429,44 +383,3 @@ def _widen_estimate(one: Estimate, none: float, form: float) -> Estimate:
         + none
     )
     return Estimate(float(value), (float(low), float(high)))
-
-
-def rank_hypotheses(
-    result: DetectionResult,
-    selected: Sequence[Selected],
-    penalties: Penalties,
-    weights: ProbabilityModel,
-    machine: Machine,
-    unknown: float,
-) -> list[Ranked]:
-    """Return all rivals worth naming, most probable first; `none` and `unknown` among them, none above an unknown that is told."""
-    named = {one.effect: Ranked(one.effect, one.joints, one.probability) for one in selected}
-    is_told = is_unknown(result, penalties, weights)
-    most = min(unknown, 1.0 - unknown) if is_told else 1.0 - unknown
-    over = max(result.chosen.net_gain, 0.0)
-    for name in result.rays:
-        worth, places = _score_alone(result, penalties, name)
-        if name not in named and places:
-            odds = float(np.clip((worth - over) / weights.temperature, -30.0, 30.0))
-            joints = tuple(machine.joint_names[j] for j in places)
-            named[name] = Ranked(name, joints, min(float(1.0 / (1.0 + np.exp(-odds))), most))
-    chances = [one.probability for one in selected]
-    nothing = calibration.compute_probability(
-        weights.none, read_none_signs(result, penalties, weights)
-    )
-    least = 1.0 - max([*chances, unknown if unknown > 0.5 else 0.0])
-    none = min(nothing, least, most if is_told else 1.0)
-    rows = [*named.values(), Ranked("none", (), none), Ranked("unknown", (), unknown)]
-    return sorted(rows, key=lambda one: -one.probability)[:MAX_LISTED]
-
-
-def _score_alone(
-    result: DetectionResult, penalties: Penalties, name: str
-) -> tuple[float, list[int]]:
-    """Return the net gain of a single effect, and the joints on which it is positive."""
-    only, worth, places = frozenset({name}), -penalties.name, []
-    for j, table in enumerate(result.tables):
-        if only in table.scores and table.scores[only].total > penalties.joint:
-            more = table.scores[only].total - result.price(j, only)
-            worth, places = worth + max(more, 0.0), [*places, *([j] if more > 0 else [])]
-    return worth, places

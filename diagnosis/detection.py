@@ -33,6 +33,7 @@ from diagnosis.responses import (
     Response,
     choose_rays,
     fit_joint_faults,
+    rewhiten_responses,
     scale_responses,
     simulate_effect,
 )
@@ -76,8 +77,6 @@ class Penalties:
         partial: For each joint that lacks an effect with one cause for all joints.
         share: Least part of the gain of its joint's set: an effect that adds less only corrects the
             form of another.
-        tool: Error of measured tool points over that of the reference from which something unknown
-            is there.
     """
 
     joint: float
@@ -85,7 +84,21 @@ class Penalties:
     name: float
     partial: float
     share: float
-    tool: float
+
+
+@dataclass(frozen=True)
+class CandidateEffects:
+    """Effects to choose among.
+
+    Attributes:
+        residuals: Residuals of the simulator on the field.
+        rays: Rays of each effect.
+        shapes: Responses of each joint to each effect, one a ray.
+    """
+
+    residuals: Residuals
+    rays: dict[str, list[ParameterRay]]
+    shapes: list[dict[str, list[Response]]]
 
 
 @dataclass
@@ -107,6 +120,8 @@ class DetectionResult:
         strays: Free-run error with the set over that on the reference, each over its expectation
             under the noise, `(J,)`.
         tool_left: Remaining error of measured tool points over that of the reference.
+        alone: Scores of effects by themselves, before any was chosen.
+        alone_rays: Their rays; `None` for restored findings.
     """
 
     residuals: Residuals
@@ -121,26 +136,13 @@ class DetectionResult:
     scatter: np.ndarray
     strays: np.ndarray
     tool_left: float
+    alone: Sequence[SubsetTable] = ()
+    alone_rays: dict[str, list[ParameterRay]] | None = None
 
     @property
     def names(self) -> set[str]:
         """All effects that were found."""
         return {*self.chosen.names, *(one.kind.name for one in self.detected)}
-
-
-@dataclass(frozen=True)
-class CandidateEffects:
-    """Effects to choose among.
-
-    Attributes:
-        residuals: Residuals of the simulator on the field.
-        rays: Rays of each effect.
-        shapes: Responses of each joint to each effect, one a ray.
-    """
-
-    residuals: Residuals
-    rays: dict[str, list[ParameterRay]]
-    shapes: list[dict[str, list[Response]]]
 
 
 @dataclass(frozen=True)
@@ -198,8 +200,9 @@ class EffectSearch:
         effects = self._simulate_effects(residuals)
         price = self._build_price(effects)
         search = self._choose(effects, price, np.ones(self.case.machine.num_joints))
+        alone = search.tables
         self.tell("what the speed curves show", 0.66)
-        shown = []
+        shown, proposed = [], []
         if self.curves is not None:
             proposed = shown_effects.propose_effects(self.curves, self.kinds, self.case.machine)
             parts = (effects.rays, effects.shapes, search.fitted, price)
@@ -220,6 +223,11 @@ class EffectSearch:
             # The mean delay depends on the other effects, and these on it: hence two rounds.
             search = _add_mean_delay(search, late) if late else search
             search = self._choose(search.effects, price, scatter, search.wide)
+        parts = (search.effects.rays, search.effects.shapes, search.fitted)
+        kept = shown_effects.keep_shown_numbers(search.effects.residuals, proposed, *parts)
+        if kept is not None:
+            chosen = EffectSet(refine.list_subsets(kept), search.chosen.net_gain)
+            search = replace(search, chosen=chosen, fitted=kept)
         self.tell("what is left", 0.92)
         others = [*on_sensors, *on_tool.found, *([late] if late else [])]
         beside = residual_model.apply_fitted_set(search.effects.residuals, search.fitted)
@@ -227,6 +235,7 @@ class EffectSearch:
         return DetectionResult(
             search.effects.residuals, search.tables, search.effects.rays, price, search.chosen, search.fitted,
             others, left, reference_clue_gains, self._scatter(beside.z), self._strays(beside), on_tool.left,
+            alone, effects.rays,
         )  # fmt: skip
 
     @property
@@ -419,7 +428,9 @@ class EffectSearch:
             return None, search
         # From here on residuals scatter after each change of a command.
         noisy = replace(search.effects.residuals, late=changes.spread(error))
-        return late, replace(search, effects=_rewhiten_effects(search.effects, noisy))
+        shapes = rewhiten_responses(search.effects.shapes, search.effects.residuals, noisy)
+        effects = CandidateEffects(noisy, search.effects.rays, shapes)
+        return late, replace(search, effects=effects)
 
     def _scatter(self, z: np.ndarray) -> np.ndarray:
         """Return the mean square of whitened residuals `(J, E)` over that of the reference, outliers cut, `(J,)`."""
@@ -481,18 +492,6 @@ def _add_mean_delay(search: SearchState, late: DetectedEffect) -> SearchState:
     if search.wide and fitted:
         wide = nonadditive_refit.simulate_beside(residuals, effects.rays, fitted)
     return replace(search, effects=replace(effects, residuals=residuals), wide=wide)
-
-
-def _rewhiten_effects(effects: CandidateEffects, noisy: Residuals) -> CandidateEffects:
-    """Return the effects with residuals `noisy`, responses whitened by their noise."""
-    shapes: list[dict[str, list[Response]]] = []
-    for j, mine in enumerate(effects.shapes):
-        shapes.append({})
-        for name, own in mine.items():
-            changes = [noisy.rewhiten(effects.residuals, one.change, j) for one in own]
-            pairs = zip(own, changes, strict=True)
-            shapes[j][name] = [replace(one, change=change) for one, change in pairs]
-    return CandidateEffects(noisy, effects.rays, shapes)
 
 
 def _sum_scores(tables: Sequence[SubsetTable], chosen: EffectSet) -> float:

@@ -61,6 +61,7 @@ class FittedSet:
         own: The same with the sizes fitted to their own half: the prediction of `after`.
         z: Errors of `after` over the noise, `(J, E)`.
         deviation: Standard errors of the sizes, `(R, J)`.
+        held: Joints whose sizes are given, not fitted here.
     """
 
     rays: Sequence[ParameterRay]
@@ -71,6 +72,7 @@ class FittedSet:
     own: np.ndarray
     z: np.ndarray
     deviation: np.ndarray
+    held: frozenset[int] = frozenset()
 
     @property
     def kinds(self) -> list[EffectType]:
@@ -159,6 +161,41 @@ def fit_set(
         held,
         _estimate_deviations(z[0], slopes[0], residuals, mask),
     )
+
+
+def build_held_set(
+    residuals: Residuals,
+    rays: Mapping[str, Sequence[ParameterRay]],
+    sizes_by_joint: Sequence[Mapping[str, np.ndarray]],
+    known: FittedSet | None = None,
+    held: frozenset[int] = frozenset(),
+) -> FittedSet:
+    """Return a set with given sizes, nothing fitted; joints with the sizes of `known` keep its halves.
+
+    Args:
+        residuals: Residuals of the simulator without them.
+        rays: Ways in which each effect can grow.
+        sizes_by_joint: Sizes of each effect along its rays, by joint and name.
+        known: A fitted set.
+        held: Joints whose sizes later fits must keep.
+    """
+    subsets = [frozenset(sizes) for sizes in sizes_by_joint]
+    found, mask, sizes = _lay_out(subsets, rays, sizes_by_joint)
+    sizes = np.clip(sizes, *_Fit(residuals, found, mask).bounds) * mask
+    z, slopes, paths = _linearise(residuals, found, sizes[None])
+    z_held = z[0]
+    after = paths[0] + (0.0 if residuals.mean is None else residuals.mean)
+    own, halves = after.copy(), np.stack([sizes, sizes])
+    if known is not None:
+        before = look_up_sizes(found, known)
+        for j in np.flatnonzero((np.abs(before - sizes) < 1e-9).all(0) & mask.any(0)):
+            after[..., j], own[..., j] = known.after[..., j], known.own[..., j]
+            z_held[j] = known.z[j]
+            for k, half in enumerate(known.halves):
+                one = replace(known, sizes=half)
+                halves[k, :, j] = look_up_sizes(found, one)[:, j]
+    deviation = _estimate_deviations(z[0], slopes[0], residuals, mask)
+    return FittedSet(found, mask, sizes, halves, after, own, z_held, deviation, held)
 
 
 def simulate_refit(
@@ -389,17 +426,31 @@ def drop_effects(
     fitted: FittedSet,
     subsets: Sequence[frozenset[str]],
 ) -> FittedSet:
-    """Return the repair with fewer effects, fitted anew from its sizes."""
-    return refit_from(residuals, ways, subsets, fitted.rays, fitted.sizes)
+    """Return the repair with fewer effects, fitted anew from its sizes; held joints keep theirs."""
+    found = refit_from(residuals, ways, subsets, fitted.rays, fitted.sizes)
+    if not fitted.held:
+        return found
+    sizes = list_sizes(found)
+    for j in fitted.held:
+        sizes[j] = {
+            name: size for name, size in list_sizes(fitted)[j].items() if name in subsets[j]
+        }
+    return build_held_set(residuals, ways, sizes, found, fitted.held)
+
+
+def list_sizes(fitted: FittedSet) -> list[dict[str, np.ndarray]]:
+    """Return the sizes of each effect along its rays, by joint and name."""
+    found: list[dict[str, np.ndarray]] = [{} for _ in fitted.sizes.T]
+    for ray, sizes, mask in zip(fitted.rays, fitted.sizes, fitted.mask, strict=True):
+        for j in np.flatnonzero(mask).tolist():
+            own = found[j].get(ray.kind.name, np.zeros(0))
+            found[j][ray.kind.name] = np.append(own, sizes[j])
+    return found
 
 
 def list_subsets(fitted: FittedSet) -> tuple[frozenset[str], ...]:
     """Return the effects of each joint."""
-    found = []
-    for mask in fitted.mask.T:
-        pairs = zip(fitted.rays, mask, strict=True)
-        found.append(frozenset(ray.kind.name for ray, has in pairs if has))
-    return tuple(found)
+    return tuple(frozenset(sizes) for sizes in list_sizes(fitted))
 
 
 def refit_from(

@@ -350,7 +350,9 @@ class Residuals:
         for group, whiteners in zip(self.groups, self._whiteners, strict=True):
             entries = slice(group[0] * steps, (group[-1] + 1) * steps)
             for j in range(joints):
-                found[j, :, entries] = ways[..., j][:, group].reshape(count, -1) @ whiteners[j].T
+                found[j, :, entries] = (
+                    ways[..., j][:, group].reshape(count, len(group) * steps) @ whiteners[j].T
+                )
         return found
 
     def whiten_joint(self, columns: np.ndarray, j: int) -> np.ndarray:

@@ -365,3 +365,17 @@ def fit_joint_faults(
 
 def _repeat_per_joint(trial: Mapping[str, float], joints: int) -> dict[str, np.ndarray]:
     return {name: np.full(joints, part) for name, part in trial.items()}
+
+
+def rewhiten_responses(
+    shapes: Sequence[Mapping[str, Sequence[Response]]], before: Residuals, after: Residuals
+) -> list[dict[str, list[Response]]]:
+    """Return the responses of each joint over the noise of `after`, by effect; they are over that of `before`."""
+    found: list[dict[str, list[Response]]] = []
+    for j, mine in enumerate(shapes):
+        found.append({})
+        for name, own in mine.items():
+            changes = [after.rewhiten(before, one.change, j) for one in own]
+            pairs = zip(own, changes, strict=True)
+            found[j][name] = [replace(one, change=change) for one, change in pairs]
+    return found

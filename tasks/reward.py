@@ -227,6 +227,17 @@ def peak_contact(state: ToolState) -> torch.Tensor:
     return (peak_n.clamp(max=10_000.0) - state.peak_force_n.clamp(max=10_000.0)) / 1000.0
 
 
+def heavy_contact(state: ToolState) -> torch.Tensor:
+    """Growth of the episode's peak contact force beyond 10 kN, in kN, up to 100 kN.
+
+    What `peak_contact` leaves out: to a policy whose blows are all harder than 10 kN, that term
+    says nothing about softer ones.
+    """
+    peak_n = state.peak_force_n.maximum(state.contact_force_n)
+    low, high = 10_000.0, 100_000.0
+    return (peak_n.clamp(low, high) - state.peak_force_n.clamp(low, high)) / 1000.0
+
+
 def duration(state: ToolState) -> torch.Tensor:
     """One in each step."""
     return state.reach_m.new_ones(state.reach_m.shape)

@@ -253,7 +253,9 @@ class EffectChain:
 
     @property
     def is_plannable(self) -> bool:
-        """True if all commands of a run can be given to its effects beforehand."""
+        """True if all commands of a run can be given to its effects, and to the model inside, beforehand."""
+        if not hasattr(self.inner, "plan_run") or not getattr(self.inner, "is_plannable", True):
+            return False
         told = all(e.pointwise or e.delays or e.recent for e in self.commands.values())
         told &= all(len(effect.numbers) == 1 for effect in self._delays.values())
         # One counter a step: several effects that draw would draw in another order.

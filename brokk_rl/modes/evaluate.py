@@ -16,7 +16,7 @@ from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
-from brokk_rl.rl.policy import TrainedPolicy
+from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.session import Session, write_json
@@ -113,7 +113,7 @@ def evaluate_policies(
         ConfigError: The caller asked for something that a policy does not have.
     """
     device = session.torch_device()
-    tasks = _choose_tasks(config, policies, asked)
+    tasks = choose_tasks(config, policies, asked)
     descriptions = {name: describe_task(task) for name, task in tasks.items()}
     loops: dict[str, tuple[ControlLoop, dict[str, Any]]] = {}
     starts: Starts | None = None
@@ -156,15 +156,22 @@ def evaluate_policies(
     return results
 
 
-def _choose_tasks(
+def choose_tasks(
     config: ControlLoopConfig, policies: dict[str, PolicySpec], asked: Collection[str]
 ) -> dict[str, Task]:
-    """Return the task of each policy: its own, or that of the first one."""
+    """Return the task of each policy: its own, or that of the first one.
+
+    The classical controller as a rival has the numbers that were composed: a trained policy may
+    rest on those of an earlier version, which are no honest opponent.
+    """
     tasks: dict[str, Task] = {}
-    shared = config.task
+    shared, composed = config.task, getattr(config.task, "classical", None)
     for name, policy in policies.items():
         if isinstance(policy, TrainedPolicy):
             tasks[name] = policy.choose_task(config.task, config.machine, asked)
+        elif isinstance(policy, ClassicalPolicy) and composed is not None:
+            opponent: Any = shared
+            tasks[name] = replace(opponent, classical=composed)
         else:
             tasks[name] = shared
         shared = next(iter(tasks.values()))

@@ -49,7 +49,9 @@ def moving(
     base = start[:, None] + np.cumsum(np.repeat(way, INCREMENT_SAMPLES, 1) / INCREMENT_SAMPLES, 1)
     return cast(
         Residuals,
-        SimpleNamespace(increments=way, base=base, start=start, simulator=simulator, **white),
+        SimpleNamespace(
+            increments=way, base=base, start=start, simulator=simulator, z=None, **white
+        ),
     )
 
 
@@ -188,15 +190,6 @@ def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> DetectionRe
     return DetectionResult(**cast(dict, {**fields, "chosen": chosen, "detected": shown}))
 
 
-@pytest.mark.parametrize(("shown", "unknown"), [(0.95, False), (0.6, True)])
-def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
-    monkeypatch: pytest.MonkeyPatch, weights: ProbabilityModel, shown: float, unknown: bool
-) -> None:
-    monkeypatch.setattr(decision, "compute_effect_probabilities", lambda *_: {"t": shown, "a": 0.4})
-    monkeypatch.setattr(decision, "compute_unknown_probability", lambda *_: 0.7)
-    assert decision.is_unknown(found(("a", ""), ("t",)), cast(Penalties, None), weights) is unknown
-
-
 def test_what_was_named_only_beside_another_goes_with_it(
     monkeypatch: pytest.MonkeyPatch, weights: ProbabilityModel
 ) -> None:
@@ -232,8 +225,8 @@ def test_no_answer_is_surer_than_answers_can_tell(weights: ProbabilityModel) -> 
 
 
 def test_a_missing_or_unknown_sign_is_named(weights: ProbabilityModel) -> None:
-    with pytest.raises(ConfigError, match="expected a number for nearest"):
-        dataclasses.replace(weights, none={"constant": 0.0, "outside": 0.0})
+    with pytest.raises(ConfigError, match="expected a number for margin"):
+        dataclasses.replace(weights, right={"constant": 0.0, "outside": 0.0})
     with pytest.raises(ConfigError, match="'margins' is no sign"):
         dataclasses.replace(weights, right={**weights.right, "margins": 0.0})
 

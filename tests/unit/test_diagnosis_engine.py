@@ -38,7 +38,7 @@ from diagnosis.detection import Penalties
 from diagnosis.pipeline import DiagnosisPipeline
 
 CPU = torch.device("cpu")
-PRICES = Penalties(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06, tool=2.0)
+PRICES = Penalties(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06)
 
 
 @pytest.fixture(scope="module")

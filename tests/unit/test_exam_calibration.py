@@ -14,14 +14,15 @@ from composed import option
 
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
-from diagnosis import decision, effect_library
-from diagnosis.calibration import ProbabilityModel
+from diagnosis import decision, effect_library, hypotheses
+from diagnosis.calibration import GAP_SIGNS, ProbabilityModel
 from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.hypotheses import Hypothesis
 from diagnosis.residuals import Residuals
 from diagnosis.responses import Response, fit_faults
 from diagnosis.search import SubsetTable
 from exam import dataset
-from exam.calibration import PenaltyFit, WeighedCase, load_weighed_cases
+from exam.calibration import PenaltyFit, WeighedCase, fit_choice, load_weighed_cases
 
 SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 
@@ -36,8 +37,10 @@ def weights() -> ProbabilityModel:
     return option("certainty", "default")
 
 
-def found(machine: Machine, prices: Penalties, strength: float, seed: int) -> DetectionResult:
-    """Returns findings on a machine whose first joint has a lag of some strength, in noise."""
+def found(
+    machine: Machine, prices: Penalties, strength: float, seed: int, second: float = 0.0
+) -> DetectionResult:
+    """Returns findings on a machine whose first joint has a lag, and a dead band of strength `second`, in noise."""
     random, kinds = (
         np.random.default_rng(seed),
         effect_library.load_effects(machine, ["lag", "dead_band"]),
@@ -45,7 +48,8 @@ def found(machine: Machine, prices: Penalties, strength: float, seed: int) -> De
     tables, block = [], np.arange(800) // 80
     for j in range(machine.num_joints):
         columns = random.standard_normal((2, 800))
-        z = random.standard_normal(800) + (strength * columns[0] if j == 0 else 0.0)
+        shown = strength * columns[0] + second * columns[1]
+        z = random.standard_normal(800) + (shown if j == 0 else 0.0)
         shapes = {
             name: [Response(SIZES, SIZES[:, None] * c)]
             for name, c in zip(("lag", "dead_band"), columns, strict=True)
@@ -71,7 +75,22 @@ def found(machine: Machine, prices: Penalties, strength: float, seed: int) -> De
         still + 1.0,
         still + 1.0,
         1.0,
+        tables,
     )
+
+
+def told(result: DetectionResult, prices: Penalties, error: float) -> dict[str, Any]:
+    """Returns what an answer records; `error`: of all joints over the floor."""
+    gap = dict.fromkeys(GAP_SIGNS, 0.0) | {"constant": 1.0, "error": float(np.log(error))}
+    gain = max((result.tables[0].score(frozenset({"lag"})).total, 1.0))
+    signs = {"gain": float(np.arcsinh(gain / 10.0)), "reference": 0.0, "joints": 1.0, "size": 0.0}
+    known = [
+        Hypothesis("lag", (0,), signs | {"shared": 0.0}),
+        Hypothesis("none", (), gap),
+        Hypothesis("unknown", (), gap),
+    ]
+    rows = hypotheses.serialize_hypotheses(known)
+    return decision.record_weights(result, prices) | {"hypotheses": rows}
 
 
 def test_what_was_weighed_is_chosen_from_again_as_it_was(
@@ -97,52 +116,65 @@ def label(kind: str, effects: list[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def test_prices_are_found_that_name_what_is_there_and_nothing_else(
+def test_prices_are_found_that_name_the_second_effect_too(
     machine: Machine, prices: Penalties, weights: ProbabilityModel
 ) -> None:
-    cheap = dataclasses.replace(prices, joint=2.0, name=2.0, reference=0.5)
-    lag = {"effect": "lag", "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
-    cases = [
-        *(
-            WeighedCase(
-                label("none", []), decision.record_weights(found(machine, cheap, 0.14, seed), cheap)
-            )
-            for seed in range(3)
-        ),
-        *(
-            WeighedCase(
-                label("one", [lag]),
-                decision.record_weights(found(machine, cheap, 0.4, seed), cheap),
-            )
-            for seed in range(3)
-        ),
-    ]
+    dear = dataclasses.replace(prices, joint=12.0, name=25.0, reference=3.0)
+    there = []
+    for name in ("lag", "dead_band"):
+        there.append(
+            {"effect": name, "joints": ["q1"], "size": 1.0, "parameters": {}, "nothing": {}}
+        )
+    cases = []
+    for seed in range(3):
+        nothing, several = found(machine, dear, 0.0, seed), found(machine, dear, 0.4, seed, 0.25)
+        cases.append(WeighedCase(label("none", []), told(nothing, dear, 1.0)))
+        cases.append(WeighedCase(label("several", there), told(several, dear, 3.0)))
     fit = PenaltyFit(
         machine, effect_library.load_effects(machine), [], [], trials=8, seed=0, workers=1
     )
-    assert fit.value(cases, cheap, weights) < 0.8
-    best = fit.fitted(cases, cheap, weights, lambda: None)
+    assert fit.value(cases, dear, weights) < 0.8
+    best = fit.fitted(cases, dear, weights, lambda: None)
     assert fit.value(cases, *best) == pytest.approx(1.0)
 
 
-def test_an_unknown_cause_is_told_before_it_is_more_probable_than_not_and_nothing_stands_above_it(
-    machine: Machine, prices: Penalties, weights: ProbabilityModel
-) -> None:
-    outside = {
-        **dict.fromkeys(weights.outside, 0.0),
-        "constant": float(np.log(0.45 / 0.55)),
-    }  # odds of 9 to 11, whatever is seen
-    weights = dataclasses.replace(
-        weights, outside=outside, none={"constant": 2.0, "nearest": 0.0, "outside": 0.0}
-    )
-    named, silent = found(machine, prices, 0.5, 0), found(machine, prices, 0.0, 1)
-    assert decision.is_unknown(named, prices, weights), (
-        "a fifth of causes lies outside, so few are missed only so"
-    )
-    assert not decision.is_unknown(silent, prices, weights)
-    rows = decision.rank_hypotheses(named, [], prices, weights, machine, 0.45)
-    assert max(rows, key=lambda row: row.probability).probability == pytest.approx(0.45)
-    assert {row.effect for row in rows} >= {"lag", "unknown", "none"}
+def test_the_choice_is_learned_from_which_hypotheses_were_right(weights: ProbabilityModel) -> None:
+    random, true = np.random.default_rng(1), {"gain": 2.0, "error": -1.5}
+    start = {verdict: dict.fromkeys(signs, 0.0) for verdict, signs in weights.choice.items()}
+    cases = []
+    for _ in range(3000):
+        gain, error = random.normal(size=2).tolist()
+        rows = [
+            {"name": "lag", "joints": [0], "signs": {"gain": gain}},
+            {"name": "none", "joints": [], "signs": {"constant": 1.0, "error": error}},
+            {"name": "unknown", "joints": [], "signs": {"constant": 1.0}},
+        ]
+        odds = np.exp([true["gain"] * gain, 0.5 + true["error"] * error, 0.0])
+        right = random.choice(3, p=odds / odds.sum())
+        effects = [{"effect": "lag"}] if right == 0 else []
+        outside = {"ailment": "x"} if right == 2 else None
+        cases.append(
+            WeighedCase(
+                {"effects": effects, "outside": outside}, {"hypotheses": rows, "others": []}
+            )
+        )
+    found = fit_choice(cases, start)
+    assert found["effects"]["gain"] == pytest.approx(2.0, abs=0.15)
+    assert found["none"]["error"] == pytest.approx(-1.5, abs=0.15)
+    assert found["none"]["constant"] - found["unknown"]["constant"] == pytest.approx(0.5, abs=0.15)
+    assert found["stakes"] == start["stakes"]
+
+
+def test_an_effect_that_sensors_show_leaves_nothing_for_motion(weights: ProbabilityModel) -> None:
+    """The right hypothesis is then `none`, whose constant rises with each such case."""
+    rows = [
+        {"name": "lag", "joints": [0], "signs": {}},
+        {"name": "none", "joints": [], "signs": {"constant": 1.0}},
+    ]
+    seen = {"hypotheses": rows, "others": [{"effect": "quantisation"}]}
+    case = WeighedCase({"effects": [{"effect": "quantisation"}], "outside": None}, seen)
+    found = fit_choice([case] * 20, weights.choice)
+    assert found["none"]["constant"] > weights.choice["none"]["constant"]
 
 
 def test_nothing_is_tuned_to_a_sealed_exam(tmp_path: Path) -> None:

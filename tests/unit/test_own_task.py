@@ -21,7 +21,7 @@ from conftest import Done
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import evaluate_policies
+from brokk_rl.modes.evaluate import choose_tasks, evaluate_policies
 from brokk_rl.modes.export import Export
 from brokk_rl.rl.export import export_onnx
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy, read_bundle, write_bundle
@@ -286,6 +286,20 @@ def test_an_old_policy_is_read_with_what_is_assumed(
     assert (
         "its golden answers agree" in caplog.text and "policy.onnx holds all of it" in caplog.text
     )
+
+
+def test_the_classical_rival_shares_the_task_but_has_the_numbers_composed_here(
+    machine: Machine,
+) -> None:
+    task = insertion()
+    task = replace(task, classical=replace(task.classical, gain_1_s=0.7))
+    config = runs.plant(machine, task)
+    policies: Any = {"trained": TrainedPolicy(folder=str(SHIPPED)), "classical": ClassicalPolicy()}
+    found: Any = choose_tasks(config, policies, ())
+    assert found["classical"].classical.gain_1_s == 0.7
+    assert found["trained"].classical.gain_1_s == 1.5  # of the policy that ships
+    own = replace(found["trained"], classical=task.classical)
+    assert describe_task(found["classical"]) == describe_task(own)
 
 
 @pytest.mark.parametrize("change", [lambda task: replace(task, memory=1), direct])

@@ -179,3 +179,13 @@ def test_the_weight_of_a_planar_arm_is_that_of_its_mechanics(machine: Machine) -
     assert weight.is_planar
     assert truth.abs().max() > 0.1
     torch.testing.assert_close(weight.weigh(q), truth, atol=2e-5, rtol=0.0)
+
+
+def test_effects_around_a_model_that_is_stepped_are_stepped_too(machine: Machine) -> None:
+    """A servo that follows at once plans nothing, so that nothing around it asks for its delay."""
+    model: Any = option("actuator", "ideal").build(machine, NUM_ENVS, CPU)
+    for name in ("clock_offset", "dead_time"):
+        model = effect(name, 1.0).wrap(model, machine, NUM_ENVS, CPU)
+        model.reset(torch.ones(NUM_ENVS, dtype=torch.bool))
+        assert not model.is_plannable
+        assert model.plan_run(draw_motion(machine)[0], machine.num_history) is None

@@ -162,6 +162,19 @@ def test_an_episode_pays_for_its_hardest_blow_once(
     assert reward.peak_contact(blow).item() == pytest.approx(expected)
 
 
+@pytest.mark.parametrize(
+    ("before_n", "now_n", "expected"),
+    [(0, 9_000, 0.0), (0, 12_500, 2.5), (12_000, 12_500, 0.5), (20_000, 12_500, 0.0), (0, 3e5, 90)],
+)
+def test_a_heavy_blow_pays_for_what_the_peak_grows_beyond_ten_kilonewtons(
+    state: ToolState, before_n: float, now_n: float, expected: float
+) -> None:
+    blow = replace(
+        state, peak_force_n=torch.tensor([before_n]), contact_force_n=torch.tensor([now_n])
+    )
+    assert reward.heavy_contact(blow).item() == pytest.approx(expected)
+
+
 def curriculum(**changes: object) -> RewardCurriculum:
     parts = {"begin": {"command_change": 0.2, "failure": 0.0}, "success": (0.5, 0.9)} | changes
     return RewardCurriculum(**parts)  # type: ignore[arg-type]

@@ -14,9 +14,11 @@ from actuators.effects.speed import Asymmetry, FlowGain, Lag
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.machine import Dimension, Machine
 from diagnosis import effect_library
-from diagnosis.baseline import compare_simulator
+from diagnosis.baseline import compare_simulator, fit_covariances
+from diagnosis.refine import build_held_set, drop_effects, list_subsets
+from diagnosis.residuals import Residuals
 from diagnosis.responses import choose_rays
-from diagnosis.shown_effects import compute_sizes, propose_effects
+from diagnosis.shown_effects import compute_sizes, keep_shown_numbers, propose_effects
 from diagnosis.speed_curves import SpeedCurves, change_curve, measure_curves, serialize_curves
 
 LAG = Lag(joints="all", time_constant_s=0.3)
@@ -141,3 +143,53 @@ def test_curves_are_written_as_plain_numbers(unchanged: SpeedCurves) -> None:
     assert len(found["knots"]) == len(speed) and (low <= speed).all() and (speed <= high).all()
     # the plant's own dead band of 0.07 and gain of 0.9
     assert speed[-1] == pytest.approx(0.9, abs=0.05) and speed[1] == pytest.approx(0.0, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def banded(axis: Machine) -> Residuals:
+    """The plant's simulator against the plant with a dead band, its noise fitted."""
+    put: dict[str, Effect] = {"dead_band": DeadBand(joints="all", extend=0.3, retract=0.3)}
+    recordings = driven(axis, put, 2, 60.0, 5)
+    field = compare_simulator(PLANT, [(one, 0.0) for one in recordings], axis, 0)
+    return dataclasses.replace(field.residuals, noise=fit_covariances([field], axis))
+
+
+def test_numbers_of_a_curve_stand_where_they_leave_less_error(
+    axis: Machine, banded: Residuals
+) -> None:
+    (kind,) = effect_library.load_effects(axis, ["dead_band"])
+    rays, shapes = {"dead_band": choose_rays(kind)}, [{"dead_band": []}]
+    right = [{"dead_band": {"extend": 0.3, "retract": 0.3}}]
+    kept = keep_shown_numbers(banded, right, rays, shapes, None)
+    assert kept is not None and kept.held == {0} and list_subsets(kept) == ({"dead_band"},)
+    size = 0.3 / kind.size_on("extend", 0)
+    assert kept.sizes[:, 0] == pytest.approx([size, size]), "nothing is fitted"
+    measured = banded.simulator.cut.measured
+    left = [np.sqrt(np.mean(np.square(one - measured))) for one in (kept.after, banded.base)]
+    assert left[0] < 0.3 * left[1]
+    # the set that holds them already is not improved, and wrong numbers improve nothing
+    assert keep_shown_numbers(banded, right, rays, shapes, kept) is None
+    wrong = [{"dead_band": {"extend": 0.85, "retract": 0.85}}]
+    assert keep_shown_numbers(banded, wrong, rays, shapes, kept) is None
+
+
+def test_held_joints_keep_their_sizes_when_an_effect_goes(axis: Machine, banded: Residuals) -> None:
+    kinds = {one.name: one for one in effect_library.load_effects(axis, ["dead_band", "lag"])}
+    rays = {name: choose_rays(kind) for name, kind in kinds.items()}
+    sizes = [{"dead_band": np.array([1.0, 2.0]), "lag": np.array([0.5])}]
+    fitted = build_held_set(banded, rays, sizes, None, frozenset({0}))
+    kept = drop_effects(banded, rays, fitted, [frozenset({"dead_band"})])
+    assert kept.sizes[:, 0] == pytest.approx([1.0, 2.0]) and kept.held == {0}
+    free = drop_effects(
+        banded, rays, dataclasses.replace(fitted, held=frozenset()), [frozenset({"dead_band"})]
+    )
+    assert np.abs(free.sizes[:, 0] - [1.0, 2.0]).max() > 0.5, "else sizes are fitted anew"
+
+
+def test_a_simulator_without_numbers_of_its_own_is_wrong_in_its_speeds_only(
+    axis: Machine, banded: Residuals
+) -> None:
+    """`faults` of a servo that follows at once: the speed of either side."""
+    simulator = dataclasses.replace(banded.simulator, base=option("actuator", "ideal"))
+    plain = dataclasses.replace(banded, simulator=simulator)
+    assert plain.faults.shape == (1, 2, plain.z.shape[1])

@@ -28,6 +28,8 @@ from brokk_rl.rl.vec_env import ControlLoopConfig
 
 NUM_PATHS = 8
 """Episodes whose path is shown."""
+WHOLE = 0.95
+"""Part of the largest budget of a prefix below which a training was cut short and is not drawn."""
 CPU = ("session.device=cpu", "sim=native")
 COLUMNS = {"return": "Reward of an episode", "success_paper": "Success by the paper's criterion"}
 
@@ -54,7 +56,9 @@ def draw_curves(lines: list[dict[str, Any]], picture: Path) -> None:
         groups.setdefault(line["name"].rpartition("_")[0], []).append(line)
     figure = Figure(figsize=(10, 3.8), layout="constrained")
     for axis, (column, title) in zip(figure.subplots(1, 2), COLUMNS.items(), strict=True):
-        for index, (name, runs) in enumerate(groups.items()):
+        for index, (name, group) in enumerate(groups.items()):
+            whole = WHOLE * max(run["env_steps"] for run in group)
+            runs = [run for run in group if run["env_steps"] >= whole]
             last = min(run["curve"]["env_steps"][-1] for run in runs)
             steps = np.linspace(0, last, 200)
             values = []
@@ -79,10 +83,11 @@ def read_scale(words: list[str]) -> float:
 def draw_trajectories(words: list[str], bundle: Path, picture: Path) -> None:
     """Draw paths of the chisel's tip from above and from the side, and one episode's commands."""
     spec = compose([*words, *CPU])
+    trained = TrainedPolicy(folder=str(bundle))
     config = ControlLoopConfig(
         machine=spec.machine,
         sim=spec.sim,
-        task=spec.task,
+        task=trained.choose_task(spec.task, spec.machine, ()),
         actuator=spec.actuator,
         effects=spec.effect,
         follower=spec.follower,
@@ -90,7 +95,7 @@ def draw_trajectories(words: list[str], bundle: Path, picture: Path) -> None:
     )
     torch.manual_seed(spec.evaluation.seed)
     loop = config.build(torch.device("cpu"), NUM_PATHS, NUM_PATHS, spec.evaluation.seed)
-    policy = TrainedPolicy(folder=str(bundle)).build(loop, 0)
+    policy = trained.build(loop, 0)
     seed, starts = spec.evaluation.seed, loop.starts
     episodes = evaluate_policy(loop, policy, starts, seed, NUM_PATHS).episodes
     figure = Figure(figsize=(13, 4.2), layout="constrained")
