@@ -59,11 +59,13 @@ def main() -> None:
                 f"exam.workers={given.makers}")  # fmt: skip
             for case in sorted((exam / "cases").iterdir()):
                 row: dict[str, Any] = {"case": case.name, "field_minutes": minutes}
-                for name, (tree, workers) in versions.items():
-                    out = Path(folder) / f"{minutes:g}_{case.name}_{name[:8].strip()}_{workers}"
-                    row[name] = diagnose(tree, case, out, workers)
+                answers = []
+                for number, (name, (tree, workers)) in enumerate(versions.items()):
+                    out = Path(folder) / f"{minutes:g}_{case.name}_{number}"
+                    row[name], answer = diagnose(tree, case, out, workers)
+                    answers.append(answer)
                     print(minutes, case.name, name, row[name], flush=True)
-                row["same"] = compare([row[name].pop("answer") for name in versions])
+                row["same"] = compare(answers)
                 told["cases"].append(row)
                 given.out.write_text(json.dumps(told, indent=1) + "\n")
     for minutes in given.minutes:
@@ -92,13 +94,15 @@ def run(tree: Path, folder: Path, *words: str) -> tuple[float, float]:
     return round(cpu_s, 1), round(time.monotonic() - begun_s, 1)
 
 
-def diagnose(tree: Path, case: Path, out: Path, workers: int | None) -> dict[str, Any]:
-    """Diagnose a case; return its times, the load of the machine, and the answer."""
+def diagnose(
+    tree: Path, case: Path, out: Path, workers: int | None
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Diagnose a case; return its times beside the load of the machine, and the answer."""
     words = ["mode=diagnose", f"diagnosis.case={case}", f"session.out={out}", "session.device=cpu"]
     words += [] if workers is None else [f"diagnosis.workers={workers}"]
     cpu_s, wall_s = run(tree, out.parent, *words)
-    answer = json.loads((out / "diagnosis.json").read_text())
-    return {"cpu_s": cpu_s, "wall_s": wall_s, "load": round(os.getloadavg()[0], 1), "answer": answer}  # fmt: skip
+    times = {"cpu_s": cpu_s, "wall_s": wall_s, "load": round(os.getloadavg()[0], 1)}
+    return times, json.loads((out / "diagnosis.json").read_text())
 
 
 def compare(answers: list[dict[str, Any]]) -> dict[str, Any]:
