@@ -14,7 +14,7 @@ const DE = {
   "refused nowhere": "Abgelehnt: dort ist keine Fläche gemessen", "boreholes seen": "Loch wählen, antippen", "no borehole seen": "Bohrloch antippen", "refused malformed": "Abgelehnt: nicht verstanden", "refused lost": "Keine Verbindung zur Steuerung",
   "refused unconfirmed": "STOPP NICHT BESTÄTIGT: Not-Halt drücken", "recording failed": "AUFNAHME ABGEBROCHEN",
   nothing: "alles in Ordnung", "bus down": "Bus gestört", "time stood still": "Zeit stand still", "emergency stop": "NOT-HALT",
-  "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen",
+  "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen", "valve feedback missing": "Ventilrückmeldung fehlt",
   "joint positions not plausible": "Gelenkstellungen unglaubwürdig", "messages corrupted or from two senders": "Nachrichten verfälscht oder von zwei Sendern",
   "operator's switches missing": "Bedienseite der Steuerung still", "way to the gateway and back unknown or too long": "Weg zum Steuergerät unbekannt oder zu lang",
   "somebody else sends commands": "Ein anderer sendet Befehle", "operator moves a lever": "Bediener bewegt Hebel", "no fresh command": "Kein frischer Befehl",
