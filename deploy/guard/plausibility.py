@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from deploy.guard.limits import GuardLimits, JointBounds
 
-
 WINDOW = 50
 """Samples of a joint among which the rejected ones are counted: half a second of the example bus,
 as many as a channel remembers. A loose contact that spoils every second sample is found."""

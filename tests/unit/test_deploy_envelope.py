@@ -285,12 +285,12 @@ def test_what_lies_below_the_ground_touches_it() -> None:
 
 def test_the_way_to_rest_is_looked_at_and_nothing_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
     envelope, face, rest = build_envelope(), (2.0, 0.0, 1.0), HOME + 0.4
-    tips_m, asked = np.zeros((5, 3)), []
+    tips_m, step_m, asked = np.zeros((5, 3)), np.array([0.25, 0.0, 0.0]), []
 
     def locate_tip(q: np.ndarray) -> np.ndarray:
         asked.append(q)
         # Half a metre of motion within the reaction time: far too fast.
-        return np.concatenate([tips_m, tips_m - [0.25, 0.0, 0.0], tips_m + [0.25, 0.0, 0.0]])
+        return np.concatenate([tips_m, tips_m - step_m, tips_m + step_m])
 
     monkeypatch.setattr(envelope, "locate_tip", locate_tip)
 

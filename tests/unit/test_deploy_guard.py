@@ -33,8 +33,8 @@ LIMITS = GuardLimits(
 )  # fmt: skip
 WELL = GuardInput(
     q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
-    status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True, feedback_age_s=0.01, controls_age_s=0.01, round_trip_s=0.03,
-    observed=GuardTrip.NONE,
+    status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True, feedback_age_s=0.01, controls_age_s=0.01,
+    round_trip_s=0.03, observed=GuardTrip.NONE,
 )  # fmt: skip
 RELEASED = replace(WELL, deadman=False)
 STILL = (0.0, 0.0, 0.0)
