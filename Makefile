@@ -4,7 +4,7 @@ BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
 SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode
 
-.PHONY: help train test test-all mutants check setup clean
+.PHONY: help train test test-all mutants figures check setup clean
 
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -20,6 +20,9 @@ test-all: setup         ## the slow tests too
 
 mutants: setup          ## one small change at a time to what decides about the valves: do the tests notice?
 	$(BIN)/python tests/mutants.py
+
+figures: setup          ## what the figures of the docs rest on, and which are older than their code
+	$(BIN)/python benchmarks/figures.py
 
 check: setup            ## format, lint, types
 	$(BIN)/ruff format --check .

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import stat
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -287,8 +288,10 @@ def test_an_interrupted_program_leaves_no_note_and_sits_again(
     case, answers = tmp_path / "case", tmp_path / "answers"
     case.mkdir()
     (case / "a").touch()
+    # A job in the background of a shell inherits an ignored SIGINT, so the program restores it first.
+    program = "from signal import *; signal(SIGINT, SIG_DFL); raise_signal(SIGINT)"
     command = run_cases.CommandCandidate(
-        command=("sh", "-c", "kill -INT $$ #{case}{out}"), limit_s=10.0, threads=1
+        command=(sys.executable, "-c", program, "{case}", "{out}"), limit_s=10.0, threads=1
     )
     with pytest.raises(KeyboardInterrupt):
         run_cases.answer_cases(command, [case], answers, machine, 1, CaseProgress("", 1))

@@ -20,7 +20,7 @@ const DE = {
   "messages arrive late": "Nachrichten kommen spät", "recorder does not write": "Aufnahme schreibt nicht", "recording has gaps": "Aufnahme hat Lücken",
   "the model no longer fits": "Das Modell passt nicht mehr", flow_gain: "Ölstrom", asymmetry: "Unsymmetrie", dead_time: "Totzeit", creep: "Kriechen", dead_band: "Totband",
   nothing: "alles in Ordnung", "bus down": "Bus gestört", "time stood still": "Zeit stand still", "emergency stop": "NOT-HALT",
-  "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen",
+  "machine status missing": "Maschinenzustand fehlt", "remote missing": "Fernbedienung fehlt", "joint positions missing": "Gelenkstellungen fehlen", "valve feedback missing": "Ventilrückmeldung fehlt",
   "joint positions not plausible": "Gelenkstellungen unglaubwürdig", "messages corrupted or from two senders": "Nachrichten verfälscht oder von zwei Sendern",
   "operator's switches missing": "Bedienseite der Steuerung still", "way to the gateway and back unknown or too long": "Weg zum Steuergerät unbekannt oder zu lang",
   "somebody else sends commands": "Ein anderer sendet Befehle", "operator moves a lever": "Bediener bewegt Hebel", "no fresh command": "Kein frischer Befehl",
