@@ -33,7 +33,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 import brokk_rl
-from brokk_rl import distributed, extensions, gpu_pool, registry
+from brokk_rl import distributed, extensions, extras, gpu_pool, registry
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.session import read_earlier_job, remove_empty_folders
 from brokk_rl.sweep import SweepFolder
@@ -248,6 +248,8 @@ def set_up_logging() -> None:
         format="%(message)s",
         handlers=[handler],
     )
+    # Hydra logs a target that cannot be loaded before it raises the error, which `main` explains.
+    logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
     logging.getLogger("matplotlib").setLevel(
         logging.WARNING
     )  # It reports its font cache otherwise.
@@ -270,6 +272,9 @@ def explain(error: BaseException) -> str | None:
     if missing:
         key = str(missing.full_key or missing)
         return f"{key} has no default and must be given: {key}=<value>"
+    lacking = next((e for e in chain if isinstance(e, ModuleNotFoundError) and e.name), None)
+    if lacking and (text := _explain_missing_module(lacking, chain)):
+        return text
     if isinstance(error, MissingConfigException):
         return _explain_missing_option(error)
     if isinstance(error, InstantiationException):
@@ -287,6 +292,16 @@ def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
     while error is not None:
         yield error
         error = error.__cause__
+
+
+def _explain_missing_module(lacking: ModuleNotFoundError, chain: list[BaseException]) -> str | None:
+    """Explain a package that is not installed; `None` where no extra brings it."""
+    for error in chain:
+        # Hydra names the target that it could not load, in one of two ways.
+        target = re.search(r"(?:target|loading) '([\w.]+)'", str(error))
+        if target:
+            return extras.explain_missing_module(str(lacking.name), target[1])
+    return extras.explain_missing_module(str(lacking.name), "this run")
 
 
 def _explain_missing_option(error: MissingConfigException) -> str:

@@ -14,8 +14,6 @@ from glob import glob
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 
 from brokk_rl.errors import RecordingError, StorageError, list_choices
 from brokk_rl.machine import Machine
@@ -214,6 +212,10 @@ def write_recording(recording: Recording, path: Path) -> None:
         RecordingError: the recording breaks a rule of the format.
         StorageError: the file could not be written.
     """
+    # Here, not above: the machine's computer captures and repairs without Parquet.
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     check_recording(recording, str(path))
     columns: dict[str, np.ndarray] = {"t_s": recording.t_s.astype(np.float64)}
     for j, joint in enumerate(recording.joints):
@@ -266,6 +268,9 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
         stated, `None` where nothing can be read; and every place where it breaks a rule of the
         format.
     """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
     try:
         table = pq.read_table(path)
     except FileNotFoundError:

@@ -13,18 +13,17 @@ from importlib import metadata, util
 from pathlib import Path
 from typing import Literal
 
-from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 import brokk_rl
-from brokk_rl import registry
+from brokk_rl import extras, registry
 from brokk_rl.errors import BrokkError
 from brokk_rl.sim import probe
 from brokk_rl.spec import spec
 
-DISTRIBUTION = "brokk-rl"
 IMPORT_NAMES = (
     "brokk_rl",
     "conf",
@@ -81,9 +80,9 @@ class Doctor:
         table = Table(box=None, show_header=False, padding=(0, 1, 0, 0))
         failed = False
         for topic, finding in self.findings():
-            advice = f"\n[dim]→ {finding.advice}[/dim]" if finding.advice else ""
+            advice = f"\n[dim]→ {escape(finding.advice)}[/dim]" if finding.advice else ""
             table.add_row(
-                f"[{COLORS[finding.level]}]{finding.level}[/]", topic, finding.text + advice
+                f"[{COLORS[finding.level]}]{finding.level}[/]", topic, escape(finding.text) + advice
             )
             failed |= finding.level == "fail"
         Console().print(table)
@@ -108,6 +107,10 @@ class Doctor:
             try:
                 for finding in examine():
                     yield topic, finding
+            except ModuleNotFoundError as error:
+                extra = extras.find_extra(str(error.name), __name__)
+                advice = f"pip install '{extras.DISTRIBUTION}[{extra}]'" if extra else "make setup"
+                yield topic, DoctorFinding("warn", f"{error.name} is not installed", advice)
             # A failure inside another package must not hide the rest of the report.
             except Exception as error:
                 yield topic, DoctorFinding("warn", f"cannot tell: {type(error).__name__}: {error}")
@@ -134,33 +137,37 @@ def check_packages() -> Iterator[DoctorFinding]:
     if about is None:
         yield DoctorFinding(
             "warn",
-            f"{DISTRIBUTION} runs from its sources and is not installed; versions are not checked",
+            f"{extras.DISTRIBUTION} runs from its sources and is not installed; versions are not checked",
             "make setup",
         )
         return
-    wanted = [Requirement(line) for line in metadata.requires(DISTRIBUTION) or ()]
-    wanted = [
-        requirement
-        for requirement in wanted
-        if requirement.marker is None or requirement.marker.evaluate()
-    ]
-    fit = 0
-    for requirement in wanted:
-        try:
-            version = metadata.version(requirement.name)
-        except metadata.PackageNotFoundError:
-            yield DoctorFinding("fail", f"{requirement.name} is missing", "make setup")
-            continue
-        if requirement.specifier.contains(version, prereleases=True):
-            fit += 1
+    wanted = extras.read_extras()
+    complete, partial = [], []
+    for extra, requirements in wanted.items():
+        missing = []
+        for requirement in requirements:
+            try:
+                version = metadata.version(requirement.name)
+            except metadata.PackageNotFoundError:
+                missing.append(requirement.name)
+                continue
+            if not requirement.specifier.contains(version, prereleases=True):
+                yield DoctorFinding(
+                    "warn",
+                    f"{requirement.name} {version} is installed, the project wants {requirement.specifier}",
+                    "make setup",
+                )
+        if extra == "":
+            for name in missing:
+                yield DoctorFinding("fail", f"{name} is missing", "make setup")
+        elif missing:
+            partial.append(f"{extra} (lacks {', '.join(missing[:3])}{' …' * (len(missing) > 3)})")
         else:
-            yield DoctorFinding(
-                "warn",
-                f"{requirement.name} {version} is installed, the project wants {requirement.specifier}",
-                "make setup",
-            )
+            complete.append(extra)
     yield DoctorFinding(
-        "ok", f"{fit} of {len(wanted)} as wanted; {DISTRIBUTION} {about['Version']}"
+        "ok",
+        f"{extras.DISTRIBUTION} {about['Version']}; extras: {', '.join(complete) or 'none'}; "
+        f"not installed: {', '.join(partial) or 'none'}",
     )
 
 
@@ -302,7 +309,7 @@ def check_import_names() -> Iterator[DoctorFinding]:
         for path in distribution.files or ():
             if path.parts:
                 tops.add(path.parts[0].removesuffix(".py"))
-        if name != DISTRIBUTION and (clash := sorted(tops.intersection(IMPORT_NAMES))):
+        if name != extras.DISTRIBUTION and (clash := sorted(tops.intersection(IMPORT_NAMES))):
             yield DoctorFinding(
                 "warn",
                 f"the package {name} also installs {', '.join(clash)}",
@@ -327,6 +334,6 @@ def check_extensions() -> Iterator[DoctorFinding]:
 
 def _read_metadata() -> metadata.PackageMetadata | None:
     try:
-        return metadata.metadata(DISTRIBUTION)
+        return metadata.metadata(extras.DISTRIBUTION)
     except metadata.PackageNotFoundError:
         return None
