@@ -47,7 +47,7 @@ MIN_DEVIANCE_GAIN = 50.0
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether a calibration may be used.
+    """Judgement of a calibration and its reasons.
 
     Attributes:
         status: `good`, `not to be trusted` or `cannot tell`.
