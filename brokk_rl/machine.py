@@ -15,6 +15,9 @@ import numpy as np
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.spec import spec
 
+JointPart = Literal["slew", "arm_1", "arm_2", "arm_3", "boom", "stick", "bucket", "tool"]
+"""Parts of demolition machines and excavators; the operator's page has a word and an icon for each."""
+
 
 @spec
 class Dimension:
@@ -63,6 +66,7 @@ class Joint:
 
     Attributes:
         name: `q1`, `q2`, …; names the columns of recordings and the joint of the MJCF.
+        part: Part that it moves: people read its word and see its icon; `null`: its name.
         kind: `hinge` (rad) or `slide` (m).
         lower: Lower end of travel (rad or m).
         upper: Upper end of travel.
@@ -73,6 +77,7 @@ class Joint:
     """
 
     name: str
+    part: JointPart | None
     kind: Literal["hinge", "slide"]
     lower: Dimension
     upper: Dimension

@@ -336,8 +336,8 @@ class _StateChecks:
         if turned:
             faults.append(f"sign turned: {', '.join(turned)}")
         # The policy sees only its history: a longer dead time hides the effect of its own
-        # commands.
-        if dead_s and max(dead_s) > (machine.num_history - 1) * machine.period_s:
+        # commands. The oldest command in it began so many whole periods before the newest position.
+        if dead_s and max(dead_s) > machine.num_history * machine.period_s:
             faults.append(
                 f"dead time of up to {max(dead_s):.2f} s is longer than the policy's history"
             )

@@ -21,6 +21,8 @@ from deploy.guidance import LeverPositions
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
+    InsertionReading,
+    LoopHealth,
     OperatorRequest,
     PageState,
     RecordingStatus,
@@ -61,6 +63,7 @@ SHOWN = PageState(
     commands=False,
     streams=tuple(SourceAge(name, 0.0, 1e6) for name in ("positions", "levers", "advice", "borehole")),
     recording=RecordingStatus(False, 0.0, 0, failed=False),
+    health=LoopHealth(0.0, 0.15, log_behind=False, supervisor_silent=False), insertion=None,
     targets=(
         BoreholeChoice("A", (2.6, 0.0, 0.75), (0.0, 0.0, 1.0), 0.05, 0.002, 0.97, True),
         BoreholeChoice("B", (2.2, 0.4, 0.75), (0.0, 0.0, 1.0), 0.05, None, None, False),
@@ -68,6 +71,11 @@ SHOWN = PageState(
     path_in_base_m=((2.6, 0.3, 1.2), (2.6, 0.0, 1.05), (2.6, 0.0, 0.65)), block_in_base_m=None,
 )  # fmt: skip
 """All is well, all levers in neutral."""
+READING = InsertionReading(
+    depth_m=-0.12, lateral_m=0.034, angle_rad=0.05, wanted_m=0.1, inserted=False,
+    center_in_view_m=(0.03, 0.016, 0.12), axis_in_view=(0.05, 0.0, -0.99875),
+)  # fmt: skip
+"""A tool 12 cm above a borehole, 34 mm beside its axis, and leaning by 0.05 rad."""
 
 
 def change_state(shown: PageState, **changes: Any) -> PageState:

@@ -150,7 +150,6 @@ class BlockMeter:
     """
 
     def __init__(self, machine: Machine, joint: int) -> None:
-        self._period_s = machine.period_s
         self._full = float(machine.max_speed[joint]) * machine.period_s
         self._steps = max(1, round(STEP_S / machine.period_s))
         self._num_moving = round(BLOCK_S / machine.period_s)

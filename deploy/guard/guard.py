@@ -55,6 +55,7 @@ class GuardTrip(Enum):
     LEVERS_STALE = "remote missing"
     JOINTS_STALE = "joint positions missing"
     JOINTS_INVALID = "joint positions not plausible"
+    FEEDBACK_STALE = "valve feedback missing"
     CHANNEL_INVALID = "messages corrupted or from two senders"
     CONTROLS_STALE = "operator's switches missing"
     ROUND_TRIP = "way to the gateway and back unknown or too long"
@@ -90,6 +91,7 @@ class GuardInput:
         bus_up: Whether the bus works.
         alone: Whether nobody else sends valve commands.
         followed: Whether the gateway says that it goes by our commands.
+        feedback_age_s: Age of the valves' feedback; it matters only while armed.
         controls_age_s: Age of the switches that arm; they matter only while armed.
         round_trip_s: Time from the gateway to here and back to it, as the gateway measured it on
             our commands; it matters only while armed, since nothing is sent otherwise.
@@ -108,6 +110,7 @@ class GuardInput:
     bus_up: bool
     alone: bool
     followed: bool
+    feedback_age_s: float
     controls_age_s: float
     round_trip_s: float
     observed: GuardTrip
@@ -245,7 +248,9 @@ class Guard:
 
     def _check_way(self, seen: GuardInput) -> GuardTrip:
         """Return the fault of what only matters where commands are sent."""
-        if not seen.controls_age_s <= self._limits.controls_s:
+        if not seen.feedback_age_s <= self._limits.status_s:
+            return GuardTrip.FEEDBACK_STALE
+        if not _is_recent(seen.controls_age_s, self._limits.controls_s):
             return GuardTrip.CONTROLS_STALE
         if not seen.round_trip_s <= self._limits.round_trip_s:
             return GuardTrip.ROUND_TRIP
@@ -253,8 +258,10 @@ class Guard:
 
     def _check_request(self, request: CommandRequest | None) -> GuardTrip:
         """Return the fault of a request."""
-        if request is None or not request.age_s <= self._limits.request_s:
+        if request is None or not _is_recent(request.age_s, self._limits.request_s):
             return GuardTrip.REQUEST_STALE
+        if not all(map(math.isfinite, request.face_in_base_m or ())):
+            return GuardTrip.REQUEST_INVALID
         full = 1.0 + self._limits.overrun
         if len(request.u) != len(self._still) or not all(
             -full <= value <= full for value in request.u
@@ -303,3 +310,9 @@ class Guard:
         if self._envelope is not None:
             self._envelope.note_sent(self._before_s, u)
         return GuardDecision(self._state, u, trip, self._cause)
+
+
+def _is_recent(age_s: float, most_s: float) -> bool:
+    """Return whether a record of this computer is new enough; one from the future is none."""
+    # A record may be written between the clock's reading and its own.
+    return abs(age_s) <= most_s

@@ -138,7 +138,7 @@ class GuardLimits:
         jump_slack: Jump (rad or m) that noise alone may make.
         range_slack: Distance beyond the joint limits (rad or m) at which a position is still
             believed.
-        num_jumps: Jumps in a row after which positions are not plausible.
+        num_jumps: Jumps among the last samples (`deploy.guard.plausibility.WINDOW`) after which positions are not plausible.
         envelope: Limits of the arm in space; `null`: none. Without the machine's geometry there
             is none either.
         observer: Limits of the observer; `null`: none. For a machine other than that of its file

@@ -159,9 +159,13 @@ class Observer:
         self._joint = joint
         # The newest part tells what is wrong: the others may be from before.
         recent = max(1, len(predicted) // NEWEST)
-        newer = predicted[-recent:, joint], measured[-recent:, joint]
-        newer_way = float(np.abs(newer[0]).sum())
-        self._fault = classify_fault(float(newer[1].sum()), float(newer[0].sum()), newer_way)
+        newer_moved = float(measured[-recent:, joint].sum())
+        newer_way = float(np.abs(predicted[-recent:, joint]).sum())
+        # A joint at rest tells nothing: then the whole window does.
+        if newer_way == 0.0 and abs(newer_moved) <= self._slack[joint]:
+            recent, newer_moved, newer_way = 0, float(moved[joint]), float(way[joint])
+        newer_wanted = float(predicted[-recent:, joint].sum())
+        self._fault = classify_fault(newer_moved, newer_wanted, newer_way)
 
 
 def classify_fault(moved: float, wanted: float, way: float) -> GuardTrip:
@@ -173,7 +177,7 @@ def classify_fault(moved: float, wanted: float, way: float) -> GuardTrip:
         way: Sum of the predicted steps, without sign.
     """
     # At rest, or to and fro: a ratio of small numbers says nothing.
-    if abs(wanted) < way / 2 or abs(wanted) < abs(moved) / MOST:
+    if wanted == 0.0 or abs(wanted) < way / 2 or abs(wanted) < abs(moved) / MOST:
         return GuardTrip.JOINT_DRIFTS
     ratio = moved / wanted
     if ratio < TURNED:

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from deploy.guard.limits import GuardLimits, JointBounds
 
+WINDOW = 50
+"""Samples of a joint among which the rejected ones are counted: half a second of the example bus,
+as many as a channel remembers. A loose contact that spoils every second sample is found."""
+MASK = (1 << WINDOW) - 1
+
 
 class PlausibilityFilter:
     """Rejects joint positions that the machine could not have reached.
 
-    A few rejected in a row make all positions implausible.
+    A few rejected among the last `WINDOW` make all positions implausible.
 
     Args:
         limits: Gives margin, slack and number.
@@ -18,12 +23,13 @@ class PlausibilityFilter:
     def __init__(self, limits: GuardLimits, bounds: JointBounds) -> None:
         self._limits, self._bounds = limits, bounds
         self._last: list[tuple[float, float] | None] = [None] * len(bounds.lower)
+        # One bit a sample, the newest lowest.
         self._jumps = [0] * len(bounds.lower)
 
     @property
     def plausible(self) -> bool:
-        """True if no joint has jumped too often in a row."""
-        return max(self._jumps) < self._limits.num_jumps
+        """True if no joint has jumped too often of late."""
+        return max(map(int.bit_count, self._jumps)) < self._limits.num_jumps
 
     def accept(self, joint: int, now_s: float, position: float) -> bool:
         """Return whether to use a new position of `joint`.
@@ -40,8 +46,8 @@ class PlausibilityFilter:
             <= position
             <= bounds.upper[joint] + limits.range_slack
         )
-        if inside and (last is None or abs(position - last[1]) <= reach):
-            self._last[joint], self._jumps[joint] = (now_s, position), 0
-            return True
-        self._jumps[joint] += 1
-        return False
+        good = inside and (last is None or abs(position - last[1]) <= reach)
+        self._jumps[joint] = (self._jumps[joint] << 1 | (not good)) & MASK
+        if good:
+            self._last[joint] = now_s, position
+        return good

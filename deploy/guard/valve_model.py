@@ -19,8 +19,6 @@ from brokk_rl.machine import Machine
 
 SCHEMA = 1
 """Of the observer's file."""
-WHOLE = 5e-7
-"""Part of a period by which a dead time may fall short of a whole number of periods: rounding."""
 BEYOND = 1.2
 """Positions, in halves of the travel from its middle, beyond which the pose counts no further."""
 SHORTEST_S = 1e-6
@@ -56,10 +54,9 @@ class ValvePredictor:
 
     def __init__(self, tables: Mapping[str, Any], machine: Machine) -> None:
         number = {name: np.array(tables[name], float) for name in tables if name != "pose"}
-        self._period_s = machine.period_s
         periods = number["dead_time_s"] / machine.period_s
-        self._whole = np.floor(periods + WHOLE).astype(int)
-        self._part = (periods - self._whole).clip(0.0, 1.0)
+        self._whole = np.floor(periods).astype(int)
+        self._part = periods - self._whole
         self._half_play = number["play"] / 2
         self._spool_kept = np.exp(-machine.period_s / number["spool_s"].clip(SHORTEST_S))
         self._speed_kept = np.exp(-machine.period_s / number["speed_s"].clip(SHORTEST_S))
@@ -88,7 +85,7 @@ class ValvePredictor:
         self._pilot = np.clip(self._pilot, acting - self._half_play, acting + self._half_play)
         self._spool = self._pilot + self._spool_kept * (self._spool - self._pilot)
         signs = np.where(self._spool > 0, 1, -1)
-        stroke = np.abs(self._spool).clip(0.0, 1.0)
+        stroke = np.abs(self._spool)
         flow, full = np.zeros(len(u)), np.zeros(len(u))
         for j, sign in enumerate(signs):
             curve = self._curves[int(sign)][j]

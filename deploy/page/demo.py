@@ -22,6 +22,8 @@ from deploy.guidance import AXES, LeverPositions
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
+    InsertionReading,
+    LoopHealth,
     OperatorRequest,
     PageState,
     RecordingStatus,
@@ -29,7 +31,7 @@ from deploy.page.protocol import (
     SourceAge,
     Vector,
 )
-from deploy.page.scene import locate_borehole, plan_approach
+from deploy.page.scene import locate_borehole, measure_insertion, plan_approach
 from deploy.runtime.operator_state import OperatorState
 from deploy.runtime.shared_memory import RecordLayout
 from deploy.runtime.target import NEAR_M
@@ -41,6 +43,8 @@ LEAD_IN_S = 1.5
 """Time for which the button is announced."""
 LIMITS_S = {"positions": 0.15, "levers": 0.15, "advice": 0.15, "camera": 1.0, "borehole": 600.0}
 """Age from which each source is stale: about those of the loop."""
+DELAY_S = 0.15
+"""Delay of messages from which the guard would let nothing pass: that of `conf/guard`."""
 BUS_PERIOD_S, REMOTE_PERIOD_S = 0.01, 0.02
 """Between positions, and between messages of the remote, as in the example DBC."""
 BLOCK_M = ((1.9, -0.8, 0.0), (3.3, 0.8, 0.75))
@@ -134,6 +138,7 @@ class DemoFeed:
         levers, due_s = self._run_programme(number * machine.period_s)
         targets = tuple(replace(target, chosen=target.name == self._chosen) for target in TARGETS)
         state = self._build_state(now_s, t_s)
+        path, insertion = self._place_tool(state.q, targets)
         recorded_s = now_s - self._recorded_s if self._recording else 0.0
         return PageState(
             t_s=now_s,
@@ -144,8 +149,10 @@ class DemoFeed:
             commands=False,
             streams=self._measure_ages(t_s, number),
             recording=RecordingStatus(self._recording, recorded_s, 0, failed=False),
+            health=LoopHealth(0.0, DELAY_S, log_behind=False, supervisor_silent=False),
             targets=targets,
-            path_in_base_m=self._plan_path(state.q, targets),
+            insertion=insertion,
+            path_in_base_m=path,
             block_in_base_m=BLOCK_M,
         )
 
@@ -200,14 +207,19 @@ class DemoFeed:
         }
         return tuple(SourceAge(name, ages_s[name], limit_s) for name, limit_s in LIMITS_S.items())
 
-    def _plan_path(self, q: np.ndarray, targets: tuple[BoreholeChoice, ...]) -> tuple[Vector, ...]:
-        if not self._machine.has_bodies or not self._guiding:
-            return ()
+    def _place_tool(
+        self, q: np.ndarray, targets: tuple[BoreholeChoice, ...]
+    ) -> tuple[tuple[Vector, ...], InsertionReading | None]:
+        if not self._machine.has_bodies:
+            return (), None
         # There is always a chosen one: the demo begins with the first.
         chosen = next(target for target in targets if target.chosen)
-        tip_m = compute_tool_kinematics(self._machine, q).tip_in_base_m
+        tool = compute_tool_kinematics(self._machine, q)
+        insertion = measure_insertion(tool, chosen)
+        if not self._guiding:
+            return (), insertion
         center_m, axis = np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base)
-        return plan_approach(tip_m, center_m, axis)
+        return plan_approach(tool.tip_in_base_m, center_m, axis), insertion
 
     def _choose_at(self, x: float, y: float) -> bool:
         """Choose the borehole at a point of the picture; return whether there is one."""

@@ -25,6 +25,8 @@ from deploy.guidance import LeverGuidance, convert_to_positions, find_full_angle
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
+    InsertionReading,
+    LoopHealth,
     OperatorRequest,
     PageState,
     RecordingStatus,
@@ -32,14 +34,14 @@ from deploy.page.protocol import (
     SourceAge,
     Vector,
 )
-from deploy.page.scene import locate_borehole, plan_approach
+from deploy.page.scene import locate_borehole, measure_insertion, plan_approach, to_vector
 from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
 from deploy.runtime.bus_process import TEXT
-from deploy.runtime.operator_state import LoopSnapshot, PolicyAdvice, StopRequest
+from deploy.runtime.operator_state import LoopSnapshot, OperatorState, PolicyAdvice, StopRequest
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
-from deploy.runtime.shm_layout import LoopMemory
+from deploy.runtime.shm_layout import LOG_BYTES, LoopMemory
 from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, read_holes
 
 log = logging.getLogger(__name__)
@@ -48,6 +50,12 @@ ADVICE_PERIODS = 3
 """Control periods without a new advice from which the last one is stale. Chosen by hand: one late
 period must not grey the levers."""
 UP: Vector = (0.0, 0.0, 1.0)
+LOG_BEHIND_BYTES = LOG_BYTES // 32
+"""Bytes that wait for the log process from which it counts as stuck: about 4 s of a full bus. It
+looks 20 times a second. Chosen by hand."""
+SUPERVISOR_S = 1.0
+"""Age of the supervisor's switches from which it counts as silent: 20 of its cycles. Chosen by
+hand."""
 UNNAMED = "+"
 """Name of a borehole that perception does not know: one from a file, from the configuration, or
 pointed at."""
@@ -64,6 +72,7 @@ class PageProcessConfig:
         session: Where the link goes.
         positions_s: Age from which positions are stale.
         levers_s: Age from which the operator's levers are.
+        delay_s: Delay of messages from which the guard lets nothing pass.
         borehole_s: Age from which the borehole is.
         camera_s: Age from which the camera's picture is; `None`: there is no camera.
     """
@@ -74,6 +83,7 @@ class PageProcessConfig:
     session: Session
     positions_s: float
     levers_s: float
+    delay_s: float
     borehole_s: float
     camera_s: float | None = None
 
@@ -127,9 +137,7 @@ class LoopFeed:
         targets = self._list_targets(aim)
         chosen = next((one for one in targets if one.chosen), None)
         state, advice = snapshot.state, snapshot.advice
-        path: tuple[Vector, ...] = ()
-        if chosen is not None and state is not None:
-            path = self._plan_path(state.q, chosen)
+        path, insertion = self._place_tool(state, chosen)
         return PageState(
             t_s=snapshot.t_s,
             alive=snapshot.alive,
@@ -139,7 +147,9 @@ class LoopFeed:
             commands=snapshot.commands,
             streams=self._measure_ages(snapshot, aim),
             recording=self._describe_recording(snapshot),
+            health=self._check_health(snapshot),
             targets=targets,
+            insertion=insertion,
             path_in_base_m=path,
             block_in_base_m=None,
         )
@@ -247,6 +257,17 @@ class LoopFeed:
         failed = controls is not None and controls.recording_failed
         return RecordingStatus(on, seconds, dropped, failed)
 
+    def _check_health(self, snapshot: LoopSnapshot) -> LoopHealth:
+        memory, controls = self._memory, self._memory.controls.read()
+        # Before its first switches the supervisor is still starting.
+        silent = controls is not None and snapshot.t_s - controls.t_s > SUPERVISOR_S
+        return LoopHealth(
+            delay_s=0.0 if snapshot.state is None else snapshot.state.held_up_s,
+            delay_limit_s=self._config.delay_s,
+            log_behind=any(pipe.waiting > LOG_BEHIND_BYTES for pipe in memory.logs),
+            supervisor_silent=silent,
+        )
+
     def _read_frame_t_s(self) -> float | None:
         return self._memory.frame and self._memory.frame.peek("t_s")
 
@@ -260,8 +281,8 @@ class LoopFeed:
         for hole in holes:
             choice = BoreholeChoice(
                 name=str(int(hole["name"])),
-                center_in_base_m=_to_vector(hole["center_in_base_m"]),
-                axis_in_base=_to_vector(hole["axis_in_base"]),
+                center_in_base_m=to_vector(hole["center_in_base_m"]),
+                axis_in_base=to_vector(hole["axis_in_base"]),
                 radius_m=float(hole["radius_m"]),
                 std_m=float(hole["std_m"]),
                 confidence=float(hole["score"]),
@@ -271,7 +292,7 @@ class LoopFeed:
         if aim is not None and chosen is None:
             choice = BoreholeChoice(
                 name=UNNAMED,
-                center_in_base_m=_to_vector(aim["center_in_base_m"]),
+                center_in_base_m=to_vector(aim["center_in_base_m"]),
                 axis_in_base=UP,
                 radius_m=self._config.page.borehole_radius_m,
                 # 0 stands for "not known" in shared memory.
@@ -303,15 +324,16 @@ class LoopFeed:
         known = find_nearest(read_holes(self._memory.holes), found[0])
         return TargetPosition(*found, frame.t_s) if known is None else locate_hole(known)
 
-    def _plan_path(self, q: np.ndarray, target: BoreholeChoice) -> tuple[Vector, ...]:
+    def _place_tool(
+        self, state: OperatorState | None, chosen: BoreholeChoice | None
+    ) -> tuple[tuple[Vector, ...], InsertionReading | None]:
+        """Return the way of the tool into the chosen borehole, and where it is relative to it."""
         machine = self._config.machine
-        if not self._guiding or not machine.has_bodies:
-            return ()
-        tip_m = compute_tool_kinematics(machine, q).tip_in_base_m
-        center_m, axis = np.array(target.center_in_base_m), np.array(target.axis_in_base)
-        return plan_approach(tip_m, center_m, axis)
-
-
-def _to_vector(values: Any) -> Vector:
-    x, y, z = map(float, values)
-    return x, y, z
+        if state is None or chosen is None or not machine.has_bodies:
+            return (), None
+        tool = compute_tool_kinematics(machine, state.q)
+        insertion = measure_insertion(tool, chosen)
+        if not self._guiding:
+            return (), insertion
+        center_m, axis = np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base)
+        return plan_approach(tool.tip_in_base_m, center_m, axis), insertion

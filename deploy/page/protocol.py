@@ -79,6 +79,46 @@ class RecordingStatus:
 
 
 @dataclass(frozen=True)
+class LoopHealth:
+    """Readings of the loop itself, from which alarms come.
+
+    Attributes:
+        delay_s: Largest delay of a message of the bus beyond the shortest seen.
+        delay_limit_s: Delay from which the guard lets nothing pass.
+        log_behind: Whether records wait for the log process for seconds.
+        supervisor_silent: Whether the supervisor has not written its switches for long.
+    """
+
+    delay_s: float
+    delay_limit_s: float
+    log_behind: bool
+    supervisor_silent: bool
+
+
+@dataclass(frozen=True)
+class InsertionReading:
+    """Position of the tool relative to the chosen borehole.
+
+    Attributes:
+        depth_m: Depth of the tip below the rim, along the hole's axis; negative above the rim.
+        lateral_m: Distance of the tip from that axis.
+        angle_rad: Angle between tool and axis.
+        wanted_m: Depth from which it counts as inserted.
+        inserted: Whether it is, within the hole's radius.
+        center_in_view_m: Centre of the rim as seen along the tool: right, up, ahead of the tip.
+        axis_in_view: Unit vector out of the hole, likewise.
+    """
+
+    depth_m: float
+    lateral_m: float
+    angle_rad: float
+    wanted_m: float
+    inserted: bool
+    center_in_view_m: Vector
+    axis_in_view: Vector
+
+
+@dataclass(frozen=True)
 class BoreholeChoice:
     """A borehole that can be chosen.
 
@@ -114,7 +154,9 @@ class PageState:
         commands: Whether this loop can command valves at all.
         streams: Age of each source.
         recording: State of the recording.
+        health: Of the loop itself.
         targets: Boreholes to choose from.
+        insertion: Tool and chosen borehole; `None` while either is not known.
         path_in_base_m: Way of the tool from its tip; empty where nothing is planned.
         block_in_base_m: Two opposite corners of a block to draw; `None` where only the point cloud
             is known.
@@ -128,7 +170,9 @@ class PageState:
     commands: bool
     streams: tuple[SourceAge, ...]
     recording: RecordingStatus
+    health: LoopHealth
     targets: tuple[BoreholeChoice, ...]
+    insertion: InsertionReading | None
     path_in_base_m: tuple[Vector, ...]
     block_in_base_m: tuple[Vector, Vector] | None
 
@@ -182,6 +226,7 @@ class PageState:
             "safety": self.safety,
             "recording": asdict(self.recording),
             "targets": [asdict(one) for one in self.targets],
+            "insertion": self.insertion and asdict(self.insertion),
             "path_in_base_m": self.path_in_base_m,
             "block_in_base_m": self.block_in_base_m,
         }

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from brokk_rl.kinematics import ToolKinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from deploy.page.protocol import Vector
+from deploy.page.protocol import BoreholeChoice, InsertionReading, Vector
 
 ABOVE_M = 0.3
 """Height over the rim from which the tool goes straight down. Chosen by hand: clear of the face."""
@@ -56,6 +57,51 @@ def describe_geometry(machine: Machine) -> dict[str, Any] | None:
         origin_m = [dimension.value for dimension in body.origin_m]
         links.append({"kind": joint.kind, "axis": list(body.axis), "origin_m": origin_m})
     return {"links": links, "tip_m": machine.tip_m.tolist()}
+
+
+def measure_insertion(tool: ToolKinematics, hole: BoreholeChoice) -> InsertionReading:
+    """Return the position of the tool relative to a borehole.
+
+    Args:
+        tool: Pose of the tool, without batch.
+        hole: The borehole.
+    """
+    center_m, axis = np.array(hole.center_in_base_m), np.array(hole.axis_in_base)
+    off_m = center_m - tool.tip_in_base_m
+    depth_m = float(off_m @ axis)
+    lateral_m = float(np.linalg.norm(np.cross(off_m, axis)))
+    into = float(np.clip(-tool.axis_in_base @ axis, -1.0, 1.0))
+    view = _find_view_along(tool)
+    return InsertionReading(
+        depth_m=depth_m,
+        lateral_m=lateral_m,
+        angle_rad=math.acos(into),
+        wanted_m=BELOW_M,
+        inserted=depth_m >= BELOW_M and lateral_m <= hole.radius_m,
+        center_in_view_m=to_vector(view @ off_m),
+        axis_in_view=to_vector(view @ axis),
+    )
+
+
+def _find_view_along(tool: ToolKinematics) -> np.ndarray:
+    """Return the rotation from the base to the view along the tool: right, up, ahead, `(3, 3)`.
+
+    Right is the machine's right of the direction in which the arm points. Levers and view then
+    agree: for a tool that points down, forward is up.
+    """
+    x, y, _ = tool.tip_in_base_m
+    ahead = tool.axis_in_base
+    # An arm that stands over the machine's own axis points nowhere; forward is as good as any.
+    right = np.array([y, -x, 0.0]) if math.hypot(x, y) > 0 else np.array([0.0, -1.0, 0.0])
+    right = right - (right @ ahead) * ahead
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, ahead), ahead])
+
+
+def to_vector(values: np.ndarray) -> Vector:
+    """Return an array `(3,)` as a tuple of plain numbers."""
+    x, y, z = map(float, values)
+    return x, y, z
 
 
 def plan_approach(tip_m: np.ndarray, center_m: np.ndarray, axis: np.ndarray) -> tuple[Vector, ...]:

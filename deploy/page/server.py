@@ -20,6 +20,7 @@ import os
 import secrets
 import time
 from collections.abc import Callable, Coroutine, Mapping
+from dataclasses import asdict
 from http import HTTPStatus
 from typing import Protocol
 
@@ -32,6 +33,7 @@ from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.page import access, frame_codec
+from deploy.page.alarms import list_alarms
 from deploy.page.clock import PageClock
 from deploy.page.connections import ConnectionBudget, LatestValue, SendWindow
 from deploy.page.files import FILES, SECURITY, load_files
@@ -260,7 +262,9 @@ class PageServer:
                     apart_s, advised_s = now_s - advised_s, now_s
                 if silent or facts != before:
                     sent_s, before, advised = now_s, facts, number
-                    message = {"number": self._state.number + 1, "shown": state.to_plain()}
+                    alarms = [asdict(one) for one in list_alarms(state)]
+                    shown = state.to_plain() | {"alarms": alarms}
+                    message = {"number": self._state.number + 1, "shown": shown}
                     text = json.dumps(message, separators=(",", ":"))
                     await self._state.put((state, text))
             # Short sleeps only around the expected moment: polling costs processor time.
@@ -458,6 +462,7 @@ def _list_facts(state: PageState) -> tuple[object, ...]:
         state.guiding,
         state.recording.on,
         state.recording.failed,
+        list_alarms(state),
         state.targets,
     )
 

@@ -181,8 +181,8 @@ class PolicyAdviser:
         if state is None:
             return AdviceStatus.NO_STATE
         stale_s = self._config.stale_s
-        # Old positions and a silent bus process are equally bad.
-        if now_s - state.q_t_s > stale_s or now_s - state.t_s > stale_s:
+        # Old positions, old commands in force and a silent bus process are equally bad.
+        if now_s - min(state.q_t_s, state.flow_t_s, state.t_s) > stale_s:
             self._history.empty()
             return AdviceStatus.STALE
         if not state.q_plausible or not state.trusted:

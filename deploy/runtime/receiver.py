@@ -165,6 +165,7 @@ class BusReceiver:
             estop=self.estop,
             bus_up=bus_up,
             followed=self.followed,
+            feedback_age_s=now_s - self.flow_t_s,
             alone=self._is_alone(now_s),
             controls_age_s=controls_age_s,
             round_trip_s=self.round_trip_s,

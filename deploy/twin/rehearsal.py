@@ -38,8 +38,9 @@ PRESSES_S = {"dead-man": (0.2, 0.8), "e-stop": (1.2, 1.6)}
 """When in a round a switch is pressed and released. No joint moves meanwhile."""
 JOINTS_S = 2.2
 """When in a round the first joints are moved."""
-PUSHES_S = ((1.0, 1.6, PUSH), (3.4, 4.0, -PUSH))
-"""Beginning, end and deflection of the motions in a part."""
+PUSHES_S = ((1.0, 1.6, -PUSH), (3.4, 4.0, PUSH))
+"""Beginning, end and deflection of the motions in a part. Upwards first: downwards, the tool of the
+simulated machine touches the ground, and a joint that is pushed back has no dead time."""
 SOUND_ROUNDS = 3
 """Rounds after which a person who fails the shadow run spoils it: the joints have been seen by then."""
 SPOILED_S = 1.0
@@ -169,7 +170,8 @@ def run_person(
                 begun_s = now_s + rest_s
             t_s = now_s - begun_s
             person.move(remote, t_s)
-            bus.send(remote.build_frame())
+            if remote.is_ready:
+                bus.send(remote.build_frame())
             # A busy twin may not answer in time: then the person tries again.
             with contextlib.suppress(TimeoutError):
                 if person.holds("e-stop", t_s) and not pressed:

@@ -32,6 +32,8 @@ class RadioRemote:
         button_right: Whether the right button is held.
         deadman: Whether the dead-man is held.
         on: Whether it is switched on.
+        is_ready: Whether it has heard the gateway's clock. Before that its stamps would look like
+            those of late copies, so it sends nothing.
     """
 
     def __init__(self, description: BusDescription) -> None:
@@ -43,6 +45,7 @@ class RadioRemote:
         self.on = True
         self._counter, self._clock = 0, GatewayClock()
         self._heard = description.layouts[description.message_of("EStop")]
+        self.is_ready = not self._heard.stamp_wrap_s
 
     @property
     def frame_ids(self) -> list[int]:
@@ -56,6 +59,7 @@ class RadioRemote:
         values = self._description.decode(self._heard, frame.data)
         if not isinstance(values, MessageFault):
             self._clock.learn(values[STAMP], self._heard.stamp_wrap_s, now_s)
+            self.is_ready = True
 
     def build_frame(self, frozen: int | None = None) -> CanFrame:
         """Return the next message; `frozen` is a counter that stands still, a fault."""
@@ -122,7 +126,8 @@ def run_operator(
                 angles_rad, remote.button_right = own.levers(given)
                 remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
             cycle += 1
-            bus.send(remote.build_frame())
+            if remote.is_ready:
+                bus.send(remote.build_frame())
 
 
 def _read_displayed_command(memory: LoopMemory, levers: LeverMap) -> np.ndarray:

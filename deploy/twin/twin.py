@@ -285,7 +285,7 @@ class RunningTwin:
         layout = self._description.layouts[self._description.message_of("DeadMan")]
         held = self._holds_deadman(now_s)
         released = remote.deadman and not held  # a release does not wait for its turn
-        if now_s < self._due_s.get(layout.name, now_s) and not released:
+        if not remote.is_ready or (now_s < self._due_s.get(layout.name, now_s) and not released):
             return
         # The schedule keeps its phase after a delay, and does not send the missed ones in a
         # burst.

@@ -68,7 +68,7 @@ class Desk:
         self.number += 4
         blank = RecordLayout(OperatorState, NUM_JOINTS).new()
         known = {"t_s": self.now_s, "q_t_s": self.now_s, "q": MACHINE.home, "q_plausible": True}
-        known |= {"trusted": True, "flow_number": self.number}
+        known |= {"trusted": True, "flow_number": self.number, "flow_t_s": self.now_s}
         return replace(blank, **(known | changes))
 
     def aim(self, t_s: float | None = None) -> None:
@@ -150,6 +150,7 @@ def test_the_first_call_is_made_before_anything_depends_on_it() -> None:
         ({"q_plausible": False}, AdviceStatus.IMPLAUSIBLE),
         ({"trusted": False}, AdviceStatus.IMPLAUSIBLE),
         ({"q_t_s": -0.151}, AdviceStatus.STALE),
+        ({"flow_t_s": -0.151}, AdviceStatus.STALE),
         ({"t_s": -0.151}, AdviceStatus.STALE),
     ],
 )
@@ -173,7 +174,7 @@ def test_positions_up_to_the_limit_are_fresh_and_no_state_is_none(desk: Desk) ->
     assert desk.adviser.run_cycle(0, desk.now_s) is AdviceStatus.NO_STATE
     desk.advised()
     fresh_s = desk.now_s + MACHINE.period_s - 0.15
-    assert desk.go(q_t_s=fresh_s, t_s=fresh_s) is AdviceStatus.VALID
+    assert desk.go(q_t_s=fresh_s, flow_t_s=fresh_s, t_s=fresh_s) is AdviceStatus.VALID
 
 
 def test_without_a_borehole_or_with_an_old_one_there_is_no_advice(desk: Desk) -> None:

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,9 +21,10 @@ from actuators.excite.player import NominalMachine
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from deploy.bringup import BringupResult, measure_joint_response
-from deploy.bus.can_bus import CanBus
+from deploy.bringup import BringupResult, JointResponse, _StateChecks, measure_joint_response
+from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
+from deploy.bus.protection import MessageFault
 from deploy.modes.bringup import BringupMode
 from deploy.runtime.process import ChildProcess, CycleTimer
 from deploy.twin.faults import ActiveFaults, request_fault
@@ -57,6 +59,19 @@ def test_a_joint_that_moved_one_way_only_or_not_at_all_says_nothing() -> None:
     assert measure_joint_response(T_S, np.zeros_like(q), flow, 2.0) is None
 
 
+@pytest.mark.parametrize(("dead_s", "passed"), [(0.64, True), (0.66, False)])
+def test_a_dead_time_beyond_the_commands_of_the_history_fails_the_check(
+    dead_s: float, passed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # 13 commands of 50 ms: the oldest began 0.65 s before the newest position.
+    machine = option("machine", "brokk170")
+    checks = _StateChecks(SimpleNamespace(), machine, SimpleNamespace(memory=None), print)  # type: ignore[arg-type]
+    found = {name: JointResponse(True, 0.5, 0.2) for name in machine.joint_names}
+    found["q2"] = JointResponse(True, dead_s, 0.2)
+    monkeypatch.setattr(checks, "_watch_joints", lambda: found)
+    assert checks._check_joints().passed is passed
+
+
 def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -> None:
     """Does what the checklist asks for: dead-man, emergency stop, then each joint both ways."""
     remote = RadioRemote(BusDescription(DBC, machine))
@@ -80,7 +95,8 @@ def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -
             part, remote.button_right = t_s % 4.8, t_s >= 4.8
             pushed = (0.6 if part < 2.0 else -0.6) if 1.0 < part < 1.6 or 3.4 < part < 4.0 else 0.0
             remote.levers = (0.0, 0.0, pushed, 0.0) if remote.button_right else (pushed,) * 4
-            bus.send(remote.build_frame())
+            if remote.is_ready:
+                bus.send(remote.build_frame())
 
 
 @pytest.mark.slow
@@ -166,6 +182,22 @@ def test_a_twin_says_what_it_does(brokk: Callable[..., Any], tmp_path: Path) -> 
     assert done.code == 0 and "twin of brokk170 on udp_multicast" in done.err
 
 
+def test_a_remote_is_silent_until_it_has_heard_the_gateway() -> None:
+    """Its stamps would jump at the first message it hears, and look like those of late copies."""
+    machine = option("machine", "brokk170")
+    description = BusDescription(DBC, machine)
+    remote = RadioRemote(description)
+    status = description.layouts[description.message_of("EStop")]
+    assert not remote.is_ready
+    remote.hear(CanFrame(status.frame_id, bytes(8)), 1.0)
+    assert not remote.is_ready  # its CRC is wrong
+    remote.hear(CanFrame(status.frame_id, description.encode(status.name, {"Stamp": 0.9}, 0)), 1.0)
+    assert remote.is_ready
+    values = description.decode(remote._layout, remote.build_frame().data)
+    assert not isinstance(values, MessageFault)
+    assert values["Stamp"] == pytest.approx(0.9, abs=0.01)
+
+
 def sample_person(fails: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A round of the scripted person: commands, dead-man and emergency stop every 20 ms."""
     person = ScriptedPerson(option("machine", "brokk170"), fails)
@@ -177,6 +209,8 @@ def sample_person(fails: str | None) -> tuple[np.ndarray, np.ndarray, np.ndarray
 def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     commands, deadman, estop = sample_person(None)
     assert (commands.max(0) > 0.5).all() and (commands.min(0) < -0.5).all()
+    # Upwards first: positive commands lower the arm, and home is near the ground.
+    assert (commands[np.argmax(commands != 0, axis=0), range(5)] < 0).all()
     # q2 moves alone, and nothing moves while a switch is pressed.
     moves = commands != 0
     assert not (moves[:, 1] & moves[:, [0, 2, 3, 4]].any(1)).any()
@@ -189,7 +223,7 @@ def test_a_scripted_person_does_all_that_the_checklist_asks() -> None:
     assert not person.command(-1.0).any() and not person.holds("dead-man", -ROUND_S + 0.5)
     remote = RadioRemote(BusDescription(DBC, option("machine", "brokk170")))
     person.move(remote, 2.2 + 1.2)
-    assert max(remote.levers) == pytest.approx(0.6) and not remote.button_right
+    assert min(remote.levers) == pytest.approx(-0.6) and not remote.button_right
     person.move(remote, 2.2 + 4.8 + 1.2)
     assert remote.button_right and sum(one != 0 for one in remote.levers) == 1
     person.move(remote, 0.5)

@@ -168,6 +168,7 @@ def feed(exchange: LoopMemory, tmp_path: Path) -> LoopFeed:
             session,
             0.15,
             0.15,
+            0.15,
             600.0,
             1.0,
         ),

@@ -17,7 +17,13 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from deploy.guard.envelope import Envelope, measure_segment_to_box
 from deploy.guard.limits import StayOutBox
-from deploy.guard.shapes import RoundedBox, fit_capsules, read_machine_shapes
+from deploy.guard.shapes import (
+    LinkCapsule,
+    MachineShapes,
+    RoundedBox,
+    fit_capsules,
+    read_machine_shapes,
+)
 
 MACHINE = option("machine", "brokk170")
 LIMITS = option("guard", "default").envelope
@@ -27,6 +33,7 @@ MJCF = Path(brokk_rl.sim.__file__).parent / "assets" / "brokk170.xml"
 BODIES = ("undercarriage", *(f"{name}_link" for name in MACHINE.joint_names))
 WALL = StayOutBox(lower_m=(1.0, 1.4, 0.2), upper_m=(4.0, 1.6, 2.5))
 HOME = np.array(MACHINE.home)
+ROD = LinkCapsule(2, np.array([-0.5, 0.0, 0.0]), np.array([0.7, 0.0, 0.0]), 0.05)
 STILL = (0.0,) * 5
 DT_S = 0.025
 SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
@@ -231,9 +238,95 @@ def test_worked_distances() -> None:
         ((-5.0, 0.0, 3.0), (5.0, 0.0, 3.0), 2.0),  # passing above
         ((0.0, 4.0, 2.0), (0.0, 2.0, 4.0), 4.0 / math.sqrt(2)),  # around an edge
         ((-5.0, 0.0, 0.0), (5.0, 0.0, 0.0), 0.0),  # through it
+        ((0.5, 3.0, 0.0), (1.5, 2.8, 0.0), 1.9 / math.sqrt(1.04)),  # foot of the edge's normal
     ):
         found = measure_segment_to_box(np.array(begin), np.array(end), half)
         assert found == pytest.approx(expected)
+
+
+def build_lone_rod(**change: object) -> tuple[Envelope, np.ndarray, np.ndarray]:
+    """An envelope of one rod of 1.2 m on the third link, and its ends in the base frame at home."""
+    limits = replace(LIMITS, ground_m=None, **change)
+    model = read_spec().compile()
+    data = mujoco.MjData(model)
+    data.qpos[:5] = HOME
+    mujoco.mj_kinematics(model, data)
+    link = data.body("q3_link")
+    ends_m = [link.xpos + link.xmat.reshape(3, 3) @ end for end in (ROD.begin_m, ROD.end_m)]
+    return Envelope(limits, MACHINE, MachineShapes((ROD,), ())), ends_m[0], ends_m[1]
+
+
+def test_the_bound_of_far_shapes_is_that_of_their_enclosing_balls() -> None:
+    post = StayOutBox(lower_m=(8.0, 3.0, 2.0), upper_m=(8.4, 3.6, 2.8))
+    envelope, begin_m, end_m = build_lone_rod(stay_out={"post": post})
+    center_m = np.array([8.2, 3.3, 2.4])
+    apart_m = float(np.linalg.norm((begin_m + end_m) / 2 - center_m))
+    bound_m = apart_m - 0.6 - 0.05 - math.hypot(0.2, 0.3, 0.4)
+    assert envelope.measure_clearance(HOME[None], 0.5)[0] == pytest.approx(bound_m)
+    # A post beyond the end of the rod, far from its middle, is computed.
+    along = (end_m - begin_m) / np.linalg.norm(end_m - begin_m)
+    at_m = end_m + 0.25 * along
+    near = StayOutBox(lower_m=tuple(at_m - 0.01), upper_m=tuple(at_m + 0.01))
+    envelope, _, _ = build_lone_rod(stay_out={"post": near})
+    assert envelope.measure_clearance(HOME[None], 0.25)[0] == pytest.approx(0.2, abs=0.02)
+    assert envelope.measure_clearance(HOME[None], 0.25) == envelope.measure_clearance(HOME[None])
+
+
+def test_what_lies_below_the_ground_touches_it() -> None:
+    envelope, begin_m, end_m = build_lone_rod()
+    above_m = max(begin_m[2], end_m[2]) + 1.0
+    rod = Envelope(replace(LIMITS, ground_m=above_m), MACHINE, MachineShapes((ROD,), ()))
+    assert rod.measure_clearance(HOME[None])[0] == pytest.approx(-0.05)
+    below_m = min(begin_m[2], end_m[2]) - 1.0
+    rod = Envelope(replace(LIMITS, ground_m=below_m), MACHINE, MachineShapes((ROD,), ()))
+    assert rod.measure_clearance(HOME[None])[0] == pytest.approx(0.95)
+    assert np.isinf(envelope.measure_clearance(HOME[None])).all()
+
+
+def test_the_way_to_rest_is_looked_at_and_nothing_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
+    envelope, face, rest = build_envelope(), (2.0, 0.0, 1.0), HOME + 0.4
+    tips_m, step_m, asked = np.zeros((5, 3)), np.array([0.25, 0.0, 0.0]), []
+
+    def locate_tip(q: np.ndarray) -> np.ndarray:
+        asked.append(q)
+        # Half a metre of motion within the reaction time: far too fast.
+        return np.concatenate([tips_m, tips_m - step_m, tips_m + step_m])
+
+    monkeypatch.setattr(envelope, "locate_tip", locate_tip)
+
+    def is_slow(heights_m: list[float], aside_m: list[float]) -> bool:
+        tips_m[:] = np.array(face)
+        tips_m[:, 1] += aside_m
+        tips_m[:, 2] += heights_m
+        return envelope._find_slowdown(np.ones(5), HOME, rest, face) < 1.0
+
+    far_m = LIMITS.face_radius_m + 1.0
+    assert is_slow([0.5, -0.5, -0.5, -0.5, -0.5], [0.0] * 5)
+    # It passes the surface elsewhere; then it is below it, and goes on there.
+    assert not is_slow([0.5, -0.5, -0.5, -0.5, -0.5], [0.0, far_m, 0.0, 0.0, 0.0])
+    assert not is_slow([0.5] * 5, [0.0] * 5)
+    way = asked[0][:5]
+    assert way[0] == pytest.approx(HOME) and way[-1] == pytest.approx(rest)
+    assert np.diff(way, axis=0) == pytest.approx(0.1)
+
+
+def test_a_command_that_leads_nowhere_is_not_withheld() -> None:
+    at = HOME.copy()
+    at[0] = MACHINE.upper[0]
+    # The ground so high that the arm is always too near.
+    clear_m = float(build_envelope(ground_m=0.7).measure_clearance(at[None])[0])
+    envelope = build_envelope(ground_m=0.7 + clear_m - LIMITS.margin_m / 2)
+    outward = (1.0, 0.0, 0.0, 0.0, 0.0)
+    assert 0.0 < envelope.measure_clearance(at[None])[0] < LIMITS.margin_m
+    assert envelope.limit_command(1.0, outward, tuple(at), None) == (outward, False)
+
+
+def test_commands_that_have_come_to_rest_are_forgotten() -> None:
+    envelope, period_s = build_envelope(), 0.01
+    for number in range(3000):
+        envelope.note_sent(number * period_s, STILL)
+    horizon_s = MACHINE.dead_time_s + LIMITS.coast_s
+    assert len(envelope._sent) <= horizon_s / period_s + 2
 
 
 def test_capsules_enclose_boxes_and_balls() -> None:

@@ -33,8 +33,8 @@ LIMITS = GuardLimits(
 )  # fmt: skip
 WELL = GuardInput(
     q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
-    status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True, controls_age_s=0.01, round_trip_s=0.03,
-    observed=GuardTrip.NONE,
+    status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True, feedback_age_s=0.01, controls_age_s=0.01,
+    round_trip_s=0.03, observed=GuardTrip.NONE,
 )  # fmt: skip
 RELEASED = replace(WELL, deadman=False)
 STILL = (0.0, 0.0, 0.0)
@@ -146,6 +146,7 @@ ASKED = [
     (None, 0.0, GuardTrip.REQUEST_STALE),
     ((0.1, 0.0, 0.0), LIMITS.request_s + 0.001, GuardTrip.REQUEST_STALE),
     ((0.1, 0.0, 0.0), math.nan, GuardTrip.REQUEST_STALE),
+    ((0.1, 0.0, 0.0), -LIMITS.request_s - 0.001, GuardTrip.REQUEST_STALE),
     ((math.nan, 0.0, 0.0), 0.0, GuardTrip.REQUEST_INVALID),
     ((0.0, 0.0, math.inf), 0.0, GuardTrip.REQUEST_INVALID),
     ((1.002, 0.0, 0.0), 0.0, GuardTrip.REQUEST_INVALID),
@@ -299,6 +300,10 @@ def test_nothing_moves_further_out_at_a_stop_but_everything_back() -> None:
 WAY = [
     ({"controls_age_s": LIMITS.controls_s + 0.001}, GuardTrip.CONTROLS_STALE),
     ({"controls_age_s": math.nan}, GuardTrip.CONTROLS_STALE),
+    ({"controls_age_s": -LIMITS.controls_s - 0.001}, GuardTrip.CONTROLS_STALE),
+    ({"feedback_age_s": LIMITS.status_s + 0.001}, GuardTrip.FEEDBACK_STALE),
+    ({"feedback_age_s": math.inf}, GuardTrip.FEEDBACK_STALE),
+    ({"feedback_age_s": math.nan}, GuardTrip.FEEDBACK_STALE),
     ({"round_trip_s": LIMITS.round_trip_s + 0.001}, GuardTrip.ROUND_TRIP),
     ({"round_trip_s": math.inf}, GuardTrip.ROUND_TRIP),
     ({"round_trip_s": math.nan}, GuardTrip.ROUND_TRIP),
@@ -306,7 +311,7 @@ WAY = [
 
 
 @pytest.mark.parametrize(("change", "trip"), WAY, ids=str)
-def test_old_switches_and_an_unknown_way_latch_but_matter_only_where_something_is_sent(
+def test_old_switches_and_feedback_and_an_unknown_way_latch_but_matter_only_where_something_is_sent(
     change: dict[str, Any], trip: GuardTrip
 ) -> None:
     hand = Hand()
@@ -322,9 +327,21 @@ def test_old_switches_and_an_unknown_way_latch_but_matter_only_where_something_i
     assert hand.decide(estop=True, **change).trip is GuardTrip.ESTOP, "what is worse is said"
 
 
+@pytest.mark.parametrize("number", range(3))
+def test_a_work_surface_that_is_no_place_refuses_the_command(number: int) -> None:
+    """No comparison with NaN holds, so that the tip would not be slowed there."""
+    hand, face = Hand().active(), [2.0, 0.0, 1.0]
+    for value, trip in ((0.5, GuardTrip.NONE), (math.nan, GuardTrip.REQUEST_INVALID)):
+        face[number] = value
+        request = CommandRequest((0.1, 0.0, 0.1), 0.0, tuple(face))
+        hand.now_s += DT
+        assert hand.guard.decide(hand.now_s, True, WELL, request).trip is trip
+
+
 def test_switches_and_way_at_their_limits_will_do() -> None:
     hand = Hand().active()
     seen = {"controls_age_s": LIMITS.controls_s, "round_trip_s": LIMITS.round_trip_s}
+    seen["feedback_age_s"] = LIMITS.status_s
     assert hand.decide(u=(0.1, 0.0, 0.1), **seen).u == pytest.approx((0.1, 0.0, 0.1))
 
 
@@ -428,7 +445,7 @@ def test_whatever_happens_the_guard_keeps_its_promises(story: list[dict[str, Any
         before, state, pressed = decision.u, decision.state, cycle["deadman"]
 
 
-def test_a_joint_that_jumps_is_refused_and_three_in_a_row_make_all_implausible() -> None:
+def test_a_joint_that_jumps_is_refused_and_three_of_fifty_make_all_implausible() -> None:
     watch = PlausibilityFilter(LIMITS, BODY)
     assert watch.accept(0, 1.00, 0.0)
     assert watch.accept(0, 1.01, 0.0249)  # 0.01 + 3 * 0.5 rad/s * 0.01 s
@@ -436,7 +453,24 @@ def test_a_joint_that_jumps_is_refused_and_three_in_a_row_make_all_implausible()
         assert watch.plausible
         assert not watch.accept(0, 1.01 + 0.01 * number, 0.9)
     assert not watch.plausible
-    assert watch.accept(0, 1.05, 0.03) and watch.plausible
+    # The first of the three is forgotten after fifty further samples.
+    for number in range(47):
+        assert watch.accept(0, 1.05 + 0.01 * number, 0.03) and not watch.plausible
+    assert watch.accept(0, 2.0, 0.03) and watch.plausible
+
+
+def test_a_loose_contact_that_spoils_every_second_sample_is_found() -> None:
+    watch = PlausibilityFilter(LIMITS, BODY)
+    for number in range(5):
+        assert watch.plausible
+        watch.accept(0, 0.01 * number, 0.5 * (number % 2))
+    watch.accept(0, 0.05, 0.5)
+    assert not watch.plausible
+    # Another joint's samples do not count.
+    other = PlausibilityFilter(LIMITS, BODY)
+    for joint in (0, 1, 2):
+        other.accept(joint, 0.0, 9.0)
+    assert other.plausible
 
 
 def test_a_joint_that_stays_at_its_new_place_is_believed_once_it_could_have_got_there() -> None:

@@ -98,6 +98,7 @@ def state(
         blank,
         t_s=now_s,
         q_t_s=now_s,
+        flow_t_s=now_s,
         q=q * each,
         flow_number=number,
         flow_sum=flow * number * each,

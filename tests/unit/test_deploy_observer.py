@@ -14,6 +14,7 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
+from deploy.guard.drift_watch import Misfit
 from deploy.guard.guard import GuardTrip
 from deploy.guard.observer import NOTHING_OBSERVED, Observer, classify_fault
 from deploy.guard.valve_model import ValvePredictor, load_observer_file
@@ -213,6 +214,80 @@ def test_nothing_is_judged_before_the_first_look_can_know() -> None:
     assert joints.fault is not GuardTrip.NONE
 
 
+def test_the_first_periods_pass_unjudged_and_no_more() -> None:
+    # A dead time of 0.55 s and 0.3 s until the arm rests, in periods of 0.05 s.
+    for periods, fault in ((18, GuardTrip.NONE), (19, GuardTrip.JOINT_DRIFTS)):
+        joints = Joints()
+        for number in range(periods):
+            joints.q = HOME + 0.5 * (number == periods - 1)
+            joints.go((0.0,) * 5, PERIOD_S)
+        assert joints.fault is fault, periods
+
+
+def test_letting_go_without_a_fault_forgets_no_motion() -> None:
+    joints = Joints()
+    joints.go((0.0,) * 5, 2.0)
+    joints.drift[1], found = 0.1, set()
+    for _ in range(20):
+        joints.observer.clear()
+        joints.go((0.0,) * 5, PERIOD_S)
+        found.add(joints.fault)
+    assert GuardTrip.JOINT_DRIFTS in found
+
+
+def name_fault(measured: list[float], predicted: list[float]) -> GuardTrip:
+    """The fault of the second joint by a whole window of its motions, of a full step each."""
+    observer = Joints(replace(LIMITS, slack_s=1e-3)).observer
+    step = SPEED * PERIOD_S
+    for own, model in zip(measured, predicted, strict=True):
+        # Only the last motion is judged.
+        observer._fault, observer._joint = GuardTrip.LEVER, 0
+        if len(observer._measured) == len(measured) - 1:
+            observer._fault = GuardTrip.NONE
+        second = np.eye(5)[1]
+        observer._compare(own * step * second, model * step * second)
+    return observer.observation.fault
+
+
+def test_the_newest_quarter_of_the_window_names_the_fault() -> None:
+    moves = [1.0] * 15
+    for newest, expected, fault in (
+        # Five of twenty: without the first of them, or with one more, the joint stood still.
+        ([-2.5, 0.0, 0.0, 0.0, 0.0], [1.0] * 5, GuardTrip.JOINT_TURNED),
+        ([0.0, 0.0, 0.0, 0.0, -2.5], [1.0] * 5, GuardTrip.JOINT_TURNED),
+        ([0.0] * 5, [1.0] * 5, GuardTrip.JOINT_STILL),
+        # At rest: all of the window names it.
+        ([0.0] * 5, [0.0] * 5, GuardTrip.JOINT_STILL),
+        # To and fro: the way counts as it was predicted.
+        ([0.0] * 5, [1.0, -1.0, 1.0, -1.0, 0.6], GuardTrip.JOINT_DRIFTS),
+    ):
+        before = [0.9] * 15 if expected[1] > 0 else [0.2] * 15
+        assert name_fault(before + newest, moves + expected) is fault
+    assert name_fault([*moves[:14], 0.0, -0.5, -0.5, -0.5, -0.5, 0.0], [1.0] * 20) is (
+        GuardTrip.JOINT_TURNED
+    )
+    # Of a short window the last motion alone.
+    assert name_fault([0.0, 0.0, 2.0, -1.0], [1.0] * 4) is GuardTrip.JOINT_TURNED
+    assert name_fault([0.0, 2.0, -1.0], [1.0] * 3) is GuardTrip.JOINT_TURNED
+
+
+def test_the_watch_hears_of_each_period_and_its_finding_is_passed_on() -> None:
+    joints = Joints(scores=[[0.02, 0.03, 0.04, 0.05] * 50] * 5)
+    scores: list[list[float]] = []
+    joints.gain[2] = 0.85
+    for number in range(3000):
+        sign = 1.0 if number // 30 % 2 else -1.0
+        joints.go((0.0, 0.0, sign, 0.0, 0.0), PERIOD_S)
+        scores += [[one for one in joints.observer.scores if one is not None]]
+    found = [own[0] for own in scores if own]
+    # Ten seconds of motion each. Of the three halves of a second between two reversals one holds 0.2
+    # s of the way back, the dead time: 15 % of (0.5 + 0.5 + 0.1) / 1.5 of the way.
+    assert len(found) == pytest.approx(3000 * PERIOD_S / 10.0, abs=2)
+    assert found[3] == pytest.approx(0.15 * 1.1 / 1.5, rel=0.05)
+    observation = joints.observer.observation
+    assert (observation.misfit, observation.misfit_joint) == (Misfit.FLOW_GAIN, 2)
+
+
 def test_a_period_is_due_when_it_is_over() -> None:
     observer = Joints().observer
     assert observer.is_due(0.0)
@@ -233,6 +308,13 @@ def test_classes_of_faults() -> None:
         (0.1, 0.0, 0.0, GuardTrip.JOINT_DRIFTS),
         (-0.1, 0.02, 0.02, GuardTrip.JOINT_DRIFTS),
         (0.0, 0.04, 0.1, GuardTrip.JOINT_DRIFTS),  # to and fro
+        # At the limits themselves, which binary fractions hold exactly.
+        (0.0, 0.5, 1.0, GuardTrip.JOINT_STILL),
+        (-3.0, 1.0, 1.0, GuardTrip.JOINT_TURNED),
+        (-3.5, 1.0, 1.0, GuardTrip.JOINT_DRIFTS),
+        (-0.3, 1.0, 1.0, GuardTrip.JOINT_STILL),
+        (0.3, 1.0, 1.0, GuardTrip.JOINT_WEAK),
+        (1.0, 1.0, 1.0, GuardTrip.JOINT_DRIFTS),
     ):
         assert classify_fault(moved, wanted, way) is fault, (moved, wanted, way)
 

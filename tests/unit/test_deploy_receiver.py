@@ -25,7 +25,8 @@ def sender() -> Sender:
 
 def test_before_anything_came_nothing_is_known() -> None:
     seen, state = Sender().seen(), Sender().state()
-    ages = (seen.joints_age_s, seen.levers_age_s, seen.status_age_s, seen.round_trip_s)
+    ages = (seen.joints_age_s, seen.levers_age_s, seen.status_age_s, seen.feedback_age_s)
+    ages += (seen.round_trip_s,)
     assert all(age == math.inf for age in ages)
     assert not (seen.joints_plausible or seen.deadman or seen.estop or seen.followed)
     assert seen.trusted and seen.alone and seen.bus_up
@@ -109,7 +110,7 @@ def test_one_joint_called_invalid_makes_all_of_them_implausible(sender: Sender, 
     assert sender.seen().joints_plausible
 
 
-def test_a_jump_is_not_used_and_three_in_a_row_are_implausible(sender: Sender) -> None:
+def test_a_jump_is_not_used_and_three_of_them_are_implausible(sender: Sender) -> None:
     for number in range(3):
         sender.now_s += 0.01
         assert sender.seen().joints_plausible, number
@@ -124,6 +125,7 @@ def test_what_stays_away_grows_old_and_nothing_else_does(sender: Sender, name: s
     seen = sender.seen()
     ages = {"JointPos": seen.joints_age_s, "LeverState": seen.levers_age_s}
     ages["MachineStatus"] = seen.status_age_s
+    ages["ValveFeedback"] = seen.feedback_age_s
     for message, age_s in ages.items():
         low, high = (0.29, 0.33) if name.startswith(message) else (0.0, 0.03)
         assert low <= age_s <= high

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import SHOWN, STATE, TOKEN, Scripted, change_state, chromium, lever, served
+from browser import READING, SHOWN, STATE, TOKEN, Scripted, change_state, chromium, lever, served
+from composed import option
 from PIL import Image
 
 from brokk_rl.signals import Frame
@@ -146,7 +147,7 @@ def test_the_button_is_announced_and_then_green(
 ) -> None:
     page = opened(port)
     button = page.locator("#button")
-    assert "q2: Release button" in button.inner_text()
+    assert "Arm 1: Release button" in button.inner_text()
     feed.advise(2, due_s=1.2)
     page.wait_for_selector("#button.due")
     assert "1.2 s" in button.inner_text()
@@ -156,7 +157,7 @@ def test_the_button_is_announced_and_then_green(
     assert time.monotonic() - began_s < 2.0
     assert button.evaluate("node => getComputedStyle(node).backgroundColor") == "rgb(0, 117, 43)"
     assert "HOLD" in button.inner_text()
-    assert page.locator("#right text", has_text="q2").count() == 1, (
+    assert page.locator("#right text", has_text="Arm 1").count() == 1, (
         "the shared axis bears the name of the joint that is meant"
     )
 
@@ -262,6 +263,96 @@ def test_a_recording_that_has_failed_is_an_alarm_and_a_stop_that_is_not_confirme
     eventually(lambda: told.inner_text().startswith("STOP NOT CONFIRMED"))
 
 
+def test_alarms_are_listed_by_gravity_and_stay_a_while_after_they_have_passed(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
+    page = opened(port)
+    assert page.locator("#alarms").is_hidden()
+    dead = (SourceAge("camera", 3.0, 1.0), *SHOWN.streams)
+    feed.now = replace(
+        SHOWN,
+        streams=dead,
+        recording=FAILED,
+        health=replace(SHOWN.health, delay_s=0.09, supervisor_silent=True),
+    )
+    page.wait_for_selector("#alarms .alarm")
+    lines = page.locator("#alarms li")
+    eventually(lambda: lines.count() == 4)
+    assert [text.partition(" ·")[0] for text in lines.all_inner_texts()] == [
+        "Too old: Camera",
+        "Supervisor silent: no recording, no start",
+        "RECORDING HAS FAILED",
+        "Messages arrive late: 90 ms",
+    ]
+    assert lines.nth(3).get_attribute("class") == "caution"
+    until(page, "() => window.measured.signals.filter(name => name === 'alarm').length === 1")
+    feed.now = SHOWN
+    page.wait_for_selector("#alarms li.over")
+    assert page.locator("#alarms .alarm").count() == 0
+
+
+def test_depth_lateral_distance_and_angle_are_shown_and_inserted_is_said(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
+    page = opened(port)
+    assert page.locator("#insertion").is_hidden(), "nothing is measured yet"
+    feed.now = replace(SHOWN, insertion=READING)
+    page.wait_for_selector("#insertion:not([hidden])")
+    numbers = page.locator("#insertion dd").all_inner_texts()
+    assert numbers == ["-120 mm", "34 mm", "2.9°"]
+    assert page.locator("#insertion .inserted").inner_text() == "Over the hole"
+    # the rim lies where the reading says, right and up, on the same scale as its radius
+    rim = page.locator(".along .rim")
+    x, y = map(float, re.findall(r"translate\((\S+) (\S+)\)", rim.get_attribute("transform"))[0])
+    scale = float(rim.get_attribute("ry")) / 0.05
+    assert (x / scale, -y / scale) == pytest.approx((0.03, 0.016), abs=1e-3)
+    deep = replace(READING, depth_m=0.13, lateral_m=0.01, inserted=True)
+    feed.now = replace(SHOWN, insertion=deep)
+    page.wait_for_selector("#insertion.in")
+    assert page.locator("#insertion .inserted").inner_text() == "INSERTED"
+    assert "inserted" in page.evaluate("window.measured.signals")
+    tip = page.locator(".depth .tip").get_attribute("transform")
+    wanted = float(page.locator(".depth .wanted").get_attribute("y1"))
+    assert float(re.findall(r"[\d.]+", tip)[1]) > wanted, "the tip lies below the mark"
+    old = tuple(replace(one, age_s=1.0, limit_s=0.1) for one in SHOWN.streams)
+    feed.now = replace(feed.now, streams=old)
+    page.wait_for_selector("#insertion.stale:not(.in)")
+
+
+def test_a_machine_without_a_button_is_told_nothing_about_one(
+    feed: Scripted, opened: Callable[..., Any]
+) -> None:
+    state = replace(STATE, q=np.zeros(4))
+    feed.now = replace(SHOWN, state=state)
+    with served(feed, machine=option("machine", "mini_excavator")) as port:
+        page = opened(port)
+        assert page.locator("#button").is_hidden()
+
+
+def test_the_night_is_dark_and_can_be_read(port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+
+    def luminance(name: str, what: str) -> float:
+        text = page.locator(name).first.evaluate(f"node => getComputedStyle(node).{what}")
+        parts = np.array([float(part) / 255 for part in re.findall(r"[\d.]+", text)[:3]])
+        linear = np.where(parts <= 0.04045, parts / 12.92, ((parts + 0.055) / 1.055) ** 2.4)
+        return float(linear @ [0.2126, 0.7152, 0.0722])
+
+    assert luminance("body", "backgroundColor") == pytest.approx(1.0)
+    page.keyboard.press("n")
+    page.wait_for_selector(":root.night")
+    paper = luminance("body", "backgroundColor")
+    assert paper < 0.01
+    for name in ("body", "#safety", "#streams li", "#deadman", "#targets button"):
+        # contrast of WCAG 2
+        assert (luminance(name, "color") + 0.05) / (paper + 0.05) >= 4.5, name
+    assert (luminance("#stop", "color") + 0.05) / (
+        luminance("#stop", "backgroundColor") + 0.05
+    ) >= 4.5
+    page.reload()
+    page.wait_for_selector(":root.night")
+
+
 def test_german(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
     page = opened(port, query="?lang=de")
     assert page.locator("html").get_attribute("lang") == "de"
@@ -307,12 +398,13 @@ def test_everything_is_done_by_keys_and_by_gloves(
             and box["y"] + box["height"] <= SIZE["height"]
         )
     reached = set()
-    for _ in range(10):
+    for _ in range(13):
         page.keyboard.press("Tab")
         reached.add(
             page.evaluate("document.activeElement.id || document.activeElement.dataset.target")
         )
     assert {"language", "scene", "A", "B", "start", "stop", "record"} <= reached
+    assert {"along", "sound", "night"} <= reached
 
 
 def test_without_dead_man_or_token_nothing_is_done_and_the_page_says_why(
@@ -400,7 +492,9 @@ def test_a_touch_in_the_picture_is_a_place_in_it_whatever_its_size(
     ] == pytest.approx([0.25, 0.6], abs=0.01)
 
 
-SIZES = [(640, 400), (800, 600), (1100, 700), (1280, 800), (1920, 1080), (768, 1024), (390, 844)]
+AREAS = ("#view", "#insertion", "aside", "#levers")
+SIZES = [(640, 400), (800, 600), (1100, 700), (1280, 800), (1600, 900), (1920, 1080), (768, 1024)]
+SIZES += [(640, 1000), (390, 844)]
 
 
 @pytest.mark.parametrize("size", SIZES, ids=str)
@@ -409,9 +503,10 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
     feed: Scripted, port: int, opened: Callable[..., Any], size: tuple[int, int], language: str
 ) -> None:
     streams = (*SHOWN.streams, SourceAge("camera", 0.0, 1e6))
-    failed = replace(SHOWN, commands=True, streams=streams, recording=FAILED)
+    failed = replace(SHOWN, commands=True, streams=streams, recording=FAILED, insertion=READING)
     # the longest words that the header has to hold
     feed.now = change_state(failed, guard=GuardState.LATCHED, trip=GuardTrip.ROUND_TRIP)
+    feed.now = change_state(feed.now, cause=GuardTrip.ROUND_TRIP)
     page = opened(port, query=f"?lang={language}")
     page.set_viewport_size({"width": size[0], "height": size[1]})
     until(page, "!document.getElementById('camera').hidden")
@@ -419,7 +514,7 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
     assert stop["x"] >= 0 and stop["x"] + stop["width"] <= size[0]
     assert stop["y"] >= 0 and stop["y"] + stop["height"] <= size[1]
     cut = page.evaluate(
-        """() => [...document.querySelectorAll("button, #advice, #boreholes, header, header > *")].filter(node =>
+        """() => [...document.querySelectorAll("button, dl, .inserted, #advice, #boreholes, header, header > *")].filter(node =>
         node.scrollHeight > node.clientHeight + 1 || node.scrollWidth > node.clientWidth + 1)
         .map(node => node.id + node.textContent)"""
     )
@@ -432,7 +527,7 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
         return work.height === 0 || work.bottom <= stop.top + 1; }"""
     )
     assert apart_from_buttons
-    boxes = [page.locator(name).bounding_box() for name in ("#view", "aside", "#levers")]
+    boxes = [page.locator(name).bounding_box() for name in AREAS]
     for number, one in enumerate(boxes):
         for other in boxes[number + 1 :]:
             apart = (

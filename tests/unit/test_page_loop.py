@@ -45,6 +45,7 @@ def feed(memory: LoopMemory, tmp_path: Path) -> LoopFeed:
             session,
             0.15,
             0.15,
+            0.15,
             600.0,
         ),
         memory,
@@ -244,7 +245,7 @@ def test_a_loop_that_sends_nothing_has_nothing_to_confirm(tmp_path: Path) -> Non
     session = Session(out=str(tmp_path), seed=1, device="cpu")
     guidance = option("guidance", "machine")
     config = PageProcessConfig(
-        option("page", "local"), MACHINE, guidance, session, 0.15, 0.15, 600.0
+        option("page", "local"), MACHINE, guidance, session, 0.15, 0.15, 0.15, 600.0
     )
     feed = LoopFeed(config, memory)
     assert feed.submit(OperatorRequest("stop", "")) and feed.confirms_stop()
@@ -310,7 +311,7 @@ def test_other_lever_patterns_have_their_own_full_angles(
         guidance, levers=tuple(replace(one, max_angle_rad=0.5) for one in guidance.levers)
     )
     feed = LoopFeed(
-        PageProcessConfig(option("page", "local"), MACHINE, wide, session, 0.15, 0.15, 600.0),
+        PageProcessConfig(option("page", "local"), MACHINE, wide, session, 0.15, 0.15, 0.15, 600.0),
         memory,
     )
     say(memory)

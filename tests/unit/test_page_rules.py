@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
 import math
 import re
 from dataclasses import replace
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,15 +19,24 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.kinematics import Kinematics
+from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
+from brokk_rl.machine import JointPart
 from brokk_rl.signals import Frame
-from deploy.page import access, frame_codec
+from deploy.guard.drift_watch import Misfit
+from deploy.guard.guard import GuardState, GuardTrip
+from deploy.page import access, alarms, frame_codec
 from deploy.page.clock import PageClock
 from deploy.page.connections import ConnectionBudget, SendWindow
 from deploy.page.demo import DemoMachine
 from deploy.page.files import load_files
-from deploy.page.protocol import OperatorRequest, SourceAge
-from deploy.page.scene import plan_approach
+from deploy.page.protocol import (
+    BoreholeChoice,
+    OperatorRequest,
+    PageState,
+    RecordingStatus,
+    SourceAge,
+)
+from deploy.page.scene import measure_insertion, plan_approach
 from deploy.page.server import build_link
 
 MINE = access.list_own_hosts("127.0.0.1", 8170, ())
@@ -251,6 +262,90 @@ def test_the_way_leads_over_the_rim_and_then_down_the_axis() -> None:
     )
 
 
+def test_the_tool_is_measured_along_and_across_the_axis_of_the_hole() -> None:
+    machine = option("machine", "brokk170")
+    # q2 + q3 + q4 + q5 = pi/2 points the chisel straight down; the slew turns the view with it
+    q = np.array([0.4, -0.9, 0.6, 1.2, np.pi / 2 - 0.9])
+    tool = compute_tool_kinematics(machine, q)
+    ahead, left = np.array([np.cos(0.4), np.sin(0.4), 0]), np.array([-np.sin(0.4), np.cos(0.4), 0])
+    rim_m = tool.tip_in_base_m + 0.02 * ahead - 0.01 * left + np.array([0, 0, 0.12])
+    up = (0.0, 0.0, 1.0)
+    hole = BoreholeChoice("1", tuple(rim_m), up, 0.05, None, None, True)
+    found = measure_insertion(tool, hole)
+    assert found.depth_m == pytest.approx(0.12)
+    assert found.lateral_m == pytest.approx(math.hypot(0.02, 0.01))
+    assert found.angle_rad == pytest.approx(0.0, abs=1e-6)
+    assert found.inserted
+    assert found.center_in_view_m == pytest.approx((0.01, 0.02, -0.12)), "right, up, ahead"
+    assert found.axis_in_view == pytest.approx((0.0, 0.0, -1.0), abs=1e-9)
+    # leaning outwards by 0.1 rad about the tip: the hole's axis then leans towards the machine
+    leaning = measure_insertion(compute_tool_kinematics(machine, q - [0, 0, 0, 0, 0.1]), hole)
+    assert leaning.angle_rad == pytest.approx(0.1)
+    assert leaning.axis_in_view[1] == pytest.approx(math.sin(0.1))
+    beside = replace(hole, radius_m=0.02)
+    assert not measure_insertion(tool, beside).inserted, "beside a hole is not in it"
+    shallow = replace(hole, center_in_base_m=tuple(rim_m - [0, 0, 0.03]))
+    assert not measure_insertion(tool, shallow).inserted
+
+
+def list_names(shown: PageState) -> list[str]:
+    return [f"{one.level} {one.name} {one.detail}".strip() for one in alarms.list_alarms(shown)]
+
+
+def test_alarms_name_what_has_failed_and_nothing_else() -> None:
+    assert list_names(SHOWN) == []
+    assert list_names(replace(SHOWN, alive=False)) == ["alarm control computer silent"]
+    old = (*SHOWN.streams[:2], SourceAge("borehole", 700.0, 600.0), SourceAge("camera", 3.0, 1.0))
+    assert list_names(replace(SHOWN, streams=old)) == [
+        "alarm too old camera",
+        "caution too old borehole",
+    ]
+    never = (SourceAge("positions", None, 0.1), SourceAge("camera", None, 1.0))
+    assert list_names(replace(SHOWN, streams=never)) == [
+        "alarm nothing has come positions",
+        "caution nothing has come camera",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "names"),
+    [
+        (0.07, []),
+        (0.08, ["caution messages arrive late 80 ms"]),
+        (0.2, ["alarm messages arrive late 200 ms"]),
+    ],
+)
+def test_delay_warns_at_half_its_limit(delay_s: float, names: list[str]) -> None:
+    assert list_names(replace(SHOWN, health=replace(SHOWN.health, delay_s=delay_s))) == names
+
+
+def test_a_recorder_that_is_dead_or_stuck_is_an_alarm_and_one_that_is_off_is_none() -> None:
+    on = RecordingStatus(on=True, seconds=3.0, dropped=0, failed=False)
+    stuck = replace(SHOWN.health, log_behind=True)
+    assert list_names(replace(SHOWN, recording=on)) == []
+    assert list_names(replace(SHOWN, recording=on, health=stuck)) == [
+        "alarm recorder does not write"
+    ]
+    assert list_names(replace(SHOWN, recording=replace(on, dropped=4))) == [
+        "alarm recording has gaps 4"
+    ]
+    dead = replace(on, on=False, failed=True)
+    assert list_names(replace(SHOWN, recording=dead)) == ["alarm recording failed"]
+    silent = replace(SHOWN.health, supervisor_silent=True)
+    assert list_names(replace(SHOWN, health=silent)) == ["alarm supervisor silent"]
+
+
+def test_the_guard_and_its_observer_are_alarms() -> None:
+    latched = {"guard": GuardState.LATCHED, "cause": GuardTrip.JOINT_STILL, "observed_joint": 3}
+    assert list_names(change_state(SHOWN, **latched)) == [
+        f"alarm {GuardTrip.JOINT_STILL.value} joint 3"
+    ]
+    misfit = change_state(SHOWN, misfit=Misfit.DEAD_TIME, misfit_joint=2)
+    assert list_names(misfit) == ["caution the model no longer fits joint 2 dead_time"]
+    stopped = change_state(SHOWN, estop=True, guard=GuardState.LATCHED, cause=GuardTrip.ESTOP)
+    assert list_names(stopped) == ["alarm emergency stop"]
+
+
 def test_the_demo_keeps_to_the_machine() -> None:
     machine, now_s = option("machine", "brokk170"), [0.0]
     demo: DemoMachine = option("feed", "demo")
@@ -305,10 +400,12 @@ def test_both_languages_say_everything() -> None:
         for name, part in (("de", german), ("en", english))
     }
     assert keys["en"] <= keys["de"]
-    from deploy.guard.guard import GuardTrip
     from deploy.runtime.operator_state import AdviceStatus
 
     said = {one.value for one in (*GuardTrip, *AdviceStatus)} - {"valid"}
+    said |= {one.value for one in Misfit} - {"none"}
+    rules = inspect.getsource(alarms)
+    said |= set(re.findall(r'Alarm\((?:"\w+"|.+?), "([^"]+)"', rules)) | set(get_args(JointPart))
     assert said - {key for key in said if f'"{key}":' in german or f" {key}:" in german} == set()
 
 

@@ -1,4 +1,6 @@
 // Both levers seen from above: up is forward, right is right; full deflection is TRAVEL units from the middle.
+import { drawIcon } from "./icons.js";
+
 export const TRAVEL = 95;
 const NS = "http://www.w3.org/2000/svg";
 const DIAMOND = "M0,-24 L24,0 L0,24 L-24,0 Z";
@@ -19,7 +21,13 @@ export class LeverView {
     put("rect", { class: "gate", x: -TRAVEL / 2, y: -TRAVEL / 2, width: TRAVEL, height: TRAVEL, rx: 4 });
     put("path", { class: "cross", d: `M${-TRAVEL},0 H${TRAVEL} M0,${-TRAVEL} V${TRAVEL}` });
     const joints = axis => setup.shared[`${side}_${axis}`];
-    this.names = { theta: put("text", { x: 0, y: -TRAVEL - 16 }), psi: put("text", { x: TRAVEL + 18, y: 0 }) };
+    // the name of the joint and its icon, above the gate and along its right side
+    this.names = {};
+    for (const [axis, place] of [["theta", `translate(0 ${-TRAVEL - 17})`], ["psi", `translate(${TRAVEL + 17} 0) rotate(90)`]]) {
+      const group = put("g", { class: "name", transform: place });
+      this.names[axis] = { text: put("text", { x: 10, y: 0 }, group), icon: put("g", { class: "icon" }, group), joint: null };
+    }
+    this.parts = setup.parts;
     this.joints = { theta: joints("theta"), psi: joints("psi") };
     this.exclusive = setup.exclusive;
     put("text", { class: "tick", x: -TRAVEL - 16, y: -TRAVEL - 12 }, svg, "✓");
@@ -33,7 +41,8 @@ export class LeverView {
   }
 
   // own and advised: {left_theta, …} of full, or null; fresh: whether each is to be relied on; button: whether the shared axis is the exclusive joint's.
-  draw(own, advised, fresh, button) {
+  // name: makes words of a joint.
+  draw(own, advised, fresh, button, name) {
     const at = levers => [TRAVEL * levers[`${this.side}_psi`], -TRAVEL * levers[`${this.side}_theta`]];
     const place = (node, levers) => {
       node.setAttribute("visibility", levers ? "visible" : "hidden");
@@ -52,8 +61,11 @@ export class LeverView {
     for (const axis of ["theta", "psi"]) {
       const joints = this.joints[axis];
       const meant = joints.length > 1 ? joints.filter(name => this.exclusive.includes(name) === button) : joints;
-      const text = meant.join(" ");
-      if (this.names[axis].textContent !== text) this.names[axis].textContent = text;
+      const text = meant.map(name).join(" "), label = this.names[axis];
+      if (label.text.textContent === text) continue;
+      label.text.textContent = text;
+      drawIcon(label.icon, meant.length === 1 ? this.parts[meant[0]] : null);
+      label.icon.setAttribute("transform", `translate(${(-3.6 * text.length - 18).toFixed(1)} -11)`);
     }
   }
 }

@@ -21,8 +21,8 @@ export function perspective(fov, aspect, near, far) {
   return new Float32Array([f / aspect, 0, 0, 0, 0, f, 0, 0, 0, 0, (far + near) / d, -1, 0, 0, 2 * far * near / d, 0]);
 }
 
-export function lookAt(eye, at) {
-  const z = unit(sub(eye, at)), x = unit(cross([0, 0, 1], z)), y = cross(z, x);
+export function lookAt(eye, at, up = [0, 0, 1]) {
+  const z = unit(sub(eye, at)), x = unit(cross(up, z)), y = cross(z, x);
   return new Float32Array([x[0], y[0], z[0], 0, x[1], y[1], z[1], 0, x[2], y[2], z[2], 0, -dot(x, eye), -dot(y, eye), -dot(z, eye), 1]);
 }
 
@@ -47,4 +47,21 @@ export function chain(geometry, q) {
     return { origin, at, axis, axes };
   });
   return { links, tip: add(at, inBase(geometry.tip_m)) };
+}
+
+// Returns tip, direction and upward direction of somebody who looks along the tool; up is forward for a tool that points down.
+export function lookAlong(geometry, q) {
+  const { links, tip } = chain(geometry, q), ahead = unit(sub(tip, links.at(-1).at));
+  const side = Math.hypot(tip[0], tip[1]) > 0 ? [tip[1], -tip[0], 0] : [0, -1, 0];
+  return { at: tip, ahead, up: cross(unit(add(side, ahead, -dot(side, ahead))), ahead) };
+}
+
+const RIM_PARTS = 32;
+// Returns the points of a borehole's rim, the first one again at the end.
+export function rim(hole) {
+  const axis = unit(hole.axis_in_base), x = unit(cross(Math.abs(axis[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0], axis)), y = cross(axis, x);
+  return Array.from({ length: RIM_PARTS + 1 }, (_, index) => {
+    const angle = 2 * Math.PI * index / RIM_PARTS;
+    return add(add(hole.center_in_base_m, x, hole.radius_m * Math.cos(angle)), y, hole.radius_m * Math.sin(angle));
+  });
 }

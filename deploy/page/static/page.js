@@ -1,5 +1,9 @@
 // The operator's page: newest state in, drawn once a frame, and said back when it was drawn; wishes out.
+import { AlarmList } from "./alarms.js";
+import { InsertionView } from "./insertion.js";
 import { LeverView } from "./levers.js";
+import { Overlay } from "./overlay.js";
+import { Signals } from "./signals.js";
 import { Socket } from "./socket.js";
 import { LANGUAGES, preferred, words } from "./words.js";
 
@@ -12,7 +16,9 @@ if (token) sessionStorage.setItem("token", token);
 history.replaceState(null, "", location.pathname + location.search);  // the key stays out of the history and of screenshots
 
 const views = { left: new LeverView($("left"), "left", setup), right: new LeverView($("right"), "right", setup) };
-const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0, allowed: null };
+const insertion = new InsertionView($("insertion")), overlay = new Overlay($("overlay")), alarms = new AlarmList($("alarms"));
+const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0, allowed: null, signals: [] };
+const signals = new Signals(name => measured.signals.push(name));
 let newest = null, came = 0, asked = false;
 
 // ---- state in, drawn back
@@ -48,6 +54,21 @@ function fresh(shown, name, since_s) {
   return Boolean(stream && stream.age_s !== null && stream.age_s + since_s <= stream.limit_s);
 }
 
+const nameOf = joint => (setup.parts[joint] ? say(setup.parts[joint]) : joint);
+
+// An alarm in words; `joint 2` is the second joint.
+function tell({ name, detail }) {
+  const about = detail.replace(/^joint (\d+)/, (_, number) => nameOf(setup.joints[number - 1] ?? number));
+  return detail ? `${say(name)}: ${say(about)}` : say(name);
+}
+
+// What is given once when it begins.
+const lasting = new Set();
+function notice(name, is) {
+  if (is && !lasting.has(name)) signals.give(name);
+  if (is) lasting.add(name); else lasting.delete(name);
+}
+
 const CALM_MS = 90;  // what is read, not followed, changes no faster
 let calm = 0;
 function draw() {
@@ -55,14 +76,19 @@ function draw() {
   const lost = newest === null || since_s > setup.stale_s;
   document.body.classList.toggle("lost", lost);
   if (lost) put($("connection"), say("lost"), "bad");
+  const now = performance.now(), calmly = now - calm >= CALM_MS || lost;
+  if (calmly) drawAlarms(lost, now);
   if (newest === null) return;
   const shown = newest.shown;
   if (!lost) put($("connection"), say(shown.alive ? "connected" : "dead"), shown.alive ? "good" : "bad");
   const good = name => !lost && shown.alive && fresh(shown, name, since_s);
   drawLevers(shown, { own: good("levers"), advised: good("advice") && good("positions") && Boolean(shown.advice?.valid) });
-  const now = performance.now();
-  if (now - calm < CALM_MS && !lost) return;
+  if (!calmly) return;
   calm = now;
+  const chosen = shown.targets.find(one => one.chosen), known = good("positions") && good("borehole");
+  insertion.draw(chosen ? shown.insertion : null, chosen, known, say);
+  notice("inserted", known && Boolean(shown.insertion?.inserted));
+  overlay.draw(shown);
   drawSafety(shown, lost, good("levers"));
   drawStreams(shown, since_s);
   $("camera").hidden = !shown.streams.some(one => one.name === "camera");
@@ -70,6 +96,12 @@ function draw() {
   drawTargets(shown);
   $("start").setAttribute("aria-pressed", shown.guiding);
   $("record").setAttribute("aria-pressed", shown.recording.on);
+}
+
+function drawAlarms(lost, now) {
+  if (newest === null && now < 1000 * setup.stale_s) return;  // the page has only just been opened
+  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : newest?.shown.alarms ?? [];
+  if (alarms.draw(grave, tell, now)) signals.give("alarm");
 }
 
 function drawSafety(shown, lost, known) {
@@ -80,7 +112,7 @@ function drawSafety(shown, lost, known) {
     const state = safety.state === "SILENT" && !safety.commands ? "listens only" : safety.state;
     const wrong = safety.estop ? "emergency stop" : safety.trip;
     const calm = safety.commands ? wrong === "nothing" : !safety.estop && safety.bus_up;
-    const why = safety.commands || safety.estop || !safety.bus_up ? ` – ${wrong.startsWith("a joint ") && safety.observed_joint ? `${setup.joints?.[safety.observed_joint - 1] ?? safety.observed_joint}: ` : ""}${say(safety.bus_up ? wrong : "bus down")}` : "";
+    const why = safety.commands || safety.estop || !safety.bus_up ? ` – ${wrong.startsWith("a joint ") && safety.observed_joint ? `${nameOf(setup.joints[safety.observed_joint - 1])}: ` : ""}${say(safety.bus_up ? wrong : "bus down")}` : "";
     const kind = lost || safety.estop || safety.state === "LATCHED" || !safety.bus_up ? "bad" : safety.state === "ACTIVE" ? "careful" : calm ? "good" : "careful";
     put($("safety"), say(state) + why, kind);
   } else put($("safety"), say("nothing from the bus"), "bad");
@@ -93,14 +125,16 @@ function drawSafety(shown, lost, known) {
 function drawLevers(shown, sure) {
   const advice = shown.guiding ? shown.advice : null;
   const button = Boolean(advice?.levers.button_right);
-  for (const view of Object.values(views)) view.draw(shown.own, advice?.levers ?? null, sure, button);
+  for (const view of Object.values(views)) view.draw(shown.own, advice?.levers ?? null, sure, button, nameOf);
   put($("advice"), !shown.guiding ? say("stopped") : shown.advice?.valid ? say("guiding") : say(shown.advice?.reason ?? "nothing from the bus"));
   $("advice").classList.toggle("none", shown.guiding && !shown.advice?.valid);
   const due = advice && sure.advised ? advice.button_due_s : null;
   const now = sure.advised && button, soon = !now && due !== null && due > 0;
   const box = $("button").classList;
   box.toggle("now", now); box.toggle("due", soon); box.toggle("stale", !sure.advised && Boolean(advice)); box.toggle("held", sure.own && Boolean(shown.own?.button_right));
-  const joint = setup.exclusive.join(" ");
+  notice("button now", now); notice("button due", soon);
+  notice("button off", Boolean(advice) && sure.advised && !button && Boolean(shown.own?.button_right));
+  const joint = setup.exclusive.map(nameOf).join(" ");
   put($("button").lastElementChild, now ? `${joint}: ${say("button now")}` : soon ? `${joint}: ${say("button due")} ${due.toFixed(1)} s` : `${joint}: ${say("button off")}`);
   if (soon) $("button").querySelector(".left").setAttribute("stroke-dasharray", `${Math.min(1, due / 1.5).toFixed(3)} 1`);
 }
@@ -151,6 +185,7 @@ const control = token ? new Socket("/control", {
 }) : null;
 
 function answered(said) {
+  if (said.refused === "unconfirmed") signals.give("alarm");
   if (said.ready) { measured.allowed = true; answer(""); } else answer(said.refused ? `refused ${said.refused}` : "");
 }
 
@@ -170,6 +205,20 @@ $("picture").onclick = event => {  // a place in the picture, whatever size it i
   const { width, height } = $("picture").getBoundingClientRect(), inside = part => Math.min(0.9999, Math.max(0.0001, part)).toFixed(4);
   wish("point", `${inside(event.offsetX / width)},${inside(event.offsetY / height)}`);
 };
+// a page of its own for the dark, and silence on request
+function choose(name, on, act) {
+  $(name).setAttribute("aria-pressed", on);
+  sessionStorage.setItem(name, on);
+  act(on);
+}
+const chosenBefore = (name, otherwise) => (new URLSearchParams(location.search).get(name) ?? sessionStorage.getItem(name) ?? String(otherwise)) === "true";
+const tools = {
+  sound: on => { signals.on = on; },
+  night: on => { document.documentElement.classList.toggle("night", on); scene?.postMessage({ night: on }); },
+  along: on => { scene?.postMessage({ along: on }); },
+};
+for (const [name, act] of Object.entries(tools)) $(name).onclick = () => choose(name, $(name).getAttribute("aria-pressed") !== "true", act);
+
 $("language").onclick = () => {
   language = LANGUAGES[(LANGUAGES.indexOf(language) + 1) % LANGUAGES.length];
   sessionStorage.setItem("language", language);
@@ -177,7 +226,7 @@ $("language").onclick = () => {
 };
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
-  const act = { Escape: () => wish("stop"), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click() }[event.key];
+  const act = { Escape: () => wish("stop"), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click(), n: () => $("night").click(), t: () => $("sound").click(), v: () => $("along").click() }[event.key];
   if (act) act();
   else if (/^[1-9]$/.test(event.key)) $("targets").children[event.key - 1]?.click();
 });
@@ -189,6 +238,12 @@ function speak() {
   document.title = `${setup.machine} – ${say("title")}`;
   for (const id of ["start", "stop", "record"]) put($(id).querySelector("b"), say(id));
   put($("language"), language === "en" ? "DE" : "EN");
+  put($("along").querySelector("b"), say("along the tool"));
+  for (const name of ["sound", "night"]) { $(name).setAttribute("aria-label", say(name)); $(name).title = say(name); }
+  const numbers = $("insertion").querySelectorAll("dt");
+  ["depth", "lateral", "angle"].forEach((name, index) => put(numbers[index], say(name)));
+  $("insertion").querySelector(".depth").setAttribute("aria-label", say("depth"));
+  $("insertion").querySelector(".along").setAttribute("aria-label", say("along the tool"));
   $("language").setAttribute("aria-label", language === "en" ? "Deutsch" : "English");
   put($("camera").querySelector("figcaption"), say("camera"));
   for (const side of ["left", "right"]) $(side).setAttribute("aria-label", say(side));
@@ -209,7 +264,7 @@ function startScene() {
   worker.postMessage({ start: { canvas: surface, geometry: setup.geometry, points: setup.points, ...size() } }, [surface]);
   worker.onmessage = ({ data }) => {
     if (data.failed) { $("noscene").hidden = false; return; }
-    if (data.picture) picture.transferFromImageBitmap(data.picture);
+    if (data.picture) { picture.transferFromImageBitmap(data.picture); overlay.see(data.lens); }
     if (data.measured) Object.assign(measured, data.measured);
   };
   new ResizeObserver(() => worker.postMessage(size())).observe(canvas);
@@ -238,7 +293,13 @@ function startScene() {
   return worker;
 }
 
+// buttons that are seldom needed stand with the others on a wide screen, and scroll with the rest on a narrow one
+const wide = matchMedia("(min-width: 1001px) and (min-height: 660px) and (min-aspect-ratio: 1/1)");
+wide.onchange = () => (wide.matches ? $("actions").insertBefore($("tools"), $("answer")) : $("work").append($("tools")));
+wide.onchange();
+$("button").hidden = !setup.button;
 speak();
 if (!token) answer("refused token");
 setInterval(() => { if (performance.now() - came > 150) draw(); }, 100);  // ages grow even when nothing comes
 scene = startScene();
+for (const [name, act] of Object.entries(tools)) choose(name, chosenBefore(name, name === "sound"), act);

@@ -54,7 +54,12 @@ export class Painter {
     this.still = { buffer: gl.createFramebuffer(), color: texture(gl), depth: texture(gl), width: 0, height: 0 };
     this.stale = true;
     gl.enable(gl.DEPTH_TEST);
-    gl.clearColor(0.87, 0.91, 0.94, 1);
+  }
+
+  // Sets the colour of the sky, for day or night.
+  shade(night) {
+    this.gl.clearColor(...(night ? [0.06, 0.07, 0.09] : [0.87, 0.91, 0.94]), 1);
+    this.stale = true;
   }
 
   cloud(header, depth, picture, limit) {

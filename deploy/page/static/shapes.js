@@ -1,10 +1,10 @@
 // What stands in the scene as boxes and cylinders: each a matrix that places a unit body (z from -1 to 1), and a colour.
-import { add, chain, cross, frame, norm, scaled, sub, unit } from "./matrices.js";
+import { add, chain, cross, frame, norm, rim, scaled, sub, unit } from "./matrices.js";
 
 const PAINT = [0.96, 0.65, 0.05], DARK = [0.16, 0.17, 0.18], STEEL = [0.42, 0.43, 0.45], LINE = [0.55, 0.6, 0.66];
 const CHOSEN = [0, 0.55, 0.2], OTHER = [0.05, 0.3, 0.85], PATH = [0.82, 0, 0.45], EDGE = [0.1, 0.1, 0.12];
 const THICK_M = [0.20, 0.13, 0.11, 0.095, 0.12];
-const RIM_PARTS = 24, DASH_M = 0.09, CHISEL_M = 0.034, CHISEL_PART = 0.4;
+const DASH_M = 0.09, CHISEL_M = 0.034, CHISEL_PART = 0.4;
 
 export class Shapes {
   constructor() { this.boxes = []; this.cylinders = []; }
@@ -61,16 +61,15 @@ export function machine(shapes, geometry, q) {
   });
 }
 
+export function tip(shapes, { at, ahead }) {  // what is seen of the chisel by somebody who looks along it
+  shapes.rod(add(at, ahead, -0.02), at, CHISEL_M, STEEL);
+}
+
 export function boreholes(shapes, targets) {
   for (const target of targets) {
-    const axis = unit(target.axis_in_base), x = unit(cross(Math.abs(axis[2]) < 0.9 ? [0, 0, 1] : [1, 0, 0], axis)), y = cross(axis, x);
-    const color = target.chosen ? CHOSEN : OTHER, wide = target.chosen ? 0.014 : 0.008;
-    const rim = index => {
-      const angle = 2 * Math.PI * index / RIM_PARTS;
-      return add(add(target.center_in_base_m, x, target.radius_m * Math.cos(angle)), y, target.radius_m * Math.sin(angle));
-    };
-    for (let i = 0; i < RIM_PARTS; i++) shapes.rod(rim(i), rim(i + 1), wide, color);
-    if (target.chosen) shapes.rod(target.center_in_base_m, add(target.center_in_base_m, axis, 0.3), 0.008, color);
+    const color = target.chosen ? CHOSEN : OTHER, wide = target.chosen ? 0.014 : 0.008, points = rim(target);
+    for (let i = 1; i < points.length; i++) shapes.rod(points[i - 1], points[i], wide, color);
+    if (target.chosen) shapes.rod(target.center_in_base_m, add(target.center_in_base_m, target.axis_in_base, 0.3), 0.008, color);
   }
 }
 
