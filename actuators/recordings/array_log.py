@@ -33,6 +33,9 @@ MATLAB_NUMBERS = (
 )
 """Classes of real arrays as MATLAB names them."""
 
+NPZ_ERRORS = (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+"""Errors of the libraries on a damaged archive."""
+
 
 class ParquetLog(LogFile):
     """A Parquet file as a log with one table."""
@@ -108,16 +111,20 @@ class NumpyLog(LogFile):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
+        shapes, member = {}, None
         try:
             with zipfile.ZipFile(path) as archive:
-                shapes = {}
                 for member in archive.namelist():
                     with archive.open(member) as file:
                         shape, _, kind = _read_npy_header(file)
                     if kind.kind in "fiu" and len(shape) in (1, 2) and shape[0] > 1:
                         shapes[member] = shape
-        except (OSError, zipfile.BadZipFile, ValueError) as error:
-            raise RecordingError(f"{path}: cannot be read as a NumPy archive ({error})") from error
+        except NPZ_ERRORS as error:
+            if member is None:
+                raise RecordingError(
+                    f"{path}: cannot be read as a NumPy archive ({error})"
+                ) from error
+            raise RecordingError(f"{path}: array '{member}' is damaged ({error})") from error
         self._members = _select_longest(shapes)
 
     def list_tables(self) -> dict[str, list[str]]:
@@ -141,7 +148,7 @@ class NumpyLog(LogFile):
                         for block in _read_npy_blocks(file, max_rows):
                             for at, name in kept.items():
                                 columns.add(name, block[:, at])
-                except (OSError, EOFError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+                except NPZ_ERRORS as error:
                     raise RecordingError(
                         f"{self.path}: array '{member}' is damaged ({error})"
                     ) from error

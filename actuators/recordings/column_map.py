@@ -91,7 +91,7 @@ class AlignedTime:
         blocks = np.array_split(np.arange(len(late_s)), min(CLOCK_POINTS, len(late_s)))
         fastest = [int(rows[np.argmin(late_s[rows])]) for rows in blocks]
         x, y = stamp_s[fastest] - stamp_s[0], late_s[fastest]
-        slope = float(theilslopes(y, x)[0]) if len(fastest) > 2 and np.ptp(x) > 0 else 0.0
+        slope = float(theilslopes(y, x).slope) if len(fastest) > 2 and np.ptp(x) > 0 else 0.0
         return stamp_s + float(np.median(y - slope * x)) + slope * (stamp_s - stamp_s[0])
 
 

@@ -15,8 +15,9 @@ from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
-TICK_TOLERANCE = 1e-6
-"""Part of a period by which a sample may lie after its tick and still count for it."""
+TICK_TOLERANCE = 1e-3
+"""Part of a period by which a sample may lie after its tick and still count for it. Seconds since
+1970 are rounded to 0.2 µs, and no logger is as punctual as this."""
 
 
 @dataclass(frozen=True)
