@@ -111,8 +111,9 @@ class ReplayFeed:
     ) -> None:
         self._replay, self._machine, self._clock = replay, machine, clock
         self._topics = {name: _Topic(rows) for name, rows in contents.messages.items()}
-        self._begin_s = min(topic.t_s[0] for topic in self._topics.values())
-        self._duration_s = max(topic.t_s[-1] for topic in self._topics.values()) - self._begin_s
+        self._begin_s = float(min(topic.t_s[0] for topic in self._topics.values()))
+        end_s = float(max(topic.t_s[-1] for topic in self._topics.values()))
+        self._duration_s = end_s - self._begin_s
         self._sources = {}
         for signal in (
             *(f"Position_{name}" for name in machine.joint_names),
@@ -123,7 +124,7 @@ class ReplayFeed:
             self._sources[signal] = found[0] if found else None
         self._blank = RecordLayout(OperatorState, machine.num_joints).new()
         self._full_rad = find_full_angles_rad(machine.levers)
-        self._marks = _list_marks(self._topics)
+        self._marks = _list_marks(self._topics, self._begin_s)
         guard = self._topics.get("guard")
         # Without any other state, the loop could only listen.
         self._commands = guard is not None and any(
@@ -281,9 +282,7 @@ class ReplayFeed:
             )
             found.append(choice)
         if goal_m is not None and not is_chosen:
-            found.append(
-                BoreholeChoice(UNNAMED, to_vector(goal_m), UP, RADIUS_M, None, None, True)
-            )
+            found.append(BoreholeChoice(UNNAMED, to_vector(goal_m), UP, RADIUS_M, None, None, True))
         return tuple(found)
 
     def _place_tool(
@@ -310,11 +309,14 @@ class _Topic:
         return None if index < 0 else (index, *self.rows[index])
 
 
-def _list_marks(topics: dict[str, _Topic]) -> tuple[TimelineMark, ...]:
+def _list_marks(topics: dict[str, _Topic], begin_s: float) -> tuple[TimelineMark, ...]:
     """Return the changes of the guard, requests of the operator and misfits, in order of time."""
-    begin_s = min(topic.t_s[0] for topic in topics.values())
-    found = []
+    found, before = [], None
     for t_s, values in topics["guard"].rows if "guard" in topics else ():
+        # The reason for sending nothing may change while the state stays.
+        if values["state"] == before:
+            continue
+        before = values["state"]
         latched = values["state"] == GuardState.LATCHED.name
         name = values["cause"] if latched else values["state"]
         found.append(TimelineMark(t_s - begin_s, "alarm" if latched else "state", name))

@@ -93,6 +93,7 @@ function draw() {
   notice("inserted", known && Boolean(shown.insertion?.inserted));
   overlay.draw(shown);
   timeline.draw(shown.replay, say);
+  document.body.classList.toggle("replay", Boolean(shown.replay));
   drawSafety(shown, lost, good("levers"));
   drawStreams(shown, since_s);
   $("camera").hidden = !shown.streams.some(one => one.name === "camera");

@@ -20,7 +20,6 @@ export class Timeline {
     if (!replay) return;
     const { position_s, duration_s, speed, marks } = replay;
     this.play.setAttribute("aria-pressed", speed > 0 && position_s < duration_s);
-    this.play.textContent = this.playing ? "⏸" : "▶";
     this.play.setAttribute("aria-label", say(this.playing ? "pause" : "play"));
     this.position.max = duration_s;
     if (!this.held) this.position.value = position_s;
@@ -32,7 +31,7 @@ export class Timeline {
     this.speed.setAttribute("aria-label", say("speed"));
     this.marks.replaceChildren(...marks.map(mark => {
       const node = document.createElement("i");
-      node.className = mark.kind;
+      node.dataset.kind = mark.kind;
       node.title = `${clock(mark.t_s)} ${say(mark.name)}`;
       node.style.left = `${100 * mark.t_s / Math.max(duration_s, 1e-9)}%`;
       return node;
