@@ -138,9 +138,11 @@ function drawLevers(shown, sure) {
   const box = $("button").classList;
   box.toggle("now", now); box.toggle("due", soon); box.toggle("stale", !sure.advised && Boolean(advice)); box.toggle("held", sure.own && Boolean(shown.own?.button_right));
   notice("button now", now); notice("button due", soon);
-  notice("button off", Boolean(advice) && sure.advised && !button && Boolean(shown.own?.button_right));
+  const wrong = sure.advised && sure.own && !now && !soon && Boolean(shown.own?.button_right);
+  box.toggle("wrong", wrong);
+  notice("button off", wrong);
   const joint = setup.exclusive.map(nameOf).join(" ");
-  put($("button").lastElementChild, now ? `${joint}: ${say("button now")}` : soon ? `${joint}: ${say("button due")} ${due.toFixed(1)} s` : `${joint}: ${say("button off")}`);
+  put($("button").lastElementChild, now ? `${joint}: ${say("button now")}` : soon ? `${joint}: ${say("button due")} ${due.toFixed(1)} s` : wrong ? `${joint}: ${say("button off")}` : "");
   if (soon) $("button").querySelector(".left").setAttribute("stroke-dasharray", `${Math.min(1, due / 1.5).toFixed(3)} 1`);
 }
 
