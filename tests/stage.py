@@ -40,6 +40,8 @@ DBC = "deploy:dbc/example_gateway.dbc"
 NO_WIRE = CanBus(interface="virtual", channel="air", bitrate=None, port=None, hops=None)
 BEGIN_S = 65.536 * 20 - 1.0
 """The gateway's clock wraps a second after the beginning."""
+TURN_MS = 2048
+"""After so long the stamp of the remote's messages begins anew."""
 WANTED = (0.3, 0.0, -0.3, 0.0, 0.2)
 
 Mode = Literal["listen", "auto", "collect"]
@@ -106,6 +108,12 @@ class Bridge:
         half: Message of which every second frame has a wrong bit.
         second_remote: Whether a second remote sends, its dead-man held.
         foreign: Values of a foreign sender of `ValveCmd`; `None`: there is none.
+        alter: By message of the gateway or the remote: changes its values on the way to the PC,
+            with counter and CRC as they have to be.
+        held_s: Time for which all messages to the PC are held, to come at once; 0: none are.
+        inserted: Data of a message that a stranger inserts every 20 ms, by its name.
+        replayed: Whether a stranger sends recorded messages of the remote, one turn of their stamp
+            old.
     """
 
     def __init__(self, stage: Stage) -> None:
@@ -114,7 +122,9 @@ class Bridge:
         self._order, self._counts = itertools.count(), Counter[int]()
         self._remote = RadioRemote(BusDescription(DBC, stage.machine))
         self._remote.deadman = True
-        self._names = {one.frame_id: one.name for one in self._remote._description.layouts.values()}
+        layouts = self._remote._description.layouts.values()
+        self._layouts = {one.frame_id: one for one in layouts}
+        self._names = {one.frame_id: one.name for one in layouts}
         self._foreign_counter = 0
         self.clear()
 
@@ -126,6 +136,9 @@ class Bridge:
         self.half, self.second_remote, self.begun_ms = "", False, self._stage.ms
         self.foreign: dict[str, float] | None = None
         self.remote_every_ms, self.foreign_every_ms, self.remote_offset = 20, 20, 0
+        self.alter: dict[str, Callable[[dict[str, float]], None]] = {}
+        self.held_s, self.inserted, self.replayed = 0.0, dict[str, bytes](), False
+        self._recorded: deque[tuple[int, CanFrame]] = deque()
 
     def carry(self, frame: CanFrame, to_gateway: bool) -> None:
         """Carry a frame."""
@@ -135,9 +148,21 @@ class Bridge:
         self._counts[frame.frame_id] += 1
         if name and name == self.half and self._counts[frame.frame_id] % 2:
             frame = CanFrame(frame.frame_id, bytes([frame.data[0] ^ 1, *frame.data[1:]]))
+        if name in self.alter and not to_gateway:
+            layout = self._layouts[frame.frame_id]
+            values = self._remote._description.decode(layout, frame.data)
+            assert isinstance(values, dict)
+            counter = int(values["Counter"])
+            self.alter[name](values)
+            data = self._remote._description.encode(name, values, counter)
+            frame = CanFrame(frame.frame_id, data)
+        if name == "LeverState":
+            self._recorded.append((self._stage.ms, frame))
         way = "to_gateway" if to_gateway else "to_pc"
         delay = self.delay_s.get(name, self.delay_s.get(way, 0.0))
         since_s = (self._stage.ms - self.begun_ms) / 1e3
+        if self.held_s and not to_gateway:
+            delay = self.held_s - since_s % self.held_s
         self._deliver(frame, to_gateway, delay(since_s) if callable(delay) else delay)
         if name in self.echo_s:
             self._deliver(frame, to_gateway, self.echo_s[name])
@@ -148,6 +173,16 @@ class Bridge:
         while self._waiting and self._waiting[0][0] <= stage.ms:
             _, _, frame, to_gateway = heapq.heappop(self._waiting)
             self._arrive(frame, to_gateway)
+        for name, data in self.inserted.items():
+            if stage.ms % 20 == 5:
+                frame_id = self._remote._description.layouts[name].frame_id
+                for to_gateway in (True, False):
+                    self._arrive(CanFrame(frame_id, data), to_gateway)
+        while self._recorded and self._recorded[0][0] + TURN_MS <= stage.ms:
+            _, frame = self._recorded.popleft()
+            for to_gateway in (True, False):
+                if self.replayed:
+                    self._arrive(frame, to_gateway)
         if self.second_remote and stage.ms % self.remote_every_ms == 7:
             counter = stage.twin._remote._counter + self.remote_offset
             self._arrive(self._remote.build_frame(counter % 16), to_gateway=True)
