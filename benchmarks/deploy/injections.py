@@ -1,9 +1,10 @@
-"""Injected faults on the way between gateway and PC: python benchmarks/deploy/injections.py <json> [trials] [word].
+"""Injected faults on the way between gateway and PC: python benchmarks/deploy/injections.py <json> [trials] [words].
 
 Twin, gateway, bus process and policy as they are, on a clock of their own (`tests/stage.py`); a
 bridge between them delays, copies and corrupts messages, and strangers send. Each trial begins at
 another phase of all cycles. Times count until the valves get nothing, for good; "moves" says that
-they still move at the end of the time watched. With a word only the rows that hold it are measured.
+they still move at the end of the time watched. With words only the rows that hold one of them are
+measured again, and the others stay as the file has them.
 """
 
 from __future__ import annotations
@@ -13,14 +14,15 @@ import math
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]  # the folder of this file is there already
 
 import numpy as np  # noqa: E402
 from composed import option  # noqa: E402
+from further_injections import FRESH, FURTHER, LASTING, STAMPED, WATCHED_S  # noqa: E402
 from stage import Mode, Stage  # noqa: E402
 
 from brokk_rl.kinematics import compute_tool_kinematics  # noqa: E402
@@ -28,12 +30,10 @@ from brokk_rl.machine import Machine  # noqa: E402
 from deploy.guard.guard import GuardState  # noqa: E402
 
 LATCHED = GuardState.LATCHED
-WATCHED_S = 4.0
+USUALLY_WATCHED_S = 4.0
 QUIET_S = 1.0
 """Standstill after which a trial is over: nothing moves again before somebody presses the dead-man."""
 MESSAGES = ("JointPos1", "JointPos2", "LeverState", "MachineStatus", "ValveFeedback", "ValveCmd")
-STAMPED = ("JointPos1", "JointPos2", "JointPos3", "MachineStatus", "ValveFeedback")
-"""Messages with the gateway's own clock."""
 
 
 def start_second_remote(stage: Stage, trial: int) -> None:
@@ -237,12 +237,13 @@ SHORT: dict[Mode, list[Callable[[Stage, int], None]]] = {
         replay_remote,
         *(insert(name) for name in MESSAGES),
         *(copy_soon(name) for name in MESSAGES),
+        *FURTHER,
     ],
     "auto": [answer(float("nan")), answer(1e30)],
 }
 
 
-AFRESH = (jump_clock, replay_remote)
+AFRESH = (jump_clock, replay_remote, *FRESH)
 """Injections each of whose trials has a loop of its own: a jump of the clock is not forgotten."""
 
 
@@ -253,7 +254,8 @@ def measure_stop(stage: Stage, inject: Callable[[Stage, int], None], trial: int)
     original = stage.adviser._bundle.command if stage.adviser else None
     inject(stage, trial)
     begun_ms = stage.ms
-    stage.go(WATCHED_S, lambda: _is_quiet(stage))
+    watched_s = WATCHED_S.get(inject, USUALLY_WATCHED_S)
+    stage.go(watched_s, lambda: inject not in LASTING and _is_quiet(stage))
     if stage.adviser:
         stage.adviser._bundle.command = original
     return None if stage.stopped_ms is None else max(0, stage.stopped_ms - begun_ms) / 1e3
@@ -402,20 +404,19 @@ def measure_unwatched(
     return {"trials": trials, "moves": moves}
 
 
-def main(path: Path, trials: int, word: str) -> None:
-    table: dict[str, object] = {}
+def main(path: Path, trials: int, words: Sequence[str]) -> None:
+    table: dict[str, object] = json.loads(path.read_text()) if words and path.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         machine = option("machine", "brokk170")
         for mode, injections in SHORT.items():
             for inject in injections:
-                if word in str(inject.__doc__):
-                    row = measure_row(machine, mode, Path(folder), inject, trials)
-                    table[f"{mode}: {inject.__doc__}"] = row
-        if not word:
+                key = f"{mode}: {inject.__doc__}"
+                if not words or any(word in key for word in words):
+                    table[key] = measure_row(machine, mode, Path(folder), inject, trials)
+                    sys.stdout.write(f"{key}: {table[key]}\n")
+        if not words:
             measure_others(table, Path(folder), trials)
     path.write_text(json.dumps(table, indent=2) + "\n")
-    for key, row in table.items():
-        sys.stdout.write(f"{key}: {row}\n")
 
 
 def measure_others(table: dict[str, object], folder: Path, trials: int) -> None:
@@ -440,8 +441,4 @@ def measure_others(table: dict[str, object], folder: Path, trials: int) -> None:
 
 
 if __name__ == "__main__":
-    main(
-        Path(sys.argv[1]),
-        int(sys.argv[2]) if len(sys.argv) > 2 else 60,
-        sys.argv[3] if len(sys.argv) > 3 else "",
-    )
+    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 60, tuple(sys.argv[3:]))
