@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
+from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
@@ -198,4 +198,4 @@ def _print_table(table: dict[str, dict[str, Any]]) -> None:
             except (KeyError, TypeError):  # not recorded, or no episode with success
                 cells.append("-")
         view.add_row(name, *cells)
-    Console().print(view)
+    print_table(view)
