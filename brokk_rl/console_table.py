@@ -31,7 +31,7 @@ def split_table(table: Table, num_keys: int, console: Console) -> list[Table]:
     parts, first = [], num_keys
     while first < num_columns:
         last = first + 1
-        while last < num_columns and _fits(_take(table, num_keys, first, last + 1), console):
+        while last < num_columns and _is_narrow(_take(table, num_keys, first, last + 1), console):
             last += 1
         parts.append(_take(table, num_keys, first, last))
         first = last
@@ -63,6 +63,6 @@ def _take(table: Table, num_keys: int, first: int, last: int) -> Table:
     return part
 
 
-def _fits(table: Table, console: Console) -> bool:
+def _is_narrow(table: Table, console: Console) -> bool:
     unlimited = console.options.update(width=10_000)
     return table.__rich_measure__(console, unlimited).maximum <= console.width
