@@ -302,4 +302,8 @@ speak();
 if (!token) answer("refused token");
 setInterval(() => { if (performance.now() - came > 150) draw(); }, 100);  // ages grow even when nothing comes
 scene = startScene();
+if (token && setup.extensions.includes("/video")) {
+  const { Video } = await import("./video.js");
+  measured.video = new Video($("view"), token, key => say(key));
+}
 for (const [name, act] of Object.entries(tools)) choose(name, chosenBefore(name, name === "sound"), act);
