@@ -4,13 +4,16 @@ BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
 SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode
 
-.PHONY: help train test test-all mutants figures check setup clean
+.PHONY: help play train test test-all mutants figures check setup clean
 
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
 train: setup            ## install, train the main task and leave a run folder
 	$(BIN)/brokk mode=train
+
+play: setup             ## install, and watch the shipped policy in a browser
+	$(BIN)/brokk mode=play
 
 test: setup             ## the tests that need no GPU, without the slow ones
 	$(BIN)/python -m pytest -q -n auto --maxprocesses 8 --dist loadfile -m "not gpu and not slow"

@@ -90,11 +90,11 @@ def _read_policy_task(cfg: DictConfig) -> str | None:
     """Return the name of the task of the policy or checkpoint that the configuration names."""
     folder = OmegaConf.select(cfg, "policy.folder", default=None)
     checkpoint = OmegaConf.select(cfg, "checkpoint", default=None)
-    if folder is not None:
-        return read_task_name(registry.resolve_package_path(str(folder)))
     if checkpoint is not None:
         path = Path(str(checkpoint))
         return read_task_name(path.parent if path.suffix == ".pt" else path)
+    if folder is not None:
+        return read_task_name(registry.resolve_package_path(str(folder)))
     return None
 
 

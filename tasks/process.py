@@ -237,6 +237,16 @@ class ToolPoseProcess:
         for value in self.episode.values():
             value.masked_fill_(mask, 0.0)
 
+    def move_target(self, mask: torch.Tensor, shift_m: torch.Tensor) -> None:
+        """Shift targets and what was estimated of them; see `MovableTask.move_target`."""
+        state = self.state
+        shift_m = torch.where(mask[:, None], shift_m, 0.0)
+        state["start.target_m"] += shift_m
+        state["start.scene"][:, :3] += shift_m
+        # one sample came with the reset, and one with each step since
+        state["estimate_sum_m"] += (state["age"] + 1)[:, None] * shift_m
+        state["estimate_m"] += shift_m
+
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """Return masked commands or proposals; see `TaskProcess.command`."""
         state = self.state

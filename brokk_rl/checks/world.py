@@ -8,6 +8,9 @@ from brokk_rl.checks.exercise import NUM_ENVS, is_in_place, is_same, require, vi
 from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.machine import Machine
 
+PLACED_M = 0.2
+"""Distance by which a block is put farther away. Chosen by hand."""
+
 
 def check_world(
     simulator: Simulator, machine: Machine, scenes: torch.Tensor, device: torch.device | str = "cpu"
@@ -77,6 +80,11 @@ def check_world(
         bool(torch.allclose(world.q[0], home[0], atol=1e-4)),
         "reset: the world of the mask is not where it was put",
     )
+    elsewhere = scenes.clone()
+    elsewhere[:, 0] += PLACED_M
+    before = world.q.clone()
+    world.place(some, elsewhere)
+    require(is_same(world.q, before), "place: the arm moved with the block")
 
 
 def _push_joints(world: World, steps: torch.Tensor) -> torch.Tensor:

@@ -1,11 +1,13 @@
 """Contract of a task, and of the policies that act in it.
 
 A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes
-of `N` environments at once. That contract is all that training and evaluation need. Two more are
-optional, and `supports_classical_control` and `supports_deployment` ask for them:
+of `N` environments at once. That contract is all that training and evaluation need. Three more are
+optional, and `supports_classical_control`, `can_move_target` and `supports_deployment` ask for
+them:
 
 * `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
   and `policy=classical` works.
+* `MovableTask`: the target may be moved during an episode, as `mode=play` does.
 * `DeployableTask`: the task can write its policy as one module from observation to command. Then
   `mode=export` and the end of `mode=train` write `policy.onnx`.
 
@@ -127,6 +129,19 @@ class ClassicalTask(Protocol):
 
 
 @runtime_checkable
+class MovableTask(Protocol):
+    """A task process whose target somebody may move during an episode; optional."""
+
+    def move_target(self, mask: torch.Tensor, shift_m: torch.Tensor) -> None:
+        """Shift the target in the environments of `mask`, `(N,)` bool, by `shift_m`, `(N, 3)`.
+
+        The estimate of the target shifts with it, and the entry `start.scene` of `state`. The block
+        itself is the world's (`brokk_rl.contracts.world.World.place`).
+        """
+        ...
+
+
+@runtime_checkable
 class DeployableTask(Protocol):
     """A task process whose policy can leave the trainer; optional."""
 
@@ -151,6 +166,11 @@ class DeployableTask(Protocol):
 def supports_classical_control(process: object) -> TypeGuard[ClassicalTask]:
     """Return whether a task process has a classical controller."""
     return isinstance(process, ClassicalTask)
+
+
+def can_move_target(process: object) -> TypeGuard[MovableTask]:
+    """Return whether the target of a task process can be moved."""
+    return isinstance(process, MovableTask)
 
 
 def supports_deployment(process: object) -> TypeGuard[DeployableTask]:

@@ -8,7 +8,7 @@ a target.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Protocol
+from typing import TYPE_CHECKING, Literal, Protocol, runtime_checkable
 
 if TYPE_CHECKING:
     import torch
@@ -58,6 +58,15 @@ class World(Protocol):
         """
         ...
 
+    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
+        """Put the block of worlds elsewhere; the machine goes on as it was.
+
+        Args:
+            mask: Worlds whose block moves, `(N,)` bool.
+            scene: Scenes, `(N, S)`; see `sim.scene`.
+        """
+        ...
+
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of everything that must be stored to go on exactly."""
         ...
@@ -77,6 +86,15 @@ class VariedWorld(World, Protocol):
     def apply_properties(self) -> None:
         """Make `properties` count from the next step on; in place, without a host synchronisation."""
         ...
+
+
+@runtime_checkable
+class LoadedWorld(Protocol):
+    """A world in which somebody can push the machine; optional."""
+
+    joint_load: torch.Tensor
+    """Torque or force on each joint from outside, `(N, J)`, N m or N; written in place by the
+    caller, and kept until written again."""
 
 
 class Simulator(Protocol):

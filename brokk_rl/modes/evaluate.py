@@ -16,7 +16,7 @@ from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
-from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
+from brokk_rl.rl.policy import ClassicalPolicy, ShippedPolicy, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.session import Session, write_json
@@ -167,7 +167,7 @@ def choose_tasks(
     tasks: dict[str, Task] = {}
     shared, composed = config.task, getattr(config.task, "classical", None)
     for name, policy in policies.items():
-        if isinstance(policy, TrainedPolicy):
+        if isinstance(policy, TrainedPolicy | ShippedPolicy):
             tasks[name] = policy.choose_task(config.task, config.machine, asked)
         elif isinstance(policy, ClassicalPolicy) and composed is not None:
             opponent: Any = shared

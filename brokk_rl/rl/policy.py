@@ -164,6 +164,36 @@ class TrainedPolicy:
         return NetworkPolicy(actor.to(loop.device), loop)
 
 
+@spec
+class ShippedPolicy:
+    """The policy that ships, or the classical controller where it fits neither machine nor task.
+
+    Attributes:
+        folder: Folder of the policy, as in `TrainedPolicy`.
+    """
+
+    folder: str
+
+    label: ClassVar[str] = "shipped"
+
+    def choose_task(self, task: Task, machine: Machine, asked: Collection[str]) -> Task:
+        """Return the policy's own task, or `task` where the classical controller stands in."""
+        try:
+            return TrainedPolicy(folder=self.folder).choose_task(task, machine, asked)
+        except (CheckpointError, ConfigError) as error:
+            log.info(
+                "the classical controller acts, for the policy that ships does not fit: %s", error
+            )
+            return task
+
+    def build(self, loop: ControlLoop, seed: int) -> Policy:
+        """Return the policy, or the classical controller."""
+        try:
+            return TrainedPolicy(folder=self.folder).build(loop, seed)
+        except CheckpointError:  # `choose_task` has said why
+            return ClassicalPolicy().build(loop, seed)
+
+
 class _ClassicalActor:
     def __init__(self, task: ClassicalTask) -> None:
         self._task = task

@@ -12,7 +12,7 @@ import inspect
 from typing import TYPE_CHECKING, Any, Literal
 
 from brokk_rl.bounds import require_range
-from brokk_rl.contracts.world import Property, Simulator, VariedWorld
+from brokk_rl.contracts.world import LoadedWorld, Property, Simulator, VariedWorld
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import name_spec, spec
@@ -97,6 +97,8 @@ class EventWorld:
         self.num_worlds, self.device = world.num_worlds, world.device
         self.q, self.contact_force_n = world.q, world.contact_force_n
         self.faults, self.supports_graphs = world.faults, world.supports_graphs
+        if isinstance(world, LoadedWorld):
+            self.joint_load = world.joint_load
         self._left_s = torch.zeros(len(events), world.num_worlds, device=world.device)
         everywhere = torch.ones_like(world.faults)
         for event in events:
@@ -124,6 +126,10 @@ class EventWorld:
         self._restart(mask)
         self._world.apply_properties()
         self._world.reset(mask, q, scene)
+
+    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
+        """Put blocks elsewhere; see `brokk_rl.contracts.world.World`."""
+        self._world.place(mask, scene)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of everything that must be stored to go on exactly."""

@@ -55,6 +55,7 @@ class NativeWorld:
         self._geom_size, self._geom_pos = (
             torch.from_numpy(self._batch.expand(name)) for name in ("geom_size", "geom_pos")
         )
+        self.joint_load = torch.from_numpy(self._batch.bind("qfrc_applied"))
         # zeros would switch the equalities of the MJCF off
         self._first_state = self._state[0].clone()
         self._placement = ScenePlacement(self.model, self.device, torch.float64)
@@ -115,13 +116,23 @@ class NativeWorld:
         self._state[rows] = self._first_state
         self._qpos[rows] = self._act[rows] = start.double()
         self._drive.reset(mask, q)
-        position, turn = self._placement.pose(placed)
-        self._mocap_pos[rows, 0], self._mocap_quat[rows, 0] = position, turn
-        size, pos = self._placement.geoms(placed)
-        index = (rows[:, None], self._placement.geom_ids)
-        self._geom_size[index], self._geom_pos[index] = size, pos
+        self._place(rows, placed)
         self._warning[rows] = 0
         self.q[rows], self.contact_force_n[rows], self.faults[rows] = start, 0.0, False
+
+    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
+        """Put blocks elsewhere; see `brokk_rl.contracts.world.World`."""
+        rows = mask.nonzero()[:, 0]
+        if len(rows):
+            self._place(rows, scene[rows])
+
+    def _place(self, rows: torch.Tensor, scene: torch.Tensor) -> None:
+        """Write the scenes, `(R, S)`, of the worlds `rows`, `(R,)`."""
+        position, turn = self._placement.pose(scene)
+        self._mocap_pos[rows, 0], self._mocap_quat[rows, 0] = position, turn
+        size, pos = self._placement.geoms(scene)
+        index = (rows[:, None], self._placement.geom_ids)
+        self._geom_size[index], self._geom_pos[index] = size, pos
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return copies of everything that must be stored to go on bit for bit."""

@@ -30,6 +30,9 @@ the bottom."""
 SCALE_BOUNDS, HOLE_RADIUS_BOUNDS_M = (0.5, 1.25), (0.01, 0.08)
 """Bounds of a scene. MuJoCo's bounding volumes are compiled for the largest geoms within them, and
 so hold every smaller one."""
+FAR_M = 10.0
+"""Horizontal distance beyond which a block is not part of the task (goal_pose puts it 20 m
+away)."""
 GROUND = "ground"
 """The plane on which the chisel stops: the ground, or the bottom of a hole that is deeper than the
 ground."""

@@ -26,16 +26,9 @@ import torch
 from brokk_rl.errors import StorageError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.sim.model import compile_model
+from brokk_rl.sim.posed_scene import SHOWN_GROUPS, PosedScene
 from brokk_rl.sim.probe import find_renderer
-from brokk_rl.sim.scene import (
-    COLUMNS,
-    HALF_LENGTH_M,
-    HALF_WIDTH_M,
-    HOLE_DEPTH_M,
-    ScenePlacement,
-    build_visual_wall,
-)
+from brokk_rl.sim.scene import FAR_M, HALF_LENGTH_M, HALF_WIDTH_M, HOLE_DEPTH_M
 
 log = logging.getLogger(__name__)
 
@@ -46,9 +39,6 @@ SIZE = (1200, 540)
 """Width and height of a picture, pixels."""
 CLOSE_WIDTH = 380
 """Width of the close-up at the right, pixels."""
-FAR_M = 10.0
-"""Horizontal distance beyond which a block is not part of the task (goal_pose puts it 20 m
-away)."""
 NUM_STILLS = 3
 """Pictures of a video. Chosen by hand; not searched."""
 RENDER_TIMEOUT_S = 600
@@ -59,8 +49,6 @@ VIDEO_QUALITY = 7
 """Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
 SCHEMATIC_DPI = 100
 """Dots an inch. Chosen by hand; not searched."""
-SHOWN_GROUPS = (0, 1, 2)
-"""Geom groups that pictures show; group 3 holds geoms that only collide."""
 
 DrawFrames = Callable[[Iterable[int]], Iterator[np.ndarray]]
 """Yields one picture, `(height, width, 3)` uint8, for each of the given steps."""
@@ -251,9 +239,7 @@ class SceneRenderer:
     """
 
     def __init__(self, machine: Machine) -> None:
-        self.model = compile_model(machine, machine.period_s, visual=True)
-        self.data = mujoco.MjData(self.model)
-        self._placement = ScenePlacement(self.model, "cpu", torch.float64)
+        self._posed = PosedScene(machine)
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = [group in SHOWN_GROUPS for group in range(6)]
@@ -268,26 +254,16 @@ class SceneRenderer:
 
     def set_pose(self, q: np.ndarray, scene: np.ndarray) -> None:
         """Put the machine at `q`, shape `(J,)`, beside the block of `scene`, shape `(S,)`."""
-        row = torch.as_tensor(scene, dtype=torch.float64)[None]
-        size, pos = self._placement.geoms(row)
-        ids = self._placement.geom_ids.numpy()
-        self.model.geom_size[ids], self.model.geom_pos[ids] = size[0].numpy(), pos[0].numpy()
-        wall = build_visual_wall(float(scene[COLUMNS.index("hole_radius_m")]))
-        ids = [self.model.geom(name).id for name in wall.names]
-        self.model.geom_size[ids], self.model.geom_pos[ids] = wall.size, wall.pos
-        position, turn = self._placement.pose(row)
-        self.data.qpos[:] = q
-        self.data.mocap_pos[0], self.data.mocap_quat[0] = position[0].numpy(), turn[0].numpy()
-        mujoco.mj_kinematics(self.model, self.data)
-        mujoco.mj_comPos(self.model, self.data)
-        mujoco.mj_camlight(self.model, self.data)
+        self._posed.set_pose(q, scene)
+        mujoco.mj_comPos(self._posed.model, self._posed.data)
+        mujoco.mj_camlight(self._posed.model, self._posed.data)
 
     def render(self, camera: str, width: int, height: int) -> np.ndarray:
         """Return the picture of `camera`, shape `(height, width, 3)` uint8."""
         key = (height, width)
         if key not in self._renderers:
-            self._renderers[key] = mujoco.Renderer(self.model, height, width)
-        self._renderers[key].update_scene(self.data, camera, self._option)
+            self._renderers[key] = mujoco.Renderer(self._posed.model, height, width)
+        self._renderers[key].update_scene(self._posed.data, camera, self._option)
         return self._renderers[key].render()
 
 

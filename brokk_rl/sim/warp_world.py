@@ -223,8 +223,6 @@ class WarpWorld:
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""
         view = self._views
-        position, turn = self._placement.pose(scene)
-        size, pos = self._placement.geoms(scene)
         rows, zero = mask[:, None], q.new_zeros(())
         for name in ("qpos", "act"):
             torch.where(rows, q, view[name], out=view[name])
@@ -232,15 +230,22 @@ class WarpWorld:
             torch.where(rows, zero, view[name], out=view[name])
         view["time"].masked_fill_(mask, 0.0)
         view["overflow"].masked_fill_(mask, 0)
+        self.place(mask, scene)
+        self._drive.reset(mask, q)
+        torch.where(rows, q, self.q, out=self.q)
+        self.contact_force_n.masked_fill_(mask, 0.0)
+        self.faults.masked_fill_(mask, False)
+
+    def place(self, mask: torch.Tensor, scene: torch.Tensor) -> None:
+        """Put blocks elsewhere; see `brokk_rl.contracts.world.World`."""
+        view, rows = self._views, mask[:, None]
+        position, turn = self._placement.pose(scene)
+        size, pos = self._placement.geoms(scene)
         for name, value in (("mocap_pos", position), ("mocap_quat", turn)):
             torch.where(rows, value, view[name][:, 0], out=view[name][:, 0])
         for name, value in (("geom_size", size), ("geom_pos", pos)):
             ids = self._placement.geom_ids
             view[name].index_copy_(1, ids, torch.where(rows[..., None], value, view[name][:, ids]))
-        self._drive.reset(mask, q)
-        torch.where(rows, q, self.q, out=self.q)
-        self.contact_force_n.masked_fill_(mask, 0.0)
-        self.faults.masked_fill_(mask, False)
 
     @property
     def properties(self) -> dict[str, torch.Tensor]:

@@ -16,7 +16,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.calibrate import arm, clock_offset, evaluation, transforms
+from perception.calibrate import arm, clock_offset, evaluation, transforms, verdict
 from perception.calibrate.extrinsics import PoseResidual, build_calibration
 from perception.calibrate.hand_eye import (
     MIN_VIEWS,
@@ -254,6 +254,7 @@ class BoardCalibration:
             "corners_px": round(float(np.median([one.pose.error_px for one in known])), 3),
             "turns_rad": turns.round(4).tolist(),
             "missing": missing,
+            "verdict": self._judge(machine, trajectory, known, q, clock, solution, missing),
         }
         residuals = [*evaluation.list_residuals(views, solution), *refused]
         camera, cov = solution.guess.base_from_camera, solution.cov[:6, :6]
@@ -336,6 +337,34 @@ class BoardCalibration:
             names=tuple(one.name for one in observations),
             shared_names=tuple(names),
         )
+
+    def _judge(
+        self,
+        machine: Machine,
+        trajectory: arm.JointTrajectory,
+        observations: list[BoardObservation],
+        q: np.ndarray,
+        clock: clock_offset.ClockEstimate | None,
+        solution: HandEyeSolution,
+        missing: list[str],
+    ) -> dict[str, Any]:
+        """Return the verdict and, for a bad one, the joint that explains it; see `verdict`."""
+
+        def build_views(positions: np.ndarray) -> HandEyeViews:
+            return self._build_views(machine, trajectory, observations, positions, clock)
+
+        views = build_views(q)
+        zeros = {}
+        for name, mean in zip(views.shared_names, solution.guess.shared, strict=True):
+            if name != evaluation.CLOCK_NAME:
+                zeros[name] = (float(mean), self.zero_std_rad)
+        alone = verdict.judge_fit(int(solution.used.sum()), len(q), solution.factor, zeros, missing)
+        explanation = verdict.explain_by_joint(machine, q, views, solution, build_views)
+        otherwise = (
+            "no scale or sign of one joint explains this: look at the axes and the order of the "
+            "joints in the machine's file, and whether the joint positions belong to these frames"
+        )
+        return verdict.add_explanation(alone, explanation, otherwise).to_dict()
 
     def _check_coverage(
         self,

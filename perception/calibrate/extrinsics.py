@@ -13,6 +13,7 @@ import yaml
 from brokk_rl import record
 from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
+from perception.calibrate import verdict
 from perception.sources import validation
 
 SCHEMA = 1
@@ -66,7 +67,7 @@ def read_calibration(path: Path, where: str) -> dict[str, Any]:
     """Return the content of a file of `mode=calibrate`.
 
     Raises:
-        FrameError: it cannot be read, or is of another kind.
+        FrameError: it cannot be read, is of another kind, or is not to be trusted.
     """
     try:
         content = yaml.safe_load(path.read_text())
@@ -84,6 +85,7 @@ def read_calibration(path: Path, where: str) -> dict[str, Any]:
             f"{where}: {path} is no calibration of schema {SCHEMA}; `brokk mode=calibrate` "
             "writes one"
         )
+    verdict.check_verdict(content, f"{where}={path}")
     return content
 
 

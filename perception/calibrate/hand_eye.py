@@ -185,7 +185,7 @@ def solve_hand_eye(views: HandEyeViews) -> HandEyeSolution | None:
     best_deviance, guess = np.inf, HandEyeGuess(np.eye(4), np.eye(4), shared)
     for camera, board in generate_starts(views.base_from_link, views.camera_from_board[:, 0]):
         refined = _minimise(views, HandEyeGuess(camera, board, shared), 1.0, None)
-        deviance = _compute_deviance(views, refined)
+        deviance = compute_deviance(views, refined)
         if deviance < best_deviance:
             best_deviance, guess = deviance, refined
     factor = 1.0
@@ -336,7 +336,7 @@ def _minimise(
     return guess
 
 
-def _compute_deviance(views: HandEyeViews, guess: HandEyeGuess) -> float:
+def compute_deviance(views: HandEyeViews, guess: HandEyeGuess) -> float:
     """Return minus twice the logarithm of the likelihood of all views, but for a constant."""
     residuals = _compare(views, guess, 1.0)
     deviance = (STUDENT_T_FREEDOM + 6) * np.log1p(residuals.distance / STUDENT_T_FREEDOM)

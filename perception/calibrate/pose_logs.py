@@ -12,12 +12,14 @@ from scipy.spatial.transform import Rotation, Slerp
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
-from perception.calibrate import arm, clock_offset, evaluation, transforms
+from perception.calibrate import arm, clock_offset, evaluation, transforms, verdict
 from perception.calibrate.board import MIN_TURN_SHARE
 from perception.calibrate.extrinsics import build_calibration
 from perception.calibrate.hand_eye import (
     MIN_VIEWS,
+    HandEyeSolution,
     HandEyeViews,
+    compute_deviance,
     predict_board_poses,
     solve_hand_eye,
 )
@@ -28,6 +30,13 @@ MIN_TIME_STEP_S = 1e-6
 """Times must grow by more than this; chosen by hand."""
 MAX_NORM_ERROR = 0.01
 """Largest deviation of a quaternion's norm from 1; chosen by hand, for rounded logs."""
+
+INVERSE_NAMES = {
+    "base_from_link": "link_from_base",
+    "link_from_base": "base_from_link",
+    "camera_from_board": "board_from_camera",
+    "board_from_camera": "camera_from_board",
+}
 
 
 @dataclass(frozen=True)
@@ -43,6 +52,10 @@ class PoseLog:
         turns = Slerp(self.t_s, Rotation.from_matrix(self.poses[:, :3, :3]))(inside).as_matrix()
         shifts = arm.interpolate_columns(inside, self.t_s, self.poses[:, :3, 3])
         return transforms.make_transform(turns, shifts)
+
+    def invert(self) -> PoseLog:
+        """Return the log of the inverse transforms."""
+        return PoseLog(self.t_s, transforms.invert(self.poses))
 
 
 @spec
@@ -96,20 +109,10 @@ class PoseLogCalibration:
         """
         hand, eye = read_pose_log(Path(self.arm)), read_pose_log(Path(self.camera))
         if self.arm_tells == "link_from_base":
-            hand = PoseLog(hand.t_s, transforms.invert(hand.poses))
+            hand = hand.invert()
         if self.camera_tells == "board_from_camera":
-            eye = PoseLog(eye.t_s, transforms.invert(eye.poses))
-        clock = None
-        if self.clock_s:
-            clock = clock_offset.estimate_clock_offset(
-                eye.t_s,
-                eye.poses[:, :3, :3],
-                hand.t_s,
-                hand.poses[:, :3, :3],
-                self.clock_s,
-                self.least_correlation,
-            )
-        views = self._build_views(hand, self._choose_poses(hand, eye, clock), clock)
+            eye = eye.invert()
+        clock, views = self._match_logs(hand, eye)
         solution = solve_hand_eye(views)
         assert solution is not None  # there are enough
         link = views.base_from_link[solution.used]
@@ -127,6 +130,7 @@ class PoseLogCalibration:
             **evaluation.summarise_solution(views, solution, clock),
             "turns_rad": turns.round(4).tolist(),
             "missing": missing,
+            "verdict": self._judge(hand, eye, views, solution, missing),
         }
         residuals = evaluation.list_residuals(views, solution)
         camera, cov = solution.guess.base_from_camera, solution.cov[:6, :6]
@@ -137,6 +141,57 @@ class PoseLogCalibration:
             ("T_link_cam" if name == "T_base_cam" else name): value
             for name, value in content.items()
         }
+
+    def _match_logs(
+        self, hand: PoseLog, eye: PoseLog
+    ) -> tuple[clock_offset.ClockEstimate | None, HandEyeViews]:
+        """Return the offset of the clocks and the views."""
+        clock = None
+        if self.clock_s:
+            clock = clock_offset.estimate_clock_offset(
+                eye.t_s,
+                eye.poses[:, :3, :3],
+                hand.t_s,
+                hand.poses[:, :3, :3],
+                self.clock_s,
+                self.least_correlation,
+            )
+        return clock, self._build_views(hand, self._choose_poses(hand, eye, clock), clock)
+
+    def _judge(
+        self,
+        hand: PoseLog,
+        eye: PoseLog,
+        views: HandEyeViews,
+        solution: HandEyeSolution,
+        missing: list[str],
+    ) -> dict[str, Any]:
+        """Return the verdict and whether an inverted log explains a bad one; see `verdict`.
+
+        An inverted arm and an inverted camera look alike, since `A Y = X B` holds for the inverses
+        too. For the same reason two inverted logs fit as well as none.
+        """
+        arm_words = INVERSE_NAMES[self.arm_tells]
+        camera_words = INVERSE_NAMES[self.camera_tells]
+        words = (
+            "one of the logs holds the inverse poses: give "
+            f"calibration.arm_tells={arm_words} or calibration.camera_tells={camera_words}"
+        )
+        _, other = self._match_logs(hand.invert(), eye)
+        inverted = solve_hand_eye(other)
+        assert inverted is not None  # as many views as before
+        explanation = verdict.choose_explanation(
+            [verdict.Explanation(words, compute_deviance(other, inverted.guess), inverted)],
+            compute_deviance(views, solution.guess),
+        )
+        alone = verdict.judge_fit(
+            int(solution.used.sum()), len(views), solution.factor, {}, missing
+        )
+        otherwise = (
+            "no inverted log explains this: look at the order of the quaternions (qx qy qz qw), "
+            "the units, and whether both logs are of the same motion"
+        )
+        return verdict.add_explanation(alone, explanation, otherwise).to_dict()
 
     def _choose_poses(
         self, hand: PoseLog, eye: PoseLog, clock: clock_offset.ClockEstimate | None

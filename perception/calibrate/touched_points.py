@@ -16,7 +16,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception.calibrate import arm, transforms
+from perception.calibrate import arm, transforms, verdict
 from perception.calibrate.extrinsics import PoseResidual, build_calibration
 from perception.calibrate.hand_eye import STUDENT_T_FREEDOM
 
@@ -28,6 +28,8 @@ EXAMPLE = """expected YAML such as
     - {camera_m: [0.2, 0.1, 2.3], base_m: [2.6, 0.3, 0.4]}"""
 MIN_POINTS = 4
 """Points that can be fitted: three decide, a fourth contradicts."""
+MIN_POINTS_JUDGED = 6
+"""Points that have to agree for a verdict: three decide, three contradict; chosen by hand."""
 NUM_TRIPLES = 300
 """Random triples that are tried; with half of the points wrong, all fail once in 10^17."""
 MEDIAN_DISTANCE = float(chi2.ppf(0.5, 3))
@@ -277,11 +279,22 @@ class TouchCalibration:
             "arm_factor": round(fit.factor, 3),
             "width_m": round(width_m, 4),
             "missing": [],
+            "verdict": self._judge(fit),
         }
         camera, all_residuals = fit.base_from_camera, [*residuals, *refused]
         return build_calibration(
             "touched", machine, camera, fit.cov, all_residuals, self.work_m, more
         )
+
+    def _judge(self, fit: PointFit) -> dict[str, Any]:
+        """Return the verdict; see `verdict`."""
+        alone = verdict.judge_fit(
+            int(fit.used.sum()), len(fit.used), fit.factor, {}, [], MIN_POINTS_JUDGED
+        )
+        otherwise = (
+            "look at the pixels, at the joint positions of each touch and at the machine's axes"
+        )
+        return verdict.add_explanation(alone, None, otherwise).to_dict()
 
     def _collect_pairs(self, machine: Machine) -> tuple[list[str], PointPairs, list[PoseResidual]]:
         """Return names and coordinates of the points that can be used, and those that cannot."""

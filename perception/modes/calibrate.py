@@ -9,12 +9,14 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.spec import spec
 from perception.calibrate.board import BoardCalibration
 from perception.calibrate.pose_logs import PoseLogCalibration
 from perception.calibrate.touched_points import TouchCalibration
+from perception.calibrate.verdict import GOOD
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +46,8 @@ class Calibrate:
             Standard deviation of a point at the working distance, by the calibration alone, m.
 
         Raises:
-            FrameError: the recorded data do not determine the camera; the message names the lack.
+            FrameError: the recorded data do not determine the camera, or the verdict is not `good`;
+                the message says why. The file is written with its verdict.
             ConfigError, RecordingError: an input cannot be read.
             StorageError: the file cannot be written.
         """
@@ -53,6 +56,12 @@ class Calibrate:
         text = yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=132)
         write_text(path, text)
         _show(content)
+        verdict = content["verdict"]
+        if verdict["status"] != GOOD:
+            raise FrameError(
+                f"calibration: {verdict['status']}: {'; '.join(verdict['reasons'])}. "
+                f"{path} holds the residuals"
+            )
         if "T_base_cam" in content:
             log.info("perception/source=zed source.base_from_camera=%s", path)
         return float(content["point_std_m"]["std_m"])
@@ -62,6 +71,7 @@ def _show(content: dict[str, Any]) -> None:
     table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
     frame = "base" if "T_base_cam" in content else "link"
     place = ", ".join(f"{row[3]:.4f}" for row in content[f"T_{frame}_cam"][:3])
+    table.add_row("verdict", content["verdict"]["status"])
     table.add_row(f"camera in the {frame} frame", f"({place}) m")
     work = content["point_std_m"]
     table.add_row(f"uncertainty at {work['at_m']:g} m", f"±{1000 * work['std_m']:.1f} mm")

@@ -23,6 +23,7 @@ FLOORS = (
     ("conf", 5),
     *((f"{package}.modes", MODE) for package in ("brokk_rl", *ROOMS, *EXTENSIONS)),
     *((package, 3) for package in (*ROOMS, *EXTENSIONS)),
+    ("brokk_rl.play", 3),
     ("brokk_rl.sim", 2),
     ("brokk_rl.rl", 2),
     ("brokk_rl.spec", 0),
@@ -41,6 +42,8 @@ DOORS = {
     "tensordict": ("brokk_rl.rl",),
     "wandb": ("brokk_rl.rl",),
     "cv2": ("perception", "deploy.picture"),
+    "viser": ("brokk_rl.play",),
+    "trimesh": ("brokk_rl.play", "brokk_rl.sim"),
     "can": ("deploy",),
     "cantools": ("deploy",),
 }

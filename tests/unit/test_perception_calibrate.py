@@ -18,11 +18,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from brokk_rl import record
+from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from perception import dataset
-from perception.calibrate import arm, clock_offset, hand_eye, touched_points, transforms
-from perception.calibrate.extrinsics import compute_point_std_m
+from perception.calibrate import arm, clock_offset, hand_eye, touched_points, transforms, verdict
+from perception.calibrate.extrinsics import compute_point_std_m, load_extrinsics
 from perception.sources.folder import FrameFolder
 
 EXACT = np.diag([0.0005, 0.0005, 0.001, 0.001, 0.001, 0.0005]) ** 2
@@ -515,6 +516,13 @@ def test_logs_of_poses_of_any_arm_are_enough(
         late_s, abs=0.015
     )
     assert 15 <= told["num_left_out"] <= 28  # of 200 of 371 poses, 40 of which are wrong
+    inverted = brokk(
+        "mode=calibrate", "calibration=poses", f"calibration.arm={arm_file}", f"calibration.camera={camera_file}",
+        "calibration.arm_tells=base_from_link", "calibration.camera_tells=board_from_camera",
+        f"calibration.camera_on={camera_on}", "session.out=inverted",
+    )  # fmt: skip
+    assert inverted.code == 2
+    assert "give calibration.arm_tells=link_from_base or calibration.camera_tells=" in inverted.err
     Path("two.csv").write_text("1,0,0,0,0,0,0,1\n2,0,0,0,0,0,0,2\n")
     refused = brokk(
         "mode=calibrate",
@@ -524,3 +532,88 @@ def test_logs_of_poses_of_any_arm_are_enough(
         "session.out=no",
     )
     assert refused.code == 2 and "line 2: expected numbers and a unit quaternion" in refused.err
+
+
+def judged(machine: Machine, poses: board.Posed, q: np.ndarray, seed: int) -> verdict.Verdict:
+    """Returns the verdict on true sights of the board beside joint positions `q`."""
+
+    def build_views(positions: np.ndarray) -> hand_eye.HandEyeViews:
+        return board.views(machine, replace(poses, q=positions), EXACT, seed)[0]
+
+    views = build_views(q)
+    found = hand_eye.solve_hand_eye(views)
+    assert found is not None
+    zeros = {n: (float(z), 0.0087) for n, z in zip(views.shared_names, found.guess.shared, strict=True)}  # fmt: skip
+    alone = verdict.judge_fit(int(found.used.sum()), len(q), found.factor, zeros, [])
+    why = verdict.explain_by_joint(machine, q, views, found, build_views)
+    return verdict.add_explanation(alone, why, "no joint explains it")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_right_arm_is_called_good(machine: Machine, seed: int) -> None:
+    poses = board.posed(machine, 30, seed, 0.0044, 0.0017, 0.001)
+    assert judged(machine, poses, poses.q, seed) == verdict.Verdict("good")
+
+
+@pytest.mark.parametrize("joint", range(5))
+@pytest.mark.parametrize("factor", [1.1, -1.0])
+def test_a_joint_with_a_wrong_scale_or_sign_is_named(
+    machine: Machine, joint: int, factor: float
+) -> None:
+    poses = board.posed(machine, 30, joint, 0.0044, 0.0017, 0.001)
+    q = poses.q.copy()
+    q[:, joint] *= factor
+    told = judged(machine, poses, q, joint)
+    assert told.status == "not to be trusted"
+    name, words = told.reasons[0].split(": ", 1)
+    assert name == f"q{joint + 1}"
+    if factor < 0:
+        assert words.startswith("its sign is reversed")
+    else:
+        told_factor = float(words.split("multiplied by ")[1].split(":")[0])
+        assert told_factor == pytest.approx(1 / factor, abs=0.015)
+
+
+def test_joint_positions_of_other_frames_have_no_explanation(machine: Machine) -> None:
+    poses = board.posed(machine, 30, 0, 0.0044, 0.0017, 0.001)
+    told = judged(machine, poses, np.random.default_rng(0).permutation(poses.q), 0)
+    assert told.status == "not to be trusted" and told.reasons[-1] == "no joint explains it"
+    assert any("times as inaccurate" in reason for reason in told.reasons)
+
+
+def test_a_fit_is_judged_by_what_it_leaves_out_and_what_it_lacks() -> None:
+    right = {"q2": (0.02, 0.0087)}
+    assert verdict.judge_fit(30, 30, 1.0, right, []).status == "good"
+    assert verdict.judge_fit(15, 30, 2.0, right, []).status == "good"
+    for wrong in (
+        verdict.judge_fit(14, 30, 1.0, right, []),
+        verdict.judge_fit(30, 30, 2.01, right, []),
+        verdict.judge_fit(30, 30, 1.0, {"q2": (-0.0262, 0.0087)}, []),
+    ):
+        assert wrong.status == "not to be trusted" and len(wrong.reasons) == 1
+    assert verdict.judge_fit(7, 10, 1.0, right, []).status == "cannot tell"
+    lacking = verdict.judge_fit(30, 30, 1.0, right, ["turn more"])
+    assert lacking == verdict.Verdict("cannot tell", ("turn more",))
+
+
+def test_a_wrong_joint_ends_with_an_error_and_its_file_is_refused(
+    brokk: Callable[..., Any], footage: Path
+) -> None:
+    told = yaml.safe_load((footage / "joints.yaml").read_text())
+    Path("wrong.yaml").write_text(
+        yaml.safe_dump({name: [*q[:2], 1.1 * q[2], *q[3:]] for name, q in told.items()})
+    )
+    done = brokk(
+        "mode=calibrate", f"calibration.source.folder={footage}", "calibration.joints=wrong.yaml",
+        "session.out=run",
+    )  # fmt: skip
+    assert (
+        done.code == 2 and "not to be trusted: q3: its positions are to be multiplied" in done.err
+    )
+    content = yaml.safe_load(Path("run/calibration.yaml").read_text())
+    assert content["verdict"]["status"] == "not to be trusted"
+    with pytest.raises(FrameError, match="not to be trusted: q3"):
+        load_extrinsics("run/calibration.yaml", "source.base_from_camera")
+    content["verdict"] = {"status": "cannot tell", "reasons": ["few"]}
+    Path("open.yaml").write_text(yaml.safe_dump(content))
+    assert load_extrinsics("open.yaml", "here").base_from_camera is not None

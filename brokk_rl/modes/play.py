@@ -1,0 +1,235 @@
+"""`brokk mode=play`: shows a policy at work, live, and lets a person touch it."""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Protocol
+
+import torch
+
+from brokk_rl.contracts.actuator import Actuator, Effect, Follower
+from brokk_rl.contracts.task import Policy, Task, supports_classical_control
+from brokk_rl.contracts.world import Simulator
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.modes.evaluate import PolicySpec, choose_tasks
+from brokk_rl.play.checkpoint_watch import CheckpointWatch, find_newest, read_task
+from brokk_rl.play.levers import Gamepad
+from brokk_rl.play.session import PlaySession
+from brokk_rl.play.settings import PlaySettings
+from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
+from brokk_rl.session import Session
+from brokk_rl.sim.events import Event
+from brokk_rl.spec import name_spec, spec
+from brokk_rl.task_description import apply_behaviour
+
+log = logging.getLogger(__name__)
+
+POLICY, CLASSICAL = "policy", "classical"
+"""Names of the drivers, beside the person."""
+NUM_STARTS = 256
+"""Starts from which episodes begin. Chosen by hand: drawn in less than a second."""
+FRAME_S = 1 / 30
+"""Time between two pictures, s. Chosen by hand for the eye."""
+RATE_S = 30.0
+"""Time between two lines about the rate, s; the first comes after a tenth of it. By hand."""
+
+
+class Viewer(Protocol):
+    """Page or window of a session."""
+
+    def update(self) -> bool:
+        """Do what the person has asked for and show the state; false when the person has left."""
+        ...
+
+    def close(self) -> None:
+        """End it."""
+        ...
+
+
+@spec
+class Play:
+    """Shows a policy at work, live, and lets a person touch it.
+
+    Attributes:
+        machine: The machine.
+        sim: Physics.
+        task: The task.
+        actuator: How commands become motion.
+        effect: Effects around the actuator model, by name.
+        event: Changes of the simulated machine, by name.
+        follower: Who stands between policy and machine.
+        policy: The policy, unless a checkpoint is given.
+        checkpoint: Run folder, or checkpoint, of a training; its newest checkpoint is followed.
+        asked: Keys of the task that were given on the command line.
+        play: Viewer, worlds and pace.
+    """
+
+    machine: Machine
+    sim: Simulator
+    task: Task
+    actuator: Actuator
+    effect: dict[str, Effect]
+    event: dict[str, Event]
+    follower: Follower
+    policy: PolicySpec
+    checkpoint: str | None
+    asked: tuple[str, ...]
+    play: PlaySettings
+
+    def run(self) -> None:
+        """Show the machines until the person ends it.
+
+        Raises:
+            ConfigError: The port is taken, or a driver or device is missing.
+            CheckpointError: There is no policy, or it is of another machine or task.
+            DeviceError: There is no display for a window, or no such GPU.
+        """
+        settings = self.play
+        gamepad = self._open_gamepad()
+        if settings.viewer == "browser":
+            from brokk_rl.play.page import require_free_port
+
+            require_free_port(settings.port)
+        else:
+            from brokk_rl.sim.window import require_display
+
+            require_display()
+        session, watch = self._build_session()
+        viewer = _open_viewer(session, settings, gamepad)
+        try:
+            _drive(session, viewer, watch, settings.seconds)
+        finally:
+            viewer.close()
+            if gamepad is not None:
+                gamepad.close()
+
+    def _open_gamepad(self) -> Gamepad | None:
+        """Return the gamepad; `None` where none is configured."""
+        path, axes = self.play.gamepad, self.play.gamepad_axes
+        if path is None:
+            return None
+        if len(axes) != self.machine.num_joints:
+            raise ConfigError(
+                f"play.gamepad_axes: expected an axis for each of "
+                f"{', '.join(self.machine.joint_names)}, got {len(axes)}: {list(axes)}"
+            )
+        return Gamepad(Path(path), axes)
+
+    def _build_session(self) -> tuple[PlaySession, CheckpointWatch | None]:
+        """Return the session, and the watch of the training that is followed, if any."""
+        settings = self.play
+        session = Session(out=".", seed=settings.seed, device=settings.device)
+        device = session.torch_device()
+        session.seed_all()
+        config = ControlLoopConfig(
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects=self.effect,
+            events=self.event,
+            follower=self.follower,
+        )
+        if self.checkpoint is None:
+            task = choose_tasks(config, {POLICY: self.policy}, self.asked)[POLICY]
+        else:
+            path = find_newest(Path(self.checkpoint))
+            task = apply_behaviour(self.task, read_task(path), self.asked, f"the policy in {path}")
+        config = replace(config, task=task)
+        pool = max(NUM_STARTS, settings.worlds)
+        loop = config.build(device, settings.worlds, pool, session.stream("starts"))
+        watch = CheckpointWatch(Path(self.checkpoint), loop) if self.checkpoint else None
+        found = _gather_policies(loop, self.policy, watch, settings.seed)
+        played = PlaySession(loop, found.policies, settings.neutral)
+        if watch is not None:
+            played.replace_policy(POLICY, found.policies[POLICY], _describe(watch))
+        if settings.driver not in (POLICY, played.driver):
+            played.choose_driver(settings.driver)
+        played.set_speed(settings.speed)
+        log.info("%s drives; %s", played.driver, found.note)
+        return played, watch
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Policies by name, and where the first comes from."""
+
+    policies: dict[str, Policy]
+    note: str
+
+
+def _gather_policies(
+    loop: ControlLoop, policy: PolicySpec, watch: CheckpointWatch | None, seed: int
+) -> _Found:
+    """Return the policies that can drive, the one in question first."""
+    if watch is not None:
+        policies: dict[str, Policy] = {POLICY: watch.load()}
+        note = _describe(watch)
+    else:
+        policies = {POLICY: policy.build(loop, seed)}
+        note = f"policy={name_spec(policy)} {getattr(policy, 'folder', '')}".rstrip()
+    if supports_classical_control(loop.task):
+        classical = ClassicalPolicy().build(loop, seed)
+        if type(policies[POLICY]) is type(classical):
+            return _Found({CLASSICAL: classical}, "the task's classical controller")
+        policies[CLASSICAL] = classical
+    return _Found(policies, note)
+
+
+def _describe(watch: CheckpointWatch) -> str:
+    assert watch.loaded is not None
+    return f"{watch.loaded.parent.name}/{watch.loaded.name}"
+
+
+def _open_viewer(session: PlaySession, settings: PlaySettings, gamepad: Gamepad | None) -> Viewer:
+    """Open page or window, and say where it is."""
+    if settings.viewer == "window":
+        from brokk_rl.play.window_view import WindowView
+
+        return WindowView(session, gamepad)
+    from brokk_rl.play.page import PlayPage
+
+    page = PlayPage(session, settings.port, gamepad)
+    log.info("open http://localhost:%d in a browser; end with Ctrl-C", page.port)
+    log.info(
+        "over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", page.port, page.port
+    )
+    return page
+
+
+def _drive(
+    session: PlaySession, viewer: Viewer, watch: CheckpointWatch | None, seconds: float | None
+) -> None:
+    """Simulate at the wanted pace and show it, until the person or the time ends it."""
+    begun_s = last_s = time.monotonic()
+    report_s = begun_s + RATE_S / 10
+    with torch.no_grad():
+        while seconds is None or time.monotonic() - begun_s < seconds:
+            now_s = time.monotonic()
+            session.advance(now_s - last_s)
+            last_s = now_s
+            if not viewer.update():
+                return
+            if watch is not None and (policy := watch.poll()) is not None:
+                session.replace_policy(POLICY, policy, _describe(watch))
+                log.info("playing %s", _describe(watch))
+            if now_s >= report_s:
+                report_s = now_s + RATE_S
+                _report_rate(session)
+            time.sleep(max(0.0, FRAME_S - (time.monotonic() - now_s)))
+
+
+def _report_rate(session: PlaySession) -> None:
+    state = session.read()
+    if not state.paused:
+        log.info(
+            "%.2f times real time, %d control steps/s in each of %d worlds",
+            state.rate,
+            round(state.rate / session.machine.period_s),
+            session.loop.num_envs,
+        )

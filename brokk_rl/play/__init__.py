@@ -1,0 +1,1 @@
+"""Playing: simulated machines that a person watches and touches while they run."""

@@ -1,0 +1,458 @@
+"""Core of `mode=play`: commands of a person in, state of the simulated machines out.
+
+It knows neither browser nor window, and runs in one thread; viewers hand their commands over.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from brokk_rl.contracts.task import STEPS, SUCCESS, Policy, can_move_target
+from brokk_rl.contracts.world import LoadedWorld
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.play.dials import EffectDial, list_dials
+from brokk_rl.play.levers import PersonAtLevers
+from brokk_rl.play.settings import SPEEDS
+from brokk_rl.rl.vec_env import ControlLoop
+from brokk_rl.sim.scene import FAR_M
+
+PERSON = "person"
+"""Name of the driver who is no policy."""
+TRACE_S = 15.0
+"""Time that traces show, s. Chosen by hand: about one insertion."""
+MAX_CATCH_UP = 16
+"""Control steps between two pictures at most; a computer that is too slow falls behind the clock."""
+RATE_S = 2.0
+"""Time over which the rate is measured, s. Chosen by hand."""
+DISTANCE_M, HEIGHT_M = (1.6, 4.6), (0.0, 1.6)
+"""Where a target may be put: distance from the slew axis and height. Chosen by hand: a block that
+is nearer would stand in the undercarriage, and the arm of a Brokk 170 reaches 5.2 m."""
+PUSH_S = 0.5
+"""Time for which a push lasts, s. Chosen by hand."""
+
+
+@dataclass(frozen=True)
+class PlayState:
+    """State to draw; `N` worlds, `J` joints.
+
+    Attributes:
+        t_s: Simulated time since the start.
+        q: Joint positions, `(N, J)`, rad or m.
+        scene: Scenes, `(N, S)`; see `brokk_rl.sim.scene`; `None` where the task does not tell.
+        target_m: True targets in the base frame, `(N, 3)`; `None` where the task has none.
+        estimate_m: Targets as the policy sees them, likewise.
+        force_n: Peak contact force of the last step, `(N,)`.
+        load: Whether each world is being pushed, `(N,)` bool.
+        driver: Who drives: a policy's name, or `PERSON`.
+        note: About the policy, such as its checkpoint.
+        selected: World that traces and commands are about.
+        paused: Whether time stands still.
+        speed: Wanted share of real time.
+        rate: Simulated seconds per second, measured.
+        endings: Number of finished episodes by ending, of the present driver.
+        successes: Number of them with success.
+        episode_s: Time since the start of the selected world's episode.
+    """
+
+    t_s: float
+    q: np.ndarray
+    scene: np.ndarray | None
+    target_m: np.ndarray | None
+    estimate_m: np.ndarray | None
+    force_n: np.ndarray
+    load: np.ndarray
+    driver: str
+    note: str
+    selected: int
+    paused: bool
+    speed: float
+    rate: float
+    endings: dict[str, int]
+    successes: int
+    episode_s: float
+
+
+@dataclass(frozen=True)
+class PlayTraces:
+    """Last seconds of the selected world; `T` control steps, oldest first.
+
+    Attributes:
+        t_s: Simulated time, `(T,)`.
+        proposed: Commands of the policy, `(T, J)`.
+        given: Commands in force, `(T, J)`.
+        q: Joint positions, `(T, J)`, rad or m.
+        lateral_m: Horizontal distance of tip and target, `(T,)`.
+        height_m: Height of the tip above the target, `(T,)`.
+        force_n: Peak contact force, `(T,)`.
+    """
+
+    t_s: np.ndarray
+    proposed: np.ndarray
+    given: np.ndarray
+    q: np.ndarray
+    lateral_m: np.ndarray
+    height_m: np.ndarray
+    force_n: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Sample:
+    """One control step of all worlds; fields as in `PlayTraces`, with an axis for the worlds."""
+
+    t_s: float
+    proposed: np.ndarray
+    given: np.ndarray
+    q: np.ndarray
+    lateral_m: np.ndarray
+    height_m: np.ndarray
+    force_n: np.ndarray
+
+
+class PlaySession:
+    """Simulated machines that a person watches and touches.
+
+    Args:
+        loop: Control loop; its follower is replaced by one that knows the person.
+        policies: Policies by name; the first one drives at first.
+        neutral: Whether effects begin switched off instead of drawn as configured.
+    """
+
+    def __init__(self, loop: ControlLoop, policies: dict[str, Policy], neutral: bool) -> None:
+        self.loop, self.machine = loop, loop.machine
+        self._policies = dict(policies)
+        self._kinematics = Kinematics(loop.machine, loop.device)
+        self._person = PersonAtLevers(loop.follower, loop.machine)
+        loop.follower = self._person
+        self.dials: dict[str, EffectDial] = {}
+        for dial in list_dials(loop.actuator, loop.machine):
+            self.dials[dial.label] = dial
+            if neutral:
+                dial.turn(0.0)
+        self.starts_neutral = neutral
+        self.driver = next(iter(policies))
+        self.selected, self.paused, self.speed = 0, False, 1.0
+        self._notes = dict.fromkeys(policies, "")
+        self._acting = self.driver
+        self._owed_s, self._steps = 0.0, 0
+        self._pins: dict[int, torch.Tensor] = {}
+        self._restarted = torch.zeros(loop.num_envs, dtype=torch.bool, device=loop.device)
+        self._push_n: dict[int, tuple[torch.Tensor, int]] = {}
+        self._pulled: int | None = None
+        self._trace: deque[_Sample] = deque(maxlen=round(TRACE_S / loop.machine.period_s))
+        self._clock: deque[tuple[float, int]] = deque()
+        self._endings: Counter[str] = Counter()
+        self._successes = 0
+        loop.begin()
+
+    @property
+    def drivers(self) -> list[str]:
+        """Names of those who can drive."""
+        return [*self._policies, PERSON]
+
+    @property
+    def can_push(self) -> bool:
+        """True where the simulator knows loads from outside."""
+        return isinstance(self.loop.world, LoadedWorld)
+
+    @property
+    def can_move_target(self) -> bool:
+        """True where the task lets its target be moved."""
+        return can_move_target(self.loop.task)
+
+    def choose_driver(self, name: str) -> None:
+        """Let a policy drive all machines, or the person the selected one.
+
+        Raises:
+            ConfigError: There is no such driver.
+        """
+        if name not in self.drivers:
+            raise ConfigError(f"play.driver={name}: {list_choices(name, self.drivers)}")
+        self.driver = name
+        if name != PERSON:
+            self._acting = name
+        self.release_levers()
+        self._endings.clear()
+        self._successes = 0
+
+    def replace_policy(self, name: str, policy: Policy, note: str) -> None:
+        """Put a newer policy in the place of the one called `name`; episodes go on."""
+        self._policies[name], self._notes[name] = policy, note
+        self._endings.clear()
+        self._successes = 0
+
+    def select_world(self, index: int) -> None:
+        """Choose the world that traces and commands are about.
+
+        Raises:
+            ConfigError: There is no such world.
+        """
+        if not 0 <= index < self.loop.num_envs:
+            raise ConfigError(f"expected a world of 0 to {self.loop.num_envs - 1}, got {index}")
+        self.selected = index
+        self.release_levers()
+
+    def pause(self, paused: bool) -> None:
+        """Stop time, or let it go on."""
+        self.paused = paused
+        self._clock.clear()
+
+    def set_speed(self, speed: float) -> None:
+        """Set the share of real time, limited to `SPEEDS`."""
+        self.speed = min(max(speed, SPEEDS[0]), SPEEDS[1])
+        self._clock.clear()
+
+    def nudge_lever(self, joint: int, change: float) -> None:
+        """Move the person's lever of a joint by `change`, of full stroke."""
+        levers = self._person.levers
+        levers[joint] = (levers[joint] + change).clamp(-1.0, 1.0)
+
+    def set_levers(self, levers: torch.Tensor) -> None:
+        """Put the person's levers to positions, `(J,)` in [-1, 1]."""
+        self._person.levers.copy_(levers.clamp(-1.0, 1.0))
+
+    def release_levers(self) -> None:
+        """Let all levers spring back to neutral."""
+        self._person.levers.zero_()
+        self._person.env = self.selected if self.driver == PERSON else None
+
+    @property
+    def levers(self) -> np.ndarray:
+        """Positions of the person's levers, `(J,)`."""
+        return self._person.levers.numpy().copy()
+
+    def turn_dial(self, label: str, size: float) -> None:
+        """Give all machines an effect, in typical sizes; see `EffectDial`.
+
+        Raises:
+            ConfigError: There is no such dial.
+        """
+        if label not in self.dials:
+            raise ConfigError(f"there is no effect {label}; {list_choices(label, self.dials)}")
+        self.dials[label].turn(size)
+
+    def reset(self, world: int | None = None) -> None:
+        """Begin a new episode in a world, or in all, with the next step."""
+        rows = slice(None) if world is None else world
+        self._restarted[rows] = True
+        self.loop.task.state[STEPS][rows] = float(self.loop.task.max_episode_steps)
+        if self.paused:
+            self.step()
+
+    def push(self, force_n: np.ndarray) -> None:
+        """Push the tip of the selected arm for `PUSH_S`.
+
+        Args:
+            force_n: Force in the base frame, `(3,)`, N.
+
+        Raises:
+            ConfigError: The simulator cannot do that.
+        """
+        self._read_load()
+        force = torch.as_tensor(force_n, dtype=torch.float32, device=self.loop.device)
+        self._push_n[self.selected] = force, round(PUSH_S / self.machine.period_s)
+
+    def pull_joints(self, load: np.ndarray | None) -> None:
+        """Load the joints of the selected machine until told otherwise.
+
+        Args:
+            load: Torque or force on each joint, `(J,)`, N m or N; `None` for none.
+        """
+        if load is None:
+            if self._pulled is not None:
+                self._read_load()[self._pulled] = 0.0
+            self._pulled = None
+            return
+        self._pulled = self.selected
+        self._read_load()[self._pulled] = torch.as_tensor(load)
+
+    def _read_load(self) -> torch.Tensor:
+        """Return the loads that the world knows, `(N, J)`."""
+        world = self.loop.world
+        if not isinstance(world, LoadedWorld):
+            raise ConfigError("this simulator knows no loads from outside; push with sim=native")
+        return world.joint_load
+
+    def move_target(self, position_m: np.ndarray) -> np.ndarray:
+        """Put the selected world's target, and the block with it, elsewhere; it stays there.
+
+        Args:
+            position_m: Wanted place in the base frame, `(3,)`.
+
+        Returns:
+            The place, limited to `DISTANCE_M` and `HEIGHT_M`.
+
+        Raises:
+            ConfigError: The task's target cannot be moved.
+        """
+        if not self.can_move_target:
+            raise ConfigError(f"the target of {type(self.loop.task).__name__} cannot be moved")
+        position = np.asarray(position_m, float)
+        distance = max(float(np.hypot(*position[:2])), 1e-6)
+        position = np.array(
+            [
+                *position[:2] * np.clip(distance, *DISTANCE_M) / distance,
+                np.clip(position[2], *HEIGHT_M),
+            ]
+        )
+        place = torch.as_tensor(position, dtype=torch.float32, device=self.loop.device)
+        self._pins[self.selected] = place
+        self._put_target(self.selected, place)
+        return position
+
+    def free_target(self) -> None:
+        """Let the selected world draw its target again, from its next episode on."""
+        self._pins.pop(self.selected, None)
+
+    def advance(self, elapsed_s: float) -> int:
+        """Simulate as much as `elapsed_s` of the wall clock ask for; return the control steps."""
+        if self.paused:
+            self._owed_s = 0.0
+            return 0
+        period_s = self.machine.period_s
+        self._owed_s += elapsed_s * self.speed
+        due = int(self._owed_s / period_s)
+        self._owed_s -= due * period_s
+        steps = min(due, MAX_CATCH_UP)
+        for _ in range(steps):
+            self.step()
+        self._clock.append((elapsed_s, steps))
+        return steps
+
+    def step(self) -> None:
+        """Simulate one control period."""
+        loop, task = self.loop, self.loop.task
+        self._apply_pushes()
+        if self._person.env is not None and not self._restarted[self._person.env]:
+            # a person has the time that it takes
+            task.state[STEPS][self._person.env].clamp_(max=float(task.max_episode_steps - 2))
+        with torch.no_grad():
+            groups = loop.get_observations()
+            loop.step(self._policies[self._acting].act(dict(groups.items())))  # type: ignore[arg-type]
+        self._steps += 1
+        self._record()
+        self._count_endings()
+        for world, place in self._pins.items():
+            if loop.done[world]:
+                self._put_target(world, place)
+
+    def read(self) -> PlayState:
+        """Return the state to draw."""
+        loop, state = self.loop, self.loop.task.state
+        target, estimate = state.get("start.target_m"), state.get("estimate_m")
+        scene = state.get("start.scene")
+        load = np.zeros(loop.num_envs, bool)
+        load[list(self._push_n)] = True
+        return PlayState(
+            t_s=self._steps * self.machine.period_s,
+            q=loop.world.q.cpu().numpy().copy(),
+            scene=None if scene is None else _to_numpy(scene),
+            target_m=None if target is None else _to_numpy(target),
+            estimate_m=None if estimate is None else _to_numpy(estimate),
+            force_n=_to_numpy(loop.end_force_n),
+            load=load,
+            driver=self.driver,
+            note=self._notes[self._acting],
+            selected=self.selected,
+            paused=self.paused,
+            speed=self.speed,
+            rate=self._measure_rate(),
+            endings=dict(self._endings),
+            successes=self._successes,
+            episode_s=float(state[STEPS][self.selected]) * self.machine.period_s,
+        )
+
+    def read_traces(self) -> PlayTraces:
+        """Return the last seconds of the selected world."""
+        rows, world = list(self._trace), self.selected
+        empty = np.zeros((0, self.machine.num_joints))
+
+        def gather(name: str) -> np.ndarray:
+            values = [getattr(row, name)[world] for row in rows]
+            return np.array(values) if rows else empty
+
+        return PlayTraces(
+            t_s=np.array([row.t_s for row in rows]),
+            proposed=gather("proposed"),
+            given=gather("given"),
+            q=gather("q"),
+            lateral_m=gather("lateral_m"),
+            height_m=gather("height_m"),
+            force_n=gather("force_n"),
+        )
+
+    def read_observation(self) -> np.ndarray:
+        """Return the vector that the policy sees in the selected world, `(O,)`."""
+        groups = self.loop.get_observations()
+        return _to_numpy(groups["policy"][self.selected])
+
+    def _apply_pushes(self) -> None:
+        """Write the loads of running pushes, and take those of finished ones away."""
+        for index, (force, left) in list(self._push_n.items()):
+            if left == 0:
+                self._read_load()[index] = 0.0
+                del self._push_n[index]
+                continue
+            tip = self._kinematics.jacobian(self.loop.world.q[index : index + 1]).tip[0]
+            self._read_load()[index] = tip.T @ force
+            self._push_n[index] = force, left - 1
+
+    def _put_target(self, world: int, place: torch.Tensor) -> None:
+        """Move target and block of a world to `place`, `(3,)`."""
+        task = self.loop.task
+        assert can_move_target(task)
+        mask = torch.zeros(self.loop.num_envs, dtype=torch.bool, device=self.loop.device)
+        mask[world] = True
+        task.move_target(mask, place - self.loop.task.state["start.target_m"])
+        scene = self.loop.task.state["start.scene"]
+        if float(scene[world, :2].norm()) < FAR_M:
+            self.loop.world.place(mask, scene)
+
+    def _record(self) -> None:
+        """Add the step that was just simulated to the traces."""
+        loop = self.loop
+        tip = self._kinematics.pose(loop.end_q).tip_in_base_m
+        target = loop.task.state.get("start.target_m")
+        error = tip - target if target is not None else torch.full_like(tip, torch.nan)
+        # a finished world has its next target already; NaN leaves a gap in the line
+        error = torch.where(loop.done[:, None], torch.nan, error)
+        proposed = self._person.proposed
+        assert proposed is not None
+        self._trace.append(
+            _Sample(
+                t_s=self._steps * self.machine.period_s,
+                proposed=_to_numpy(proposed),
+                given=_to_numpy(loop.end_u),
+                q=_to_numpy(loop.end_q),
+                lateral_m=_to_numpy(error[:, :2].norm(dim=1)),
+                height_m=_to_numpy(error[:, 2]),
+                force_n=_to_numpy(loop.end_force_n),
+            )
+        )
+
+    def _count_endings(self) -> None:
+        """Count the episodes that have ended, but for those that the person ended."""
+        loop = self.loop
+        ended = loop.done & ~self._restarted
+        for index in ended.nonzero()[:, 0].tolist():
+            self._endings[loop.task.reasons[int(loop.reason[index])]] += 1
+            self._successes += int(loop.finished[SUCCESS][index] > 0)
+        self._restarted &= ~loop.done
+
+    def _measure_rate(self) -> float:
+        """Return simulated seconds per second over the last `RATE_S`."""
+        clock = self._clock
+        elapsed_s = sum(row[0] for row in clock)
+        while clock and elapsed_s - clock[0][0] > RATE_S:
+            elapsed_s -= clock.popleft()[0]
+        if self.paused or not elapsed_s:
+            return 0.0
+        return sum(row[1] for row in clock) * self.machine.period_s / elapsed_s
+
+
+def _to_numpy(value: torch.Tensor) -> np.ndarray:
+    return value.detach().cpu().numpy().copy()

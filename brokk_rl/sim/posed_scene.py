@@ -1,0 +1,45 @@
+"""The machine beside its block in any pose and scene, for pictures and viewers."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import torch
+
+from brokk_rl.machine import Machine
+from brokk_rl.sim.model import compile_model
+from brokk_rl.sim.scene import COLUMNS, ScenePlacement, build_visual_wall
+
+SHOWN_GROUPS = (0, 1, 2)
+"""Geom groups that pictures show; group 3 holds geoms that only collide."""
+
+
+class PosedScene:
+    """One world with all that pictures need, put where it is wanted; nothing is simulated.
+
+    Args:
+        machine: The machine.
+
+    Attributes:
+        model: MuJoCo's model with the geoms, cameras and lights that only pictures need.
+        data: Its state after the last `set_pose`.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self.model = compile_model(machine, machine.period_s, visual=True)
+        self.data = mujoco.MjData(self.model)
+        self._placement = ScenePlacement(self.model, "cpu", torch.float64)
+
+    def set_pose(self, q: np.ndarray, scene: np.ndarray) -> None:
+        """Put the machine at `q`, shape `(J,)`, beside the block of `scene`, shape `(S,)`."""
+        row = torch.as_tensor(scene, dtype=torch.float64)[None]
+        size, pos = self._placement.geoms(row)
+        ids = self._placement.geom_ids.numpy()
+        self.model.geom_size[ids], self.model.geom_pos[ids] = size[0].numpy(), pos[0].numpy()
+        wall = build_visual_wall(float(scene[COLUMNS.index("hole_radius_m")]))
+        ids = [self.model.geom(name).id for name in wall.names]
+        self.model.geom_size[ids], self.model.geom_pos[ids] = wall.size, wall.pos
+        position, turn = self._placement.pose(row)
+        self.data.mocap_pos[0], self.data.mocap_quat[0] = position[0].numpy(), turn[0].numpy()
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)

@@ -1,0 +1,275 @@
+"""The core of `mode=play`: a person's commands go in, the state of the simulated machines comes out."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.play.checkpoint_watch import find_newest
+from brokk_rl.play.levers import Gamepad
+from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
+from brokk_rl.play.settings import PlaySettings
+from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.vec_env import ControlLoopConfig
+
+NUM = 2
+PERIOD_S = 0.05
+
+
+@pytest.fixture(scope="module")
+def made() -> Callable[..., PlaySession]:
+    """Makes sessions of two quiet machines, on which the classical controller drives."""
+    task = option("task", "borehole_insertion")
+    config = ControlLoopConfig(
+        machine=option("machine", "brokk170"),
+        sim=option("sim", "native"),
+        task=replace(task, noise=replace(task.noise, filter="mean")),
+        actuator=option("actuator", "ideal"),
+        effects={"library": option("effect", "library")},
+        follower=option("follower", "none"),
+    )
+
+    def make(neutral: bool = True) -> PlaySession:
+        torch.manual_seed(0)
+        loop = config.build(torch.device("cpu"), NUM, 16, seed=0)
+        return PlaySession(loop, {"classical": ClassicalPolicy().build(loop, 0)}, neutral)
+
+    return make
+
+
+def run(session: PlaySession, steps: int) -> None:
+    for _ in range(steps):
+        session.step()
+
+
+def test_simulated_time_follows_the_clock_at_the_wanted_speed(made: Callable) -> None:
+    session = made()
+    for _ in range(30):
+        session.advance(1 / 30)
+    assert session.read().t_s == pytest.approx(1.0, abs=PERIOD_S)
+    assert session.read().rate == pytest.approx(1.0, abs=0.06)
+    session.set_speed(3.0)
+    for _ in range(30):
+        session.advance(1 / 30)
+    assert session.read().t_s == pytest.approx(4.0, abs=PERIOD_S)
+    assert session.read().rate == pytest.approx(3.0, abs=0.2)
+
+
+def test_a_pause_stops_time_and_a_step_is_one_control_period(made: Callable) -> None:
+    session = made()
+    run(session, 3)
+    session.pause(True)
+    assert session.advance(1.0) == 0
+    before = session.read()
+    assert before.paused
+    assert before.rate == 0.0
+    session.step()
+    assert session.read().t_s == pytest.approx(before.t_s + PERIOD_S)
+    session.pause(False)
+    assert session.advance(PERIOD_S) == 1
+
+
+def test_the_controller_inserts_and_the_ending_is_counted(made: Callable) -> None:
+    session = made()
+    run(session, 380)
+    state = session.read()
+    assert state.successes >= 1
+    assert state.endings["success"] == state.successes
+
+
+def test_a_reset_begins_one_episode_anew_and_is_no_ending(made: Callable) -> None:
+    session = made()
+    run(session, 10)
+    before = session.read()
+    session.reset(1)
+    session.step()
+    state = session.read()
+    assert np.abs(state.q[0] - before.q[0]).max() < 0.05
+    assert np.abs(state.scene[1] - before.scene[1]).max() > 0.05
+    assert state.endings == {}
+    session.select_world(1)
+    assert session.read().episode_s < 2 * PERIOD_S
+
+
+def test_a_target_that_is_moved_takes_block_estimate_and_arm_with_it(made: Callable) -> None:
+    session = made()
+    run(session, 20)
+    before = session.read()
+    place = before.target_m[0] + np.array([0.0, 0.25, 0.05])
+    session.move_target(place)
+    state = session.read()
+    np.testing.assert_allclose(state.target_m[0], place, atol=1e-5)
+    np.testing.assert_allclose(state.scene[0, :3], place, atol=1e-5)
+    # the machine believes the old error of the new place, and stands where it stood
+    error = before.estimate_m - before.target_m
+    np.testing.assert_allclose(state.estimate_m - state.target_m, error, atol=1e-5)
+    np.testing.assert_array_equal(state.q, before.q)
+    np.testing.assert_array_equal(state.target_m[1], before.target_m[1])
+    block = session.loop.world._mocap_pos[0, 0].numpy()
+    np.testing.assert_allclose(block, place, atol=1e-5)
+    run(session, 1)
+    np.testing.assert_allclose(
+        session.read().estimate_m[0] - place, error[0], atol=5e-3
+    )  # one more noisy sample in the mean of 22
+    run(session, 400)
+    np.testing.assert_allclose(session.read().target_m[0], place, atol=1e-5)
+    assert session.read().successes >= 1, "the arm went to the new place"
+
+
+def test_a_target_stays_out_of_the_machine_and_is_drawn_again_when_freed(made: Callable) -> None:
+    session = made()
+    assert np.hypot(*session.move_target(np.array([0.1, 0.0, 0.7]))[:2]) == pytest.approx(
+        DISTANCE_M[0]
+    )
+    session.reset()
+    session.step()
+    assert np.hypot(*session.read().target_m[0, :2]) == pytest.approx(DISTANCE_M[0], abs=1e-4)
+    session.free_target()
+    session.reset()
+    session.step()
+    assert np.hypot(*session.read().target_m[0, :2]) > DISTANCE_M[0] + 0.1
+
+
+def test_a_push_moves_the_tip_its_own_way_and_ends(made: Callable) -> None:
+    session, still = made(), made()
+    for each in (session, still):
+        each.choose_driver(PERSON)  # nobody corrects it
+    session.push(np.array([0.0, 1500.0, 0.0]))
+    run(session, 4)
+    run(still, 4)
+    tips = [s._kinematics.pose(s.loop.world.q).tip_in_base_m[0].numpy() for s in (session, still)]
+    shift = tips[0] - tips[1]
+    assert shift[1] > 0.01
+    assert abs(shift[1]) > 3 * abs(shift[2])
+    np.testing.assert_array_equal(session.read().load, [True, False])
+    run(session, 10)
+    assert not session.read().load.any()
+    assert not session.loop.world.joint_load.any()
+
+
+def test_a_person_drives_one_machine_and_the_policy_the_other(made: Callable) -> None:
+    session = made()
+    session.choose_driver(PERSON)
+    before = session.read().q
+    session.nudge_lever(2, 0.5)
+    session.nudge_lever(2, 0.75)  # to the end of the stroke
+    run(session, 30)
+    traces, after = session.read_traces(), session.read().q
+    np.testing.assert_array_equal(traces.given[-1], [0, 0, 1, 0, 0])
+    assert np.abs(traces.proposed[-1]).max() > 0, "the policy's proposal is shown"
+    assert after[0, 2] - before[0, 2] > 0.1
+    np.testing.assert_allclose(after[0, [0, 1, 3, 4]], before[0, [0, 1, 3, 4]], atol=2e-3)
+    assert np.abs(after[1] - before[1]).max() > 0.05
+    session.release_levers()
+    session.step()
+    assert not session.read_traces().given[-1].any()
+
+
+def test_the_exclusive_lever_rules_out_the_others(made: Callable) -> None:
+    session = made()
+    session.choose_driver(PERSON)
+    session.set_levers(torch.tensor([1.0, -0.5, 1.0, 0.0, 0.0]))
+    session.step()
+    np.testing.assert_allclose(session.read_traces().given[-1], [0, -0.5, 0, 0, 0])
+
+
+def test_a_person_has_the_time_that_it_takes(made: Callable) -> None:
+    session = made()
+    session.choose_driver(PERSON)
+    run(session, session.loop.task.max_episode_steps + 5)
+    assert session.read().endings.get("time_limit", 0) <= 1  # that of the other machine
+    assert session.loop.task.state["age"][0] > session.loop.task.max_episode_steps
+
+
+def test_effects_begin_off_and_a_dial_gives_them_to_all_machines(made: Callable) -> None:
+    session = made()
+    dial = session.dials["backlash.gap_rad"]
+    assert not dial.parameters[dial.key].any()
+    session.turn_dial("backlash.gap_rad", 1.0)
+    expected = torch.as_tensor(dial.typical).expand(NUM, -1)
+    torch.testing.assert_close(dial.parameters[dial.key], expected)
+    session.reset()
+    session.step()  # a new episode draws no other size
+    torch.testing.assert_close(dial.parameters[dial.key], expected)
+    session.turn_dial("backlash.gap_rad", -5.0)
+    assert not dial.parameters[dial.key].any()
+    assert (
+        made(neutral=False).dials["dead_time.dead_time_s"].parameters["dead_time.dead_time_s"].any()
+    )
+
+
+def test_a_dial_changes_how_the_machine_moves(made: Callable) -> None:
+    moved = []
+    for size in (0.0, 3.0):
+        session = made()
+        session.choose_driver(PERSON)
+        session.turn_dial("flow_gain.gain", size)
+        session.nudge_lever(0, 1.0)
+        before = session.read().q[0, 0]
+        run(session, 20)
+        moved.append(session.read().q[0, 0] - before)
+    assert abs(moved[1] / moved[0] - 1) > 0.2
+
+
+def test_what_there_is_not_is_refused_with_the_choices(made: Callable) -> None:
+    session = made()
+    with pytest.raises(ConfigError, match="choices: classical, person"):
+        session.choose_driver("robot")
+    with pytest.raises(ConfigError, match=r"did you mean 'backlash\.gap_rad'"):
+        session.turn_dial("backlash.gap", 1.0)
+    with pytest.raises(ConfigError, match="expected a world of 0 to 1, got 2"):
+        session.select_world(2)
+
+
+def test_the_observation_is_the_policys_own(made: Callable) -> None:
+    session = made()
+    session.select_world(1)
+    run(session, 5)
+    groups = session.loop.get_observations()
+    np.testing.assert_array_equal(session.read_observation(), groups["policy"][1].numpy())
+
+
+def test_a_gamepad_moves_the_levers(tmp_path: Path) -> None:
+    events = [(0, 32767, 0x82, 3), (9, 16384, 0x02, 0), (12, -3000, 0x02, 1), (15, 1, 0x01, 4)]
+    path = tmp_path / "js0"
+    path.write_bytes(b"".join(struct.pack("IhBB", *event) for event in events))
+    pad = Gamepad(path, axes=(0, -3, 1, 7, 2))
+    levers = pad.read()
+    assert levers is not None
+    # half a stroke less the dead zone; turned round; within the dead zone; never moved
+    np.testing.assert_allclose(levers, [(0.5 - 0.12) / 0.88, -1.0, 0.0, 0.0, 0.0], atol=1e-3)
+    assert pad.read() is None
+    pad.close()
+    with pytest.raises(ConfigError, match=r"play.gamepad=.*gone: No such file.*ls /dev/input"):
+        Gamepad(tmp_path / "gone", axes=(0,))
+
+
+def test_a_run_without_checkpoints_is_explained(tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="there is no such run folder"):
+        find_newest(tmp_path / "gone")
+    with pytest.raises(CheckpointError, match=r"rl\.save_interval"):
+        find_newest(tmp_path)
+    for number in (9, 10):
+        (tmp_path / f"model_{number}.pt").touch()
+    assert find_newest(tmp_path).name == "model_10.pt"
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("port", 80), ("worlds", 0), ("speed", 11.0), ("seed", -1), ("seconds", 0)]
+)
+def test_bad_settings_are_named(field: str, value: float) -> None:
+    good = {
+        "viewer": "browser", "port": 8080, "worlds": 1, "speed": 1.0, "driver": "policy",
+        "neutral": True, "gamepad": None, "gamepad_axes": (0,), "seed": 0, "device": "cpu",
+        "seconds": None,
+    }  # fmt: skip
+    with pytest.raises(ConfigError, match=f"play.{field}: expected"):
+        PlaySettings(**good | {field: value})
