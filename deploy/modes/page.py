@@ -40,7 +40,10 @@ class PageMode:
 
         Raises:
             LinkError: the address is taken.
+            ModuleNotFoundError: the extra `video` is not installed.
         """
+        if self.video is not None:
+            self.video.require_packages()
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
         console = Console(stderr=True)
 

@@ -107,6 +107,8 @@ class DeploymentLoop(BusAndPolicySettings):
             LinkError: bus or policy process died.
         """
         self.check_machine(machine)
+        if self.video is not None:
+            self.video.require_packages()
         with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:
             self._run(machine, session, companions, sockets)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Protocol
 
 from brokk_rl.errors import ConfigError
@@ -107,6 +108,15 @@ class VideoSettings:
                 "video: expected 0 < min_bitrate <= max_bitrate, "
                 f"got {self.min_bitrate} and {self.max_bitrate}"
             )
+
+    def require_packages(self) -> None:
+        """Check before any process starts that the video process can.
+
+        Raises:
+            ModuleNotFoundError: the extra `video` is not installed.
+        """
+        if find_spec("aiortc") is None:
+            raise ModuleNotFoundError("video needs aiortc", name="aiortc")
 
 
 @dataclass(frozen=True)

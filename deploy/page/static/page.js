@@ -19,7 +19,7 @@ const views = { left: new LeverView($("left"), "left", setup), right: new LeverV
 const insertion = new InsertionView($("insertion")), overlay = new Overlay($("overlay")), alarms = new AlarmList($("alarms"));
 const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0, allowed: null, signals: [] };
 const signals = new Signals(name => measured.signals.push(name));
-let newest = null, came = 0, asked = false;
+let newest = null, came = 0, asked = false, video = null;
 
 // ---- state in, drawn back
 const painted = new MessageChannel();
@@ -100,7 +100,7 @@ function draw() {
 
 function drawAlarms(lost, now) {
   if (newest === null && now < 1000 * setup.stale_s) return;  // the page has only just been opened
-  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : newest?.shown.alarms ?? [];
+  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : [...video?.listAlarms(now) ?? [], ...newest?.shown.alarms ?? []];
   if (alarms.draw(grave, tell, now)) signals.give("alarm");
 }
 
@@ -226,7 +226,7 @@ $("language").onclick = () => {
 };
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
-  const act = { Escape: () => wish("stop"), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click(), n: () => $("night").click(), t: () => $("sound").click(), v: () => $("along").click() }[event.key];
+  const act = { Escape: () => wish("stop"), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click(), n: () => $("night").click(), t: () => $("sound").click(), v: () => $("along").click(), c: () => video?.enlargeNext() }[event.key];
   if (act) act();
   else if (/^[1-9]$/.test(event.key)) $("targets").children[event.key - 1]?.click();
 });
@@ -304,6 +304,6 @@ setInterval(() => { if (performance.now() - came > 150) draw(); }, 100);  // age
 scene = startScene();
 if (token && setup.extensions.includes("/video")) {
   const { Video } = await import("./video.js");
-  measured.video = new Video($("view"), token, key => say(key));
+  measured.video = video = new Video($("view"), token, key => say(key));
 }
 for (const [name, act] of Object.entries(tools)) choose(name, chosenBefore(name, name === "sound"), act);

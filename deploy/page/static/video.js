@@ -3,13 +3,16 @@ import { Socket } from "./socket.js";
 
 const PIECE = 400;       // characters: the server takes no long message from anybody
 const LOOK_MS = 500;     // between looks at losses and ages
+const OVER = 4;          // looks over which losses and delays are taken: 2 s
 const STALE_MS = 500;    // a picture that is not replaced for so long stands still
+const PATIENCE_MS = 4000; // for the first picture, before its lack is an alarm
 const GIVE_UP_MS = 8000; // without any picture: begin again
 const KEPT = 256;        // times of pictures that are remembered
 
 export class Video {
   constructor(view, token, say) {
-    Object.assign(this, { view, token, say, cameras: [], peer: null, ahead_ms: null, shortest_ms: Infinity });
+    Object.assign(this, { view, token, say, cameras: [], full: false, peer: null, ahead_ms: null, shortest_ms: Infinity, lacking: performance.now() + PATIENCE_MS });
+    view.classList.add("live");
     this.box = document.createElement("div");
     this.box.id = "videos";
     view.append(this.box);
@@ -22,6 +25,7 @@ export class Video {
   }
 
   async heard(said) {
+    this.full = Boolean(said.full);
     if (said.cameras) await this.begin(said.cameras);
     if (said.sdp) await this.peer?.setRemoteDescription({ type: "answer", sdp: said.sdp });
   }
@@ -32,14 +36,17 @@ export class Video {
     this.cameras = names.map(name => {
       const figure = document.createElement("figure"), video = document.createElement("video"), caption = document.createElement("figcaption");
       Object.assign(video, { autoplay: true, muted: true, playsInline: true });
+      const [title, numbers] = ["name", "numbers"].map(kind => Object.assign(document.createElement("span"), { className: kind }));
+      title.textContent = name;
+      caption.append(title, numbers);
       figure.append(video, caption);
-      figure.onclick = () => figure.classList.toggle("large");
+      figure.onclick = () => this.enlarge(figure.classList.contains("large") ? null : camera);
       this.box.append(figure);
-      const camera = { name, figure, video, caption, taken: new Map(), delays: [], shown: 0, lost: 0, got: 0, share: 0, delay_ms: null };
+      const camera = { name, figure, video, numbers, taken: new Map(), delays: [], counts: [], shown: 0, share: 0, delay_ms: null };
       const drawn = (now, { rtpTimestamp, expectedDisplayTime }) => {
         camera.shown = now;
         const taken_s = camera.taken.get(rtpTimestamp);
-        if (taken_s !== undefined && this.ahead_ms !== null) camera.delays.push(expectedDisplayTime - (1e3 * taken_s + this.ahead_ms));
+        if (taken_s !== undefined && this.ahead_ms !== null) camera.delays.push([now, expectedDisplayTime - (1e3 * taken_s + this.ahead_ms)]);
         video.requestVideoFrameCallback(drawn);
       };
       video.requestVideoFrameCallback(drawn);
@@ -75,25 +82,44 @@ export class Video {
   async look() {
     if (!this.peer) return;
     const now = performance.now();
+    if (document.hidden) { this.began = now; return; }  // a page that nobody sees draws nothing
     if (this.channel.readyState === "open") this.channel.send(JSON.stringify({ at_ms: now }));
     this.shortest_ms += 0.01;  // clocks drift: a later exchange may count again
     const every = [...(await this.peer.getStats()).values()].filter(one => one.type === "inbound-rtp");
     for (const [index, camera] of this.cameras.entries()) {
       const mid = this.peer?.getTransceivers()[index]?.mid, stats = every.find(one => one.mid === mid);
-      if (stats) {
-        const lost = stats.packetsLost - camera.lost, got = stats.packetsReceived - camera.got;
-        camera.share = lost + got > 0 ? Math.max(0, lost) / (lost + got) : 0;
-        Object.assign(camera, { lost: stats.packetsLost, got: stats.packetsReceived });
-      }
-      if (camera.delays.length) camera.delay_ms = camera.delays.sort((a, b) => a - b)[Math.floor(0.95 * (camera.delays.length - 1))];
-      camera.delays.length = 0;
+      if (stats) camera.counts = [...camera.counts.slice(-OVER), [stats.packetsLost, stats.packetsReceived]];
+      const [lost, got] = [0, 1].map(what => (camera.counts.at(-1)?.[what] ?? 0) - (camera.counts[0]?.[what] ?? 0));
+      camera.share = lost + got > 0 ? Math.max(0, lost) / (lost + got) : 0;
+      camera.delays = camera.delays.filter(([at]) => now - at < OVER * LOOK_MS);
+      const delays = camera.delays.map(([, delay_ms]) => delay_ms).sort((a, b) => a - b);
+      camera.delay_ms = delays.length ? delays[Math.floor(0.95 * (delays.length - 1))] : null;
       const stale = now - camera.shown > STALE_MS;
       camera.figure.classList.toggle("stale", stale);
       const age = camera.delay_ms === null ? "– ms" : `${Math.round(camera.delay_ms)} ms`;
-      camera.caption.textContent = stale ? `${camera.name} · ${this.say("no picture")}` : `${camera.name} · ${age} · ${(100 * camera.share).toFixed(1)} % ${this.say("packets lost")}`;
+      camera.numbers.textContent = stale ? this.say("no picture") : `${age} · ${(100 * camera.share).toFixed(1)} % ${this.say("packets lost")}`;
     }
     const newest = Math.max(this.began, ...this.cameras.map(one => one.shown));
     if (now - newest > GIVE_UP_MS) this.socket.socket.close();
+  }
+
+  // What lacks now; a dead or silent video process and a lost link look the same from here.
+  listAlarms(now) {
+    if (this.cameras.length && this.cameras.every(one => one.shown)) this.lacking = 0;
+    if (now < this.lacking) return [];
+    const stale = this.cameras.filter(one => now - one.shown > STALE_MS).map(one => one.name);
+    if (this.full) return [{ level: "alarm", name: "no live picture", detail: "watched elsewhere" }];
+    if (this.cameras.length && !stale.length) return [];
+    return [{ level: "alarm", name: "no live picture", detail: this.cameras.length === stale.length ? "" : stale.join(", ") }];
+  }
+
+  enlarge(chosen) {
+    for (const camera of this.cameras) camera.figure.classList.toggle("large", camera === chosen);
+  }
+
+  enlargeNext() {
+    const large = this.cameras.findIndex(one => one.figure.classList.contains("large"));
+    this.enlarge(this.cameras[large + 1] ?? null);
   }
 
   end() {

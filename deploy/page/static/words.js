@@ -14,7 +14,6 @@ const DE = {
   "refused nowhere": "Abgelehnt: dort ist keine Fläche gemessen", "boreholes seen": "Loch wählen, antippen", "no borehole seen": "Bohrloch antippen", "refused malformed": "Abgelehnt: nicht verstanden", "refused lost": "Keine Verbindung zur Steuerung",
   "refused unconfirmed": "STOPP NICHT BESTÄTIGT: Not-Halt drücken", "recording failed": "AUFNAHME ABGEBROCHEN",
   depth: "Tiefe", lateral: "Seitlich", angle: "Winkel", inserted: "EINGEFÜHRT", "in the hole": "Im Loch", "over the hole": "Über dem Loch", "beside the hole": "Neben dem Loch",
-  "no picture": "kein Bild", "packets lost": "Pakete verloren",
   "along the tool": "Am Werkzeug entlang", sound: "Töne", night: "Nacht",
   slew: "Schwenken", arm_1: "Arm 1", arm_2: "Arm 2", arm_3: "Arm 3", boom: "Ausleger", stick: "Stiel", bucket: "Löffel", tool: "Werkzeug",
   "control computer silent": "Steuerrechner still", "supervisor silent": "Überwacher still: Aufnahme und Start gehen nicht", "nothing has come": "Noch nichts gekommen", "too old": "Veraltet",
@@ -34,7 +33,7 @@ const DE = {
   "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
   "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
   "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",
-  "no picture": "kein Bild", "packets lost": "verloren",
+  "no live picture": "KEIN LIVEBILD", "no picture": "kein Bild", "packets lost": "verloren", "watched elsewhere": "andere sehen zu",
 };
 const EN = {
   connected: "Connected", lost: "NO CONNECTION", dead: "Control computer silent", title: "operator's page",
@@ -55,7 +54,7 @@ const EN = {
   "messages arrive late": "Messages arrive late", "recorder does not write": "Recorder does not write", "recording has gaps": "Recording has gaps",
   "the model no longer fits": "The model no longer fits", flow_gain: "flow gain", asymmetry: "asymmetry", dead_time: "dead time", creep: "creep", dead_band: "dead band",
   "refused lost": "No connection to the loop", nothing: "all is well", "emergency stop": "EMERGENCY STOP",
-  "no picture": "no picture", "packets lost": "lost",
+  "no live picture": "NO LIVE PICTURE", "no picture": "no picture", "packets lost": "lost", "watched elsewhere": "others are watching",
 };
 
 export function words(language) {
