@@ -75,18 +75,23 @@ def test_who_has_no_token_does_not_reach_the_video_process(tmp_path: Path) -> No
     reached = list[str]()
 
     async def run(port: int, token: str) -> str:
-        async def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             reached.append(token)
             writer.write(b'{"cameras": []}\n')
+            await reader.read()  # until the relay goes
+            writer.close()
+            gone.set()
 
-        own = f"http://localhost:{port}"
+        own, gone = f"http://localhost:{port}", asyncio.Event()
         async with await asyncio.start_unix_server(answer, tmp_path / SOCKET):
             try:
                 async with connect(
                     f"ws://localhost:{port}/video", origin=own, proxy=None
                 ) as socket:  # type: ignore[arg-type]
                     await socket.send(json.dumps({"token": token}))
-                    return "".join([str(await asyncio.wait_for(socket.recv(), 5)) for _ in "12"])
+                    said = [str(await asyncio.wait_for(socket.recv(), 5)) for _ in range(2)]
+                await asyncio.wait_for(gone.wait(), 5)
+                return "".join(said)
             except ConnectionClosed as error:
                 return error.rcvd.reason if error.rcvd else "closed"
 
