@@ -9,7 +9,7 @@ from typing import Protocol
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.video.sources import LoopPictures, OpenedDevice, PictureSource, TestPattern
+from deploy.video.sources import LoopPictures, OpenedDevice, VideoSource, TestPattern
 
 SOCKET = "video"
 """Name of the socket between page and video process, in a folder that only its owner may enter."""
@@ -18,7 +18,7 @@ SOCKET = "video"
 class VideoCamera(Protocol):
     """A spec of one camera."""
 
-    def build(self, memory: LoopMemory | None) -> PictureSource:
+    def build(self, memory: LoopMemory | None) -> VideoSource:
         """Return the open camera.
 
         Raises:
@@ -41,7 +41,7 @@ class DeviceCamera:
     container: str | None
     options: dict[str, str]
 
-    def build(self, memory: LoopMemory | None) -> PictureSource:
+    def build(self, memory: LoopMemory | None) -> VideoSource:
         """See `VideoCamera`."""
         return OpenedDevice(self.device, self.container, self.options)
 
@@ -56,7 +56,7 @@ class LoopCamera:
 
     rate_hz: float
 
-    def build(self, memory: LoopMemory | None) -> PictureSource:
+    def build(self, memory: LoopMemory | None) -> VideoSource:
         """See `VideoCamera`."""
         if memory is None or memory.frame is None:
             raise ConfigError("video: there is no camera beside the loop; choose camera=… as well")
@@ -77,7 +77,7 @@ class PatternCamera:
     height_px: int
     rate_hz: float
 
-    def build(self, memory: LoopMemory | None) -> PictureSource:
+    def build(self, memory: LoopMemory | None) -> VideoSource:
         """See `VideoCamera`."""
         return TestPattern(self.width_px, self.height_px, self.rate_hz)
 

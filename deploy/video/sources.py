@@ -24,15 +24,17 @@ CLOCK_HZ = 90_000
 """Rate of the clock of video in RTP (RFC 6184)."""
 RETRY_S = 1.0
 """Between attempts to open or read a camera that fails. Chosen by hand."""
+TICK_S = 1e-3
+"""Unit of the time in a test picture."""
 CODE_BITS, CODE_CHECK = 32, 8
-"""Bits of the time in a test picture, in ms, and of its check."""
+"""Bits of the time in a test picture, and of its check."""
 CODE_COLUMNS, CODE_PARTS = 8, 8
 """Blocks of the code in a row, and blocks as parts of the picture's height."""
 DARK, LIGHT = 30, 225
 """Grey levels of the code: away from the ends, where the coder cuts."""
 
 
-class PictureSource(Protocol):
+class VideoSource(Protocol):
     """An open camera."""
 
     def read(self) -> tuple[Any, float]:
@@ -61,7 +63,7 @@ class TestPattern:
         self._due_s = time.monotonic()
 
     def read(self) -> tuple[Any, float]:
-        """See `PictureSource`."""
+        """See `VideoSource`."""
         self._due_s += self._period_s
         time.sleep(max(0.0, self._due_s - time.monotonic()))
         now_s = time.monotonic()
@@ -81,7 +83,7 @@ class TestPattern:
 def draw_time_code(picture: np.ndarray, t_s: float) -> None:
     """Draw a time as dark and light blocks into the upper left of a grey picture, `(h, w)` uint8."""
     side = picture.shape[0] // CODE_PARTS // 2
-    for place, bit in enumerate(_list_code_bits(round(1e3 * t_s) % (1 << CODE_BITS))):
+    for place, bit in enumerate(_list_code_bits(round(t_s / TICK_S) % (1 << CODE_BITS))):
         row, column = divmod(place, CODE_COLUMNS)
         block = picture[side * row : side * (row + 1), side * column : side * (column + 1)]
         block[:] = LIGHT if bit else DARK
@@ -97,15 +99,15 @@ def read_time_code(picture: np.ndarray) -> float | None:
         # The middle of a block: its edge is blurred by the coder.
         inner = block[side // 4 : -(side // 4), side // 4 : -(side // 4)]
         value = value << 1 | int(inner.mean() > (DARK + LIGHT) / 2)
-    time_ms = value >> CODE_CHECK
-    bits = _list_code_bits(time_ms)
-    return time_ms / 1e3 if value == int("".join(map(str, bits)), 2) else None
+    num_ticks = value >> CODE_CHECK
+    bits = _list_code_bits(num_ticks)
+    return num_ticks * TICK_S if value == int("".join(map(str, bits)), 2) else None
 
 
-def _list_code_bits(time_ms: int) -> list[int]:
+def _list_code_bits(num_ticks: int) -> list[int]:
     """Return the bits of a time and of its check, the sum of its bytes inverted."""
-    check = ~sum(time_ms.to_bytes(CODE_BITS // 8, "big")) & (1 << CODE_CHECK) - 1
-    value = time_ms << CODE_CHECK | check
+    check = ~sum(num_ticks.to_bytes(CODE_BITS // 8, "big")) & (1 << CODE_CHECK) - 1
+    value = num_ticks << CODE_CHECK | check
     return [value >> place & 1 for place in reversed(range(CODE_BITS + CODE_CHECK))]
 
 
@@ -116,7 +118,7 @@ class LoopPictures:
         self._slot, self._period_s, self._t_s = slot, 1.0 / rate_hz, 0.0
 
     def read(self) -> tuple[Any, float]:
-        """See `PictureSource`."""
+        """See `VideoSource`."""
         while True:
             t_s = self._slot.peek("t_s")
             if t_s is not None and t_s > self._t_s:
@@ -145,7 +147,7 @@ class OpenedDevice:
         self._device, self._pictures = device, self._container.decode(video=0)
 
     def read(self) -> tuple[Any, float]:
-        """See `PictureSource`."""
+        """See `VideoSource`."""
         import av  # pyright: ignore[reportMissingImports]
 
         try:
@@ -173,7 +175,7 @@ class CameraReader:
         number: Pictures so far.
     """
 
-    def __init__(self, name: str, opener: Callable[[], PictureSource]) -> None:
+    def __init__(self, name: str, opener: Callable[[], VideoSource]) -> None:
         self.name, self.number = name, 0
         self._open, self._newest, self._told = opener, None, ""
         threading.Thread(target=self._read_all, name=name, daemon=True).start()
