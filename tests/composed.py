@@ -13,10 +13,11 @@ from brokk_rl import extensions, registry
 extensions.register_options([])  # the exam's options are those of an extension
 
 
-def option(group: str, name: str) -> Any:
-    """Returns the spec of one option, instantiated by itself."""
+def option(group: str, name: str, **fields: object) -> Any:
+    """Returns the spec of one option with these fields, instantiated by itself."""
+    changes = [f"subject.{field}={value}" for field, value in fields.items()]
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject={name}"])
+        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject={name}", *changes])
     return instantiate(cfg.subject, _convert_="all")
 
 

@@ -1,4 +1,4 @@
-"""`brokk mode=page`: serves the operator's page with a simulated state, to try it at a desk."""
+"""`brokk mode=page`: serves the operator's page with a simulated or recorded state."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from deploy.video.settings import VideoProcessConfig, VideoSettings
 
 @spec
 class PageMode:
-    """Serve the operator's page with a simulated state; `brokk preset=bench` shows the loop's own."""
+    """Serve the operator's page, simulated or recorded; `brokk preset=bench` shows the loop's own."""
 
     session: Session
     machine: Machine

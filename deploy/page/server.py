@@ -460,6 +460,7 @@ def _list_facts(state: PageState) -> tuple[object, ...]:
         state.recording.failed,
         list_alarms(state),
         state.targets,
+        state.replay,
     )
 
 
