@@ -9,7 +9,7 @@ from typing import Protocol
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.video.sources import LoopPictures, OpenedDevice, VideoSource, TestPattern
+from deploy.video.sources import LoopPictures, OpenedDevice, TestPattern, VideoSource
 
 SOCKET = "video"
 """Name of the socket between page and video process, in a folder that only its owner may enter."""
