@@ -21,7 +21,7 @@ const insertion = new InsertionView($("insertion")), overlay = new Overlay($("ov
 const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0, allowed: null, signals: [] };
 const signals = new Signals(name => measured.signals.push(name));
 const opened = performance.now(), PATIENCE_MS = 2000;
-let newest = null, came = 0, asked = false;
+let newest = null, came = 0, asked = false, video = null;
 
 // ---- state in, drawn back
 const painted = new MessageChannel();
@@ -105,7 +105,7 @@ function draw() {
 
 function drawAlarms(lost, now) {
   if (newest === null && now - opened < PATIENCE_MS) return;  // the page has only just been opened
-  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : newest?.shown.alarms ?? [];
+  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : [...video?.listAlarms(now) ?? [], ...newest?.shown.alarms ?? []];
   if (alarms.draw(grave, tell, now)) signals.give("alarm");
 }
 
@@ -234,7 +234,7 @@ $("language").onclick = () => {
 };
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
-  const act = { Escape: () => wish("stop"), " ": () => (newest?.shown.replay ? (event.preventDefault(), $("play").click()) : null), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click(), n: () => $("night").click(), t: () => $("sound").click(), v: () => $("along").click() }[event.key];
+  const act = { Escape: () => wish("stop"), " ": () => (newest?.shown.replay ? (event.preventDefault(), $("play").click()) : null), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click(), n: () => $("night").click(), t: () => $("sound").click(), v: () => $("along").click(), c: () => video?.enlargeNext() }[event.key];
   if (act) act();
   else if (/^[1-9]$/.test(event.key)) $("targets").children[event.key - 1]?.click();
 });
@@ -310,4 +310,8 @@ speak();
 if (!token) answer("refused token");
 setInterval(() => { if (performance.now() - came > 150) draw(); }, 100);  // ages grow even when nothing comes
 scene = startScene();
+if (token && setup.extensions.includes("/video")) {
+  const { Video } = await import("./video.js");
+  measured.video = video = new Video($("view"), token, key => say(key));
+}
 for (const [name, act] of Object.entries(tools)) choose(name, chosenBefore(name, name === "sound"), act);

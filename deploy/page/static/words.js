@@ -35,6 +35,7 @@ const DE = {
   "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
   "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
   "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",
+  "no live picture": "KEIN LIVEBILD", "no picture": "kein Bild", "packets lost": "verloren", "watched elsewhere": "andere sehen zu",
 };
 const EN = {
   connected: "Connected", lost: "NO CONNECTION", dead: "Control computer silent", title: "operator's page",
@@ -57,6 +58,7 @@ const EN = {
   "messages arrive late": "Messages arrive late", "recorder does not write": "Recorder does not write", "recording has gaps": "Recording has gaps",
   "the model no longer fits": "The model no longer fits", flow_gain: "flow gain", asymmetry: "asymmetry", dead_time: "dead time", creep: "creep", dead_band: "dead band",
   "refused lost": "No connection to the loop", nothing: "all is well", "emergency stop": "EMERGENCY STOP",
+  "no live picture": "NO LIVE PICTURE", "no picture": "no picture", "packets lost": "lost", "watched elsewhere": "others are watching",
 };
 
 export function words(language) {
