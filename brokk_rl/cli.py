@@ -8,17 +8,19 @@ import logging
 import math
 import os
 import re
+import shutil
 import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import (
     ConfigCompositionException,
     HydraException,
@@ -35,8 +37,9 @@ from rich.logging import RichHandler
 import brokk_rl
 from brokk_rl import distributed, extensions, extras, gpu_pool, registry
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.mode_help import describe_mode
 from brokk_rl.session import read_earlier_job, remove_empty_folders
-from brokk_rl.sweep import SweepFolder
+from brokk_rl.sweep import SweepFolder, name_job
 from brokk_rl.task_choice import choose_task
 
 log = logging.getLogger(__name__)
@@ -76,6 +79,9 @@ def main() -> int:
     try:
         with _make_hydra_raise():
             extensions.register_options(sys.argv[1:])
+            if _is_mode_help(sys.argv[1:]):
+                sys.stdout.write(_describe_chosen_mode())
+                return 0
             command = hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")
             command(run_job)()
             sys.stdout.flush()
@@ -223,7 +229,10 @@ def choose_run_folder(cfg: DictConfig) -> Path:
     """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`."""
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
-        return Path(settings.runtime.output_dir)
+        fixed = settings.job.config.override_dirname.exclude_keys
+        return Path(settings.sweep.dir) / name_job(
+            int(settings.job.num), list(settings.overrides.task), list(fixed)
+        )
     out = OmegaConf.select(cfg, "session.out", default=None)
     if out:
         return Path(out)
@@ -368,7 +377,7 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
         return f"{source} '{key}', but '{renamed[0]}' is now '{renamed[1]}'"
     # The mode itself may not compose; the message is then shorter.
     with contextlib.suppress(Exception):
-        cfg = _compose_mode()
+        cfg = _compose_choices()
         if "No match in the defaults list" in text or key in {
             option.group for option in registry.list_options()
         }:
@@ -389,14 +398,48 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --cfg job` shows what it has"
 
 
-def _compose_mode() -> DictConfig:
-    """Compose the mode of the command line without other overrides, to list its groups and fields."""
-    modes = []
-    for arg in sys.argv[1:]:
-        if arg.startswith("mode="):
-            modes.append(arg)
+def _is_mode_help(arguments: Sequence[str]) -> bool:
+    """Return true where the help of one mode is asked for, not that of the command."""
+    asked = "--help" in arguments or "-h" in arguments
+    return asked and any(argument.startswith("mode=") for argument in arguments)
+
+
+def _describe_chosen_mode() -> str:
+    """Return the help of the mode of the command line, with the options chosen there."""
+    cfg = _compose_choices()
+    own = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
+    choices, node = map(OmegaConf.to_container, (cfg.hydra.runtime.choices, own))
+    assert isinstance(choices, dict) and isinstance(node, dict)
+    return describe_mode(
+        {str(key): value for key, value in choices.items()},
+        {str(key): value for key, value in node.items()},
+        shutil.get_terminal_size().columns,
+    )
+
+
+def _compose_choices() -> DictConfig:
+    """Compose the options that the command line chooses, without its values.
+
+    Of a sweep's options the first is taken. Options that do not compose are left out, up to the
+    mode: the message of an error then lists what the mode has by itself.
+    """
+    groups = {option.group for option in registry.list_options()}
+    chosen: list[str] = []
+    for override in OverridesParser.create().parse_overrides(
+        [argument for argument in sys.argv[1:] if "=" in argument and argument[0] != "-"]
+    ):
+        if override.key_or_group not in groups:
+            continue
+        line = str(override.input_line)
+        if override.is_sweep_override():
+            line = f"{line.partition('=')[0]}={next(iter(override.sweep_string_iterator()))}"
+        chosen.append(line)
+    modes = [line for line in chosen if line.startswith("mode=")]
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
+        try:
+            return hydra.compose("config", overrides=chosen, return_hydra_config=True)
+        except (HydraException, OmegaConfBaseException):
+            return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
 
 
 def _read_mode_name(cfg: DictConfig) -> str:

@@ -8,6 +8,7 @@ is therefore cheap, and a broken option can be listed too.
 from __future__ import annotations
 
 import ast
+import inspect
 import json
 import re
 from dataclasses import dataclass
@@ -45,7 +46,12 @@ class Option:
         """Return the first sentence of the file's comment, else the first line of its target."""
         text = self.path.read_text()
         target = (yaml.safe_load(text) or {}).get("_target_")
-        return _read_comment(text) or (_read_docstring_line(target) if target else "")
+        comment = re.split(r"(?<=\.) ", _read_comment(text))[0]
+        return comment or (_read_docstring(target).split("\n")[0] if target else "")
+
+    def comment(self) -> str:
+        """Return the whole comment at the top of the file, in one line."""
+        return _read_comment(self.path.read_text())
 
 
 def find_packages() -> dict[str, Path]:
@@ -147,8 +153,19 @@ def _find_folder(package: str, who: str) -> Path:
     return Path(next(iter(place.submodule_search_locations)))
 
 
-def _read_docstring_line(target: str) -> str:
-    """Return the first docstring line of the class or function `target`, or an empty string."""
+def read_attributes(target: str) -> dict[str, str]:
+    """Return the meaning of each field under `Attributes:` in the docstring of the class `target`."""
+    _, _, section = inspect.cleandoc(_read_docstring(target)).partition("\nAttributes:\n")
+    found = {}
+    for entry in re.split(r"\n(?= {4}\S)", "\n" + section.split("\n\n")[0]):
+        name, colon, text = entry.strip().partition(":")
+        if colon and name.isidentifier():
+            found[name] = " ".join(text.split())
+    return found
+
+
+def _read_docstring(target: str) -> str:
+    """Return the docstring of the class or function `target` from its source, or an empty string."""
     module, _, name = str(target).rpartition(".")
     try:
         place = util.find_spec(module)
@@ -158,16 +175,16 @@ def _read_docstring_line(target: str) -> str:
         return ""
     for node in ast.parse(Path(place.origin).read_text()).body:
         if isinstance(node, (ast.ClassDef, ast.FunctionDef)) and node.name == name:
-            return (ast.get_docstring(node) or "").split("\n")[0]
+            return ast.get_docstring(node) or ""
     return ""
 
 
 def _read_comment(text: str) -> str:
-    """Return the first sentence of the comment at the top of a file, or an empty string."""
+    """Return the comment at the top of a file in one line, or an empty string."""
     lines = []
     for line in text.splitlines():
         if not line.startswith("#"):
             break
         if not line.lstrip("# ").startswith("@package"):
             lines.append(line.lstrip("#").strip())
-    return re.split(r"(?<=\.) ", " ".join(lines).strip())[0]
+    return " ".join(lines).strip()

@@ -40,6 +40,8 @@ DBC = "deploy:dbc/example_gateway.dbc"
 NO_WIRE = CanBus(interface="virtual", channel="air", bitrate=None, port=None, hops=None)
 BEGIN_S = 65.536 * 20 - 1.0
 """The gateway's clock wraps a second after the beginning."""
+TURN_MS = 2048
+"""After so long the stamp of the remote's messages begins anew."""
 WANTED = (0.3, 0.0, -0.3, 0.0, 0.2)
 
 Mode = Literal["listen", "auto", "collect"]
@@ -106,6 +108,13 @@ class Bridge:
         half: Message of which every second frame has a wrong bit.
         second_remote: Whether a second remote sends, its dead-man held.
         foreign: Values of a foreign sender of `ValveCmd`; `None`: there is none.
+        alter: By message: changes its values on the way, with counter and CRC as they have to be.
+            The gateway has heard its own remote before.
+        lose: By message: how many of the next ones are lost.
+        held_s: Time for which all messages to the PC are held, to come at once; 0: none are.
+        inserted: Data of a message that a stranger inserts every 20 ms, by its name.
+        replayed: Whether a stranger sends recorded messages of the remote, one turn of their stamp
+            old.
     """
 
     def __init__(self, stage: Stage) -> None:
@@ -114,7 +123,9 @@ class Bridge:
         self._order, self._counts = itertools.count(), Counter[int]()
         self._remote = RadioRemote(BusDescription(DBC, stage.machine))
         self._remote.deadman = True
-        self._names = {one.frame_id: one.name for one in self._remote._description.layouts.values()}
+        layouts = self._remote._description.layouts.values()
+        self._layouts = {one.frame_id: one for one in layouts}
+        self._names = {one.frame_id: one.name for one in layouts}
         self._foreign_counter = 0
         self.clear()
 
@@ -126,6 +137,10 @@ class Bridge:
         self.half, self.second_remote, self.begun_ms = "", False, self._stage.ms
         self.foreign: dict[str, float] | None = None
         self.remote_every_ms, self.foreign_every_ms, self.remote_offset = 20, 20, 0
+        self.alter: dict[str, Callable[[dict[str, float]], None]] = {}
+        self.lose = Counter[str]()
+        self.held_s, self.inserted, self.replayed = 0.0, dict[str, bytes](), False
+        self._recorded: deque[tuple[int, CanFrame]] = deque()
 
     def carry(self, frame: CanFrame, to_gateway: bool) -> None:
         """Carry a frame."""
@@ -135,9 +150,24 @@ class Bridge:
         self._counts[frame.frame_id] += 1
         if name and name == self.half and self._counts[frame.frame_id] % 2:
             frame = CanFrame(frame.frame_id, bytes([frame.data[0] ^ 1, *frame.data[1:]]))
+        if self.lose[name] > 0:
+            self.lose[name] -= 1
+            return
+        if name in self.alter:
+            layout = self._layouts[frame.frame_id]
+            values = self._remote._description.decode(layout, frame.data)
+            assert isinstance(values, dict)
+            counter = int(values["Counter"])
+            self.alter[name](values)
+            data = self._remote._description.encode(name, values, counter)
+            frame = CanFrame(frame.frame_id, data)
+        if name == "LeverState":
+            self._recorded.append((self._stage.ms, frame))
         way = "to_gateway" if to_gateway else "to_pc"
         delay = self.delay_s.get(name, self.delay_s.get(way, 0.0))
         since_s = (self._stage.ms - self.begun_ms) / 1e3
+        if self.held_s and not to_gateway:
+            delay = self.held_s - since_s % self.held_s
         self._deliver(frame, to_gateway, delay(since_s) if callable(delay) else delay)
         if name in self.echo_s:
             self._deliver(frame, to_gateway, self.echo_s[name])
@@ -148,6 +178,16 @@ class Bridge:
         while self._waiting and self._waiting[0][0] <= stage.ms:
             _, _, frame, to_gateway = heapq.heappop(self._waiting)
             self._arrive(frame, to_gateway)
+        for name, data in self.inserted.items():
+            if stage.ms % 20 == 5:
+                frame_id = self._remote._description.layouts[name].frame_id
+                for to_gateway in (True, False):
+                    self._arrive(CanFrame(frame_id, data), to_gateway)
+        while self._recorded and self._recorded[0][0] + TURN_MS <= stage.ms:
+            _, frame = self._recorded.popleft()
+            for to_gateway in (True, False):
+                if self.replayed:
+                    self._arrive(frame, to_gateway)
         if self.second_remote and stage.ms % self.remote_every_ms == 7:
             counter = stage.twin._remote._counter + self.remote_offset
             self._arrive(self._remote.build_frame(counter % 16), to_gateway=True)
@@ -174,10 +214,10 @@ class Bridge:
             stage.air.inbox.append(frame)
         elif self._names.get(frame.frame_id) == "LeverState":
             # The twin takes its own remote's messages for its own; the gateway hears all of them.
-            stage.twin._gateway.take(frame, stage.now_s)
-            stage.twin._apply_flow(stage.now_s)
+            stage.twin._gateway.take(frame, stage.machine_s)
+            stage.twin._apply_flow(stage.machine_s)
         else:
-            stage.twin.hear(frame, stage.now_s)
+            stage.twin.hear(frame, stage.machine_s)
 
 
 def write_nominal_observer(machine: Machine, folder: Path) -> Path:
@@ -202,6 +242,10 @@ class Stage:
         folder: Where a session may write.
         again_s: When the operator who is not followed presses the dead-man again.
         watched: Whether the guard has its envelope and its observer.
+
+    Attributes:
+        meddle: Called each millisecond, for what else goes wrong.
+        clock_jump_s: By which the gateway's clock is ahead.
     """
 
     def __init__(
@@ -217,9 +261,10 @@ class Stage:
         self.air, self.request_s, self.wanted = Air(self), 0.05, WANTED
         self.bridge, self.supervised = Bridge(self), True
         self.stopped_ms: int | None = None
-        self._times = 0
+        self.meddle: Callable[[], None] | None = None
+        self.clock_jump_s, self._times = 0.0, 0
         with self._time():
-            twin = Twin(
+            self._twin_settings = Twin(
                 wire=NO_WIRE,
                 dbc=DBC,
                 remote=True,
@@ -229,10 +274,10 @@ class Stage:
                 seconds=None,
                 realtime=False,
             )
-            link = NominalMachine().build(
+            self._link = NominalMachine().build(
                 machine, 1, Session(out=str(folder), seed=0, device="cpu")
             )
-            self.twin = RunningTwin(twin, machine, link, Gateway(self), FaultPort(None))
+            self.start_twin()
             limits, wire = option("guard", "default"), self.air
             if hasattr(limits, "observer"):
                 observer = replace(
@@ -256,6 +301,16 @@ class Stage:
     def now_s(self) -> float:
         return BEGIN_S + self.ms / 1e3
 
+    @property
+    def machine_s(self) -> float:
+        """Time by the clock of the gateway."""
+        return self.now_s + self.clock_jump_s
+
+    def start_twin(self) -> None:
+        """Starts gateway and remote, or starts them anew; the machine stays where it is."""
+        settings, port = self._twin_settings, FaultPort(None)
+        self.twin = RunningTwin(settings, self.machine, self._link, Gateway(self), port)
+
     def go(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         """Lets time go by."""
         end_ms = self.ms + round(1e3 * seconds)
@@ -275,8 +330,10 @@ class Stage:
         """Lets a millisecond go by."""
         self.ms += 1
         self.bridge.tick()
+        if self.meddle is not None:
+            self.meddle()
         if self.ms % 10 == 0:
-            self.twin.cycle(self.now_s)
+            self.twin.cycle(self.machine_s)
         if self.ms % 50 == 1 and self.supervised:
             self._write("controls", t_s=self.now_s, **self._switches)
         if self.mode != "collect" and self.ms % 50 == 3 and self.adviser is not None:
@@ -308,7 +365,7 @@ class Stage:
     def fault(self, fault: str, message: str = "") -> None:
         """Switches a fault on, or all off (`none`)."""
         text = json.dumps({"fault": fault, "message": message}).encode()
-        self.twin._faults.request(text, self.now_s)
+        self.twin._faults.request(text, self.machine_s)
 
     def get_going(self) -> None:
         """Goes the operator's way until the machine moves; where nothing is sent, until there is an advice."""
@@ -319,7 +376,7 @@ class Stage:
         )  # to and fro: no joint comes to its end, no policy to its goal
         self.air.broken, self.air.echo, self.request_s = False, False, 0.05
         self.bridge.clear()
-        self.supervised = True
+        self.supervised, self.meddle = True, None
         self.arm()
         self.wanted = tuple(side * u for u in WANTED)
         self._write("target", t_s=self.now_s, center_in_base_m=(2.5, 0.7 * side, 0.75))

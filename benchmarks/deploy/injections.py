@@ -1,9 +1,10 @@
-"""Injected faults on the way between gateway and PC: python benchmarks/deploy/injections.py <json> [trials].
+"""Injected faults on the way between gateway and PC: python benchmarks/deploy/injections.py <json> [trials] [words].
 
 Twin, gateway, bus process and policy as they are, on a clock of their own (`tests/stage.py`); a
 bridge between them delays, copies and corrupts messages, and strangers send. Each trial begins at
 another phase of all cycles. Times count until the valves get nothing, for good; "moves" says that
-they still move at the end of the time watched.
+they still move at the end of the time watched. With words only the rows that hold one of them are
+measured again, and the others stay as the file has them.
 """
 
 from __future__ import annotations
@@ -13,21 +14,25 @@ import math
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]
+sys.path[:0] = [str(ROOT / "tests"), str(ROOT)]  # the folder of this file is there already
 
 import numpy as np  # noqa: E402
 from composed import option  # noqa: E402
-from stage import Stage  # noqa: E402
+from further_injections import FRESH, FURTHER, LASTING, STAMPED, WATCHED_S  # noqa: E402
+from stage import Mode, Stage  # noqa: E402
 
 from brokk_rl.kinematics import compute_tool_kinematics  # noqa: E402
+from brokk_rl.machine import Machine  # noqa: E402
 from deploy.guard.guard import GuardState  # noqa: E402
 
 LATCHED = GuardState.LATCHED
-WATCHED_S = 4.0
+USUALLY_WATCHED_S = 4.0
+QUIET_S = 1.0
+"""Standstill after which a trial is over: nothing moves again before somebody presses the dead-man."""
 MESSAGES = ("JointPos1", "JointPos2", "LeverState", "MachineStatus", "ValveFeedback", "ValveCmd")
 
 
@@ -98,6 +103,101 @@ def delay(message: str) -> Callable[[Stage, int], None]:
     return inject
 
 
+def drop_feedback(stage: Stage, trial: int) -> None:
+    """The valves' feedback stays away."""
+    stage.fault("drop", "ValveFeedback")
+
+
+def hide_stuck_sensors(stage: Stage, trial: int) -> None:
+    """The valves' feedback comes 0.2 s late, and the position sensors stand still."""
+    stage.bridge.delay_s = {"ValveFeedback": 0.2}
+    stage.fault("stuck")
+
+
+def loosen_contact(stage: Stage, trial: int) -> None:
+    """Every second position of the first joint is off by 0.5 rad, with a right CRC."""
+
+    def spoil(values: dict[str, float]) -> None:
+        values["Position_q1"] += 0.5 * (values["Counter"] % 2)
+
+    stage.bridge.alter = {"JointPos1": spoil}
+
+
+def turn_joint(stage: Stage, trial: int) -> None:
+    """The first joint's sensor jumps by a whole turn, as far as its signal goes."""
+
+    def spoil(values: dict[str, float]) -> None:
+        turned = values["Position_q1"] + 2 * math.pi * (1 - 2 * (trial % 2))
+        values["Position_q1"] = max(-3.2, min(3.2, turned))
+
+    stage.bridge.alter = {"JointPos1": spoil}
+
+
+def jump_clock(stage: Stage, trial: int) -> None:
+    """The gateway's clock jumps by 0.1 to 30 s either way, in all its messages."""
+    jump_s = (0.1, 0.2, 0.3, 1.0, 10.0, 30.0)[trial // 2 % 6] * (1 - 2 * (trial % 2))
+
+    def shift(values: dict[str, float]) -> None:
+        values["Stamp"] += jump_s
+
+    stage.bridge.alter = dict.fromkeys(STAMPED, shift)
+
+
+def lose_place(stage: Stage, trial: int) -> None:
+    """The borehole's place is no number, while somebody else commands."""
+    place = [2.6, 0.0, 0.75]
+    place[trial % 3] = (math.nan, math.inf)[trial % 2]
+    stage._write("target", t_s=stage.now_s, center_in_base_m=tuple(place))
+
+
+def ask_from_future(stage: Stage, trial: int) -> None:
+    """A command carries a time 100 s ahead; then its sender dies."""
+    stage._write("request", t_s=stage.now_s + 100.0, u=stage.wanted)
+    stage.request_s = 60.0
+
+
+def arm_from_future(stage: Stage, trial: int) -> None:
+    """The switches carry a time 100 s ahead; then the supervisor hangs."""
+    stage._write("controls", t_s=stage.now_s + 100.0, **stage._switches)
+    stage.supervised = False
+
+
+def arm_late(stage: Stage, trial: int) -> None:
+    """The supervisor stands still while arming is asked for, STOP comes, and it goes on arming."""
+    stage.supervised = False
+    stage.arm()
+    stage.go(0.05)
+    stage.stop()
+    stage.supervised = True
+
+
+def hold_messages(stage: Stage, trial: int) -> None:
+    """All messages to the PC are held for 0.2 s and come at once, again and again."""
+    stage.bridge.begun_ms, stage.bridge.held_s = stage.ms, 0.2
+
+
+def replay_remote(stage: Stage, trial: int) -> None:
+    """A recording of the remote is sent again, one turn of its stamp later, and the real one lets go."""
+    stage.bridge.replayed = True
+    stage.fault("deadman_released")
+
+
+def insert(name: str) -> Callable[[Stage, int], None]:
+    def inject(stage: Stage, trial: int) -> None:
+        stage.bridge.inserted = {name: bytes((0, 1, 7, 9, 64)[trial % 5])}
+
+    inject.__doc__ = f"`{name}` of 0, 1, 7, 9 or 64 bytes, every 20 ms."
+    return inject
+
+
+def copy_soon(name: str) -> Callable[[Stage, int], None]:
+    def inject(stage: Stage, trial: int) -> None:
+        stage.bridge.echo_s = {name: (0.001, 0.005, 0.02, 0.05)[trial % 4]}
+
+    inject.__doc__ = f"`{name}` comes once more, 1 to 50 ms later."
+    return inject
+
+
 def answer(value: float) -> Callable[[Stage, int], None]:
     def inject(stage: Stage, trial: int) -> None:
         bundle = stage.adviser._bundle
@@ -112,7 +212,7 @@ SENSORS = [
     break_sensor("drift", "The first joint's sensor drifts by 0.1 rad/s."),
     break_sensor("mirrored", "The position sensors count backwards from now on."),
 ]
-SHORT: dict[str, list[Callable[[Stage, int], None]]] = {
+SHORT: dict[Mode, list[Callable[[Stage, int], None]]] = {
     "collect": [
         start_second_remote,
         start_second_remote_alone,
@@ -123,10 +223,28 @@ SHORT: dict[str, list[Callable[[Stage, int], None]]] = {
         hang_supervisor,
         *SENSORS,
         *(corrupt_half(name) for name in MESSAGES),
-        *(delay(name) for name in MESSAGES if name != "ValveFeedback"),
+        *(delay(name) for name in (*MESSAGES, "JointPos3")),
+        drop_feedback,
+        hide_stuck_sensors,
+        loosen_contact,
+        turn_joint,
+        jump_clock,
+        lose_place,
+        ask_from_future,
+        arm_from_future,
+        arm_late,
+        hold_messages,
+        replay_remote,
+        *(insert(name) for name in MESSAGES),
+        *(copy_soon(name) for name in MESSAGES),
+        *FURTHER,
     ],
     "auto": [answer(float("nan")), answer(1e30)],
 }
+
+
+AFRESH = (jump_clock, replay_remote, *FRESH)
+"""Injections each of whose trials has a loop of its own: a jump of the clock is not forgotten."""
 
 
 def measure_stop(stage: Stage, inject: Callable[[Stage, int], None], trial: int) -> float | None:
@@ -136,10 +254,15 @@ def measure_stop(stage: Stage, inject: Callable[[Stage, int], None], trial: int)
     original = stage.adviser._bundle.command if stage.adviser else None
     inject(stage, trial)
     begun_ms = stage.ms
-    stage.go(WATCHED_S)
+    watched_s = WATCHED_S.get(inject, USUALLY_WATCHED_S)
+    stage.go(watched_s, lambda: inject not in LASTING and _is_quiet(stage))
     if stage.adviser:
         stage.adviser._bundle.command = original
     return None if stage.stopped_ms is None else max(0, stage.stopped_ms - begun_ms) / 1e3
+
+
+def _is_quiet(stage: Stage) -> bool:
+    return stage.stopped_ms is not None and stage.ms - stage.stopped_ms > 1e3 * QUIET_S
 
 
 def measure_constant_delay(stage: Stage) -> dict[str, object]:
@@ -248,15 +371,20 @@ def measure_ground(stage: Stage) -> dict[str, object]:
 
 
 def measure_row(
-    stage: Stage, inject: Callable[[Stage, int], None], trials: int
+    machine: Machine, mode: Mode, folder: Path, inject: Callable[[Stage, int], None], trials: int
 ) -> dict[str, object]:
     """Return the row of an injection."""
     found, causes = [], Counter[str]()
+    stage = Stage(machine, mode, folder)
     for trial in range(trials):
+        if inject in AFRESH:
+            stage.close()
+            stage = Stage(machine, mode, folder)
         found.append(measure_stop(stage, inject, trial))
         state = stage.view.state
         joint = f"joint {state.observed_joint}: " if state.observed_joint else ""
         causes[joint + state.cause.value] += 1
+    stage.close()
     stopped = sorted(1e3 * one for one in found if one is not None)
     row: dict[str, object] = {"trials": trials, "moves": found.count(None)}
     if stopped:
@@ -276,35 +404,41 @@ def measure_unwatched(
     return {"trials": trials, "moves": moves}
 
 
-def main(path: Path, trials: int) -> None:
-    table: dict[str, object] = {}
+def main(path: Path, trials: int, words: Sequence[str]) -> None:
+    table: dict[str, object] = json.loads(path.read_text()) if words and path.exists() else {}
     with tempfile.TemporaryDirectory() as folder:
         machine = option("machine", "brokk170")
         for mode, injections in SHORT.items():
-            stage = Stage(machine, mode, Path(folder))  # type: ignore[arg-type]
             for inject in injections:
-                table[f"{mode}: {inject.__doc__}"] = measure_row(stage, inject, trials)
-            stage.close()
-        # As before there was an observer and an envelope.
-        for inject in SENSORS:
-            row = measure_unwatched(Path(folder), inject, trials)
-            table[f"unwatched: {inject.__doc__}"] = row
-        stage = Stage(machine, "collect", Path(folder), watched=False)
-        table[f"unwatched: {measure_ground.__doc__}"] = measure_ground(stage)
-        stage.close()
-        stage = Stage(machine, "collect", Path(folder))
-        for measure in (measure_ground, measure_constant_delay, measure_drift):
-            table[str(measure.__doc__)] = measure(stage)
-        table[str(measure_start_delay.__doc__)] = measure_start_delay(Path(folder))
-        table[str(measure_random_corruption.__doc__)] = measure_random_corruption(stage, 10)
-        stage.close()
-        stage = Stage(machine, "auto", Path(folder))
-        table[str(measure_reversals.__doc__)] = measure_reversals(stage)
-        stage.close()
+                key = f"{mode}: {inject.__doc__}"
+                if not words or any(word in key for word in words):
+                    table[key] = measure_row(machine, mode, Path(folder), inject, trials)
+                    sys.stdout.write(f"{key}: {table[key]}\n")
+        if not words:
+            measure_others(table, Path(folder), trials)
     path.write_text(json.dumps(table, indent=2) + "\n")
-    for key, row in table.items():
-        sys.stdout.write(f"{key}: {row}\n")
+
+
+def measure_others(table: dict[str, object], folder: Path, trials: int) -> None:
+    """Add the rows that are no time to the table."""
+    machine = option("machine", "brokk170")
+    # As before there was an observer and an envelope.
+    for inject in SENSORS:
+        row = measure_unwatched(folder, inject, trials)
+        table[f"unwatched: {inject.__doc__}"] = row
+    stage = Stage(machine, "collect", folder, watched=False)
+    table[f"unwatched: {measure_ground.__doc__}"] = measure_ground(stage)
+    stage.close()
+    stage = Stage(machine, "collect", folder)
+    for measure in (measure_ground, measure_constant_delay, measure_drift):
+        table[str(measure.__doc__)] = measure(stage)
+    table[str(measure_start_delay.__doc__)] = measure_start_delay(folder)
+    table[str(measure_random_corruption.__doc__)] = measure_random_corruption(stage, 10)
+    stage.close()
+    stage = Stage(machine, "auto", folder)
+    table[str(measure_reversals.__doc__)] = measure_reversals(stage)
+    stage.close()
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 60)
+    main(Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 60, tuple(sys.argv[3:]))

@@ -6,7 +6,8 @@ A line of the jobs: `{"name": …, "words": […], "evaluate": [[…], …], "af
 `words` are those of `brokk mode=train`. `evaluate` holds further words for one evaluation each
 beside that under the conditions of the training, or under those of the words `evaluated_as`.
 `after` names a job whose bundle this one needs, in `{folder}/<name>`. `seconds` bounds the
-training. With `"classical": true` nothing is trained, and the classical controller is evaluated.
+training; a job for which less than `least_s` is left is not begun. With `"classical": true` nothing is
+trained, and the classical controller is evaluated.
 
 Several such processes share a folder and its jobs. The numbers are those of `brokk mode=train`
 with the same words, but that the starts are drawn once for all jobs of a task (`--start-seed`),
@@ -104,6 +105,8 @@ def take_jobs(jobs: list[dict], folder: Path, end_s: float) -> Iterator[dict]:
             return
         for job in left:
             if "after" in job and not (folder / job["after"] / "policy.json").exists():
+                continue
+            if end_s - time.time() < job.get("least_s", 0.0):
                 continue
             try:
                 os.close(os.open(folder / "taken" / job["name"], os.O_CREAT | os.O_EXCL))

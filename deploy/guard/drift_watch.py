@@ -102,7 +102,7 @@ class DriftWatch:
         self, scores: Sequence[Sequence[float]], false_alarms: float, machine: Machine, seed: int
     ) -> None:
         self._martingales = [ConformalMartingale(own, seed + j) for j, own in enumerate(scores)]
-        self._is_watched = [len(own) > 0 for own in scores]
+        self._is_watched = [bool(own) for own in scores]
         self._limit = math.log(len(scores) / false_alarms)
         self._meters = [BlockMeter(machine, joint) for joint in range(machine.num_joints)]
         self._moves = MOVES * machine.max_speed * machine.period_s
@@ -180,31 +180,34 @@ class BlockMeter:
 
     def _note_forms(self, residual: float, predicted: float) -> None:
         """Add up how well each effect's form explains the residuals."""
-        sign = math.copysign(1.0, predicted) if predicted else 0.0
+        is_slow = 0.0 < abs(predicted) < self._full / 2
         forms = (
             predicted,  # flow_gain
             max(predicted, 0.0),  # asymmetry, positive direction
             min(predicted, 0.0),  # asymmetry, negative direction
             self._before - predicted,  # dead_time: a motion that comes later
             self._full if predicted == 0.0 else 0.0,  # creep
-            -sign * self._full if 0.0 < abs(predicted) < self._full / 2 else 0.0,  # dead_band
+            math.copysign(self._full, predicted) if is_slow else 0.0,  # dead_band
         )
         self._before = predicted
         for number, form in enumerate(forms):
             self._sums[number] += residual * form, form * form
 
-    def name_effect(self) -> Misfit:
-        """Return the effect whose form explains most of the residuals."""
+    def explain(self) -> dict[Misfit, float]:
+        """Return the sum of squared residuals that each effect's form explains."""
         cross, square = self._sums.T
-        explained = np.where(square > 0, cross**2 / np.where(square > 0, square, 1.0), 0.0)
+        explained = np.divide(cross**2, square, out=np.zeros(NUM_FORMS), where=square > 0)
         gain, extend, retract, dead_time, creep, dead_band = explained.tolist()
-        # Both directions together have one number more to fit; a shared gain is the simpler word.
-        one_side = max(extend, retract)
-        chances = {
+        return {
             Misfit.FLOW_GAIN: gain,
-            Misfit.ASYMMETRY: one_side,
+            # Both directions together have one number more to fit; a shared gain is simpler.
+            Misfit.ASYMMETRY: max(extend, retract),
             Misfit.DEAD_TIME: dead_time,
             Misfit.CREEP: creep,
             Misfit.DEAD_BAND: dead_band,
         }
-        return max(chances, key=lambda effect: chances[effect])
+
+    def name_effect(self) -> Misfit:
+        """Return the effect whose form explains most of the residuals."""
+        explained = self.explain()
+        return max(explained, key=lambda effect: explained[effect])

@@ -52,7 +52,7 @@ class BusInputs:
 
     Attributes:
         controls: Switches on the operator's side.
-        stop: The operator's stop.
+        stop: The operator's stop; stronger than all switches before it, once it was read.
         request: Command to be sent.
         face_in_base_m: Rim of the chosen borehole, a point of the work surface.
     """
@@ -96,7 +96,8 @@ class BusLogic:
         # Sum and number of valve feedback at the observer's last update.
         self._flow_sum, self._flow_number = np.zeros(machine.num_joints), 0
         self._zeros_left = 0
-        self._controls_age_s = math.inf
+        # The latest stop is remembered here: what is written over it later takes nothing back.
+        self._stopped_s, self._controls_age_s = -math.inf, math.inf
         # Counters and due times are kept by message name, since each has its own cycle.
         self._counters: dict[str, int] = {}
         self._due_s: dict[str, float] = {}
@@ -131,7 +132,9 @@ class BusLogic:
             u, age_s = tuple(requested.u.tolist()), now_s - requested.t_s
             request = CommandRequest(u, age_s, inputs.face_in_base_m)
         before = self.decision
-        armed = self._commands and is_armed(controls, inputs.stop)
+        if inputs.stop is not None:
+            self._stopped_s = max(self._stopped_s, inputs.stop.t_s)
+        armed = self._commands and is_armed(controls, self._stopped_s)
         self.decision = self._guard.decide(now_s, armed, seen, request)
         if not self._commands:
             return []
@@ -213,8 +216,6 @@ class BusLogic:
         return CanFrame(layout.frame_id, data, layout.extended)
 
 
-def is_armed(controls: OperatorControls | None, stop: StopRequest | None) -> bool:
-    """Return whether commands are to be sent: armed, and later than the operator's last stop."""
-    if controls is None or not controls.armed:
-        return False
-    return stop is None or controls.armed_t_s > stop.t_s
+def is_armed(controls: OperatorControls | None, stopped_s: float) -> bool:
+    """Return whether commands are to be sent: armed, and later than the last stop at `stopped_s`."""
+    return controls is not None and controls.armed and controls.armed_t_s > stopped_s

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import struct
 import time
 from collections.abc import Mapping, Sequence
@@ -26,6 +27,7 @@ from deploy.guard.observer import Observer
 from deploy.guard.shapes import read_machine_shapes
 from deploy.guard.valve_model import load_observer_file
 from deploy.runtime.bus_logic import CYCLE_S, BusInputs, BusLogic
+from deploy.runtime.operator_state import StopRequest
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
 
@@ -126,9 +128,11 @@ class BusProcess:
         """Decide, send and publish."""
         now_s, memory, logic = time.monotonic(), self._memory, self._logic
         request = None if memory.request is None else memory.request.read()
-        target = memory.target.read()
-        face = None if target is None else tuple(target["center_in_base_m"].tolist())
-        inputs = BusInputs(memory.controls.read(), memory.stop.read(), request, face)
+        stop = memory.stop.read()
+        if stop is None and memory.stop.number:
+            # Damaged memory may hold a stop.
+            stop = StopRequest(now_s)
+        inputs = BusInputs(memory.controls.read(), stop, request, self._read_face())
         before = logic.decision
         frames = logic.decide(now_s, self._bus is not None, inputs, self._timer.missed)
         self._send(frames, now_s)
@@ -138,6 +142,13 @@ class BusProcess:
         state = logic.build_state(now_s, self._bus is not None, self._timer.missed)
         memory.state.write(state)
         self._flush_log()
+
+    def _read_face(self) -> tuple[float, ...] | None:
+        """Return the rim of the borehole; NaN where it was written and cannot be read."""
+        target = self._memory.target.read()
+        if target is None:
+            return (math.nan,) * 3 if self._memory.target.number else None
+        return tuple(target["center_in_base_m"].tolist())
 
     def _log_change(self, before: GuardDecision | None, after: GuardDecision, now_s: float) -> None:
         """Log a change of the guard; the state itself stands in every record."""

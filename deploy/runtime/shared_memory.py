@@ -209,6 +209,11 @@ class RecordSlot(Generic[R]):
         """The slot's memory."""
         return self._slot.memory
 
+    @property
+    def number(self) -> int:
+        """Number of records written so far; see `Slot.number`."""
+        return self._slot.number
+
     def write(self, record: R) -> None:
         """Make `record` the newest."""
         self._slot.write(self._layout.pack(record))

@@ -51,6 +51,19 @@ COMPARE = ("mode=compare", "compare.runs=nowhere")
             ("mode=deploy", "camera=pictures", "deploy.camera.forget_s=3"),
             ("'deploy.camera.forget_s' is now 'deploy.camera.tracker.forget_s'",),
         ),
+        (
+            ("effect=[backlash]", "effect.backlash.width=1"),
+            ("'effect.backlash' has no 'width'", "gap_rad"),
+        ),
+        (("task=goal_pose", "task.hole.radius_m=1"), ("'task' has no 'hole'", "tolerance")),
+        (
+            ("mode=perceive", "perception/segmenter=onnx", "perception.segmenter.wrong=1"),
+            ("'perception.segmenter' has no 'wrong'", "choices: margin, threads, weights"),
+        ),
+        (
+            ("-m", "effect=[backlash],[lag]", "effect.backlash.width=1"),
+            ("'effect.backlash' has no 'width'",),
+        ),
         (("mode=null",), ("must be a string",)),
         (("--config-dir", "nowhere", "mode=list"), ("nowhere",)),
     ],
@@ -75,9 +88,15 @@ def test_the_traceback_comes_on_request(
     assert "Traceback" in brokk("mode=lst").err
 
 
+def test_tab_completes_options(brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COMP_LINE", "brokk mode=ide")
+    monkeypatch.setenv("COMP_POINT", "14")
+    assert "mode=identify" in brokk("-sc", "query=bash").out
+
+
 def test_help_is_short_and_says_how_to_begin(brokk: Callable[..., Any]) -> None:
     done = brokk("--help")
     assert done.code == 0
     for part in ("brokk mode=list", "brokk mode=doctor", "-m", "session.out"):
         assert part in done.out
-    assert len(done.out.splitlines()) < 80
+    assert len(done.out.splitlines()) < 25

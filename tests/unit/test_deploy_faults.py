@@ -307,6 +307,27 @@ def test_a_delay_that_was_always_there_is_measured_and_nothing_moves(
     stage.close()
 
 
+@pytest.mark.parametrize("pressed", [True, False])
+def test_memory_that_cannot_be_read_takes_no_stop_back_and_hides_no_surface(
+    machine: Machine, tmp_path: Path, pressed: bool
+) -> None:
+    stage = Stage(machine, "collect", tmp_path)
+    stage.get_going()
+    if pressed:
+        stage.stop()
+        stage.go(0.1)
+    slot = stage.memory.stop if pressed else stage.memory.target
+    # All of both records, behind the number of the newest.
+    slot.memory.bytes[8:] = bytes(one ^ 0x5A for one in slot.memory.bytes[8:])
+    assert stage.stops_within_s(0.3) <= 0.011
+    stage.fault("deadman_released")
+    stage.go(0.2)
+    stage.fault("none")
+    stage.go(1.0)
+    assert not stage.moves, stage.view
+    stage.close()
+
+
 @pytest.mark.parametrize("mode", COMMANDING)
 def test_a_stop_needs_no_supervisor_and_a_supervisor_that_hangs_ends_the_motion(
     stages: dict[str, Stage], mode: str

@@ -261,22 +261,32 @@ def test_a_stop_is_stronger_than_any_arming_before_it_and_no_stronger_than_one_a
 
 
 @pytest.mark.parametrize(
-    ("controls", "stop", "armed"),
+    ("controls", "stopped_s", "armed"),
     [
-        (None, None, False),
-        (None, StopRequest(1.0), False),
-        (build_controls(9.0, False, 5.0), None, False),
-        (build_controls(9.0, True, 5.0), None, True),
-        (build_controls(9.0, True, 5.0), StopRequest(4.9), True),
-        (build_controls(9.0, True, 5.0), StopRequest(5.0), False),
-        (build_controls(9.0, True, 5.0), StopRequest(5.1), False),
-        (build_controls(9.0, False, 5.0), StopRequest(4.9), False),
+        (None, -math.inf, False),
+        (None, 1.0, False),
+        (build_controls(9.0, False, 5.0), -math.inf, False),
+        (build_controls(9.0, True, 5.0), -math.inf, True),
+        (build_controls(9.0, True, 5.0), 4.9, True),
+        (build_controls(9.0, True, 5.0), 5.0, False),
+        (build_controls(9.0, True, 5.0), 5.1, False),
+        (build_controls(9.0, False, 5.0), 4.9, False),
     ],
 )
-def test_who_is_armed(
-    controls: OperatorControls | None, stop: StopRequest | None, armed: bool
+def test_who_is_armed(controls: OperatorControls | None, stopped_s: float, armed: bool) -> None:
+    assert is_armed(controls, stopped_s) is armed
+
+
+def test_a_stop_that_was_read_once_is_not_taken_back_by_an_earlier_one_or_by_none(
+    loop: Loop,
 ) -> None:
-    assert is_armed(controls, stop) is armed
+    loop.armed_s = loop.now_s - 1.0
+    loop.stop_s = loop.now_s
+    loop.cycle()
+    for stop_s in (None, loop.now_s - 2.0):
+        loop.stop_s = stop_s
+        loop.go(0.3)
+        assert loop.state is GuardState.SILENT
 
 
 def test_without_switches_nothing_is_ever_sent() -> None:
