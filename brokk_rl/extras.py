@@ -32,6 +32,8 @@ EXTRA_OF_MODULE = (
     ("perception", "perception"),
     ("diagnosis", "diagnose"),
     ("exam", "diagnose"),
+    ("actuators.recordings", "logs"),
+    ("actuators.modes.import_logs", "logs"),
     ("", "train"),
 )
 """The extra that all of a package's own work needs; the first prefix that fits decides."""
