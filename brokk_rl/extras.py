@@ -18,6 +18,7 @@ DISTRIBUTION_NAMES = {
     "can": "python-can",
     "cv2": "opencv-python-headless",
     "hydra_plugins": "hydra-submitit-launcher",
+    "mcap_protobuf": "mcap-protobuf-support",
     "rsl_rl": "rsl-rl-lib",
     "sklearn": "scikit-learn",
     "tensordict": "rsl-rl-lib",

@@ -73,11 +73,18 @@ class CanLog(LogFile):
         tables = {chosen[at].name: Table(store) for at, store in stores.items()}
         yield LogRun(self.path.stem, str(self.path), tables)
 
+    def _check_size(self, reader: Any) -> None:
+        """Refuse a BLF file that is shorter than its header says; python-can reads it without a word."""
+        stated, there = getattr(reader, "file_size", 0), self.path.stat().st_size
+        if there < stated:
+            raise RecordingError(f"{self.path}: cut off at byte {there} of {stated}")
+
     def _iterate(self) -> Iterator[can.Message]:
         """Yield the frames that carry data."""
         count, last_s = 0, 0.0
         try:
             with can.LogReader(self.path) as reader:
+                self._check_size(reader)
                 for frame in reader:
                     count, last_s = count + 1, frame.timestamp
                     if not (frame.is_error_frame or frame.is_remote_frame):

@@ -13,6 +13,8 @@ from actuators.recordings.text_log import CsvLayout
 MAP = "actuators.recordings.column_map"
 MISSING = "???"
 """A value that a person must give; the configuration refuses to run without it."""
+QUOTED_MISSING = f'"{MISSING}"'
+"""The same within braces, where YAML takes a bare question mark for something else."""
 HIGHEST_RATE_HZ = 100.0
 """Rate of a machine made from a faster log: joints of arms and machines show nothing beyond."""
 SHORTEST_S = 5.0
@@ -158,23 +160,25 @@ def _format_joint(joint: JointGuess, survey: JointSurvey) -> list[str]:
     is_unsure = columns.sureness == "unsure"
     command = MISSING if is_unsure else joint.command
     position = MISSING if is_unsure else joint.position
-    scale = MISSING if unit.sureness == "unsure" else repr(joint.scale)
+    scale = QUOTED_MISSING if unit.sureness == "unsure" else repr(joint.scale)
     lines = [
         f"  {joint.name}:   # {_explain(columns)}",
         f"    _target_: {MAP}.JointColumns",
         f"    # command: {_explain(kind)}",
     ]
     if kind.sureness == "unsure":
-        lines.append(f"    command: {MISSING}")
+        lines.append(f"    command: {QUOTED_MISSING}")
     elif joint.kind == "target":
-        speed = MISSING if scale == MISSING else f"{measure_full_speed(joint, survey):g}"
+        speed = (
+            QUOTED_MISSING if scale == QUOTED_MISSING else f"{measure_full_speed(joint, survey):g}"
+        )
         lines.append(
             f"    command: {{_target_: {MAP}.TargetColumn, column: {_quote(command)}, scale: {scale}, full_speed: {speed}}}"
             f"   # {joint.unit}/s, the fastest target of the logs"
         )
     else:
         full = scale_command(joint, survey)
-        numbers = [MISSING] * 3
+        numbers = [QUOTED_MISSING] * 3
         if full.guess.sureness != "unsure":
             numbers = ["null" if v is None else repr(v) for v in (full.neutral, full.full_plus, full.full_minus)]  # fmt: skip
         lines += [
@@ -251,8 +255,6 @@ def _explain(guess: Guess) -> str:
 
 
 def _quote(text: str) -> str:
-    if text == MISSING:
-        return text
     return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t") + '"'
 
 

@@ -2,7 +2,7 @@
 
 Each topic is a table. Its columns are the numbers in its messages by their path, `pose.x`; items of
 a list are named by the list `name` beside it, `position[elbow]`, or by their number. `log_time` is
-the recorder's clock, `header.stamp` that of the sensor, both in s.
+the recorder's clock since the first message, `header.stamp` that of the sensor, both in s.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ import json
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -95,10 +96,11 @@ class MessageLog(LogFile):
         tables: dict[str, list[str]] = {}
         waiting = set(self._guard(self._list_topics))
         for topic in sorted(waiting):
-            message = next(self._iterate_safely({topic}), None)
+            messages = self._iterate_safely({topic})  # its file stays open while it is held
+            message = next(messages, None)
             if message is None:
                 continue
-            names = MessageReader().find_numbers(self._guard(message.decode))
+            names = MessageReader().find_numbers(message.decode())
             if names:
                 tables[topic] = [LOG_TIME, *names]
         return tables
@@ -115,8 +117,11 @@ class MessageLog(LogFile):
         stores = {topic: StoredColumns([LOG_TIME, *several]) for topic, several in names.items()}
         rows: dict[str, list[list[float]]] = {topic: [] for topic in wanted}
         counts = dict.fromkeys(wanted, 0)
+        begin_ns = None
         for message in self._iterate_safely(wanted):
             topic = message.topic
+            # Seconds since 1970 would be rounded to 0.2 µs.
+            begin_ns = message.log_time_ns if begin_ns is None else begin_ns
             if max_rows is not None and counts[topic] >= max_rows:
                 if all(count >= max_rows for count in counts.values()):
                     break
@@ -124,7 +129,7 @@ class MessageLog(LogFile):
             values = readers[topic].read(message.decode(), names[topic])
             if values and all(value != value for value in values):
                 continue
-            rows[topic].append([message.log_time_ns * 1e-9, *values])
+            rows[topic].append([(message.log_time_ns - begin_ns) * 1e-9, *values])
             counts[topic] += 1
             if len(rows[topic]) >= BLOCK_ROWS:
                 _store(stores[topic], rows[topic], names[topic])
@@ -135,29 +140,30 @@ class MessageLog(LogFile):
 
     def _iterate_safely(self, topics: Collection[str]) -> Iterator[TopicMessage]:
         """Yield messages; decoding errors of the consumer and damage become a `RecordingError`."""
-        count, begin_ns, last_ns = 0, None, 0
+        count, begin_ns, last_ns = 0, 0, 0
         try:
             for message in self._iterate(topics):
-                begin_ns = message.log_time_ns if begin_ns is None else begin_ns
                 last_ns = message.log_time_ns
-
-                def decode(message: TopicMessage = message, count: int = count) -> Any:
-                    try:
-                        return message.decode()
-                    except Exception as error:  # a decoder raises what it stumbles over
-                        raise RecordingError(
-                            f"{self.path}: message {count} ({(message.log_time_ns - begin_ns) * 1e-9:.3f} s from the first "  # type: ignore[operator]
-                            f"one), topic {message.topic}: cannot be decoded ({error})"
-                        ) from error
-
-                yield TopicMessage(message.topic, message.log_time_ns, decode)
+                begin_ns = begin_ns or last_ns
+                place = f"message {count}, {(last_ns - begin_ns) * 1e-9:.3f} s from the first one"
+                yield replace(message, decode=partial(self._decode, message, place))
                 count += 1
         except RecordingError:
             raise
         except Exception as error:  # the libraries raise what they stumble over
-            where = f"after {count} messages, {(last_ns - (begin_ns or 0)) * 1e-9:.3f} s from the first one"
+            where = (
+                f"after {count} messages, {(last_ns - begin_ns) * 1e-9:.3f} s from the first one"
+            )
             raise RecordingError(
                 f"{self.path}: damaged {where} ({self._explain(error)})"
+            ) from error
+
+    def _decode(self, message: TopicMessage, place: str) -> Any:
+        try:
+            return message.decode()
+        except Exception as error:  # a decoder raises what it stumbles over
+            raise RecordingError(
+                f"{self.path}: {place}, topic {message.topic}: cannot be decoded ({error!r})"
             ) from error
 
     def _guard(self, call: Callable[[], Any]) -> Any:
@@ -264,7 +270,7 @@ def _find_damage(path: Path) -> str:
         except Exception:
             pass
         size = file.seek(0, 2)
-    if at >= size:
+    if at >= size > 0:
         return "all its records are there, so a chunk is damaged inside"
     return f"whole up to byte {at} of {size}; `mcap recover` saves that part"
 
@@ -284,9 +290,8 @@ def _find_leaves(value: Any, prefix: str, keys: Keys) -> Iterator[tuple[str, Key
     labels = next(([*inner] for name, inner in listed if name in LABELS and _is_names(inner)), None)
     for name, inner in listed:
         path = f"{prefix}{name}"
-        if _is_number(inner):
-            yield path, (*keys, name)
-        elif name.endswith("stamp") and _read_time(inner) is not None:
+        is_time = name.endswith("stamp") and _read_time(inner) is not None
+        if is_time or _is_number(inner):
             yield path, (*keys, name)
         elif _is_sequence(inner):
             yield from _find_items(inner, path, (*keys, name), labels)
@@ -327,7 +332,7 @@ def _follow(value: Any, keys: Keys) -> Any:
     try:
         for key in keys:
             is_inside = isinstance(key, int) or isinstance(value, Mapping)
-            value = value[key] if is_inside else getattr(value, key)
+            value = value[key] if is_inside else getattr(value, str(key))
     except (KeyError, IndexError, TypeError, AttributeError):
         return None
     return value
