@@ -29,7 +29,7 @@ class JointSurvey:
         top_target_speed: Fastest change of the command, per second.
         top_speed: Fastest change of the position over a tenth of a second, per second.
         rest: Most frequent command at rest; NaN where the joint never rests.
-        rest_share: Its share of the rows at rest.
+        rest_share: Share of all rows that are at rest with it, in the log with the most.
     """
 
     lowest_command: float = np.inf
@@ -56,9 +56,9 @@ class JointSurvey:
         self.top_speed = max(self.top_speed, float(np.nanmax(speed, initial=0.0)))
         at_rest = np.interp(clock_s, t_s[step:], speed) <= REST_SPEED * self.top_speed
         values, counts = np.unique(command[at_rest], return_counts=True)
-        if len(values) and counts.max() / counts.sum() > self.rest_share:
+        if len(values) and counts.max() / len(command) > self.rest_share:
             self.rest = float(values[counts.argmax()])
-            self.rest_share = float(counts.max() / counts.sum())
+            self.rest_share = float(counts.max() / len(command))
 
 
 @dataclass(frozen=True)
