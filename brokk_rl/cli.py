@@ -39,7 +39,7 @@ from brokk_rl import distributed, extensions, extras, gpu_pool, registry
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.mode_help import describe_mode
 from brokk_rl.session import read_earlier_job, remove_empty_folders
-from brokk_rl.sweep import SweepFolder
+from brokk_rl.sweep import SweepFolder, name_job
 from brokk_rl.task_choice import choose_task
 
 log = logging.getLogger(__name__)
@@ -229,7 +229,10 @@ def choose_run_folder(cfg: DictConfig) -> Path:
     """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`."""
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
-        return Path(settings.runtime.output_dir)
+        fixed = settings.job.config.override_dirname.exclude_keys
+        return Path(settings.sweep.dir) / name_job(
+            int(settings.job.num), list(settings.overrides.task), list(fixed)
+        )
     out = OmegaConf.select(cfg, "session.out", default=None)
     if out:
         return Path(out)

@@ -127,11 +127,15 @@ class Scripted:
 
 @contextmanager
 def served(
-    feed: Any, port: int = 0, machine: Machine | None = None, extension: Any = None, **changes: Any
+    feed: Any,
+    port: int = 0,
+    machine: Machine | None = None,
+    extensions: tuple[Any, ...] = (),
+    **changes: Any,
 ) -> Iterator[int]:
-    """Serves the page of `conf/page/local.yaml` with `changes`, and the pages of `extension`; yields the port."""
+    """Serves the page of `conf/page/local.yaml` with `changes`, and the pages of `extensions`; yields the port."""
     page: PageSettings = replace(option("page", "local"), port=port, token=TOKEN, **changes)
-    server = PageServer(page, machine or option("machine", "brokk170"), feed, TOKEN, extension)
+    server = PageServer(page, machine or option("machine", "brokk170"), feed, TOKEN, *extensions)
     ready, ending, found, failed = (
         threading.Event(),
         threading.Event(),

@@ -4,20 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-import hydra
 import pytest
-from hydra.utils import instantiate
 
 from brokk_rl import extensions, registry
 
 extensions.register_options([])  # the exam's options are those of an extension
 
 
-def option(group: str, name: str) -> Any:
-    """Returns the spec of one option, instantiated by itself."""
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject={name}"])
-    return instantiate(cfg.subject, _convert_="all")
+def option(group: str, name: str, **fields: object) -> Any:
+    """Returns the spec of one option with these fields, instantiated by itself."""
+    return extensions.load_option(group, name, **fields)
 
 
 def names(group: str) -> list[str]:

@@ -11,9 +11,9 @@ from statistics import median
 from typing import Any, ClassVar
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
+from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
@@ -306,4 +306,4 @@ def _print(rows: list[dict[str, Any]]) -> None:
         if kind in rows[0]:
             told.append(text)
     table.caption = f"In brackets: rate {'; '.join(told)}." if told else None
-    Console().print(table)
+    print_table(table)

@@ -7,10 +7,10 @@ import io
 import logging
 from collections.abc import Sequence
 
-from rich.console import Console
-
 from brokk_rl.comparison import (
+    MEASURES,
     PROGRESS_COLUMNS,
+    RATES,
     REACHED,
     SUCCESS,
     Curve,
@@ -26,6 +26,7 @@ from brokk_rl.comparison import (
     load_run,
     read_progress,
 )
+from brokk_rl.console_table import print_table
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 
@@ -33,8 +34,6 @@ log = logging.getLogger(__name__)
 
 MOST_ROWS = 250
 """Rows of a learning curve in `learning.csv`: about the horizontal pixels of one axis at 50 dpi."""
-FILE_WIDTH = 120
-"""Columns of the printed table where the output is a file or a pipe."""
 
 
 @spec
@@ -72,10 +71,8 @@ class Compare:
         write_text(folder / "comparison.csv", format_csv(columns, results))
         draw_comparison(groups).savefig(folder / "comparison.png", dpi=150)
         self._write_learning(runs, columns)
-        console = Console()
-        console.print(
-            build_table(columns, groups), width=None if console.is_terminal else FILE_WIDTH
-        )
+        table = build_table(columns, groups)
+        print_table(table, num_keys=len(table.columns) - len((*RATES, *MEASURES)))
         log.info("%d runs compared in %s", len(runs), folder)
 
     def _write_learning(self, runs: Sequence[EvaluatedRun], columns: Sequence[str]) -> None:

@@ -8,9 +8,9 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
-from rich.console import Console
 from rich.table import Table
 
+from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
@@ -151,6 +151,7 @@ def evaluate_policies(
     if evaluation.video:
         recorded = evaluated[first].episodes
         shown = next((episode for episode in recorded if episode.success), recorded[0])
+        log.info("drawing a video of one episode")
         path = render_video(config.machine, shown, session.folder / "insertion.mp4")
         log.info("video of one episode: %s", path)
     return results
@@ -184,7 +185,7 @@ def _print_table(table: dict[str, dict[str, Any]]) -> None:
         ("strict success", lambda row: f"{row['success_strict']['mean']:.3f}"),
         ("95 %", lambda row: "{:.3f} to {:.3f}".format(*row["success_strict"]["ci95"])),
         ("paper's success", lambda row: f"{row['success_paper']['mean']:.3f}"),
-        ("time to insert", lambda row: f"{row['time_to_insert_s']['median']:.1f} s"),
+        ("time to success", lambda row: f"{row['time_to_insert_s']['median']:.1f} s"),
         ("lateral error", lambda row: f"{1000 * row['lateral_error_m']:.1f} mm"),
         ("peak force", lambda row: f"{row['peak_force_n']:.0f} N"),
         ("valve travel", lambda row: f"{row['valve_travel']:.2f} /s"),
@@ -198,4 +199,4 @@ def _print_table(table: dict[str, dict[str, Any]]) -> None:
             except (KeyError, TypeError):  # not recorded, or no episode with success
                 cells.append("-")
         view.add_row(name, *cells)
-    Console().print(view)
+    print_table(view)

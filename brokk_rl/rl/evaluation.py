@@ -33,6 +33,7 @@ class RecordedEpisode:
         u: Commands, `(T, J)`.
         force_n: Peak contact force of each step, `(T,)`.
         scene: Scene vector, `(S,)`.
+        target_m: Target of the tip in the base frame, `(3,)`; `None` where the task has none.
         success: Whether it ended with strict success.
     """
 
@@ -41,6 +42,7 @@ class RecordedEpisode:
     u: np.ndarray
     force_n: np.ndarray
     scene: np.ndarray
+    target_m: np.ndarray | None
     success: bool
 
 
@@ -156,7 +158,7 @@ def _collect_episodes(
     q, u, force_n, running = (
         torch.stack(steps).cpu().numpy() for steps in (tape.q, tape.u, tape.force_n, tape.running)
     )
-    episodes = []
+    episodes, targets = [], starts.get("target_m")
     for row in range(q.shape[1]):
         length = max(2, int(running[:, row].sum()))
         first = starts["q"][row].cpu().numpy()[None]
@@ -167,6 +169,7 @@ def _collect_episodes(
                 u=np.concatenate((np.zeros_like(first), u[:length, row])),
                 force_n=np.concatenate(([0.0], force_n[:length, row])),
                 scene=starts["scene"][row].cpu().numpy(),
+                target_m=None if targets is None else targets[row].cpu().numpy(),
                 success=bool(success[row] > 0),
             )
         )

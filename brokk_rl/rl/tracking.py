@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
+from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 
 
@@ -63,7 +64,7 @@ class WandbTracking:
     project: str
     group: str | None
     tags: tuple[str, ...]
-    mode: str
+    mode: Literal["offline", "online", "disabled"]
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
         """Return a tracker with a run of its own, named after the run folder."""
@@ -95,20 +96,30 @@ class _TensorBoardTracker:
 class _WandbTracker:
     def __init__(self, config: WandbTracking, folder: Path, run_config: dict[str, Any]) -> None:
         os.environ.setdefault("WANDB_SILENT", "true")
+        for name in [name for name in os.environ if name.startswith("WANDB_")]:
+            if not os.environ[name]:  # wandb refuses an empty value where it takes a missing one
+                del os.environ[name]
         import wandb
 
         # reinit: a sweep with Hydra's basic launcher runs its jobs in one process, and each must
         # get a run of its own
-        self._run = wandb.init(
-            project=config.project,
-            group=config.group,
-            tags=list(config.tags),
-            name=folder.name,
-            dir=str(folder),
-            config=run_config,
-            mode=config.mode,  # type: ignore[arg-type]
-            reinit="create_new",
-        )
+        try:
+            self._run = wandb.init(
+                project=config.project,
+                group=config.group,
+                tags=list(config.tags),
+                name=folder.name,
+                dir=str(folder),
+                config=run_config,
+                mode=config.mode,
+                reinit="create_new",
+            )
+        except (ValueError, wandb.Error) as error:
+            given = {n: value for n, value in os.environ.items() if n.startswith("WANDB_")}
+            raise ConfigError(
+                f"tracking=wandb cannot begin a run: {error}\nChange tracking.<field>=… or the "
+                f"environment, which has {', '.join(sorted(given))}; tracking=none goes without."
+            ) from error
 
     def log(self, figures: dict[str, float], step: int) -> None:
         self._run.log(figures, step=step)

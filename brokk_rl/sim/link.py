@@ -29,10 +29,13 @@ class SimulatedMachines:
     Attributes:
         actuator: The machine that is driven; with effects around it, as recordings show it.
         noise: Standard deviation of the measured positions, rad or m.
+        one_machine: Numbers of effects that are drawn from ranges are drawn once: all runs record
+            the same machine. `False` draws them for each run.
     """
 
     actuator: Actuator
     noise: float
+    one_machine: bool
 
     def check(self) -> None:
         _check_noise(self.noise)
@@ -74,6 +77,8 @@ class SimulatedMachinesLink:
             torch.manual_seed(session.stream("link"))
             self._model = config.actuator.build(machine, num_runs, device)
             self._model.reset(everywhere)
+        if config.one_machine:
+            _share_drawn_numbers(self._model)
         self._logged = _find_logged_states(self._model)
         self._steps = 0
         self._measure()
@@ -227,6 +232,13 @@ def _check_noise(noise: float) -> None:
 def _make_history(machine: Machine, num_runs: int, device: torch.device) -> History:
     shape = (num_runs, machine.num_history, machine.num_joints)
     return History(q=torch.zeros(shape, device=device), u=torch.zeros(shape, device=device))
+
+
+def _share_drawn_numbers(model: ActuatorModel) -> None:
+    """Give all environments the drawn numbers of the first; noise stays different."""
+    for path, value in model.state.items():
+        if "drawn" in path.split("."):
+            value.copy_(value[:1].clone().expand_as(value))
 
 
 def _find_logged_states(model: ActuatorModel) -> dict[str, str]:

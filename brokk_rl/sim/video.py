@@ -45,6 +45,10 @@ RENDER_TIMEOUT_S = 600
 """Bound on the rendering process; 200 frames take about 40 s on a CPU."""
 FONT_SIZE = 18
 """Size of the text, px. Chosen by hand; not searched."""
+MARK_RADIUS_M, MARK_RGBA = 0.06, (0.1, 0.75, 0.35, 0.8)
+"""Ball that marks a target without a block: seen beside the arm, smaller than the breaker."""
+TARGET_VIEW = (2.6, 130.0, -20.0)
+"""Close-up of such a target: distance in m, azimuth and elevation in degrees. Chosen by eye."""
 VIDEO_QUALITY = 7
 """Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
 SCHEMATIC_DPI = 100
@@ -77,6 +81,11 @@ class SimulatedEpisode(Protocol):
         """The scene, `(S,)`; see `sim.scene`."""
         ...
 
+    @property
+    def target_m(self) -> np.ndarray | None:
+        """Target of the tip in the base frame, `(3,)`; `None` where the task has none."""
+        ...
+
 
 @dataclass(frozen=True)
 class RenderJob:
@@ -88,6 +97,7 @@ class RenderJob:
         u: Commands, `(T, J)`.
         force_n: Peak contact force of each step, `(T,)`.
         scene: The scene, `(S,)`.
+        target_m: Target of the tip, `(3,)` or `None`.
         path: The mp4 to write.
     """
 
@@ -96,7 +106,18 @@ class RenderJob:
     u: np.ndarray
     force_n: np.ndarray
     scene: np.ndarray
+    target_m: np.ndarray | None
     path: Path
+
+    @property
+    def has_block(self) -> bool:
+        """True where the block is within the machine's reach; tasks without one put it far away."""
+        return float(np.hypot(*self.scene[:2])) < FAR_M
+
+    @property
+    def mark_m(self) -> np.ndarray | None:
+        """Target to mark: that of a task without a block, whose hole would show it."""
+        return None if self.has_block else self.target_m
 
 
 def render_video(machine: Machine, episode: SimulatedEpisode, path: Path) -> Path:
@@ -119,6 +140,7 @@ def render_video(machine: Machine, episode: SimulatedEpisode, path: Path) -> Pat
             u=np.asarray(episode.u),
             force_n=np.asarray(episode.force_n),
             scene=np.asarray(episode.scene),
+            target_m=None if episode.target_m is None else np.asarray(episode.target_m),
             path=draft,
         )
         if not _render_in_subprocess(job):
@@ -211,20 +233,19 @@ def write_video(path: Path, draw: DrawFrames, num_steps: int, period_s: float) -
 
 
 def write_captions(job: RenderJob) -> list[str]:
-    """Return a line for each step: time, tip relative to the rim, contact force.
-
-    A block that is far away is left out of the line.
-    """
+    """Return a line for each step: time, tip relative to the rim or the target, contact force."""
     q = torch.as_tensor(job.q, dtype=torch.float32)
-    tip = Kinematics(job.machine).pose(q).tip_in_base_m.numpy() - job.scene[:3]
-    has_block = float(np.hypot(*job.scene[:2])) < FAR_M
+    tip_m = Kinematics(job.machine).pose(q).tip_in_base_m.numpy()
     lines = []
-    for step, ((x, y, z), force) in enumerate(zip(tip, job.force_n, strict=True)):
-        side = "above" if z > 0 else "below"
-        off_axis_cm = 100 * math.hypot(x, y)
-        where = f"{100 * abs(z):4.0f} cm {side} the rim, {off_axis_cm:5.1f} cm off axis    "
-        time_s = step * job.machine.period_s
-        lines.append(f"{time_s:5.1f} s    {where if has_block else ''}{force:6.0f} N")
+    for step, (at_m, force) in enumerate(zip(tip_m, job.force_n, strict=True)):
+        where = ""
+        if job.has_block:
+            x, y, z = at_m - job.scene[:3]
+            side, off_axis_cm = "above" if z > 0 else "below", 100 * math.hypot(x, y)
+            where = f"{100 * abs(z):4.0f} cm {side} the rim, {off_axis_cm:5.1f} cm off axis    "
+        elif job.target_m is not None:
+            where = f"{100 * np.linalg.norm(at_m - job.target_m):5.1f} cm to the target    "
+        lines.append(f"{step * job.machine.period_s:5.1f} s    {where}{force:6.0f} N")
     return lines
 
 
@@ -258,30 +279,52 @@ class SceneRenderer:
         mujoco.mj_comPos(self._posed.model, self._posed.data)
         mujoco.mj_camlight(self._posed.model, self._posed.data)
 
-    def render(self, camera: str, width: int, height: int) -> np.ndarray:
-        """Return the picture of `camera`, shape `(height, width, 3)` uint8."""
+    def render(
+        self, camera: str | mujoco.MjvCamera, width: int, height: int, mark_m: np.ndarray | None
+    ) -> np.ndarray:
+        """Return the picture of `camera`, shape `(height, width, 3)` uint8.
+
+        Args:
+            camera: Name of a camera of the model, or a free one.
+            width: Pixels.
+            height: Pixels.
+            mark_m: Centre of a ball that marks a target, `(3,)`; `None` for none.
+        """
         key = (height, width)
         if key not in self._renderers:
             self._renderers[key] = mujoco.Renderer(self._posed.model, height, width)
-        self._renderers[key].update_scene(self._posed.data, camera, self._option)
-        return self._renderers[key].render()
+        renderer = self._renderers[key]
+        renderer.update_scene(self._posed.data, camera, self._option)
+        if mark_m is not None:
+            scene = renderer.scene
+            mujoco.mjv_initGeom(
+                scene.geoms[scene.ngeom],
+                mujoco.mjtGeom.mjGEOM_SPHERE,
+                np.full(3, MARK_RADIUS_M),
+                np.asarray(mark_m, float),
+                np.eye(3).ravel(),
+                np.array(MARK_RGBA, np.float32),
+            )
+            scene.ngeom += 1
+        return renderer.render()
 
 
 def draw_rendered(job: RenderJob) -> DrawFrames:
-    """Return a function that renders steps: overview, close-up of the borehole, commands."""
+    """Return a function that renders steps: overview, close-up of the target, commands."""
     from PIL import Image, ImageDraw, ImageFont
 
     lines, font, (width, height) = write_captions(job), ImageFont.load_default(FONT_SIZE), SIZE
     split = width - CLOSE_WIDTH
     outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
+    close = "close" if job.mark_m is None else _look_at(job.mark_m)
 
     def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
         with SceneRenderer(job.machine) as renderer:
             for step in steps:
                 renderer.set_pose(job.q[step], job.scene)
                 views = (
-                    renderer.render("overview", split, height),
-                    renderer.render("close", CLOSE_WIDTH, height),
+                    renderer.render("overview", split, height, job.mark_m),
+                    renderer.render(close, CLOSE_WIDTH, height, job.mark_m),
                 )
                 picture = Image.fromarray(np.concatenate(views, axis=1))
                 pen = ImageDraw.Draw(picture)
@@ -291,6 +334,14 @@ def draw_rendered(job: RenderJob) -> DrawFrames:
                 yield np.asarray(picture)
 
     return draw
+
+
+def _look_at(target_m: np.ndarray) -> mujoco.MjvCamera:
+    """Return a camera that looks at a target from beside the arm."""
+    camera = mujoco.MjvCamera()
+    camera.lookat[:] = target_m
+    camera.distance, camera.azimuth, camera.elevation = TARGET_VIEW
+    return camera
 
 
 def _draw_command_bars(
@@ -328,7 +379,7 @@ def draw_schematic(job: RenderJob, size: tuple[int, int]) -> DrawFrames:
         canvas = FigureCanvasAgg(figure)
         side, top = figure.subplots(1, 2)
         # (second coordinate shown, line of the arm, line of the chisel) of each view
-        views = [(2, *_draw_view(side, job.scene, 2)), (1, *_draw_view(top, job.scene, 1))]
+        views = [(up, *_draw_view(axes, job, up)) for axes, up in ((side, 2), (top, 1))]
         title = figure.suptitle("", family="monospace", fontsize=10)
         for step in steps:
             for up, links, chisel in views:
@@ -341,13 +392,15 @@ def draw_schematic(job: RenderJob, size: tuple[int, int]) -> DrawFrames:
     return draw
 
 
-def _draw_view(axes: Any, scene: np.ndarray, up: int) -> tuple[Any, Any]:
-    """Draw the block, seen along y (`up` = 2) or from above (`up` = 1).
+def _draw_view(axes: Any, job: RenderJob, up: int) -> tuple[Any, Any]:
+    """Draw the block or the marked target, seen along y (`up` = 2) or from above (`up` = 1).
 
     Returns:
         The still empty lines of the arm and of the chisel.
     """
-    x, y, rim_z, yaw, scale, radius = scene
+    x, y, rim_z, yaw, scale, radius = job.scene
+    if job.mark_m is not None:
+        axes.plot(job.mark_m[0], job.mark_m[up], "o", color=MARK_RGBA[:3], markersize=9)
     length, width = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale
     if up == 2:
         half = abs(length * np.cos(yaw)) + abs(width * np.sin(yaw))

@@ -1,7 +1,8 @@
-"""`brokk mode=page`: serves the operator's page with a simulated state, to try it at a desk."""
+"""`brokk mode=page`: serves the operator's page with a simulated or recorded state."""
 
 from __future__ import annotations
 
+import tempfile
 import time
 
 from rich.console import Console
@@ -13,16 +14,21 @@ from brokk_rl.spec import spec
 from deploy.page.protocol import FeedSpec
 from deploy.page.server import serve_page
 from deploy.page.settings import PageSettings
+from deploy.page.video_relay import VideoRelay
+from deploy.runtime.process import ChildProcess
+from deploy.runtime.process_group import PATIENCE_S
+from deploy.video.settings import VideoProcessConfig, VideoSettings
 
 
 @spec
 class PageMode:
-    """Serve the operator's page with a simulated state; `brokk preset=bench` shows the loop's own."""
+    """Serve the operator's page, simulated or recorded; `brokk preset=bench` shows the loop's own."""
 
     session: Session
     machine: Machine
     feed: FeedSpec
     page: PageSettings
+    video: VideoSettings | None
     seconds: float | None
 
     def check(self) -> None:
@@ -34,7 +40,10 @@ class PageMode:
 
         Raises:
             LinkError: the address is taken.
+            ModuleNotFoundError: the extra `video` is not installed.
         """
+        if self.video is not None:
+            self.video.require_packages()
         end_s = None if self.seconds is None else time.monotonic() + self.seconds
         console = Console(stderr=True)
 
@@ -45,4 +54,14 @@ class PageMode:
             console.print(f"operator's page: {link}", soft_wrap=True, highlight=False)
 
         feed = self.feed.build(self.machine)
-        serve_page(self.page, stop, self.machine, feed, self.session, show)
+        if self.video is None:
+            serve_page(self.page, stop, self.machine, feed, self.session, show)
+            return
+        with tempfile.TemporaryDirectory(prefix="brokk-") as folder:
+            config = VideoProcessConfig(self.video, folder)
+            child = ChildProcess("video", "deploy.video.video_process:run", (config,), ())
+            try:
+                relay = VideoRelay(folder)
+                serve_page(self.page, stop, self.machine, feed, self.session, show, relay)
+            finally:
+                child.end(PATIENCE_S)

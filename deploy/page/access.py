@@ -15,14 +15,19 @@ from typing import Literal
 
 from deploy.page.protocol import REQUEST_KINDS, OperatorRequest, PageState
 
-RefusalReason = Literal["token", "malformed", "deadman", "target", "nowhere", "busy", "unconfirmed"]
+RefusalReason = Literal[
+    "token", "malformed", "deadman", "target", "nowhere", "busy", "unconfirmed", "replay", "live"
+]
 """Why a request was refused: wrong token; no such request; the dead-man is not held; no such
 target; nothing is measured where the person points; the loop does not take it; the guard does not
-confirm the stop."""
+confirm the stop; a recording takes no requests to a machine; a machine none to a recording."""
 LOCAL = ("localhost", "127.0.0.1", "[::1]")
 ANY_ADDRESS = ("0.0.0.0", "::")
 POINT = re.compile(r"0?\.\d{1,6},0?\.\d{1,6}")
 """A point of the picture: parts of its width and height, at neither edge."""
+SECONDS = re.compile(r"\d{1,6}(\.\d{1,3})?")
+SPEEDS = ("off", "0.25", "1", "4", "16")
+"""Of a recording that is played."""
 LONGEST = 256
 """Bytes of a request. Chosen by hand: the page's own are below 100."""
 
@@ -63,13 +68,17 @@ def parse_request(text: str | bytes) -> OperatorRequest | None:
         "record": value in ("on", "off"),
         "target": bool(value),
         "point": bool(POINT.fullmatch(value)),
+        "seek": bool(SECONDS.fullmatch(value)),
+        "play": value in SPEEDS,
     }.get(kind, value == "")
     return OperatorRequest(kind, value) if fits else None
 
 
 def find_refusal(request: OperatorRequest, state: PageState) -> RefusalReason | None:
     """Return why a request must not be passed on now, `None` where it may."""
-    if request.kind == "stop":
+    if (request.kind in ("seek", "play")) != (state.replay is not None):
+        return "live" if state.replay is None else "replay"
+    if request.kind in ("stop", "seek", "play"):
         return None
     if not state.deadman:
         return "deadman"

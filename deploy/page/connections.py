@@ -7,8 +7,8 @@ from typing import Generic, TypeVar
 
 WATCHING = 2
 """WebSockets of one page that only watch: states and frames."""
-OPERATING = 2
-"""WebSockets of one page that show the token: requests, and an extension such as a study."""
+OPERATING = 3
+"""WebSockets of one page that show the token: requests, and extensions such as study and video."""
 UNPROVEN = 8
 """WebSockets that may still have to send their token. Chosen by hand: a page sends its token within
 one round trip, and only mute ones grow old."""

@@ -37,6 +37,7 @@ from deploy.page.protocol import (
 from deploy.page.scene import locate_borehole, measure_insertion, plan_approach, to_vector
 from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
+from deploy.page.video_relay import VideoRelay
 from deploy.runtime.bus_process import TEXT
 from deploy.runtime.operator_state import LoopSnapshot, OperatorState, PolicyAdvice, StopRequest
 from deploy.runtime.perception_process import read_frame
@@ -75,6 +76,7 @@ class PageProcessConfig:
         delay_s: Delay of messages from which the guard lets nothing pass.
         borehole_s: Age from which the borehole is.
         camera_s: Age from which the camera's picture is; `None`: there is no camera.
+        video_folder: Folder with the socket of the video process; `None`: there is no video.
     """
 
     page: PageSettings
@@ -86,6 +88,7 @@ class PageProcessConfig:
     delay_s: float
     borehole_s: float
     camera_s: float | None = None
+    video_folder: str | None = None
 
 
 def run(stop: Stop, config: PageProcessConfig, memory: LoopMemory) -> None:
@@ -101,7 +104,8 @@ def run(stop: Stop, config: PageProcessConfig, memory: LoopMemory) -> None:
         log.info("%s; the link with the token, for requests, stands in %s", host, link)
 
     feed = LoopFeed(config, memory)
-    serve_page(config.page, stop, config.machine, feed, config.session, announce)
+    extensions = (VideoRelay(config.video_folder),) if config.video_folder else ()
+    serve_page(config.page, stop, config.machine, feed, config.session, announce, *extensions)
 
 
 class LoopFeed:

@@ -16,7 +16,7 @@ from deploy.guidance import LeverPositions
 from deploy.runtime.operator_state import OperatorState, convert_to_plain
 
 Vector = tuple[float, float, float]
-RequestKind = Literal["start", "stop", "record", "target", "point"]
+RequestKind = Literal["start", "stop", "record", "target", "point", "seek", "play"]
 REQUEST_KINDS: tuple[RequestKind, ...] = get_args(RequestKind)
 
 
@@ -142,6 +142,38 @@ class BoreholeChoice:
 
 
 @dataclass(frozen=True)
+class TimelineMark:
+    """An event on the timeline of a recording.
+
+    Attributes:
+        t_s: Time since its beginning.
+        kind: `alarm`, `state` of the guard, or `request` of the operator.
+        name: Event in English words.
+    """
+
+    t_s: float
+    kind: Literal["alarm", "state", "request"]
+    name: str
+
+
+@dataclass(frozen=True)
+class ReplayTimeline:
+    """Place in a recording that is played.
+
+    Attributes:
+        position_s: Time since its beginning.
+        duration_s: Its length.
+        speed: Of the playback over real time; 0: it stands still.
+        marks: Events, in order of time.
+    """
+
+    position_s: float
+    duration_s: float
+    speed: float
+    marks: tuple[TimelineMark, ...]
+
+
+@dataclass(frozen=True)
 class PageState:
     """Everything that the page shows at one moment.
 
@@ -160,6 +192,7 @@ class PageState:
         path_in_base_m: Way of the tool from its tip; empty where nothing is planned.
         block_in_base_m: Two opposite corners of a block to draw; `None` where only the point cloud
             is known.
+        replay: Place in the recording that is played; `None`: this is live.
     """
 
     t_s: float
@@ -175,6 +208,7 @@ class PageState:
     insertion: InsertionReading | None
     path_in_base_m: tuple[Vector, ...]
     block_in_base_m: tuple[Vector, Vector] | None
+    replay: ReplayTimeline | None = None
 
     @property
     def own(self) -> LeverPositions | None:
@@ -229,6 +263,7 @@ class PageState:
             "insertion": self.insertion and asdict(self.insertion),
             "path_in_base_m": self.path_in_base_m,
             "block_in_base_m": self.block_in_base_m,
+            "replay": self.replay and asdict(self.replay),
         }
         return convert_to_plain(found)
 
@@ -239,9 +274,10 @@ class OperatorRequest:
 
     Attributes:
         kind: `start` and `stop` guiding, `record` on or off, choose a `target`, `point` at a
-            borehole in the picture.
+            borehole in the picture; `seek` and `play` in a recording.
         value: `on` or `off` for `record`, the name of the `target`, `x,y` of the point as parts of
-            the picture from its upper left corner, else empty.
+            the picture from its upper left corner, the time in s to `seek`, the speed to `play` at
+            or `off`, else empty.
     """
 
     kind: RequestKind

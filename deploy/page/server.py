@@ -77,7 +77,7 @@ POLICY_VIOLATION, TRY_AGAIN_LATER = 1008, 1013
 
 
 class PageExtension(Protocol):
-    """Further pages on the same server: those of a study.
+    """Further pages or sockets on the same server: those of a study, and the video.
 
     Attributes:
         files: Type and content by path; a path that is the page's own takes its place.
@@ -103,7 +103,7 @@ def serve_page(
     feed: PageFeed,
     session: Session,
     announce: Callable[[str], None],
-    extension: PageExtension | None = None,
+    *extensions: PageExtension,
 ) -> None:
     """Serve the page until `stop` says so or a person stops it.
 
@@ -116,7 +116,7 @@ def serve_page(
         feed: Source of the state.
         session: Run folder.
         announce: Gets the link to open.
-        extension: Further pages; `None`: none.
+        extensions: Further pages.
 
     Raises:
         LinkError: the address is taken or not this computer's.
@@ -130,7 +130,7 @@ def serve_page(
         announce(address)
 
     with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(PageServer(page, machine, feed, token, extension).run(stop, begin))
+        asyncio.run(PageServer(page, machine, feed, token, *extensions).run(stop, begin))
 
 
 def build_link(page: PageSettings, port: int, token: str) -> str:
@@ -158,7 +158,7 @@ class PageServer:
         machine: The machine.
         feed: Source of the state.
         token: Secret that a browser must show with a request.
-        extension: Further pages; `None`: none.
+        extensions: Further pages.
     """
 
     def __init__(
@@ -167,19 +167,20 @@ class PageServer:
         machine: Machine,
         feed: PageFeed,
         token: str,
-        extension: PageExtension | None = None,
+        *extensions: PageExtension,
     ) -> None:
-        self._page, self._feed, self._token, self._extension = page, feed, token, extension
+        self._page, self._feed, self._token, self._extensions = page, feed, token, extensions
         # The setup never changes during a run, so it is encoded once and served like a file.
-        self._files = load_files(json.dumps(page.describe_setup(machine)).encode())
+        setup = page.describe_setup(machine) | {"extensions": [one.path for one in extensions]}
+        self._files = load_files(json.dumps(setup).encode())
         self._handlers = {
             STATE: self._send_states,
             FRAMES: self._send_frames,
             CONTROL: self._take_requests,
         }
-        if extension is not None:
+        for extension in extensions:
             self._files |= extension.files
-            self._handlers[extension.path] = self._serve_extension
+            self._handlers[extension.path] = extension.talk
         # Filled when the port is known; until then every host name is refused.
         self._hosts: frozenset[str] = frozenset()
         self._state: LatestValue[tuple[PageState | None, str]] = LatestValue((None, ""))
@@ -227,8 +228,7 @@ class PageServer:
         socket_log.setLevel(logging.WARNING)
         async with server, asyncio.TaskGroup() as group:
             tasks = [group.create_task(self._watch()), group.create_task(self._watch_frames())]
-            if self._extension is not None:
-                tasks.append(group.create_task(self._extension.run()))
+            tasks += [group.create_task(one.run()) for one in self._extensions]
             begin(port)
             while not stop():
                 await asyncio.sleep(STOP_POLL_S)
@@ -400,10 +400,6 @@ class PageServer:
 
         await _run_both(listen(), speak())
 
-    async def _serve_extension(self, connection: ServerConnection) -> None:
-        assert self._extension is not None
-        await self._extension.talk(connection)
-
     async def _take_requests(self, connection: ServerConnection) -> None:
         async for text in connection:
             await connection.send(json.dumps(await self._submit(text)))
@@ -464,6 +460,7 @@ def _list_facts(state: PageState) -> tuple[object, ...]:
         state.recording.failed,
         list_alarms(state),
         state.targets,
+        state.replay,
     )
 
 

@@ -138,6 +138,8 @@ def _list_holes(tracked: Sequence[TrackedHole]) -> list[dict[str, Any]]:
             {
                 "name": hole.name,
                 "center_in_base_m": np.round(hole.pose.center_m, 4).tolist(),
+                "axis_in_base": np.round(hole.pose.axis, 5).tolist(),
+                "radius_m": round(float(hole.pose.radius_m), 4),
                 "std_m": round(hole.std_m, 5),
                 "score": round(float(hole.pose.score), 3),
                 "seen_t_s": hole.seen_s,

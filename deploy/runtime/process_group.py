@@ -31,6 +31,7 @@ OPTIONAL = {
     "page": "nothing is shown any more",
     "terminal": "nothing is shown here any more",
     "camera": "nothing new is seen any more",
+    "video": "the page shows no video any more",
 }
 """Processes without which the loop goes on, and the loss that the alarm names."""
 END_ORDER = {"policy": 0, "bus": 1, "log": 3}

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 import logging
+import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -31,6 +32,7 @@ from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_prior
 from deploy.runtime.process_group import PATIENCE_S, BusAndPolicySettings, ProcessGroup
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import DetectedTarget, TargetSelector
+from deploy.video.settings import VideoProcessConfig, VideoSettings
 
 log = logging.getLogger(__name__)
 
@@ -58,6 +60,7 @@ class DeploymentLoop(BusAndPolicySettings):
         show: Whether to show levers and state in the terminal.
         page: The operator's page; `null`: none.
         camera: Camera beside the loop; `null`: there is none.
+        video: Live video on the page; `null`: none.
     """
 
     target_s: float
@@ -69,6 +72,7 @@ class DeploymentLoop(BusAndPolicySettings):
     show: bool
     page: PageSettings | None
     camera: CameraConfig | None
+    video: VideoSettings | None
 
     def check(self) -> None:
         if self.armed and not self.commands:
@@ -77,6 +81,8 @@ class DeploymentLoop(BusAndPolicySettings):
             )
         if self.seconds is not None and self.seconds <= 0:
             raise ConfigError(f"deploy.seconds: expected more than 0, or null, got {self.seconds}")
+        if self.video is not None and self.page is None:
+            raise ConfigError("video: there is no page to show it; choose page=… as well")
         if isinstance(self.target, DetectedTarget) and (
             self.camera is None or self.camera.finder is None
         ):
@@ -104,11 +110,17 @@ class DeploymentLoop(BusAndPolicySettings):
         self.check_machine(machine)
         if self.commands:
             read_observer_content(self.limits, machine, self.wire.interface, commands=True)
-        with detach_logging():
-            self._run(machine, session, companions)
+        if self.video is not None:
+            self.video.require_packages()
+        with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:
+            self._run(machine, session, companions, sockets)
 
     def _run(
-        self, machine: Machine, session: Session, companions: Sequence[CompanionProcess]
+        self,
+        machine: Machine,
+        session: Session,
+        companions: Sequence[CompanionProcess],
+        sockets: str,
     ) -> None:
         frame_px = self.camera.num_px if self.camera else 0
         memory = LoopMemory.new(machine.num_joints, self.commands, frame_px)
@@ -118,7 +130,7 @@ class DeploymentLoop(BusAndPolicySettings):
             # Companions first: the loop then finds its bus in use from the beginning.
             for one in companions:
                 group.start(one.name, one.target, one.arguments, one.realtime)
-            self._start(group, machine, session)
+            self._start(group, machine, session, sockets)
             if self.realtime:
                 ask_for_priority(SUPERVISOR_PRIORITY, inherited=False)
             recorder.refresh()
@@ -139,10 +151,14 @@ class DeploymentLoop(BusAndPolicySettings):
             _write_timing_report(memory, session)
             memory.close()
 
-    def _start(self, group: ProcessGroup, machine: Machine, session: Session) -> None:
+    def _start(self, group: ProcessGroup, machine: Machine, session: Session, sockets: str) -> None:
         self.start_processes(group, machine, self.target_s, self.pitch_rad)
         if self.page is not None:
             config = self.build_page_config(self.page, machine, session)
+            if self.video is not None:
+                config = replace(config, video_folder=sockets)
+                video = VideoProcessConfig(self.video, sockets)
+                group.start("video", "deploy.video.video_process:run", (video,))
             group.start("page", "deploy.page.loop_feed:run", (config,))
         if self.show:
             # A process of its own: a terminal that is not read blocks whoever writes to it.

@@ -96,7 +96,12 @@ class Sitting:
             )
         target = session.folder / TARGET
         loop = replace(
-            self.loop, page=None, record=False, show=False, target=FileTarget(path=str(target))
+            self.loop,
+            page=None,
+            video=None,
+            record=False,
+            show=False,
+            target=FileTarget(path=str(target)),
         )
         operators = self.bench.operators if isinstance(self.bench, Participant) else {}
         room = StudyServerConfig(

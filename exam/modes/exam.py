@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 import numpy as np
 import yaml
-from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
 from actuators.excite.schedule import Approach
+from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -454,4 +454,4 @@ def _show(tables: dict[str, dict[str, Any]]) -> None:
     shown = Table("", *tables)
     for label, *cells in report.build_rows(tables):
         shown.add_row(str(label), *map(report.format_cell, cells))
-    Console().print(shown)
+    print_table(shown)

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from brokk_rl import record
+from brokk_rl.console_table import print_table
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.record import Recording
 from brokk_rl.report import Cell
@@ -191,6 +192,5 @@ def _print_table(results: dict[str, dict[str, Any]], folder: Path) -> None:
                 cell = Cell(cell.value)
             cells.append(scorecard.format_cell(cell))
         table.add_row(*cells)
-    console = Console()
-    console.print(table)
-    console.print(f"report: {folder / scorecard.REPORT_FILE}", highlight=False)
+    print_table(table)
+    Console().print(f"report: {folder / scorecard.REPORT_FILE}", highlight=False)

@@ -10,6 +10,7 @@ import pytest
 from packages import install_package
 
 from brokk_rl import registry
+from brokk_rl.sweep import name_job
 
 PARTS = '''"""Parts of another package."""
 
@@ -179,12 +180,17 @@ def test_a_sweep_has_one_folder_for_each_job_and_no_others(
 ) -> None:
     assert (
         brokk(
-            "-m", "mode=show", "session.seed=3,4", "actuator.share=0.5,0.75", "session.out=sweep"
+            "-m",
+            "mode=show",
+            "session.seed=3,4",
+            "actuator.share=0.5,0.75",
+            "session.device=cpu",
+            "session.out=sweep",
         ).code
         == 0
     )
     jobs = [
-        f"{i}_actuator.share={share},session.seed={seed}"
+        f"{i}_seed-{seed}_share-{share}"
         for i, (seed, share) in enumerate(((3, 0.5), (3, 0.75), (4, 0.5), (4, 0.75)))
     ]
     assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [*jobs, "multirun.yaml"]
@@ -197,12 +203,18 @@ def test_a_sweep_has_one_folder_for_each_job_and_no_others(
     assert [path.name for path in tmp_path.iterdir()] == ["sweep"]
 
 
+def test_the_name_of_a_job_can_be_typed() -> None:
+    overrides = ["effect=[@found/effects.yaml,lag]", "fit@baselines.lag=lag", "mode=train"]
+    assert name_job(7, overrides, ["mode"]) == "7_effect-effects-lag_lag-lag"
+    assert len(name_job(0, [f"a.b={'x' * 300}"], [])) == 120
+
+
 def test_the_jobs_of_a_sweep_go_on_when_one_fails(
     mine: Path, brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
     assert brokk("-m", "mode=show", "session.seed=x,4", "session.out=sweep").code == 2
     assert sorted(path.name for path in (tmp_path / "sweep").iterdir()) == [
-        "1_session.seed=4",
+        "1_seed-4",
         "multirun.yaml",
     ]
 

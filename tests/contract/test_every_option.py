@@ -50,7 +50,9 @@ def test_it_is_an_excitation(name: str, machine: Machine) -> None:
 def test_the_simulated_machine_is_a_link(
     actuator: str, num_runs: int, machine: Machine, tmp_path: Path
 ) -> None:
-    connection = SimulatedMachines(actuator=option("actuator", actuator), noise=0.001)
+    connection = SimulatedMachines(
+        actuator=option("actuator", actuator), noise=0.001, one_machine=True
+    )
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     check_link(connection.build(machine, num_runs, session), machine, num_runs)
 

@@ -304,12 +304,14 @@ def test_a_simulated_machine_is_its_actuator_model_with_noise(
     )
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     quiet, noisy = (
-        SimulatedMachines(actuator=plant, noise=noise).build(machine, 2, session)
+        SimulatedMachines(actuator=plant, noise=noise, one_machine=True).build(machine, 2, session)
         for noise in (0.0, 0.01)
     )
     model = option("actuator", "lag").build(machine, 2, torch.device("cpu"))
     neutral = SimulatedMachines(
-        actuator=ActuatorWithEffects(actuator=option("actuator", "lag"), effects={}), noise=0.0
+        actuator=ActuatorWithEffects(actuator=option("actuator", "lag"), effects={}),
+        noise=0.0,
+        one_machine=True,
     ).build(machine, 2, session)
     home = torch.as_tensor(machine.home, dtype=torch.float32).repeat(2, 1)
     history = History(q=home[:, None].repeat(1, 13, 1), u=torch.zeros(2, 13, 5))
@@ -326,3 +328,18 @@ def test_a_simulated_machine_is_its_actuator_model_with_noise(
     assert np.std(differences) == pytest.approx(0.01, rel=0.1)
     assert max(played) > 0.001, "the backlash is there"
     assert quiet.read().t_s == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("one_machine", [True, False])
+def test_all_runs_record_one_machine_where_effects_are_drawn(
+    one_machine: bool, machine: Machine, tmp_path: Path
+) -> None:
+    plant = ActuatorWithEffects(
+        actuator=option("actuator", "ideal"), effects={"asymmetry": option("effect", "asymmetry")}
+    )
+    connection = SimulatedMachines(actuator=plant, noise=0.0, one_machine=one_machine)
+    link = connection.build(machine, 3, Session(out=str(tmp_path), seed=0, device="cpu"))
+    for _ in range(60):
+        link.send(Command(np.full((3, 5), 0.4)))
+    spread = np.ptp(link.read().q, axis=0).max()
+    assert spread == 0.0 if one_machine else spread > 1e-3

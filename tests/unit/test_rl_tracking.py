@@ -5,9 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+import wandb
 from composed import option
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from brokk_rl.errors import ConfigError
 from brokk_rl.rl.tracking import NoTracking, TensorBoardTracking, WandbTracking
 
 
@@ -57,3 +59,19 @@ def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
     assert found[0][0].name != found[1][0].name and all(
         list(runs[0].glob("run-*.wandb")) for runs in found
     )
+
+
+@pytest.mark.parametrize("mode", ["", "sideways"])
+def test_an_environment_that_wandb_refuses_is_explained(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+    wandb.teardown()  # it reads the environment once a process
+    monkeypatch.setenv("WANDB_MODE", mode)
+    tracking = WandbTracking(project="tests", group=None, tags=(), mode="disabled")
+    if mode:
+        with pytest.raises(ConfigError, match="WANDB_MODE"):
+            tracking.open(tmp_path, {})
+    else:
+        tracking.open(tmp_path, {}).close()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from brokk_rl.errors import StorageError
+from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.sim import video
 from brokk_rl.sim.probe import find_renderer
 from brokk_rl.sim.scene import make_nominal_scenes
@@ -19,6 +20,7 @@ def motion(machine):
         u=np.zeros((5, machine.num_joints)),
         force_n=np.zeros(5),
         scene=make_nominal_scenes(1)[0].numpy(),
+        target_m=None,
     )
 
 
@@ -52,3 +54,19 @@ def test_a_gl_library_gives_pictures_of_the_machine(machine, motion, tmp_path):
     picture = imageio.imread(tmp_path / "insertion_2.png").astype(int)
     yellow = (picture[..., 0] > 180) & (picture[..., 2] < 60)
     assert picture.shape == (540, 1200, 3) and yellow.mean() > 0.01
+
+
+def test_a_task_without_a_block_shows_its_target(machine, motion, tmp_path, monkeypatch):
+    """The drawing holds a green ball, and the caption the distance to it by hand."""
+    import imageio.v2 as imageio
+
+    monkeypatch.setattr(video, "find_renderer", lambda: None)
+    motion.scene[0] = 50.0
+    tip = compute_tool_kinematics(machine, motion.q[0]).tip_in_base_m
+    motion.target_m = tip + np.array([0.3, 0.0, 0.4])
+    video.render_video(machine, motion, tmp_path / "reach.mp4")
+    picture = imageio.imread(tmp_path / "reach_0.png").astype(int)
+    green = (picture[..., 1] > 150) & (picture[..., 0] < 80) & (picture[..., 2] < 140)
+    assert green.sum() > 50
+    job = video.RenderJob(machine=machine, path=tmp_path, **vars(motion))
+    assert "50.0 cm to the target" in video.write_captions(job)[0]

@@ -45,7 +45,7 @@ def asked(lead: Conductor) -> Conductor:
 
 @pytest.fixture
 def port(lead: Conductor) -> Iterator[int]:
-    with served(StudyFeed(feed(), lead), extension=StudyPages(lead)) as found:
+    with served(StudyFeed(feed(), lead), extensions=(StudyPages(lead),)) as found:
         yield found
 
 
@@ -210,7 +210,7 @@ def test_the_whole_questionnaire_by_key_in_german(
 def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
     tmp_path: Path, asked: Conductor, opened: Callable[..., Any]
 ) -> None:
-    with served(StudyFeed(feed(), asked), extension=StudyPages(asked)) as port:
+    with served(StudyFeed(feed(), asked), extensions=(StudyPages(asked),)) as port:
         page = opened(port)
         at(page, 0)
         page.keyboard.press("End")
@@ -224,7 +224,7 @@ def test_half_a_questionnaire_survives_a_killed_browser_and_a_killed_server(
         until(page, "() => window.sitting().ratings.physical === 0")
     again = conductor(tmp_path, Arm(MACHINE))  # another process would know no more than this
     again.choose("P01")
-    with served(StudyFeed(feed(), again), port=port, extension=StudyPages(again)):
+    with served(StudyFeed(feed(), again), port=port, extensions=(StudyPages(again),)):
         until(page, "() => window.sitting().at === 2")  # the page comes back by itself
         page.locator("#study .language").click()
         until(

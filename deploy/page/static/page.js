@@ -5,6 +5,7 @@ import { LeverView } from "./levers.js";
 import { Overlay } from "./overlay.js";
 import { Signals } from "./signals.js";
 import { Socket } from "./socket.js";
+import { Timeline } from "./timeline.js";
 import { LANGUAGES, preferred, words } from "./words.js";
 
 const $ = id => document.getElementById(id);
@@ -19,7 +20,8 @@ const views = { left: new LeverView($("left"), "left", setup), right: new LeverV
 const insertion = new InsertionView($("insertion")), overlay = new Overlay($("overlay")), alarms = new AlarmList($("alarms"));
 const measured = window.measured = { drawn: 0, number: 0, fps: 0, points: 0, frames: 0, frame_ms: 0, allowed: null, signals: [] };
 const signals = new Signals(name => measured.signals.push(name));
-let newest = null, came = 0, asked = false;
+const opened = performance.now(), PATIENCE_MS = 2000;
+let newest = null, came = 0, asked = false, video = null;
 
 // ---- state in, drawn back
 const painted = new MessageChannel();
@@ -80,7 +82,8 @@ function draw() {
   if (calmly) drawAlarms(lost, now);
   if (newest === null) return;
   const shown = newest.shown;
-  if (!lost) put($("connection"), say(shown.alive ? "connected" : "dead"), shown.alive ? "good" : "bad");
+  if (!lost && shown.replay) put($("connection"), say("replay"), "careful");
+  else if (!lost) put($("connection"), say(shown.alive ? "connected" : "dead"), shown.alive ? "good" : "bad");
   const good = name => !lost && shown.alive && fresh(shown, name, since_s);
   drawLevers(shown, { own: good("levers"), advised: good("advice") && good("positions") && Boolean(shown.advice?.valid) });
   if (!calmly) return;
@@ -89,6 +92,8 @@ function draw() {
   insertion.draw(chosen ? shown.insertion : null, chosen, known, say);
   notice("inserted", known && Boolean(shown.insertion?.inserted));
   overlay.draw(shown);
+  timeline.draw(shown.replay, say);
+  document.body.classList.toggle("replay", Boolean(shown.replay));
   drawSafety(shown, lost, good("levers"));
   drawStreams(shown, since_s);
   $("camera").hidden = !shown.streams.some(one => one.name === "camera");
@@ -99,8 +104,8 @@ function draw() {
 }
 
 function drawAlarms(lost, now) {
-  if (newest === null && now < 1000 * setup.stale_s) return;  // the page has only just been opened
-  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : newest?.shown.alarms ?? [];
+  if (newest === null && now - opened < PATIENCE_MS) return;  // the page has only just been opened
+  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : [...video?.listAlarms(now) ?? [], ...newest?.shown.alarms ?? []];
   if (alarms.draw(grave, tell, now)) signals.give("alarm");
 }
 
@@ -133,9 +138,11 @@ function drawLevers(shown, sure) {
   const box = $("button").classList;
   box.toggle("now", now); box.toggle("due", soon); box.toggle("stale", !sure.advised && Boolean(advice)); box.toggle("held", sure.own && Boolean(shown.own?.button_right));
   notice("button now", now); notice("button due", soon);
-  notice("button off", Boolean(advice) && sure.advised && !button && Boolean(shown.own?.button_right));
+  const wrong = sure.advised && sure.own && !now && !soon && Boolean(shown.own?.button_right);
+  box.toggle("wrong", wrong);
+  notice("button off", wrong);
   const joint = setup.exclusive.map(nameOf).join(" ");
-  put($("button").lastElementChild, now ? `${joint}: ${say("button now")}` : soon ? `${joint}: ${say("button due")} ${due.toFixed(1)} s` : `${joint}: ${say("button off")}`);
+  put($("button").lastElementChild, now ? `${joint}: ${say("button now")}` : soon ? `${joint}: ${say("button due")} ${due.toFixed(1)} s` : wrong ? `${joint}: ${say("button off")}` : "");
   if (soon) $("button").querySelector(".left").setAttribute("stroke-dasharray", `${Math.min(1, due / 1.5).toFixed(3)} 1`);
 }
 
@@ -198,6 +205,7 @@ function wish(kind, value = "") {
   else control.send(JSON.stringify({ kind, value }));
 }
 
+const timeline = new Timeline($("timeline"), wish);
 $("start").onclick = () => wish("start");
 $("stop").onclick = () => wish("stop");
 $("record").onclick = () => wish("record", newest?.shown.recording.on ? "off" : "on");
@@ -226,7 +234,7 @@ $("language").onclick = () => {
 };
 addEventListener("keydown", event => {
   if (event.ctrlKey || event.altKey || event.metaKey || event.repeat) return;
-  const act = { Escape: () => wish("stop"), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click(), n: () => $("night").click(), t: () => $("sound").click(), v: () => $("along").click() }[event.key];
+  const act = { Escape: () => wish("stop"), " ": () => (newest?.shown.replay ? (event.preventDefault(), $("play").click()) : null), g: () => $("start").click(), r: () => $("record").click(), l: () => $("language").click(), n: () => $("night").click(), t: () => $("sound").click(), v: () => $("along").click(), c: () => video?.enlargeNext() }[event.key];
   if (act) act();
   else if (/^[1-9]$/.test(event.key)) $("targets").children[event.key - 1]?.click();
 });
@@ -302,4 +310,8 @@ speak();
 if (!token) answer("refused token");
 setInterval(() => { if (performance.now() - came > 150) draw(); }, 100);  // ages grow even when nothing comes
 scene = startScene();
+if (token && setup.extensions.includes("/video")) {
+  const { Video } = await import("./video.js");
+  measured.video = video = new Video($("view"), token, key => say(key));
+}
 for (const [name, act] of Object.entries(tools)) choose(name, chosenBefore(name, name === "sound"), act);

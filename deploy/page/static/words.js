@@ -13,6 +13,8 @@ const DE = {
   "refused target": "Abgelehnt: dieses Bohrloch gibt es nicht mehr", "refused busy": "Abgelehnt: die Steuerung nimmt es nicht an",
   "refused nowhere": "Abgelehnt: dort ist keine Fläche gemessen", "boreholes seen": "Loch wählen, antippen", "no borehole seen": "Bohrloch antippen", "refused malformed": "Abgelehnt: nicht verstanden", "refused lost": "Keine Verbindung zur Steuerung",
   "refused unconfirmed": "STOPP NICHT BESTÄTIGT: Not-Halt drücken", "recording failed": "AUFNAHME ABGEBROCHEN",
+  replay: "Aufzeichnung", play: "Abspielen", pause: "Anhalten", speed: "Geschwindigkeit", "position in the recording": "Stelle der Aufzeichnung",
+  "refused replay": "Dies ist eine Aufzeichnung: hier ist nichts zu steuern", "refused live": "Abgelehnt: dies ist keine Aufzeichnung", target: "Bohrloch gewählt", point: "Bohrloch angetippt",
   depth: "Tiefe", lateral: "Seitlich", angle: "Winkel", inserted: "EINGEFÜHRT", "in the hole": "Im Loch", "over the hole": "Über dem Loch", "beside the hole": "Neben dem Loch",
   "along the tool": "Am Werkzeug entlang", sound: "Töne", night: "Nacht",
   slew: "Schwenken", arm_1: "Arm 1", arm_2: "Arm 2", arm_3: "Arm 3", boom: "Ausleger", stick: "Stiel", bucket: "Löffel", tool: "Werkzeug",
@@ -33,6 +35,7 @@ const DE = {
   "nothing from the bus": "Nichts vom Bus", "positions are stale": "Gelenkstellungen veraltet", "positions are not plausible": "Gelenkstellungen unglaubwürdig",
   "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
   "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",
+  "no live picture": "KEIN LIVEBILD", "no picture": "kein Bild", "packets lost": "verloren", "watched elsewhere": "andere sehen zu",
 };
 const EN = {
   connected: "Connected", lost: "NO CONNECTION", dead: "Control computer silent", title: "operator's page",
@@ -46,6 +49,8 @@ const EN = {
   "refused target": "Refused: that borehole is gone", "refused busy": "Refused: the loop does not take it", "refused malformed": "Refused: not understood",
   "refused nowhere": "Refused: no face is measured there", "boreholes seen": "Choose or touch a borehole", "no borehole seen": "Touch the borehole",
   "refused unconfirmed": "STOP NOT CONFIRMED: press the emergency stop", "recording failed": "RECORDING HAS FAILED",
+  replay: "Replay", play: "Play", pause: "Pause", speed: "Speed", "position in the recording": "Position in the recording",
+  "refused replay": "This is a recording: there is nothing to control", "refused live": "Refused: this is no recording", target: "Borehole chosen", point: "Borehole touched",
   depth: "Depth", lateral: "Lateral", angle: "Angle", inserted: "INSERTED", "in the hole": "In the hole", "over the hole": "Over the hole", "beside the hole": "Beside the hole",
   "along the tool": "Along the tool", sound: "Tones", night: "Night",
   slew: "Slew", arm_1: "Arm 1", arm_2: "Arm 2", arm_3: "Arm 3", boom: "Boom", stick: "Stick", bucket: "Bucket", tool: "Tool",
@@ -53,6 +58,7 @@ const EN = {
   "messages arrive late": "Messages arrive late", "recorder does not write": "Recorder does not write", "recording has gaps": "Recording has gaps",
   "the model no longer fits": "The model no longer fits", flow_gain: "flow gain", asymmetry: "asymmetry", dead_time: "dead time", creep: "creep", dead_band: "dead band",
   "refused lost": "No connection to the loop", nothing: "all is well", "emergency stop": "EMERGENCY STOP",
+  "no live picture": "NO LIVE PICTURE", "no picture": "no picture", "packets lost": "lost", "watched elsewhere": "others are watching",
 };
 
 export function words(language) {

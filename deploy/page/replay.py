@@ -1,0 +1,333 @@
+"""A feed that plays a recorded session on the operator's page.
+
+The state at any time is what the recording held up to then: nothing is simulated. Positions,
+levers and status come from the messages of the bus, the rest from the topics of guard, policy,
+perception and page.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
+from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from deploy.guard.drift_watch import Misfit
+from deploy.guard.guard import GuardState, GuardTrip
+from deploy.guidance import AXES, convert_to_positions, find_full_angles_rad
+from deploy.page.protocol import (
+    BoreholeChoice,
+    DrawReport,
+    InsertionReading,
+    LoopHealth,
+    OperatorRequest,
+    PageState,
+    RecordingStatus,
+    ReplayTimeline,
+    ShownAdvice,
+    SourceAge,
+    TimelineMark,
+    Vector,
+)
+from deploy.page.scene import measure_insertion, plan_approach, to_vector
+from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
+from deploy.runtime.operator_state import ALIVE_S, AdviceStatus, OperatorState
+from deploy.runtime.shared_memory import RecordLayout
+from deploy.runtime.target import NEAR_M
+
+MOST_MARKS = 200
+"""Marks on the timeline; each state carries them. Chosen by hand."""
+RADIUS_M = 0.05
+"""Radius of a borehole of which the recording holds the centre alone, as in `conf/page`."""
+UP: Vector = (0.0, 0.0, 1.0)
+UNNAMED = "+"
+
+
+@spec
+class CaptureReplay:
+    """A recorded session on the page, with a timeline.
+
+    Attributes:
+        capture: The `capture.mcap`, or the folder that it lies in.
+        bus_s: Age from which positions and levers are stale.
+        advice_s: Age from which the advice is.
+        borehole_s: Age from which the boreholes are.
+        delay_s: Delay of messages that is too long.
+    """
+
+    capture: str
+    bus_s: float
+    advice_s: float
+    borehole_s: float
+    delay_s: float
+
+    def check(self) -> None:
+        if min(self.bus_s, self.advice_s, self.borehole_s, self.delay_s) <= 0:
+            raise ConfigError("feed: expected ages and delay of more than 0")
+
+    def build(self, machine: Machine) -> ReplayFeed:
+        """Return the feed, at the beginning of the recording and playing.
+
+        Raises:
+            RecordingError: there is no such capture, or it was made on another machine.
+        """
+        path = Path(self.capture)
+        path = path / "capture.mcap" if path.is_dir() else path
+        contents = read_capture(path)
+        try:
+            machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
+        except (CheckpointError, KeyError, ValueError) as error:
+            raise RecordingError(f"{path}: {error}") from error
+        if not contents.messages:
+            raise RecordingError(f"{path}: expected messages to replay, found none")
+        return ReplayFeed(self, machine, contents, time.monotonic)
+
+
+class ReplayFeed:
+    """See `deploy.page.protocol.PageFeed`.
+
+    Args:
+        replay: Settings.
+        machine: The machine.
+        contents: Of the capture.
+        clock: Monotonic time in s.
+    """
+
+    def __init__(
+        self,
+        replay: CaptureReplay,
+        machine: Machine,
+        contents: CaptureContents,
+        clock: Callable[[], float],
+    ) -> None:
+        self._replay, self._machine, self._clock = replay, machine, clock
+        self._topics = {name: _Topic(rows) for name, rows in contents.messages.items()}
+        self._begin_s = float(min(topic.t_s[0] for topic in self._topics.values()))
+        end_s = float(max(topic.t_s[-1] for topic in self._topics.values()))
+        self._duration_s = end_s - self._begin_s
+        self._sources = {}
+        for signal in (
+            *(f"Position_{name}" for name in machine.joint_names),
+            *(f"Lever_{side}_{axis}" for side, axis in AXES),
+            *("ButtonRight", "DeadMan", "RemoteOn", "EStop", "ExclusiveSelected"),
+        ):
+            found = [topic for topic in self._topics.values() if signal in topic.rows.names]
+            self._sources[signal] = found[0] if found else None
+        self._blank = RecordLayout(OperatorState, machine.num_joints).new()
+        self._full_rad = find_full_angles_rad(machine.levers)
+        self._marks = _list_marks(self._topics, self._begin_s)
+        guard = self._topics.get("guard")
+        # Without any other state, the loop could only listen.
+        self._commands = guard is not None and any(
+            values["state"] != GuardState.SILENT.name for _, values in guard.rows
+        )
+        self._anchor_s, self._position_s, self._speed = clock(), 0.0, 1.0
+
+    @property
+    def position_s(self) -> float:
+        """Time since the beginning of the recording."""
+        since_s = (self._clock() - self._anchor_s) * self._speed
+        return min(self._duration_s, self._position_s + since_s)
+
+    def read_advice_number(self) -> int | None:
+        """See `PageFeed`."""
+        found = self._find("advice", self._begin_s + self.position_s)
+        return None if found is None else found[0]
+
+    def read_state(self) -> PageState:
+        """See `PageFeed`."""
+        position_s = self.position_s
+        at_s = self._begin_s + position_s
+        state, ages_s = self._build_state(at_s)
+        advice = self._find("advice", at_s)
+        targets = self._list_targets(at_s, None if advice is None else advice[2])
+        path, insertion = self._place_tool(state, targets)
+        replay, heard_s = self._replay, min(ages_s["positions"], ages_s["levers"])
+        streams = [
+            SourceAge("positions", _drop_infinite(ages_s["positions"]), replay.bus_s),
+            SourceAge("levers", _drop_infinite(ages_s["levers"]), replay.bus_s),
+            SourceAge("advice", None if advice is None else at_s - advice[1], replay.advice_s),
+            SourceAge("borehole", self._measure_age("holes", at_s), replay.borehole_s),
+        ]
+        return PageState(
+            t_s=self._clock(),
+            alive=heard_s < ALIVE_S,
+            guiding=True,
+            advice=None if advice is None else self._convert_advice(advice[0], advice[2]),
+            state=state,
+            commands=self._commands,
+            streams=tuple(streams),
+            recording=RecordingStatus(True, position_s, 0, failed=False),
+            health=LoopHealth(0.0, replay.delay_s, log_behind=False, supervisor_silent=False),
+            targets=targets,
+            insertion=insertion,
+            path_in_base_m=path,
+            block_in_base_m=None,
+            replay=ReplayTimeline(position_s, self._duration_s, self._speed, self._marks),
+        )
+
+    def read_frame(self, after_s: float) -> Frame | None:
+        """See `PageFeed`."""
+        return None
+
+    def submit(self, request: OperatorRequest) -> bool:
+        """See `PageFeed`; moves along the recording."""
+        position_s = self.position_s
+        if request.kind == "play":
+            self._speed = 0.0 if request.value == "off" else float(request.value)
+            if self._speed and position_s >= self._duration_s:
+                position_s = 0.0
+        elif request.kind == "seek":
+            position_s = min(self._duration_s, float(request.value))
+        else:
+            return False
+        self._anchor_s, self._position_s = self._clock(), position_s
+        return True
+
+    def confirms_stop(self) -> bool:
+        """See `PageFeed`; nothing moves."""
+        return True
+
+    def report_drawn(self, report: DrawReport) -> None:
+        """See `PageFeed`; nothing is recorded."""
+
+    def _find(self, topic: str, at_s: float) -> tuple[int, float, dict[str, Any]] | None:
+        """Return number, time and values of the last message of a topic at `at_s`."""
+        found = self._topics.get(topic)
+        return None if found is None else found.find(at_s)
+
+    def _measure_age(self, topic: str, at_s: float) -> float | None:
+        found = self._find(topic, at_s)
+        return None if found is None else at_s - found[1]
+
+    def _read_signal(self, signal: str, at_s: float) -> tuple[float, float]:
+        """Return value and age of a signal of the bus; 0 and infinite where none has come."""
+        topic = self._sources[signal]
+        found = None if topic is None else topic.find(at_s)
+        return (0.0, np.inf) if found is None else (found[2][signal], at_s - found[1])
+
+    def _build_state(self, at_s: float) -> tuple[OperatorState, dict[str, float]]:
+        names = self._machine.joint_names
+        positions = [self._read_signal(f"Position_{name}", at_s) for name in names]
+        levers = [self._read_signal(f"Lever_{side}_{axis}", at_s) for side, axis in AXES]
+        ages_s = {"positions": max(age for _, age in positions), "levers": levers[0][1]}
+        guard, misfit = self._find("guard", at_s), self._find("misfit", at_s)
+        state = replace(
+            self._blank,
+            t_s=at_s,
+            q=np.array([value for value, _ in positions]),
+            lever=np.array([value for value, _ in levers]),
+            button_right=bool(self._read_signal("ButtonRight", at_s)[0]),
+            deadman=bool(self._read_signal("DeadMan", at_s)[0]),
+            remote_on=bool(self._read_signal("RemoteOn", at_s)[0]),
+            estop=bool(self._read_signal("EStop", at_s)[0]),
+            exclusive_selected=bool(self._read_signal("ExclusiveSelected", at_s)[0]),
+            bus_up=min(ages_s.values()) < ALIVE_S,
+        )
+        if guard is not None:
+            values = guard[2]
+            joint = values.get("joint")
+            state = replace(
+                state,
+                guard=GuardState[values["state"]],
+                trip=GuardTrip(values["trip"]),
+                cause=GuardTrip(values["cause"]),
+                observed_joint=names.index(joint) + 1 if joint else 0,
+            )
+        if misfit is not None:
+            joint, effect = misfit[2]["joint"], Misfit(misfit[2]["effect"])
+            state = replace(state, misfit=effect, misfit_joint=names.index(joint) + 1)
+        return state, ages_s
+
+    def _convert_advice(self, number: int, values: dict[str, Any]) -> ShownAdvice:
+        button = bool(values["button_right"])
+        angles_rad = np.array(values["lever_rad"])
+        levers = convert_to_positions(angles_rad, self._full_rad, button)
+        reason = values["reason"]
+        valid = reason == AdviceStatus.VALID.value
+        return ShownAdvice(valid, reason, number, levers, 0.0 if button else None)
+
+    def _list_targets(
+        self, at_s: float, advice: dict[str, Any] | None
+    ) -> tuple[BoreholeChoice, ...]:
+        """Return the boreholes known at that time; the one that the advice is for is chosen."""
+        seen = self._find("holes", at_s)
+        valid = advice is not None and advice["reason"] == AdviceStatus.VALID.value
+        goal_m = np.array(advice["target_in_base_m"]) if advice is not None and valid else None
+        found, is_chosen = [], False
+        for hole in [] if seen is None else seen[2]["holes"]:
+            center_m = np.array(hole["center_in_base_m"])
+            chosen = goal_m is not None and float(np.linalg.norm(center_m - goal_m)) < NEAR_M
+            chosen = chosen and not is_chosen
+            is_chosen |= chosen
+            # Recordings of before hold neither axis nor radius.
+            axis, radius_m = hole.get("axis_in_base", UP), hole.get("radius_m", RADIUS_M)
+            choice = BoreholeChoice(
+                str(hole["name"]),
+                to_vector(center_m),
+                to_vector(np.array(axis)),
+                radius_m,
+                hole["std_m"],
+                hole["score"],
+                chosen,
+            )
+            found.append(choice)
+        if goal_m is not None and not is_chosen:
+            found.append(BoreholeChoice(UNNAMED, to_vector(goal_m), UP, RADIUS_M, None, None, True))
+        return tuple(found)
+
+    def _place_tool(
+        self, state: OperatorState, targets: tuple[BoreholeChoice, ...]
+    ) -> tuple[tuple[Vector, ...], InsertionReading | None]:
+        chosen = next((one for one in targets if one.chosen), None)
+        if chosen is None or not self._machine.has_bodies:
+            return (), None
+        tool = compute_tool_kinematics(self._machine, state.q)
+        center_m, axis = np.array(chosen.center_in_base_m), np.array(chosen.axis_in_base)
+        path = plan_approach(tool.tip_in_base_m, center_m, axis)
+        return path, measure_insertion(tool, chosen)
+
+
+class _Topic:
+    """Messages of a topic with their times as an array."""
+
+    def __init__(self, rows: TopicMessages) -> None:
+        self.rows, self.t_s = rows, rows.series("t_s")
+
+    def find(self, at_s: float) -> tuple[int, float, dict[str, Any]] | None:
+        """Return number, time and values of the last message at `at_s`, `None` before the first."""
+        index = int(np.searchsorted(self.t_s, at_s, side="right")) - 1
+        return None if index < 0 else (index, *self.rows[index])
+
+
+def _list_marks(topics: dict[str, _Topic], begin_s: float) -> tuple[TimelineMark, ...]:
+    """Return the changes of the guard, requests of the operator and misfits, in order of time."""
+    found, before = [], None
+    for t_s, values in topics["guard"].rows if "guard" in topics else ():
+        # The reason for sending nothing may change while the state stays.
+        if values["state"] == before:
+            continue
+        before = values["state"]
+        latched = values["state"] == GuardState.LATCHED.name
+        name = values["cause"] if latched else values["state"]
+        found.append(TimelineMark(t_s - begin_s, "alarm" if latched else "state", name))
+    for t_s, values in topics["wish"].rows if "wish" in topics else ():
+        found.append(TimelineMark(t_s - begin_s, "request", values["kind"]))
+    for t_s, _ in topics["misfit"].rows if "misfit" in topics else ():
+        found.append(TimelineMark(t_s - begin_s, "alarm", "the model no longer fits"))
+    # Where there are too many, alarms say most.
+    found.sort(key=lambda mark: mark.kind != "alarm")
+    return tuple(sorted(found[:MOST_MARKS], key=lambda mark: mark.t_s))
+
+
+def _drop_infinite(age_s: float) -> float | None:
+    return age_s if np.isfinite(age_s) else None

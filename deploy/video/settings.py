@@ -1,0 +1,132 @@
+"""Settings of the video beside the loop: the spec in `conf/video`, and its kinds of cameras."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.util import find_spec
+from typing import Protocol
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import spec
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.video.sources import LoopPictures, OpenedDevice, TestPattern, VideoSource
+
+SOCKET = "video"
+"""Name of the socket between page and video process, in a folder that only its owner may enter."""
+
+
+class VideoCamera(Protocol):
+    """A spec of one camera."""
+
+    def build(self, memory: LoopMemory | None) -> VideoSource:
+        """Return the open camera.
+
+        Raises:
+            FrameError: there is no such camera.
+        """
+        ...
+
+
+@spec
+class DeviceCamera:
+    """A camera that FFmpeg opens: a device of this computer, or the address of an IP camera.
+
+    Attributes:
+        device: Path or address: `/dev/video0`, `rtsp://…`.
+        container: Name that FFmpeg has for the kind of input, as `v4l2`; `null`: by the address.
+        options: Further options of FFmpeg: `{video_size: 1280x720, framerate: "15"}`.
+    """
+
+    device: str
+    container: str | None
+    options: dict[str, str]
+
+    def build(self, memory: LoopMemory | None) -> VideoSource:
+        """See `VideoCamera`."""
+        return OpenedDevice(self.device, self.container, self.options)
+
+
+@spec
+class LoopCamera:
+    """The camera beside the loop (`camera=…`): its newest picture, at its own rate.
+
+    Attributes:
+        rate_hz: Looks for a new picture a second.
+    """
+
+    rate_hz: float
+
+    def build(self, memory: LoopMemory | None) -> VideoSource:
+        """See `VideoCamera`."""
+        if memory is None or memory.frame is None:
+            raise ConfigError("video: there is no camera beside the loop; choose camera=… as well")
+        return LoopPictures(memory.frame, self.rate_hz)
+
+
+@spec
+class PatternCamera:
+    """A moving test picture that carries the time of its making, for desks and benchmarks.
+
+    Attributes:
+        width_px: Of the picture.
+        height_px: Of the picture.
+        rate_hz: Pictures a second.
+    """
+
+    width_px: int
+    height_px: int
+    rate_hz: float
+
+    def build(self, memory: LoopMemory | None) -> VideoSource:
+        """See `VideoCamera`."""
+        return TestPattern(self.width_px, self.height_px, self.rate_hz)
+
+
+@spec
+class VideoSettings:
+    """Live video on the operator's page.
+
+    Attributes:
+        cameras: Cameras by their names on the page.
+        host: Address that sends the pictures. 127.0.0.1: to browsers of this computer only.
+        min_bitrate: Bits a second of one camera, below which no bad link brings it.
+        max_bitrate: Bits a second of one camera over a good link.
+        viewers: Pages that can watch at once; each one is encoded for by itself.
+    """
+
+    cameras: dict[str, VideoCamera]
+    host: str
+    min_bitrate: int
+    max_bitrate: int
+    viewers: int
+
+    def check(self) -> None:
+        if not self.cameras or self.viewers < 1:
+            raise ConfigError("video: expected a camera and a viewer at least")
+        if not 0 < self.min_bitrate <= self.max_bitrate:
+            raise ConfigError(
+                "video: expected 0 < min_bitrate <= max_bitrate, "
+                f"got {self.min_bitrate} and {self.max_bitrate}"
+            )
+
+    def require_packages(self) -> None:
+        """Check before any process starts that the video process can.
+
+        Raises:
+            ModuleNotFoundError: the extra `video` is not installed.
+        """
+        if find_spec("aiortc") is None:
+            raise ModuleNotFoundError("video needs aiortc", name="aiortc")
+
+
+@dataclass(frozen=True)
+class VideoProcessConfig:
+    """Settings of a video process.
+
+    Attributes:
+        video: The cameras.
+        folder: Holds the socket; only its owner may enter.
+    """
+
+    video: VideoSettings
+    folder: str

@@ -1,0 +1,188 @@
+"""The video process: sends each page its cameras by WebRTC, as H.264.
+
+Pages reach it through the page's server only, which asks for the token: it hands on a page's offer
+by a socket of the file system, and the answer back. When that connection ends, so do the pictures.
+The process has a low priority and touches nothing of the loop but the newest frame of its camera.
+If it hangs or dies, the page greys the pictures, and the loop feels nothing.
+
+aiortc carries the pictures: lost packets are sent again on request, and the receiver's estimate of
+the link sets the bit rate of the encoder.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import logging
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import aioice.ice  # pyright: ignore[reportMissingImports]
+import aiortc.codecs.h264  # pyright: ignore[reportMissingImports]
+from aiortc import (  # pyright: ignore[reportMissingImports]
+    MediaStreamTrack,
+    RTCConfiguration,
+    RTCPeerConnection,
+    RTCRtpSender,
+    RTCSessionDescription,
+)
+
+from deploy.runtime.process import Stop
+from deploy.runtime.shm_layout import LoopMemory
+from deploy.video.settings import SOCKET, VideoProcessConfig, VideoSettings
+from deploy.video.sources import CameraReader
+
+log = logging.getLogger(__name__)
+
+NICENESS = 10
+"""Below everything else on the computer: late pictures are harmless."""
+POLL_S, STOP_POLL_S = 0.003, 0.05
+"""Between looks for a new picture, a fifth of a screen's frame; and between looks whether to stop."""
+LONGEST_OFFER = 1 << 16
+"""Bytes of an offer; a browser's has 10 kB for two cameras."""
+ANY_ADDRESS = ("0.0.0.0", "::")
+RTP_TIMES = 1 << 32
+"""Times of RTP have 32 bits."""
+
+
+class CameraTrack(MediaStreamTrack):
+    """The pictures of one camera for one page: always the newest one, none twice.
+
+    Args:
+        reader: The camera.
+        report: Called with the RTP time of a picture and the time at which it was taken.
+    """
+
+    kind = "video"
+
+    def __init__(self, reader: CameraReader, report: Any) -> None:
+        super().__init__()
+        self._reader, self._report = reader, report
+        self._number, self._pts = reader.number, 0
+        self.sender: Any = None
+
+    async def recv(self) -> Any:
+        """Wait for the next picture and return it."""
+        while self._reader.number == self._number:
+            await asyncio.sleep(POLL_S)
+        self._number = self._reader.number
+        frame, t_s = self._reader.read_newest()
+        # The sender asks for a picture when the one before is sent. So its last RTP time is that
+        # picture's, and tells the offset that aiortc has drawn. aiortc shows it nowhere else.
+        sent = getattr(self.sender, "_RTCRtpSender__rtp_timestamp", 0)
+        if self._pts and sent:
+            offset = sent - self._pts
+            self._report((frame.pts + offset) % RTP_TIMES, t_s)
+        self._pts = frame.pts
+        return frame
+
+
+class VideoPeer:
+    """One page that watches.
+
+    Args:
+        readers: The cameras.
+    """
+
+    def __init__(self, readers: list[CameraReader]) -> None:
+        # An empty list: without one aiortc would ask a public STUN server for our address.
+        self._connection = RTCPeerConnection(RTCConfiguration(iceServers=[]))
+        self._readers, self._channel = readers, None
+        self._connection.on("datachannel", self._take_channel)
+
+    async def answer(self, offer: str) -> str:
+        """Return the answer to a page's offer; its video sections stand for the cameras in order."""
+        await self._connection.setRemoteDescription(
+            RTCSessionDescription(hide_local_names(offer), "offer")
+        )
+        capabilities = RTCRtpSender.getCapabilities("video").codecs
+        codecs = [one for one in capabilities if one.mimeType in ("video/H264", "video/rtx")]
+        waiting = [one for one in self._connection.getTransceivers() if one.kind == "video"]
+        for index, (transceiver, reader) in enumerate(zip(waiting, self._readers, strict=False)):
+            track = CameraTrack(reader, self._make_report(index))
+            track.sender = transceiver.sender
+            transceiver.sender.replaceTrack(track)
+            transceiver.direction = "sendonly"
+            transceiver.setCodecPreferences(codecs)
+        await self._connection.setLocalDescription(await self._connection.createAnswer())
+        return self._connection.localDescription.sdp
+
+    async def close(self) -> None:
+        """End the pictures of this page."""
+        await self._connection.close()
+
+    def _take_channel(self, channel: Any) -> None:
+        """Take the page's channel; it compares clocks and learns when pictures were taken."""
+        self._channel = channel
+
+        @channel.on("message")
+        def answer_ping(text: Any) -> None:
+            with contextlib.suppress(ValueError, TypeError, KeyError):
+                at_ms = float(json.loads(text)["at_ms"])
+                channel.send(json.dumps({"at_ms": at_ms, "now_s": time.monotonic()}))
+
+    def _make_report(self, index: int) -> Any:
+        def report(rtp: int, taken_s: float) -> None:
+            channel = self._channel
+            # A channel that is behind would only report on pictures of the past.
+            if channel is not None and channel.readyState == "open" and not channel.bufferedAmount:
+                channel.send(json.dumps({"camera": index, "rtp": rtp, "taken_s": taken_s}))
+
+        return report
+
+
+def hide_local_names(offer: str) -> str:
+    """Return an offer without candidates that have a name of mDNS in place of an address.
+
+    A browser hides its addresses so. It finds the way by itself, from our addresses, and asking
+    the network for the name would cost seconds.
+    """
+    lines = offer.splitlines(keepends=True)
+    return "".join(one for one in lines if not (one.startswith("a=candidate") and ".local " in one))
+
+
+def run(stop: Stop, config: VideoProcessConfig, memory: LoopMemory | None = None) -> None:
+    """Send pictures until asked to stop."""
+    os.nice(NICENESS)
+    logging.getLogger("aioice").setLevel(logging.WARNING)
+    video = config.video
+    aiortc.codecs.h264.MIN_BITRATE = video.min_bitrate
+    aiortc.codecs.h264.MAX_BITRATE = video.max_bitrate
+    aiortc.codecs.h264.DEFAULT_BITRATE = video.max_bitrate
+    if video.host not in ANY_ADDRESS:
+        # aioice offers every address but the loopback; this process offers the one it is told.
+        aioice.ice.get_host_addresses = lambda use_ipv4, use_ipv6: [video.host]
+    asyncio.run(_serve(stop, video, Path(config.folder) / SOCKET, memory))
+
+
+async def _serve(stop: Stop, video: VideoSettings, path: Path, memory: LoopMemory | None) -> None:
+    readers = []
+    for name, camera in video.cameras.items():
+        readers.append(CameraReader(name, lambda camera=camera: camera.build(memory)))
+    watching: set[VideoPeer] = set()
+
+    async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        peer = VideoPeer(readers)
+        try:
+            full = len(watching) >= video.viewers
+            watching.add(peer)
+            hello = {"full": True} if full else {"cameras": list(video.cameras)}
+            writer.write(json.dumps(hello).encode() + b"\n")
+            while not full and (line := await reader.readline()):
+                answer = await peer.answer(json.loads(line)["sdp"])
+                writer.write(json.dumps({"sdp": answer}).encode() + b"\n")
+        except (ValueError, KeyError, ConnectionError) as error:
+            log.warning("refused a page's offer: %s", error)
+        finally:
+            watching.discard(peer)
+            await peer.close()
+            writer.close()
+
+    async with await asyncio.start_unix_server(talk, path, limit=LONGEST_OFFER):
+        log.info("%s by WebRTC on %s", ", ".join(video.cameras), video.host)
+        while not stop():
+            await asyncio.sleep(STOP_POLL_S)
+        await asyncio.gather(*(peer.close() for peer in watching))

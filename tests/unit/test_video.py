@@ -1,0 +1,154 @@
+"""Live video: what a test picture says, who may look, and what a browser shows of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import TOKEN, Scripted, chromium, served
+from composed import option
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed
+
+from brokk_rl.errors import ConfigError
+from deploy.page.video_relay import VideoRelay
+from deploy.runtime.process import ChildProcess
+from deploy.video.settings import SOCKET, VideoProcessConfig
+from deploy.video.sources import draw_time_code, read_time_code
+
+READ_CODE = """name => {
+    const camera = window.measured.video.cameras.find(one => one.name === name), { video } = camera;
+    const canvas = document.createElement("canvas");
+    [canvas.width, canvas.height] = [video.videoWidth, video.videoHeight];
+    const context = canvas.getContext("2d");
+    context.drawImage(video, 0, 0);
+    const { data } = context.getImageData(0, 0, canvas.width, canvas.height);
+    return [canvas.width, Array.from({ length: data.length / 4 }, (_, at) => data[4 * at])];
+}"""
+"""Returns the width and the red of each pixel of the picture that a camera shows now."""
+ALARMS = "() => [...document.querySelectorAll('#alarms li:not(.over)')].map(one => one.textContent)"
+SHOWS = (
+    "() => (window.measured.video?.cameras ?? []).filter(one => one.shown && one.delay_ms).length"
+)
+
+
+def eventually(claim: Any, seconds: float = 30.0) -> None:
+    end_s = time.monotonic() + seconds
+    while not claim():
+        assert time.monotonic() < end_s, "it did not come true"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("t_s", [0.0, 0.001, 86400.5, 4294967.295])
+def test_a_time_code_survives_blur_and_noise_and_a_wrong_block_is_noticed(t_s: float) -> None:
+    picture = np.full((360, 640), 128, np.uint8)
+    draw_time_code(picture, t_s)
+    for axis in (0, 1):  # a blur over five pixels, as a coder of few bits leaves it
+        picture = np.mean([np.roll(picture, by, axis) for by in range(-2, 3)], 0)
+    noisy = picture + np.random.default_rng(1).normal(0.0, 20.0, picture.shape)
+    assert read_time_code(noisy) == pytest.approx(t_s)
+    side = 360 // 16
+    noisy[:side, 7 * side : 8 * side] = 255.0 - noisy[:side, 7 * side : 8 * side]
+    assert read_time_code(noisy) is None
+
+
+def test_a_picture_without_a_code_is_not_read() -> None:
+    assert read_time_code(np.full((360, 640), 128, np.uint8)) is None
+
+
+def test_settings_that_make_no_sense_are_refused() -> None:
+    video = option("video", "pattern")
+    with pytest.raises(ConfigError, match="a camera"):
+        replace(video, cameras={})
+    with pytest.raises(ConfigError, match="min_bitrate"):
+        replace(video, min_bitrate=5_000_000)
+
+
+def test_who_has_no_token_does_not_reach_the_video_process(tmp_path: Path) -> None:
+    reached = list[str]()
+
+    async def run(port: int, token: str) -> str:
+        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            reached.append(token)
+            writer.write(b'{"cameras": []}\n')
+            await reader.read()  # until the relay goes
+            writer.close()
+            gone.set()
+
+        own, gone = f"http://localhost:{port}", asyncio.Event()
+        async with await asyncio.start_unix_server(answer, tmp_path / SOCKET):
+            try:
+                async with connect(
+                    f"ws://localhost:{port}/video", origin=own, proxy=None
+                ) as socket:  # type: ignore[arg-type]
+                    await socket.send(json.dumps({"token": token}))
+                    said = [str(await asyncio.wait_for(socket.recv(), 5)) for _ in range(2)]
+                await asyncio.wait_for(gone.wait(), 5)
+                return "".join(said)
+            except ConnectionClosed as error:
+                return error.rcvd.reason if error.rcvd else "closed"
+
+    with served(Scripted(), extensions=(VideoRelay(str(tmp_path)),)) as port:
+        assert asyncio.run(run(port, "wrong")) == "token" and reached == []
+        assert asyncio.run(run(port, TOKEN)) == '{"ready": true}{"cameras": []}\n'
+        assert reached == [TOKEN]
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with chromium() as found:
+        yield found
+
+
+@pytest.fixture
+def page(browser: Any, tmp_path: Path) -> Iterator[Any]:
+    with served(Scripted(), extensions=(VideoRelay(str(tmp_path)),)) as port:
+        context = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en-GB")
+        page = context.new_page()
+        page.route("**/scene.js", lambda route: route.fulfill(content_type="text/javascript"))
+        page.goto(f"http://localhost:{port}/#token={TOKEN}")
+        yield page
+        context.close()
+
+
+def test_a_page_without_its_video_says_so_and_goes_on(page: Any) -> None:
+    eventually(lambda: any("NO LIVE PICTURE" in one for one in page.evaluate(ALARMS)))
+    drawn = page.evaluate("window.measured.drawn")
+    eventually(lambda: page.evaluate("window.measured.drawn") > drawn + 5)
+
+
+def test_pictures_come_with_their_age_and_a_dead_process_is_an_alarm(
+    page: Any, tmp_path: Path
+) -> None:
+    pytest.importorskip("aiortc", reason="the extra video is not installed")
+    config = VideoProcessConfig(option("video", "pattern"), str(tmp_path))
+    child = ChildProcess("video", "deploy.video.video_process:run", (config,), ())
+    try:
+        eventually(lambda: page.evaluate(SHOWS) == 2)
+        for index, name in enumerate(config.video.cameras):
+
+            def read(name: str = name) -> float | None:
+                width, red = page.evaluate(READ_CODE, name)
+                return read_time_code(np.reshape(red, (-1, width)))
+
+            eventually(lambda read=read: read() is not None)
+            now_s, taken_s = time.monotonic(), read()
+            assert taken_s is not None
+            told_s = 1e-3 * page.evaluate(f"window.measured.video.cameras[{index}].delay_ms")
+            # The code in the picture knows nothing of the page's own reckoning. The picture is
+            # shown for a fifteenth of a second, and the machine may be busy.
+            assert 0.0 < now_s - taken_s < 3.0 and 0.0 < told_s < 3.0
+            assert now_s - taken_s == pytest.approx(told_s, abs=1.0)
+        eventually(lambda: page.evaluate(ALARMS) == [])
+        page.keyboard.press("c")
+        assert page.locator("figure.large .name").all_inner_texts() == ["front"]
+    finally:
+        child.end(3.0)
+    eventually(lambda: any("NO LIVE PICTURE" in one for one in page.evaluate(ALARMS)))
