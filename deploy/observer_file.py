@@ -106,7 +106,7 @@ class AlarmCounts:
 
 @spec
 class ThresholdSettings:
-    """How thresholds are taken from recordings; see `deploy.guard.observer`.
+    """Settings by which thresholds are taken from recordings; see `deploy.guard.observer`.
 
     Attributes:
         window_s: Time over which measured and predicted motion are compared.
