@@ -20,7 +20,7 @@ from brokk_rl.spec import spec
 
 # All numbers below were chosen by hand.
 REASON = "vertical disparity of the pair, px"
-GRID = (18, 10)
+GRID = (12, 7)
 """Patches across and down the picture."""
 SIDE_PX, BORDER_PX = 25, 3
 """Side of a patch, and its border without a full blur."""
@@ -161,6 +161,7 @@ def _register_patches(
     # The left gradient, whose noise is independent, serves as instrument (see `pose.alignment`).
     mine, *instruments = _filter_patches(gray[v, u].astype(np.float32), weight)
     place_u, place_v = (u - disparity).astype(np.float32), v.astype(np.float32)
+    partner = partner.astype(np.float32)
     shift = np.zeros((len(u), 2), np.float32)
     likeness = np.zeros(len(u))
     for _ in range(STEPS):
@@ -202,9 +203,9 @@ def _fit_patch_planes(values: np.ndarray, weight: np.ndarray, step: np.ndarray) 
 
 
 def _sample(picture: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Return a picture `(h, w)` at places `(n, s, s)`, float32."""
+    """Return a picture, `(h, w)` float32, at places `(n, s, s)`."""
     flat = u.reshape(len(u), -1), v.reshape(len(v), -1)
-    values = cv2.remap(picture.astype(np.float32), *flat, cv2.INTER_CUBIC)
+    values = cv2.remap(picture, *flat, cv2.INTER_CUBIC)
     return np.asarray(values).reshape(u.shape)
 
 

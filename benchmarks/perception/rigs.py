@@ -51,7 +51,7 @@ def main() -> None:
     given = parser.parse_args()
     until = time.monotonic() + 60 * given.minutes
     studio: FrameRenderer = compose("studio", "mode=render")
-    drifted: FrameRenderer = compose("studio", "mode=render", "rig/error@rig.error=drifted")
+    drifted: FrameRenderer = compose("studio", "mode=render", "rig/error=drifted")
     session: Session = compose("session", "mode=render", "session.seed=1", "session.out=.")
     after: StagedFinder = compose("perception", "mode=perceive").build()
     before = replace(after.settings, rectification=None).build()
@@ -62,9 +62,10 @@ def main() -> None:
         if number < given.count:
             for name, values in FIXED.items():
                 rigs[name] = replace(studio.rig.error, **values)
-        if number < given.drawn:
-            rigs["drawn"] = replace(drifted.rig.error, seed=number)
-        for distance_m in DISTANCES_M:
+        for place, distance_m in enumerate(DISTANCES_M):
+            if number < given.drawn:
+                seed = number * len(DISTANCES_M) + place
+                rigs["drawn"] = replace(drifted.rig.error, seed=seed)
             for name, error in rigs.items():
                 if time.monotonic() > until:
                     break
