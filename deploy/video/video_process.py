@@ -17,11 +17,12 @@ import json
 import logging
 import os
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import aioice.ice  # pyright: ignore[reportMissingImports]
-import aiortc.codecs.h264  # pyright: ignore[reportMissingImports]
+import aiortc.codecs  # pyright: ignore[reportMissingImports]
 from aiortc import (  # pyright: ignore[reportMissingImports]
     MediaStreamTrack,
     RTCConfiguration,
@@ -32,6 +33,7 @@ from aiortc import (  # pyright: ignore[reportMissingImports]
 
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
+from deploy.video.encoder import LinkEncoder
 from deploy.video.settings import SOCKET, VideoProcessConfig, VideoSettings
 from deploy.video.sources import CameraReader
 
@@ -149,9 +151,10 @@ def run(stop: Stop, config: VideoProcessConfig, memory: LoopMemory | None = None
     os.nice(NICENESS)
     logging.getLogger("aioice").setLevel(logging.WARNING)
     video = config.video
-    aiortc.codecs.h264.MIN_BITRATE = video.min_bitrate
-    aiortc.codecs.h264.MAX_BITRATE = video.max_bitrate
-    aiortc.codecs.h264.DEFAULT_BITRATE = video.max_bitrate
+    # aiortc makes its encoders by this name.
+    aiortc.codecs.H264Encoder = partial(
+        LinkEncoder, video.min_bitrate, video.max_bitrate, len(video.cameras)
+    )
     if video.host not in ANY_ADDRESS:
         # aioice offers every address but the loopback; this process offers the one it is told.
         aioice.ice.get_host_addresses = lambda use_ipv4, use_ipv6: [video.host]
