@@ -91,6 +91,8 @@ def find_offset_ms(page: Any) -> tuple[float, float]:
 
 def summarise(pictures: list[list[Any]], offset_ms: float, seconds: float) -> dict[str, Any]:
     """Return rate, latency and gaps of one camera's pictures."""
+    if len(pictures) < 2:
+        return {"pictures_s": round(len(pictures) / seconds, 1)}
     shown_ms = np.array([one[1] for one in pictures]) + offset_ms
     latency_ms, told_ms, received_ms = [], [], []
     for at_ms, (_, _, received, _, code_ms, told) in zip(shown_ms, pictures, strict=True):
