@@ -39,9 +39,9 @@ POLL_S, STOP_POLL_S = 0.003, 0.05
 """Between looks for a new picture, a fifth of a screen's frame; and between looks whether to stop."""
 LONGEST_OFFER = 1 << 16
 """Bytes of an offer; a browser's has 10 kB for two cameras."""
-AGAIN_SHARE, AGAIN_MOST = 0.1, 20.0
+AGAIN_SHARE, AGAIN_MOST = 0.25, 20.0
 """Packets that may be sent again: as a share of those sent, and at once. Browsers ask twice for each
-lost packet over 120 ms of round trip, so that this is enough for 5 % of losses."""
+lost packet over 120 ms of round trip, and for late ones in vain: this is enough for 5 % of losses."""
 ANY_ADDRESS = ("0.0.0.0", "::")
 RTP_TIMES = 1 << 32
 """Times of RTP have 32 bits."""
