@@ -11,11 +11,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import hydra
 import yaml
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -64,6 +66,21 @@ def register_options(arguments: Sequence[str]) -> None:
                 )
 
 
+def load_option(group: str, name: str, **fields: object) -> Any:
+    """Return the spec of one option, for tests and notebooks: `load_option("machine", "two_links")`.
+
+    Args:
+        group: Config group.
+        name: Name of the option, of this package or of an installed extension.
+        fields: Values that replace those of its file.
+    """
+    register_options([])
+    changes = [f"subject.{field}={value}" for field, value in fields.items()]
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject={name}", *changes])
+    return instantiate(cfg.subject, _convert_="all")
+
+
 def _offer_file(group: str, name: str, options: Sequence[registry.Option]) -> None:
     """Put the file `name` into Hydra's store as the option `@<name>` of `group`."""
     node, package = _read(group, name, options)
@@ -101,6 +118,9 @@ def _read(
         raise ConfigError(f"{where}: expected a mapping, as in a file of conf/{group}")
     for place, value in _iterate_leaves(node):
         _check_plain(where, place, value)
+    beside = Path(name).expanduser().parent / str(node.get("mjcf"))
+    if group == "machine" and beside.is_file():
+        node["mjcf"] = str(beside.resolve())
     mine = {
         str(shipped["_target_"]): package
         for shipped, package in _iterate_shipped(options, group)

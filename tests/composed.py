@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import hydra
 import pytest
-from hydra.utils import instantiate
 
 from brokk_rl import extensions, registry
 
@@ -15,10 +13,7 @@ extensions.register_options([])  # the exam's options are those of an extension
 
 def option(group: str, name: str, **fields: object) -> Any:
     """Returns the spec of one option with these fields, instantiated by itself."""
-    changes = [f"subject.{field}={value}" for field, value in fields.items()]
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject={name}", *changes])
-    return instantiate(cfg.subject, _convert_="all")
+    return extensions.load_option(group, name, **fields)
 
 
 def names(group: str) -> list[str]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.registry import resolve_package_path
+from brokk_rl.registry import find_packages, resolve_package_path
 from brokk_rl.sim.drive import add_drive
 from brokk_rl.sim.scene import add_block
 
@@ -46,6 +46,30 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
     return spec.compile()
 
 
+def find_mjcf(machine: Machine) -> Path:
+    """Return the path of the machine's MJCF.
+
+    A file name is looked up in this package, then beside the machines of installed extensions.
+
+    Raises:
+        ConfigError: The machine names none, or there is no such file.
+    """
+    if machine.mjcf is None:
+        raise ConfigError(
+            f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose "
+            "another machine=…"
+        )
+    beside = [folder / "machine" for folder in find_packages().values()]
+    for folder in (ASSETS, *beside):
+        path = folder / resolve_package_path(machine.mjcf)
+        if path.is_file():
+            return path
+    raise ConfigError(
+        f"machine {machine.name}: there is no MJCF '{machine.mjcf}'; set `mjcf` to the name of a file "
+        "beside the machine's YAML in a config package, to package:path, or to an absolute path"
+    )
+
+
 def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
     """Return 1 for the touch sensors among `sensordata`, else 0.
 
@@ -57,17 +81,7 @@ def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
-    if machine.mjcf is None:
-        raise ConfigError(
-            f"machine {machine.name} has no MJCF and cannot be simulated; set `mjcf`, or choose "
-            "another machine=…"
-        )
-    path = ASSETS / resolve_package_path(machine.mjcf)
-    if not path.exists():
-        raise ConfigError(
-            f"machine {machine.name}: no MJCF at {path}; set `mjcf` to a file under {ASSETS},"
-            " to package:path, or to an absolute path"
-        )
+    path = find_mjcf(machine)
     try:  # included rather than attached, so that names stay as the MJCF gives them
         includes = "".join(f'<include file="{file}"/>' for file in (ASSETS / "worksite.xml", path))
         spec = mujoco.MjSpec.from_string(f"<mujoco>{includes}</mujoco>")

@@ -1,10 +1,13 @@
-"""The package of `docs/extending.md` works as the page says: every file of it is written and used."""
+"""A new package installs, passes its own tests and trains; `docs/extending.md` shows its files."""
 
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,43 +17,97 @@ from composed import option
 from packages import install_package
 
 from brokk_rl import extensions
-from brokk_rl.checks import check_actuator, check_effect, check_finder, check_task
+from brokk_rl.checks import check_actuator, check_task
 from brokk_rl.machine import Machine
+from brokk_rl.modes.new import NewPackage, PackageRequest
 
-PAGE = (Path(__file__).parents[2] / "docs/extending.md").read_text()
-FILES = dict(re.findall(r"^`mine/(\S+)`:\n\n```\w+\n(.*?)^```", PAGE, re.M | re.S))
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/extending.md").read_text()
+SHOWN = dict(re.findall(r"^`mine/(\S+)`:\n\n```\w+\n(.*?)^```", PAGE, re.M | re.S))
 TRAINING = next(line for line in PAGE.splitlines() if line.startswith("brokk mode=train "))
 
 
-@pytest.fixture(autouse=True)
-def package(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The package `mine`, installed."""
-    folder = tmp_path_factory.mktemp("site")
-    install_package(folder, "mine", FILES, monkeypatch)
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project that `mode=new` writes."""
+    folder = tmp_path_factory.mktemp("projects")
+    NewPackage(new=PackageRequest(name="mine", folder=str(folder))).run()
+    return folder / "mine"
+
+
+@pytest.fixture
+def site(
+    project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """A folder with the package `mine`, installed."""
+    folder, package = tmp_path_factory.mktemp("site"), project / "mine"
+    files = {}
+    for path in package.rglob("*.*"):
+        files[str(path.relative_to(package))] = path.read_text()
+    install_package(folder, "mine", files, monkeypatch)
     extensions.register_options([])
+    return folder
 
 
-def test_the_page_has_all_kinds_of_parts() -> None:
-    groups = {path.split("/")[1] for path in FILES if path.startswith("conf/")}
+def test_the_page_shows_the_files_of_a_new_package(project: Path) -> None:
+    groups = {path.split("/")[1] for path in SHOWN if path.startswith("conf/")}
     assert groups == {"actuator", "effect", "perception", "machine", "task"}
+    for name, text in SHOWN.items():
+        assert (project / "mine" / name).read_text() == text
 
 
-def test_the_checkers_accept_each_part(machine: Machine) -> None:
-    two_links = option("machine", "two_links")
-    for some in (machine, two_links):
-        check_actuator(option("actuator", "rubber"), some)
-        check_task(option("task", "hold"), some)
-    check_effect(option("effect", "sag"), machine)
-    check_finder(option("perception", "darkest"))
+def test_a_new_package_passes_its_own_tests(project: Path, site: Path) -> None:
+    path = os.pathsep.join((str(site), str(ROOT)))
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", str(project / "tests")],
+        cwd=project,
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout
+    assert "6 passed" in done.stdout
 
 
-def test_its_options_are_listed(brokk: Callable[..., Any]) -> None:
+def test_no_name_of_the_template_is_left(tmp_path: Path) -> None:
+    NewPackage(new=PackageRequest(name="ours", folder=str(tmp_path))).run()
+    names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*.*")}
+    assert "ours/ours/conf/machine/two_links.xml" in names and "ours/tests/test_parts.py" in names
+    for path in tmp_path.rglob("*.*"):
+        assert not re.search(r"\bmine\b", path.read_text()), path
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [("torch", "installed already"), ("my-brokk", "a Python package name"), ("class", "name")],
+)
+def test_a_name_that_cannot_be_one_is_refused(
+    name: str, told: str, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    done = brokk("mode=new", f"new.name={name}")
+    assert done.code == 2 and told in done.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_exists_is_left_alone(brokk: Callable[..., Any], tmp_path: Path) -> None:
+    (tmp_path / "my_brokk").mkdir()
+    done = brokk("mode=new", "new.name=my_brokk")
+    assert done.code == 2 and "exists already" in done.err
+    assert [path.name for path in tmp_path.rglob("*")] == ["my_brokk"]
+
+
+def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machine) -> None:
+    check_actuator(option("actuator", "rubber"), machine)
+    check_task(option("task", "hold"), machine)
+
+
+def test_its_options_are_listed(site: Path, brokk: Callable[..., Any]) -> None:
     out = brokk("mode=list").out
     for text in ("rubber", "sag", "darkest", "two_links", "hold", "A planar arm of two links."):
         assert text in out
 
 
-def test_all_of_it_trains_together(brokk: Callable[..., Any], tmp_path: Path) -> None:
+def test_all_of_it_trains_together(site: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
     done = brokk(*shlex.split(TRAINING)[1:])
     assert done.code == 0, done.err
     evaluation = json.loads((tmp_path / "runs/mine/evaluation.json").read_text())

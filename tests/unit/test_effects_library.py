@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import hydra
 import numpy as np
 import pytest
 import torch
 from composed import option
+from omegaconf import OmegaConf
 
 from actuators.effects.composition import Library
 from actuators.identify import dead_time
@@ -16,6 +18,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis.effect_library import load_effects
 
 CPU = torch.device("cpu")
 EFFECTS = """
@@ -234,3 +237,24 @@ def test_what_makes_no_sense_is_refused(changes: dict[str, Any], message: str) -
         changes = {"effects": {name: option("effect", name) for name in names}, "share": 0.1}
     with pytest.raises(ConfigError, match=message):
         replace(option("effect", "library"), **changes)
+
+
+def test_wide_machines_differ_as_those_of_the_library_and_more() -> None:
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        words = ["mode=train", "session.out=unused", "effect=[library,wide]"]
+        effects = OmegaConf.to_container(hydra.compose("config", overrides=words).effect)
+    library, wide = effects["library"], effects["wide"]
+    assert wide["effects"].keys() == library["effects"].keys()
+    for name, effect in library["effects"].items():
+        for key, value in effect.items():
+            other = wide["effects"][name][key]
+            if isinstance(value, list):
+                assert other[0] <= value[0] <= value[1] <= other[1], (name, key)
+            else:
+                assert other == value, (name, key)
+
+
+def test_the_diagnosis_knows_single_effects_beside_options_that_hold_many() -> None:
+    names = [kind.name for kind in load_effects(option("machine", "brokk170"))]
+    assert "backlash" in names
+    assert not {"library", "wide"} & set(names)
