@@ -67,7 +67,8 @@ class TrainingLogger:
         self._steps, self._max_fault_rate = steps_per_iteration, max_fault_rate
         self._quiet = quiet
         self._path = folder / PROGRESS
-        self._rows: list[dict[str, Any]] = []
+        self.rows: list[dict[str, Any]] = []
+        """Figures of every iteration, as `progress.csv` holds them."""
         self._num_unwritten = 0
         self._last_episode: dict[str, float] = {}
         self._clock = time.perf_counter()
@@ -147,7 +148,7 @@ class TrainingLogger:
         if figures["episodes"] or not self._last_episode:
             self._last_episode = episode
         figures |= self._last_episode
-        self._rows.append({"iteration": it, **figures})
+        self.rows.append({"iteration": it, **figures})
         self._num_unwritten += 1
         if self.writer is not None:
             self.writer.log(figures, it)
@@ -162,7 +163,7 @@ class TrainingLogger:
         """Append new rows to `progress.csv`; called with every checkpoint so that both agree."""
         if not self._num_unwritten or self._quiet:
             return
-        rows, self._num_unwritten = self._rows[-self._num_unwritten :], 0
+        rows, self._num_unwritten = self.rows[-self._num_unwritten :], 0
         is_new = not self._path.exists()
         with self._path.open("a", newline="") as file:
             table = csv.DictWriter(file, fieldnames=list(rows[0]), extrasaction="ignore")
@@ -182,8 +183,8 @@ class TrainingLogger:
         with self._path.open(newline="") as file:
             rows = list(csv.DictReader(file))
         self._path.unlink()
-        self._rows = [row for row in rows if float(row["env_steps"]) <= self.env_steps]
-        self._num_unwritten = len(self._rows)
+        self.rows = [row for row in rows if float(row["env_steps"]) <= self.env_steps]
+        self._num_unwritten = len(self.rows)
         self.flush()
 
 

@@ -158,6 +158,8 @@ class TrainingConfig:
         keep_checkpoints: Newest checkpoints kept.
         settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
             learn fast, small ones keep it.
+        output_gain: Factor on the initial weights of the actor's last layer; 1 leaves them. With a
+            small one a residual policy begins as the classical controller.
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.exploration:CappedGaussian`.
@@ -180,6 +182,7 @@ class TrainingConfig:
     save_interval: int
     keep_checkpoints: int
     settling: float
+    output_gain: float
     exploration: Exploration | None
     teacher: Teacher | None
     near_starts: NearStarts | None
@@ -194,6 +197,7 @@ class TrainingConfig:
             require_number(f"rl.{name}", getattr(self, name), least=1)
         for name in ("settling", "max_fault_rate"):
             require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
+        require_number("rl.output_gain", self.output_gain, above=0)
         self._check_runner()
         distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}
         if self.exploration and distribution.get("class_name") != CAPPED:
