@@ -156,6 +156,10 @@ class ToolPoseProcess:
             for name, shape in self._list_state_shapes().items()
         }
         self.episode = {name: torch.zeros(num_envs, device=device) for name in FIGURES}
+        self.term_names = tuple(self._terms)
+        self._term_bits = to_constant([1 << index for index in range(len(self._terms))])
+        self.odd_terms = torch.zeros(num_envs, device=device)
+        """Sum of the bits of reward terms that were not finite in the last step, `(N,)`."""
 
     def _list_state_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of each entry of `state`, without `N`."""
@@ -301,8 +305,13 @@ class ToolPoseProcess:
         """Return the weighted sum of all terms, `(N,)`."""
         curriculum, reward = self.options.curriculum, torch.zeros_like(tool.reach_m)
         scale = curriculum.scale(self.state["succeeded"]) if curriculum else {}
+        values = []
         for name, (term, weight) in self._terms.items():
-            reward = reward + scale.get(name, 1.0) * weight * term(tool)
+            values.append(scale.get(name, 1.0) * weight * term(tool))
+            reward = reward + values[-1]
+        if values:
+            odd = ~torch.stack(values, 1).isfinite()
+            self.odd_terms.copy_((odd * self._term_bits).sum(1))
         return reward
 
     def observe(

@@ -178,6 +178,16 @@ def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
     return isinstance(process, DeployableTask)
 
 
+@runtime_checkable
+class TermedTask(Protocol):
+    """A task process that says which reward term was not finite; optional, for recorded faults."""
+
+    term_names: tuple[str, ...]
+    """Names of the reward terms, 24 at most."""
+    odd_terms: torch.Tensor
+    """Sum of 2^index over the terms that were not finite in the last step, `(N,)` float32."""
+
+
 class Task(Protocol):
     """A spec in `conf/task`: builds a task process.
 

@@ -24,13 +24,7 @@ from brokk_rl.rl.execution import capture_graph
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingConfig
-from brokk_rl.rl.success_sweep import (
-    LEVELS,
-    SuccessSweep,
-    report_sweep,
-    run_sweep,
-    summarise,
-)
+from brokk_rl.rl.success_sweep import LEVELS, SuccessSweep, report_sweep, run_sweep, summarise
 from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, read_versions, write_json

@@ -13,7 +13,7 @@ from brokk_rl import distributed
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task, supports_classical_control, supports_deployment
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import CheckpointError
+from brokk_rl.errors import CheckpointError, SimulationError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.rl.distributed import TrainingGroup
@@ -32,9 +32,15 @@ from brokk_rl.rl.tracking import NoTracking, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session
 from brokk_rl.sim.events import Event
+from brokk_rl.sim.fault_replay import describe_cause
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
+
+FAULTS = "faults"
+"""Folder of recorded faults in a run folder."""
+MAX_FAULT_FILES = 8
+"""Faults that one process writes, 100 kB each. Chosen by hand: later ones tell little more."""
 
 
 @spec
@@ -98,6 +104,8 @@ class Train:
         )
         if self.rl.near_starts:
             loop.bring_near(self.rl.near_starts, self.session.stream("starts"))
+        if self.rl.fault_steps:
+            loop.record_faults(self.rl.fault_steps)
         loop.capture(self.rl.fuse)
         group = TrainingGroup(device)
         _log_setup(loop, group)
@@ -132,11 +140,12 @@ class Train:
         """Return the logger of this process; only the first of several writes."""
         folder = self.session.folder
         tracking = self.tracking if group.rank.first else NoTracking()
+        faults = FaultLog(loop, folder / FAULTS, f"rank{group.rank.index}_")
         run_config = {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed}
         return TrainingLogger(
             folder,
             tracking.open(folder, run_config),
-            lambda: group.pool_statistics(loop.statistics()),
+            lambda: group.pool_statistics(faults.read_statistics()),
             loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count,
             self.rl.max_fault_rate,
             self.rl.budget.share_spent,
@@ -185,6 +194,44 @@ class Train:
                 (folder / PROGRESS).unlink(missing_ok=True)
             return None
         return find_checkpoint(Path(self.resume))
+
+
+class FaultLog:
+    """Writes the faults of a training with their causes.
+
+    Args:
+        loop: The control loop.
+        folder: For the files; made where there is a fault.
+        prefix: Beginning of the file names; several processes write into one folder.
+    """
+
+    def __init__(self, loop: ControlLoop, folder: Path, prefix: str) -> None:
+        self._loop, self._folder, self._prefix = loop, folder, prefix
+        self._num_written = len(list(folder.glob(f"{prefix}*.npz")))
+
+    def read_statistics(self) -> dict[str, float]:
+        """Return `ControlLoop.statistics`; write the faults since the last call.
+
+        Raises:
+            SimulationError: A reward was not finite: the next update would spoil the policy.
+        """
+        statistics = self._loop.statistics()
+        if self._loop.recorder is None or not self._loop.num_held:
+            return statistics
+        for fault in self._loop.recorder.fetch(MAX_FAULT_FILES - self._num_written):
+            fault.cause = describe_cause(fault, self._loop.machine)
+            self._folder.mkdir(exist_ok=True)
+            path = self._folder / f"{self._prefix}{self._num_written}.npz"
+            fault.save(path)
+            self._num_written += 1
+            command = f"brokk mode=replay machine={fault.machine} replay.fault={path}"
+            log.warning("a world diverged: %s. Play it: %s", fault.cause, command)
+            if fault.terms:
+                raise SimulationError(
+                    f"{fault.cause}: expected finite rewards. Look at task.reward; the state stands "
+                    f"in {path} ({command}). The newest checkpoint is from before."
+                )
+        return statistics
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

@@ -129,7 +129,8 @@ class TrainingLogger:
                 f"{statistics['fault_rate']:.2%} of the control steps of iteration {it} ended in a "
                 "world that diverged, became NaN or overflowed its contact buffers (limit "
                 f"{self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step "
-                "(sim.substeps) and the sizes of the buffers (sim)."
+                "(sim.substeps) and the sizes of the buffers (sim). The first ones are recorded in "
+                "the folder faults of the run."
             )
         figures = {
             "env_steps": float(self.env_steps),

@@ -167,6 +167,8 @@ class TrainingConfig:
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
+        fault_steps: Control steps kept of each world; those of worlds that diverge are written into
+            `faults` of the run folder. 0 records nothing.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
             compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
             less than half of a control step of few worlds, far more.
@@ -187,6 +189,7 @@ class TrainingConfig:
     teacher: Teacher | None
     near_starts: NearStarts | None
     max_fault_rate: float
+    fault_steps: int
     fuse: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
@@ -197,6 +200,7 @@ class TrainingConfig:
             require_number(f"rl.{name}", getattr(self, name), least=1)
         for name in ("settling", "max_fault_rate"):
             require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
+        require_number("rl.fault_steps", self.fault_steps, least=0)
         require_number("rl.output_gain", self.output_gain, above=0)
         self._check_runner()
         distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}

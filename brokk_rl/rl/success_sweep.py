@@ -8,7 +8,6 @@ measured is read from the table, so that a stopped sweep goes on.
 from __future__ import annotations
 
 import copy
-import csv
 import itertools
 import json
 import logging
@@ -222,7 +221,9 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             times = [row[name] for row in members if row[name] is not None]
             line[f"passed_{level:.2f}"] = len(times)
             line[name] = median(times) if 2 * len(times) > len(members) else None
-        line["env_steps_per_s"] = round(median(row["env_steps"] / row["seconds"] for row in members))
+        line["env_steps_per_s"] = round(
+            median(row["env_steps"] / row["seconds"] for row in members)
+        )
         found.append(line)
     return found
 

@@ -23,7 +23,9 @@ from brokk_rl.rl.success_sweep import (
 )
 from brokk_rl.session import Session
 
-SWEEP = SuccessSweep(num_envs=(8, 16), epochs=(1, 2), mini_batches=(2,), seeds=(3,), max_seconds=0.2)
+SWEEP = SuccessSweep(
+    num_envs=(8, 16), epochs=(1, 2), mini_batches=(2,), seeds=(3,), max_seconds=0.2
+)
 
 
 def rows(*pairs: tuple[int, float]) -> list[dict[str, float]]:
