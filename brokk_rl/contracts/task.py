@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from brokk_rl.history import History
     from brokk_rl.machine import Machine
+    from brokk_rl.symmetry import Mirror
 
 STEPS = "steps"
 """Entry of `TaskProcess.state` with the control steps of the running episode. The trainer sets it
@@ -176,6 +177,19 @@ def can_move_target(process: object) -> TypeGuard[MovableTask]:
 def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
     """Return whether the policy of a task process can be exported to ONNX."""
     return isinstance(process, DeployableTask)
+
+
+@runtime_checkable
+class MirroredTask(Protocol):
+    """A task process whose episodes have a mirror image; optional, for `rl.symmetry`."""
+
+    def mirror(self) -> Mirror:
+        """Return the mirror of all observation groups and of the action.
+
+        Raises:
+            ConfigError: The machine is not left-right symmetric.
+        """
+        ...
 
 
 @runtime_checkable

@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.errors import CheckpointError, StorageError
+from brokk_rl.contracts.task import MirroredTask
+from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.logger import TrainingLogger
@@ -70,6 +71,13 @@ class TrainingRunner(OnPolicyRunner):
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
         self.logger = logger  # type: ignore[assignment]
+        if training.symmetry and isinstance(self.alg, DevicePPO):
+            if not isinstance(env.task, MirroredTask):
+                raise ConfigError(
+                    f"rl.symmetry: the task ({type(env.task).__name__}) has no method mirror; give "
+                    "rl.symmetry=false"
+                )
+            self.alg.use_mirror(env.task.mirror())
         scale_output(self.alg.actor, training.output_gain)
         if training.teacher and isinstance(self.alg, DevicePPO):
             self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)

@@ -163,6 +163,8 @@ class TrainingConfig:
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.exploration:CappedGaussian`.
+        symmetry: Learn from each step and its left-right mirror image, at twice the arithmetic of an
+            update. The machine has to be symmetric.
         teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
@@ -186,6 +188,7 @@ class TrainingConfig:
     settling: float
     output_gain: float
     exploration: Exploration | None
+    symmetry: bool
     teacher: Teacher | None
     near_starts: NearStarts | None
     max_fault_rate: float
@@ -223,6 +226,11 @@ class TrainingConfig:
             raise ConfigError(
                 "rl.runner.algorithm.rnd_cfg: random network distillation is not supported; "
                 "more exploration comes from rl.runner.actor.distribution_cfg.std_range"
+            )
+        if self.runner.get("algorithm", {}).get("symmetry_cfg") is not None:
+            raise ConfigError(
+                "rl.runner.algorithm.symmetry_cfg: rsl-rl's own is not supported; rl.symmetry=true "
+                "learns from each step and its mirror image"
             )
         for path, bounds in RUNNER_BOUNDS.items():
             value: Any = self.runner
