@@ -1,15 +1,16 @@
 """Contract of a task, and of the policies that act in it.
 
 A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes
-of `N` environments at once. That contract is all that training and evaluation need. Three more are
-optional, and `supports_classical_control`, `can_move_target` and `supports_deployment` ask for
-them:
+of `N` environments at once. That contract is all that training and evaluation need. Five more are
+optional:
 
 * `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
   and `policy=classical` works.
 * `MovableTask`: the target may be moved during an episode, as `mode=play` does.
 * `DeployableTask`: the task can write its policy as one module from observation to command. Then
   `mode=export` and the end of `mode=train` write `policy.onnx`.
+* `MirroredTask`: episodes have a mirror image, as `rl.symmetry` needs.
+* `TermedTask`: the task names the reward term that was not finite.
 
 `brokk_rl.checks.check_task` exercises a task against all of this, for our own options and for those
 of extensions.

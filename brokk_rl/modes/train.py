@@ -28,6 +28,7 @@ from brokk_rl.rl.policy import (
 )
 from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
+from brokk_rl.rl.success_sweep import LEVELS, find_passing
 from brokk_rl.rl.tracking import NoTracking, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session
@@ -127,6 +128,7 @@ class Train:
             runner.run()
         if not group.rank.first:
             return None
+        _log_success(logger)
         facts = {
             "env_steps": logger.env_steps,
             "seconds": logger.seconds,
@@ -232,6 +234,14 @@ class FaultLog:
                     f"in {path} ({command}). The newest checkpoint is from before."
                 )
         return statistics
+
+
+def _log_success(logger: TrainingLogger) -> None:
+    """Log how many seconds of training the levels of success took."""
+    for level in LEVELS:
+        passed = find_passing(logger.rows, level)
+        text = "not reached" if passed is None else f"after {float(passed['seconds']):.1f} s"
+        log.info("strict success of %.2f while learning: %s", level, text)
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

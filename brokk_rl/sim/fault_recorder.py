@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -101,7 +102,7 @@ def load_fault(path: Path) -> Fault:
             world=about["world"],
             cause=about["cause"],
         )
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, BadZipFile) as error:
         raise ConfigError(
             f"{path} is no recorded fault ({error!r}); expected a file faults/*.npz of a run folder"
         ) from error
@@ -113,8 +114,8 @@ class FaultRecorder:
     Args:
         world: The worlds.
         machine: Their machine.
-        num_steps: Control steps kept of each world; memory is 20 numbers a joint and 100 steps
-            times five, 10 kB a world with five joints in float32.
+        num_steps: Control steps kept of each world, five numbers a joint and step: 100 steps of
+            five joints take 10 kB a world in float32.
         term_names: Names of the reward terms whose bits `close` may be given.
     """
 
