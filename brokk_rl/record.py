@@ -134,6 +134,26 @@ def find_stretches(condition: np.ndarray) -> list[tuple[int, int]]:
     return [(int(begin), int(end - begin)) for begin, end in edges.reshape(-1, 2)]
 
 
+def split_at_gaps(
+    clocks: Sequence[np.ndarray], longest_gap_s: float
+) -> Iterator[tuple[float, float]]:
+    """Yield the spans, begin and end in s, in which none of several clocks has a gap."""
+    begin_s, end_s = max(t_s[0] for t_s in clocks), min(t_s[-1] for t_s in clocks)
+    gaps: list[tuple[float, float]] = []
+    for t_s in clocks:
+        rows = np.flatnonzero(np.diff(t_s) > longest_gap_s)
+        gaps += zip(t_s[rows].tolist(), t_s[rows + 1].tolist(), strict=True)
+    at_s = begin_s
+    for before_s, after_s in sorted(gaps):
+        if before_s >= end_s:
+            break
+        if before_s >= at_s:
+            yield at_s, before_s
+        at_s = max(at_s, after_s)
+    if at_s <= end_s:
+        yield at_s, end_s
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recording:
     """One run of a machine at its control rate.

@@ -1,27 +1,44 @@
 """Logs of other machines: the meaning of their columns, and conversion to recordings.
 
-A log is a CSV file, a parquet file (`.parquet`) or a MATLAB file up to version 7 (`.mat`).
+`log_files` says which logs can be read. A log is cut at its gaps and each piece is brought to the
+machine's rate: positions linearly between samples, commands as the value in force (zero-order
+hold). Signals on clocks of their own keep them; a piece ends where any of them has a gap. Pieces of
+one run share the metadata `run`, so that no split into fit and test goes through a run.
 
-A log is cut at its gaps and each piece is brought to the machine's rate: positions linearly between
-samples, commands as the value in force (zero-order hold). Pieces of one log share the metadata
-`run`, so that no split into fit and test goes through a log.
+A column is named as in the log, with its table where the log has several:
+`/joint_states:position[elbow]`. In its place may stand arithmetic over columns, `target - q`; a
+column of another clock is interpolated.
 
 Rows in messages are those of the log's data, from 0 as in recordings, beside the line of the file
 that an editor shows.
 """
 
-import csv
-import io
+from __future__ import annotations
+
 import logging
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-from scipy import io as matlab
+from scipy.stats import theilslopes
 
+from actuators.recordings.expression import Expression
+from actuators.recordings.log_files import open_log
+from actuators.recordings.log_signals import (
+    Piece,
+    Places,
+    RunSignals,
+    Signal,
+    find_first,
+    index_columns,
+    locate,
+    refuse_missing,
+    resolve_column,
+)
+from actuators.recordings.log_tables import LogFile, LogRun, Table, join_names
+from actuators.recordings.text_log import CsvLayout
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -30,13 +47,17 @@ from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
+CLOCK_POINTS = 200
+"""Points of the line that ties one clock to another; its cost grows with their square, and 200
+points of the fastest messages fix a drift of 1 ppm within minutes."""
+
 
 @spec
 class Column:
     """A column of numbers: `scale * value + offset`.
 
     Attributes:
-        column: Its name in the header.
+        column: Its name in the log, or arithmetic over columns.
         scale: Unit of the recording for one of the log.
         offset: Added after scaling, in the unit of the recording.
     """
@@ -47,32 +68,75 @@ class Column:
 
 
 @spec
+class AlignedTime:
+    """A clock that is tied to another one of the same table by a straight line.
+
+    Samples carry the time of the sensor's own clock, whose zero and drift are unknown, and that of
+    the recorder, which is late by the varying time of the transport. The line goes through the
+    samples that were fastest.
+
+    Attributes:
+        column: Time of the sensor's clock.
+        scale: Seconds for one of it.
+        anchor: Time of the recorder's clock, to s.
+    """
+
+    column: str
+    scale: float
+    anchor: Column
+
+    def align(self, stamp_s: np.ndarray, anchor_s: np.ndarray) -> np.ndarray:
+        """Return times of the recorder's clock without the scatter of the transport, `(T,)` s."""
+        late_s = anchor_s - stamp_s
+        blocks = np.array_split(np.arange(len(late_s)), min(CLOCK_POINTS, len(late_s)))
+        fastest = [int(rows[np.argmin(late_s[rows])]) for rows in blocks]
+        x, y = stamp_s[fastest] - stamp_s[0], late_s[fastest]
+        slope = float(theilslopes(y, x).slope) if len(fastest) > 2 and np.ptp(x) > 0 else 0.0
+        return stamp_s + float(np.median(y - slope * x)) + slope * (stamp_s - stamp_s[0])
+
+
+@spec
 class CommandColumn:
     """A column of commands, linear on either side of neutral.
 
     Attributes:
-        column: Its name in the header.
+        column: Its name in the log, or arithmetic over columns.
         neutral: Value without motion.
         full_plus: Value of full command towards larger positions; may lie below `neutral`, which
-            turns the sign.
-        full_minus: Value of full command towards smaller positions.
+            turns the sign. `null` for commands that go the other way only.
+        full_minus: Value of full command towards smaller positions, or `null`.
     """
 
     column: str
     neutral: float
-    full_plus: float
-    full_minus: float
+    full_plus: float | None
+    full_minus: float | None
 
     def check(self) -> None:
-        if (self.full_plus - self.neutral) * (self.full_minus - self.neutral) >= 0:
+        if self.full_plus is None or self.full_minus is None:
+            full = self.full_plus if self.full_minus is None else self.full_minus
+            if full is None or full == self.neutral:
+                raise ConfigError(
+                    f"column '{self.column}': expected full_plus or full_minus other than neutral {self.neutral:g}"
+                )
+        elif (self.full_plus - self.neutral) * (self.full_minus - self.neutral) >= 0:
             raise ConfigError(
                 f"column '{self.column}': neutral {self.neutral:g} must lie between full_plus {self.full_plus:g} and full_minus "
                 f"{self.full_minus:g}"
             )
 
     def command(self, values: np.ndarray) -> np.ndarray:
-        """Return commands, full at -1 and 1, for values of the log; same shape."""
+        """Return commands, full at -1 and 1, for values of the log; same shape.
+
+        Where commands go one way only, those of the other way come out beyond full: NaN.
+        """
         away = values - self.neutral
+        if self.full_minus is None:
+            plus = away / (self.full_plus - self.neutral)  # type: ignore[operator]
+            return np.where(plus >= 0, plus, np.nan)
+        if self.full_plus is None:
+            minus = away / (self.full_minus - self.neutral)
+            return np.where(minus >= 0, -minus, np.nan)
         plus = away / (self.full_plus - self.neutral)
         return np.where(plus >= 0, plus, -away / (self.full_minus - self.neutral))
 
@@ -82,7 +146,7 @@ class TargetColumn:
     """A column of target positions whose speed is the command, for a servo that follows targets.
 
     Attributes:
-        column: Its name in the header.
+        column: Its name in the log, or arithmetic over columns.
         scale: Unit of the recording for one of the log; negative turns the sign.
         full_speed: Speed of the target at full command, rad/s or m/s; that of the machine's
             `max_speed`, for a model that integrates commands to give the target.
@@ -124,7 +188,8 @@ class ColumnMap:
     Attributes:
         delimiter: Between the cells of a line of a CSV file.
         decimal: Decimal sign of its numbers.
-        time: Time, to s; its zero does not matter.
+        time: Time, to s; its zero does not matter. One column for all tables of a log, or one for
+            each by its name.
         joints: Columns of each joint of the machine, by joint name.
         optional: Further columns, by their name in the recording (`ee_x_m`, `force_n`, …);
             interpolated like positions.
@@ -135,7 +200,7 @@ class ColumnMap:
 
     delimiter: Literal[",", ";", "\t", " "]
     decimal: Literal[".", ","]
-    time: Column
+    time: Column | AlignedTime | dict[str, Column | AlignedTime]
     joints: dict[str, JointColumns]
     optional: dict[str, Column]
     overrun: float
@@ -151,8 +216,9 @@ class ColumnMap:
             raise ConfigError(
                 "column map: expected overrun >= 0, longest_gap_s > 0 and shortest_s >= 0"
             )
-        if self.time.scale <= 0:
-            raise ConfigError(f"column map: time.scale {self.time.scale:g} must be positive")
+        for time in self.time.values() if isinstance(self.time, dict) else (self.time,):
+            if time.scale <= 0:
+                raise ConfigError(f"column map: time.scale {time.scale:g} must be positive")
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
         """Return the pieces of the log at `path` as recordings of `machine`.
@@ -161,261 +227,155 @@ class ColumnMap:
             ConfigError: the map is not for this machine.
             RecordingError: the log cannot be used; names file, line, row and column.
         """
+        return self.read_log(open_log(path, CsvLayout(self.delimiter, self.decimal)), machine)
+
+    def read_log(self, opened: LogFile, machine: Machine) -> list[Recording]:
+        """Return the pieces of an opened log; see `read`."""
         if set(self.joints) != set(machine.joint_names):
             raise ConfigError(
                 f"import: the map names the joints {', '.join(self.joints)}, machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
-        table = _open_table(path, self.delimiter, self.decimal)
-        t_s = table.numbers(self.time)
-        if (row := _find_first(np.diff(t_s) <= 0)) is not None:
-            where = table.where(row + 1, self.time.column)
+        places = index_columns(opened.list_tables())
+        sources = {text: resolve_column(text, places, opened.path) for text in self._list_texts()}
+        wanted = self._list_wanted(sources, places, opened.path)
+        found, num_rows = [], 0
+        for run in opened.read_runs(wanted, None):
+            clocks = {
+                name: _read_clock(run, name, table, self) for name, table in run.tables.items()
+            }
+            found += self._read_run(RunSignals(run, sources, places, clocks), clocks, machine)
+            num_rows += max(map(len, clocks.values()))
+        if not found:
             raise RecordingError(
-                f"{where}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
-            )
-        u = np.stack(
-            [self._commands(table, self.joints[name].command, t_s) for name in machine.joint_names],
-            1,
-        )
-        q = np.stack([table.numbers(self.joints[name].position) for name in machine.joint_names], 1)
-        extra = {name: table.numbers(column, empty=True) for name, column in self.optional.items()}
-        pieces = np.split(
-            np.arange(len(t_s)), np.flatnonzero(np.diff(t_s) > self.longest_gap_s) + 1
-        )
-        kept = []
-        for rows in pieces:
-            if len(rows) > 1 and t_s[rows[-1]] - t_s[rows[0]] >= max(
-                self.shortest_s, machine.period_s
-            ):
-                kept.append(rows)
-        if not kept:
-            raise RecordingError(
-                f"{path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
-                f"{len(t_s)} rows; is import.time.scale right?"
-            )
-        if len(kept) < len(pieces):
-            log.warning(
-                "%s: %d pieces shorter than %g s left out",
-                path,
-                len(pieces) - len(kept),
-                self.shortest_s,
-            )
-        found = []
-        for p in kept:
-            found.append(
-                _resample(t_s[p], u[p], q[p], {k: v[p] for k, v in extra.items()}, path, machine)
+                f"{opened.path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
+                f"{num_rows} rows; is import.time.scale right?"
             )
         return found
 
-    def _commands(
-        self, table: "_Table | _NumberTable", column: CommandColumn | TargetColumn, t_s: np.ndarray
-    ) -> np.ndarray:
-        values = table.numbers(Column(column=column.column, scale=1.0, offset=0.0))
+    def find_time(self, table: str, where: object) -> Column | AlignedTime:
+        """Return the time of a table.
+
+        Raises:
+            RecordingError: The map has none.
+        """
+        if not isinstance(self.time, dict):
+            return self.time
+        if table not in self.time:
+            raise RecordingError(
+                f"{where}: the map has no time for table '{table}'; {list_choices(table, self.time)}"
+            )
+        return self.time[table]
+
+    def _list_texts(self) -> list[str]:
+        texts = [column.column for column in self.optional.values()]
+        for joint in self.joints.values():
+            texts += [joint.command.column, joint.position.column]
+        return texts
+
+    def _list_wanted(
+        self, sources: Mapping[str, Expression | str], places: Places, where: Path
+    ) -> dict[str, set[str]]:
+        """Return the columns to read by table, those of the clocks too."""
+        wanted: dict[str, set[str]] = {}
+        for source in sources.values():
+            for name in (source,) if isinstance(source, str) else source.names:
+                table, column = places[name]
+                wanted.setdefault(table, set()).add(column)
+        for table, columns in wanted.items():
+            time = self.find_time(table, where)
+            texts = [time.column]
+            if isinstance(time, AlignedTime):
+                texts.append(time.anchor.column)
+            for text in texts:
+                refuse_missing(join_names(table, text), places, where)
+                columns.add(text)
+        return wanted
+
+    def _read_run(
+        self, signals: RunSignals, clocks: Mapping[str, np.ndarray], machine: Machine
+    ) -> list[Recording]:
+        """Return the pieces of a run; one column after the other is read and resampled."""
+        spans_s, num_left_out = [], 0
+        for begin_s, end_s in record.split_at_gaps(list(clocks.values()), self.longest_gap_s):
+            if end_s - begin_s >= max(self.shortest_s, machine.period_s) - 1e-9:
+                spans_s.append((begin_s, end_s))
+            else:
+                num_left_out += 1
+        if num_left_out:
+            log.warning(
+                "%s: %d pieces shorter than %g s left out",
+                signals.run.where,
+                num_left_out,
+                self.shortest_s,
+            )
+        pieces = [Piece(begin_s, end_s, machine) for begin_s, end_s in spans_s]
+        for j, name in enumerate(machine.joint_names):
+            command = self._read_command(signals, self.joints[name].command)
+            for piece in pieces:
+                piece.u[:, j] = command.hold(piece.ticks_s, machine.period_s)
+            position = _scale(signals, self.joints[name].position)
+            for piece in pieces:
+                piece.q[:, j] = position.interpolate(piece.ticks_s)
+        for name, column in self.optional.items():
+            optional = _scale(signals, column, True)
+            for piece in pieces:
+                piece.extra[name] = optional.interpolate(piece.ticks_s).astype(np.float32)
+        clock_s = clocks[signals.find_table(self.joints[machine.joint_names[0]].position.column)]
+        return [piece.make_recording(signals.run, clock_s) for piece in pieces]
+
+    def _read_command(self, signals: RunSignals, column: CommandColumn | TargetColumn) -> Signal:
+        signal = signals.read(column.column)
         if isinstance(column, TargetColumn):
-            u = column.command(values, t_s)
+            u = column.command(signal.values, signal.t_s)
             # a gap between pieces is no motion of the target
-            u[:-1][np.diff(t_s) > self.longest_gap_s] = 0.0
+            u[:-1][np.diff(signal.t_s) > self.longest_gap_s] = 0.0
         else:
-            u = column.command(values)
-        if (row := _find_first(np.abs(u) > 1.0 + self.overrun)) is not None:
-            raise RecordingError(
-                f"{table.where(row, column.column)}: command {u[row]:g} is beyond full by more than {self.overrun:g}; "
-                "mend full_plus, full_minus, neutral or full_speed of the column map, or the log"
-            )
-        return u.clip(-1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class Cells:
-    """The text of a CSV file.
-
-    Attributes:
-        header: Names of the columns.
-        rows: Cells of each row of data.
-        lines: Line of the file that each row ends on, from 1.
-    """
-
-    header: list[str]
-    rows: list[list[str]]
-    lines: list[int]
-
-
-class _Table:
-    """A CSV file whose cells become numbers when asked for."""
-
-    def __init__(self, path: Path, delimiter: str, decimal: str) -> None:
-        self._path, self._decimal = path, decimal
-        self._cells = _read_cells(path, delimiter)
-
-    def where(self, row: int, column: str) -> str:
-        """Return file, line, row and column for a message."""
-        return f"{self._path}: line {self._cells.lines[row]} (row {row}), column '{column}'"
-
-    def numbers(self, column: Column, empty: bool = False) -> np.ndarray:
-        """Return a column, shape `(T,)`; an empty cell is NaN where `empty` allows it."""
-        header = self._cells.header
-        if column.column not in header:
-            raise RecordingError(
-                f"{self._path}: column '{column.column}' is missing; {list_choices(column.column, header)}"
-            )
-        if header.count(column.column) > 1:
-            raise RecordingError(
-                f"{self._path}: {header.count(column.column)} columns are named '{column.column}'; rename them"
-            )
-        at = header.index(column.column)
-        values = np.empty(len(self._cells.rows))
-        for row, cells in enumerate(self._cells.rows):
-            text = cells[at]
-            try:
-                values[row] = float(text.replace(self._decimal, ".") or ("nan" if empty else ""))
-            except ValueError:
+            u = column.command(signal.values)
+        with np.errstate(invalid="ignore"):
+            row = find_first(~(np.abs(u) <= 1.0 + self.overrun))
+        if row is not None:
+            where = locate(signals.run, signal.table, row, column.column)
+            if np.isnan(u[row]):
                 raise RecordingError(
-                    f"{self.where(row, column.column)}: '{text}' is not a number"
-                ) from None
-            if not (empty or np.isfinite(values[row])):
-                raise RecordingError(f"{self.where(row, column.column)}: {text} is not a number")
-        return column.scale * values + column.offset
-
-
-class _NumberTable:
-    """A log whose columns are numbers already: parquet or MATLAB."""
-
-    def __init__(self, path: Path, columns: dict[str, np.ndarray]) -> None:
-        self._path, self._columns = path, columns
-
-    def where(self, row: int, column: str) -> str:
-        """Return file, row and column for a message."""
-        return f"{self._path}: row {row}, column '{column}'"
-
-    def numbers(self, column: Column, empty: bool = False) -> np.ndarray:
-        """Return a column, shape `(T,)`; NaN is refused unless `empty` allows it."""
-        if column.column not in self._columns:
+                    f"{where}: {signal.values[row]:g} lies on the side of neutral for which the column map has no full "
+                    "command; give both full_plus and full_minus, or mend neutral"
+                )
             raise RecordingError(
-                f"{self._path}: column '{column.column}' is missing or holds no numbers; "
-                f"{list_choices(column.column, self._columns)}"
+                f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
+                "neutral or full_speed of the column map, or the log"
             )
-        values = self._columns[column.column]
-        if not empty and (row := _find_first(~np.isfinite(values))) is not None:
-            raise RecordingError(f"{self.where(row, column.column)}: {values[row]} is not a number")
-        return column.scale * values + column.offset
+        return Signal(signal.table, signal.t_s, u.clip(-1.0, 1.0), signal.text)
 
 
-def _open_table(path: Path, delimiter: str, decimal: str) -> _Table | _NumberTable:
-    """Open a log by the ending of its name."""
-    kind = path.suffix.lower()
-    if kind == ".parquet":
-        return _NumberTable(path, _read_parquet(path))
-    if kind == ".mat":
-        return _NumberTable(path, _read_matlab(path))
-    return _Table(path, delimiter, decimal)
+def _scale(signals: RunSignals, column: Column, empty: bool = False) -> Signal:
+    """Return a column in the unit of the recording."""
+    signal = signals.read(column.column, empty)
+    return replace(signal, values=column.scale * signal.values + column.offset)
 
 
-def _read_parquet(path: Path) -> dict[str, np.ndarray]:
-    """Return the columns of numbers by name."""
-    try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowException) as error:
-        raise RecordingError(f"{path}: cannot be read as parquet ({error})") from error
-    found = {}
-    for name in table.column_names:
-        kind = table[name].type
-        if pa.types.is_floating(kind) or pa.types.is_integer(kind):
-            found[name] = table[name].to_numpy().astype(float)
-    return found
+def _read_clock(run: LogRun, name: str, table: Table, column_map: ColumnMap) -> np.ndarray:
+    """Return the times of a table, `(T,)` s.
 
-
-def _read_matlab(path: Path) -> dict[str, np.ndarray]:
-    """Return the real vectors of the most frequent length by name."""
-    try:
-        given = matlab.loadmat(path)
-    except (OSError, ValueError, NotImplementedError) as error:
+    Raises:
+        RecordingError: They do not increase.
+    """
+    time = column_map.find_time(name, run.where)
+    t_s = time.scale * np.asarray(table.columns[time.column], dtype=float)
+    if isinstance(time, Column):
+        t_s = t_s + time.offset
+    if len(t_s) < 2:
         raise RecordingError(
-            f"{path}: cannot be read as a MATLAB file up to version 7 ({error})"
-        ) from error
-    vectors = {}
-    for name, values in given.items():
-        is_real = isinstance(values, np.ndarray) and values.dtype.kind in "fiu"
-        if is_real and values.size > 1 and values.size == max(values.shape):
-            vectors[name] = values.ravel().astype(float)
-    sizes = [len(values) for values in vectors.values()]
-    length = max(sizes, key=sizes.count, default=0)
-    return {name: values for name, values in vectors.items() if len(values) == length}
-
-
-def _find_first(condition: np.ndarray) -> int | None:
-    """Return the first row where `condition` holds, or `None`."""
-    rows = np.flatnonzero(condition)
-    return int(rows[0]) if len(rows) else None
-
-
-def _read_cells(path: Path, delimiter: str) -> Cells:
-    """Read a CSV file; a last line that a crash may have cut off is left out with a warning."""
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: no such log") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: not a text file that can be read ({error})") from error
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
-    try:
-        lines = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader if cells]
-    except csv.Error as error:
-        raise RecordingError(f"{path}: line {reader.line_num}: not CSV ({error})") from error
-    if len(lines) < 2:
+            f"{run.where}: table '{name}' has {len(t_s)} rows; a log has at least 2"
+        )
+    if (row := find_first(~np.isfinite(t_s))) is not None:
+        text = table.show_cell(row, time.column)
+        raise RecordingError(f"{locate(run, name, row, time.column)}: {text} is not a number")
+    if (row := find_first(np.diff(t_s) <= 0)) is not None:
         raise RecordingError(
-            f"{path}: {max(0, len(lines) - 1)} rows of data below the header; a log has at least 2"
+            f"{locate(run, name, row + 1, time.column)}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
         )
-    (_, header), *body = lines
-    number, last = body[-1]
-    if len(last) < len(header) or not text.endswith(
-        ("\n", "\r")
-    ):  # a number may be cut off too, and still look like one
-        log.warning(
-            "%s: the last line, %d, is cut off or lacks its end (%d of %d cells): left out",
-            path,
-            number,
-            len(last),
-            len(header),
-        )
-        body.pop()
-    for row, (number, cells) in enumerate(body):
-        if len(cells) != len(header):
-            raise RecordingError(
-                f"{path}: line {number} (row {row}): {len(cells)} cells, the header has {len(header)}"
-            )
-    return Cells(header, [cells for _, cells in body], [number for number, _ in body])
-
-
-def _resample(
-    t_s: np.ndarray,
-    u: np.ndarray,
-    q: np.ndarray,
-    extra: dict[str, np.ndarray],
-    path: Path,
-    machine: Machine,
-) -> Recording:
-    """Return a piece at the machine's rate."""
-    ends_s = t_s - t_s[0]
-    period_s = np.diff(t_s)
-    was = f"{1.0 / np.median(period_s):.1f} Hz, periods of {period_s.min():.3f} to {period_s.max():.3f} s"
-    grid_s = np.arange(int(ends_s[-1] / machine.period_s + 1e-6) + 1) * machine.period_s
-    newest = np.searchsorted(ends_s, grid_s + 1e-6 * machine.period_s, side="right") - 1
-    return Recording(
-        machine=machine.name,
-        joints=machine.joint_names,
-        units=tuple(joint.unit for joint in machine.joints),
-        rate_hz=1.0 / machine.period_s,
-        t_s=grid_s,
-        u=u[newest].astype(np.float32),
-        q=np.stack([np.interp(grid_s, ends_s, values) for values in q.T], 1).astype(np.float32),
-        extra={
-            name: np.interp(grid_s, ends_s, values).astype(np.float32)
-            for name, values in extra.items()
-        },
-        metadata={
-            "source": f"log: {path.name}",
-            "run": path.stem,
-            "fingerprint": record.format_fingerprint(machine),
-            "resampled_from": was,
-        },
-    )
+    if isinstance(time, AlignedTime):
+        anchor = np.asarray(table.columns[time.anchor.column], dtype=float)
+        t_s = time.align(t_s, time.anchor.scale * anchor + time.anchor.offset)
+    return t_s

@@ -1,7 +1,7 @@
 """Contract of a task, and of the policies that act in it.
 
 A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes
-of `N` environments at once. That contract is all that training and evaluation need. Five more are
+of `N` environments at once. That contract is all that training and evaluation need. Four more are
 optional:
 
 * `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
@@ -10,7 +10,6 @@ optional:
 * `DeployableTask`: the task can write its policy as one module from observation to command. Then
   `mode=export` and the end of `mode=train` write `policy.onnx`.
 * `MirroredTask`: episodes have a mirror image, as `rl.symmetry` needs.
-* `TermedTask`: the task names the reward term that was not finite.
 
 `brokk_rl.checks.check_task` exercises a task against all of this, for our own options and for those
 of extensions.
@@ -40,6 +39,8 @@ STEPS = "steps"
 once to spread the first episodes over time."""
 FAULT = "fault"
 """Entry of `TaskProcess.reasons` for an episode whose world diverged (`World.faults`)."""
+REWARD = "reward/"
+"""Begins the figures of `TaskProcess.episode` that add up one term of the reward each."""
 SUCCESS = "success_strict"
 """Figure of `TaskProcess.episode` by which policies are compared: 1 after success, else 0."""
 
@@ -144,6 +145,15 @@ class MovableTask(Protocol):
 
 
 @runtime_checkable
+class CountedStarts(Protocol):
+    """A task process that says how many of its random starts can be done; optional."""
+
+    def count_starts(self, count: int, seed: int) -> dict[str, float]:
+        """Return shares of the candidates drawn for `count` starts, by condition, the last one all."""
+        ...
+
+
+@runtime_checkable
 class DeployableTask(Protocol):
     """A task process whose policy can leave the trainer; optional."""
 
@@ -175,6 +185,11 @@ def can_move_target(process: object) -> TypeGuard[MovableTask]:
     return isinstance(process, MovableTask)
 
 
+def can_count_starts(process: object) -> TypeGuard[CountedStarts]:
+    """Return whether a task process says how many of its starts can be done."""
+    return isinstance(process, CountedStarts)
+
+
 def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
     """Return whether the policy of a task process can be exported to ONNX."""
     return isinstance(process, DeployableTask)
@@ -191,16 +206,6 @@ class MirroredTask(Protocol):
             ConfigError: The machine is not left-right symmetric.
         """
         ...
-
-
-@runtime_checkable
-class TermedTask(Protocol):
-    """A task process that says which reward term was not finite; optional, for recorded faults."""
-
-    term_names: tuple[str, ...]
-    """Names of the reward terms, 24 at most."""
-    odd_terms: torch.Tensor
-    """Sum of 2^index over the terms that were not finite in the last step, `(N,)` float32."""
 
 
 class Task(Protocol):

@@ -14,10 +14,11 @@ from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Policy, Task, supports_classical_control
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
+from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import PolicySpec, choose_tasks
 from brokk_rl.play.checkpoint_watch import CheckpointWatch, find_newest, read_task
-from brokk_rl.play.levers import Gamepad
+from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.rl.policy import ClassicalPolicy
@@ -108,7 +109,7 @@ class Play:
             if gamepad is not None:
                 gamepad.close()
 
-    def _open_gamepad(self) -> Gamepad | None:
+    def _open_gamepad(self) -> GamepadLevers | None:
         """Return the gamepad; `None` where none is configured."""
         path, axes = self.play.gamepad, self.play.gamepad_axes
         if path is None:
@@ -118,7 +119,7 @@ class Play:
                 f"play.gamepad_axes: expected an axis for each of "
                 f"{', '.join(self.machine.joint_names)}, got {len(axes)}: {list(axes)}"
             )
-        return Gamepad(Path(path), axes)
+        return GamepadLevers(Gamepad(Path(path), "play.gamepad"), axes)
 
     def _build_session(self) -> tuple[PlaySession, CheckpointWatch | None]:
         """Return the session, and the watch of the training that is followed, if any."""
@@ -186,7 +187,9 @@ def _describe(watch: CheckpointWatch) -> str:
     return f"{watch.loaded.parent.name}/{watch.loaded.name}"
 
 
-def _open_viewer(session: PlaySession, settings: PlaySettings, gamepad: Gamepad | None) -> Viewer:
+def _open_viewer(
+    session: PlaySession, settings: PlaySettings, gamepad: GamepadLevers | None
+) -> Viewer:
     """Open page or window, and say where it is."""
     if settings.viewer == "window":
         from brokk_rl.play.window_view import WindowView

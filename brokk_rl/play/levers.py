@@ -2,26 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import struct
-from pathlib import Path
-
 import torch
 
 from brokk_rl.contracts.actuator import FollowerModel
-from brokk_rl.errors import ConfigError
+from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine, mask_exclusive_joints
 
 KEY_STEP = 0.25
 """Stroke by which one press of a key moves a lever. Chosen by hand: four presses to full speed."""
-EVENT = struct.Struct("IhBB")
-"""`js_event` of Linux (`linux/joystick.h`): time in ms, value, kind, number."""
-AXIS, INITIAL = 0x02, 0x80
-"""Kinds of a `js_event`: an axis moved; set too where the event only tells the first state."""
-FULL_SCALE = 32767.0
-"""Value of an axis at its end."""
-DEAD_ZONE = 0.12
-"""Part of the travel of a gamepad's stick that counts as centred. Chosen by hand."""
 
 
 class PersonAtLevers(FollowerModel):
@@ -71,50 +59,21 @@ class PersonAtLevers(FollowerModel):
         return self.levers * mask_exclusive_joints(self._is_exclusive, positioning)
 
 
-class Gamepad:
-    """A gamepad of this computer, read through the joystick interface of Linux.
+class GamepadLevers:
+    """Levers of all joints on a gamepad.
 
     Args:
-        path: Device, such as `/dev/input/js0`.
-        axes: Axis of the gamepad for each joint, in machine order; negative turns it round, and
-            axis 0 cannot be turned.
-
-    Raises:
-        ConfigError: The device cannot be opened.
+        gamepad: The gamepad; this closes it.
+        axes: Axis of the gamepad for each joint, in machine order, as in `Gamepad.read_axes`.
     """
 
-    def __init__(self, path: Path, axes: tuple[int, ...]) -> None:
-        self._axes = axes
-        self._values: dict[int, float] = {}
-        self._rest = b""
-        try:
-            self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        except OSError as error:
-            raise ConfigError(
-                f"play.gamepad={path}: {error.strerror}. Plug the gamepad into this computer and "
-                "give its device (ls /dev/input/js*), or leave play.gamepad out and use the keys."
-            ) from error
+    def __init__(self, gamepad: Gamepad, axes: tuple[int, ...]) -> None:
+        self._gamepad, self._axes = gamepad, axes
 
     def read(self) -> torch.Tensor | None:
         """Return positions of the levers, `(J,)`; `None` where no axis has moved since."""
-        try:
-            self._rest += os.read(self._file, 64 * EVENT.size)
-        except BlockingIOError:
-            return None
-        whole = len(self._rest) // EVENT.size * EVENT.size
-        events, self._rest = self._rest[:whole], self._rest[whole:]
-        for _, value, kind, number in EVENT.iter_unpack(events):
-            if kind & ~INITIAL == AXIS:
-                self._values[number] = value / FULL_SCALE
-        if not events:
-            return None
-        levers = []
-        for axis in self._axes:
-            value = self._values.get(abs(axis), 0.0) * (-1.0 if axis < 0 else 1.0)
-            size = max(0.0, abs(value) - DEAD_ZONE) / (1.0 - DEAD_ZONE)
-            levers.append(size if value > 0 else -size)
-        return torch.tensor(levers).clamp(-1.0, 1.0)
+        return torch.tensor(self._gamepad.read_axes(self._axes)) if self._gamepad.poll() else None
 
     def close(self) -> None:
         """Close the device."""
-        os.close(self._file)
+        self._gamepad.close()

@@ -17,7 +17,7 @@ import viser
 import viser.uplot as uplot
 
 from brokk_rl.errors import BrokkError, ConfigError
-from brokk_rl.play.levers import KEY_STEP, Gamepad
+from brokk_rl.play.levers import KEY_STEP, GamepadLevers
 from brokk_rl.play.scene_view import SceneView
 from brokk_rl.play.session import DISTANCE_M, HEIGHT_M, PERSON, PlaySession, PlayState
 from brokk_rl.play.settings import SPEEDS
@@ -68,7 +68,7 @@ class PlayPage:
         gamepad: Gamepad of this computer; `None` for none.
     """
 
-    def __init__(self, session: PlaySession, port: int, gamepad: Gamepad | None) -> None:
+    def __init__(self, session: PlaySession, port: int, gamepad: GamepadLevers | None) -> None:
         self._session, self._gamepad = session, gamepad
         self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         logging.getLogger("websockets").setLevel(logging.WARNING)

@@ -7,7 +7,7 @@ import queue
 
 import numpy as np
 
-from brokk_rl.play.levers import KEY_STEP, Gamepad
+from brokk_rl.play.levers import KEY_STEP, GamepadLevers
 from brokk_rl.play.session import PERSON, PlaySession
 from brokk_rl.sim.window import SceneWindow
 
@@ -32,7 +32,7 @@ class WindowView:
         gamepad: Gamepad of this computer; `None` for none.
     """
 
-    def __init__(self, session: PlaySession, gamepad: Gamepad | None) -> None:
+    def __init__(self, session: PlaySession, gamepad: GamepadLevers | None) -> None:
         self._session, self._gamepad = session, gamepad
         self._keys: queue.SimpleQueue[int] = queue.SimpleQueue()
         self._joint = 0

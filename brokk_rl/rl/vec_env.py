@@ -24,7 +24,7 @@ from brokk_rl.contracts.actuator import (
     FollowerModel,
     SensingModel,
 )
-from brokk_rl.contracts.task import FAULT, STEPS, Task, TaskProcess, TermedTask
+from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -212,8 +212,11 @@ class ControlLoop(VecEnv):
         Raises:
             ConfigError: The simulator shows no states.
         """
-        names = self.task.term_names if isinstance(self.task, TermedTask) else ()
-        self.recorder = FaultRecorder(self.world, self.machine, num_steps, names)
+        terms = {}
+        for name, value in self.task.episode.items():
+            if name.startswith(REWARD):
+                terms[name.removeprefix(REWARD)] = value
+        self.recorder = FaultRecorder(self.world, self.machine, num_steps, terms)
         self.begin()
 
     def bring_near(self, near: NearStarts, seed: int) -> None:
@@ -355,6 +358,9 @@ class ControlLoop(VecEnv):
         parts |= {"follower": self.follower.state, "group": self._groups}
         for prefix, part in parts.items():
             for name, value in part.items():
+                if prefix == "episode" and f"{prefix}.{name}" not in tensors:
+                    value.zero_()  # a figure that the version of the checkpoint did not have
+                    continue
                 value.copy_(tensors[f"{prefix}.{name}"])
         self.world.load_state_dict(state["world"])
         if self.recorder:  # steps before are unknown; older checkpoints hold no scenes
@@ -379,8 +385,7 @@ class ControlLoop(VecEnv):
         self.world.step(increment)
         start = self._judge()
         if self.recorder:
-            odd = self.task.odd_terms if isinstance(self.task, TermedTask) else None
-            self.recorder.close(self.reward, odd)
+            self.recorder.close(self.reward)
         self._reset_worlds(start)
         self._perceive(start)
 

@@ -8,7 +8,7 @@ are until the host fetches them, once an iteration. A control step costs some fi
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,6 +24,8 @@ from brokk_rl.sim.scene import SIZE
 
 BAD_REWARD = 1 << 20
 """Alarm of a reward that is not finite; beyond the bits of all simulators, exact in float32."""
+REWARD_ALARM = "the reward is not finite"
+"""The same in words."""
 
 
 @dataclass
@@ -116,11 +118,15 @@ class FaultRecorder:
         machine: Their machine.
         num_steps: Control steps kept of each world, five numbers a joint and step: 100 steps of
             five joints take 10 kB a world in float32.
-        term_names: Names of the reward terms whose bits `close` may be given.
+        terms: Sums of the reward terms over the running episode, by name, each `(N,)`; 12 at most.
     """
 
     def __init__(
-        self, world: World, machine: Machine, num_steps: int, term_names: Sequence[str] = ()
+        self,
+        world: World,
+        machine: Machine,
+        num_steps: int,
+        terms: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
         if not isinstance(world, TracedWorld):
             raise ConfigError(
@@ -128,7 +134,7 @@ class FaultRecorder:
                 "record; give rl.fault_steps=0"
             )
         self._world: TracedWorld = world
-        self._faults, self._machine, self._term_names = world.faults, machine, tuple(term_names)
+        self._faults, self._machine, self._terms = world.faults, machine, dict(terms or {})
         self._state = [world.trace[name] for name in TRACE]
         self._properties: dict[str, torch.Tensor] = getattr(world, "properties", {})
         num, width = self._state[0].shape
@@ -152,17 +158,18 @@ class FaultRecorder:
         self._ring.index_copy_(0, self._slot, kept[None])
         self._age.add_(1.0)
 
-    def close(self, reward: torch.Tensor, odd_terms: torch.Tensor | None = None) -> None:
+    def close(self, reward: torch.Tensor) -> None:
         """Hold the worlds that diverged in the step just made, before they are reset.
 
         Args:
             reward: Rewards, `(N,)`; one that is not finite is a fault too.
-            odd_terms: Bits of the reward terms that were not finite, `(N,)`.
         """
         bad = ~reward.isfinite()
         fresh = (self._faults | bad) & ~self.is_held
         alarms = self._world.read_alarms() + BAD_REWARD * bad
-        terms = torch.zeros_like(reward) if odd_terms is None else odd_terms
+        terms = torch.zeros_like(alarms)
+        for index, value in enumerate(self._terms.values()):
+            terms = terms + ~value.isfinite() * (1 << index)
         parts = [*self._state, self.scene, *self._properties.values(), self._age]
         parts += [alarms[:, None], terms[:, None], self._slot.expand(len(reward), 1)]
         end = torch.cat([part.to(self._end.dtype) for part in parts], 1)
@@ -202,11 +209,10 @@ class FaultRecorder:
         for name, value in self._properties.items():
             properties[name] = end[place : place + value.shape[1]]
             place += value.shape[1]
-        names = dict(self._world.alarm_names) | {BAD_REWARD: "the reward is not finite"}
+        names = dict(self._world.alarm_names) | {BAD_REWARD: REWARD_ALARM}
         odd = []
-        for index, name in enumerate(self._term_names):
-            # terms of a diverged world follow from its state, and its reward is 0
-            if alarms & BAD_REWARD and terms >> index & 1:
+        for index, name in enumerate(self._terms):
+            if terms >> index & 1:
                 odd.append(name)
         return Fault(
             machine=self._machine.name,

@@ -9,7 +9,6 @@ metadata `run`.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -48,7 +47,9 @@ class CaptureLogReader:
         """
         (contents, q, flow), found = self._series(path, machine), []
         # All joints share the pieces: a gap in one of them ends the piece for all.
-        for begin_s, end_s in _split_at_gaps([*q.values(), *flow.values()], self.longest_gap_s):
+        for begin_s, end_s in record.split_at_gaps(
+            [t_s for t_s, _ in (*q.values(), *flow.values())], self.longest_gap_s
+        ):
             if end_s - begin_s >= max(self.shortest_s, 2 * machine.period_s):
                 found.append(self._piece(contents, q, flow, begin_s, end_s, path, machine))
         if not found:
@@ -65,7 +66,9 @@ class CaptureLogReader:
             RecordingError: it cannot be read, was made on another machine, or has a gap there.
         """
         contents, q, flow = self._series(path, machine)
-        for first_s, last_s in _split_at_gaps([*q.values(), *flow.values()], self.longest_gap_s):
+        for first_s, last_s in record.split_at_gaps(
+            [t_s for t_s, _ in (*q.values(), *flow.values())], self.longest_gap_s
+        ):
             # The ends may be off by less than a gap, since messages do not fall on them.
             if first_s <= begin_s + self.longest_gap_s and last_s >= end_s - self.longest_gap_s:
                 return self._piece(
@@ -143,25 +146,6 @@ def _find_series(contents: CaptureContents, signal: str, path: Path) -> Series:
     raise RecordingError(
         f"{path}: signal '{signal}' was never heard (topics: {', '.join(sorted(contents.messages)) or 'none'})"
     )
-
-
-def _split_at_gaps(series: Sequence[Series], longest_gap_s: float) -> list[tuple[float, float]]:
-    """Return the spans, begin and end, in which none of the series has a gap."""
-    # Only the span that all series cover.
-    begin_s, end_s = max(t_s[0] for t_s, _ in series), min(t_s[-1] for t_s, _ in series)
-    gaps: list[tuple[float, float]] = []
-    for t_s, _ in series:
-        rows = np.flatnonzero(np.diff(t_s) > longest_gap_s)
-        gaps += zip(t_s[rows].tolist(), t_s[rows + 1].tolist(), strict=True)
-    gaps.sort()
-    pieces, at_s = [], begin_s
-    for before_s, after_s in gaps:
-        if before_s > at_s:
-            pieces.append((at_s, min(before_s, end_s)))
-        at_s = max(at_s, after_s)
-    if at_s < end_s:
-        pieces.append((at_s, end_s))
-    return pieces
 
 
 def _average_over_periods(series: Series, grid_s: np.ndarray, period_s: float) -> np.ndarray:

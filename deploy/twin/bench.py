@@ -1,4 +1,4 @@
-"""A desk instead of a machine: the twin, and a simulated operator at its remote."""
+"""A desk instead of a machine: the twin, and at its remote a simulated operator or a gamepad."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from deploy.guidance import LeverGuidance, LeverMap
 from deploy.runtime.supervisor import CompanionProcess
+from deploy.twin.remote import GamepadRemote
 from deploy.twin.twin import TWIN_PRIORITY, Twin
 
 
@@ -52,3 +53,39 @@ class TwinBench:
         arguments = (wire, dbc, machine, self.operator, levers, seed)
         target = "deploy.twin.remote:run_operator"
         return [twin, CompanionProcess("operator", target, arguments, TWIN_PRIORITY)]
+
+
+@spec
+class GamepadBench:
+    """Twin in place of a machine, and a gamepad in the hands of a person.
+
+    Attributes:
+        twin: The twin.
+        plant: The simulated machine behind it.
+        gamepad: The gamepad.
+    """
+
+    twin: Twin
+    plant: Connection
+    gamepad: GamepadRemote
+
+    def check(self) -> None:
+        if self.twin.remote:
+            raise ConfigError(
+                "bench=gamepad: expected twin.remote=false, since the gamepad is the remote"
+            )
+
+    def companions(self, machine: Machine, session: Session) -> list[CompanionProcess]:
+        """Return the processes to run beside the loop.
+
+        Raises:
+            ConfigError: the gamepad cannot be opened.
+        """
+        # Before anything starts: a person who has forgotten to plug it in is told so at once.
+        self.gamepad.open_device().close()
+        twin = self.twin
+        arguments: tuple[Any, ...] = (twin, machine, self.plant, session)
+        found = [CompanionProcess("twin", "deploy.twin.twin:run", arguments, TWIN_PRIORITY)]
+        arguments = (twin.wire, twin.dbc, machine, self.gamepad)
+        target = "deploy.twin.remote:run_gamepad"
+        return [*found, CompanionProcess("gamepad", target, arguments, TWIN_PRIORITY)]

@@ -7,7 +7,6 @@ emergency stop, each joint both ways. They can fail one chosen check, to see tha
 from __future__ import annotations
 
 import contextlib
-import time
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from brokk_rl.spec import spec
 from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
 from deploy.guidance import LeverMap, find_full_angles_rad
-from deploy.runtime.process import CycleTimer, Stop
+from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.supervisor import CompanionProcess
 from deploy.twin.faults import request_fault
@@ -157,15 +156,9 @@ def run_person(
     """
     remote, person = RadioRemote(BusDescription(dbc, machine)), ScriptedPerson(machine, fails)
     begun_s, pressed, spoiled = np.inf, False, False
-    timer = CycleTimer(remote.period_s)
     with wire.open(remote.frame_ids) as bus:
-        while not stop():
-            while (left_s := timer.next_s - time.monotonic()) > 0:
-                frame = bus.recv(left_s)
-                if frame is not None:
-                    remote.hear(frame, time.monotonic())
-            timer.begin()
-            state, now_s = memory.state.read(), time.monotonic()
+        for now_s in remote.iterate_cycles(stop, bus):
+            state = memory.state.read()
             if state is not None and state.q_t_s > 0 and begun_s == np.inf:
                 begun_s = now_s + rest_s
             t_s = now_s - begun_s

@@ -1,21 +1,28 @@
-"""The radio remote as a node of its own, and a simulated operator who holds it."""
+"""The radio remote as a node of its own, and who holds it: a simulated operator, or a gamepad."""
 
 from __future__ import annotations
 
+import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from brokk_rl.contracts.actuator import Follower
+from brokk_rl.errors import ConfigError
+from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine
-from deploy.bus.can_bus import CanBus, CanFrame
+from brokk_rl.spec import spec
+from deploy.bus.can_bus import CanBus, CanFrame, OpenCanBus
 from deploy.bus.clock import GatewayClock
 from deploy.bus.description import LEVER_AXES, STAMP, BusDescription
 from deploy.bus.protection import MessageFault
 from deploy.guidance import AXES, LeverMap, find_full_angles_rad
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
+
+log = logging.getLogger(__name__)
 
 STALE_S = 0.5
 """Age of an advice from which the operator does not follow it. Chosen by hand: a person notices."""
@@ -60,6 +67,17 @@ class RadioRemote:
         if not isinstance(values, MessageFault):
             self._clock.learn(values[STAMP], self._heard.stamp_wrap_s, now_s)
             self.is_ready = True
+
+    def iterate_cycles(self, stop: Stop, bus: OpenCanBus) -> Iterator[float]:
+        """Yield the time at which each message is due, until told to stop; listen in between."""
+        timer = CycleTimer(self.period_s)
+        while not stop():
+            while (left_s := timer.next_s - time.monotonic()) > 0:
+                frame = bus.recv(left_s)
+                if frame is not None:
+                    self.hear(frame, time.monotonic())
+            timer.begin()
+            yield time.monotonic()
 
     def build_frame(self, frozen: int | None = None) -> CanFrame:
         """Return the next message; `frozen` is a counter that stands still, a fault."""
@@ -110,14 +128,8 @@ def run_operator(
     # the hands move the machine's own remote, whatever pattern is displayed
     own = LeverMap(machine.levers, machine)
     remote.deadman = True
-    timer, cycle = CycleTimer(remote.period_s), 0
     with wire.open(remote.frame_ids) as bus:
-        while not stop():
-            while (left_s := timer.next_s - time.monotonic()) > 0:
-                frame = bus.recv(left_s)
-                if frame is not None:
-                    remote.hear(frame, time.monotonic())
-            timer.begin()
+        for cycle, _ in enumerate(remote.iterate_cycles(stop, bus)):
             if cycle % cycles_a_period == 0:
                 displayed = _read_displayed_command(memory, levers)
                 proposed = torch.as_tensor(displayed, dtype=torch.float32)[None]
@@ -125,7 +137,6 @@ def run_operator(
                     given = hands.step(proposed)[0].numpy().astype(float)
                 angles_rad, remote.button_right = own.levers(given)
                 remote.levers = (angles_rad / full_rad).clip(-1.0, 1.0).tolist()
-            cycle += 1
             if remote.is_ready:
                 bus.send(remote.build_frame())
 
@@ -136,3 +147,75 @@ def _read_displayed_command(memory: LoopMemory, levers: LeverMap) -> np.ndarray:
     if advice is None or time.monotonic() - advice.t_s > STALE_S:
         return np.zeros(len(levers.full_rad))
     return levers.command(advice.lever_rad, advice.button_right)
+
+
+@spec
+class GamepadRemote:
+    """A gamepad in place of the radio remote: its sticks are the levers.
+
+    Attributes:
+        device: Of the gamepad, on this computer.
+        axes: Axis of the gamepad for each of `deploy.guidance.AXES`, as in `Gamepad.read_axes`.
+        deadman: Button that is the dead-man.
+        button_right: Button that is the right lever's.
+    """
+
+    device: str
+    axes: tuple[int, ...]
+    deadman: int
+    button_right: int
+
+    def check(self) -> None:
+        if len(self.axes) != len(AXES):
+            raise ConfigError(
+                f"gamepad.axes: expected an axis for each of {len(AXES)} lever axes, got {list(self.axes)}"
+            )
+        if self.deadman == self.button_right:
+            raise ConfigError("gamepad: dead-man and right button are two buttons")
+
+    def open_device(self) -> Gamepad:
+        """Return the gamepad.
+
+        Raises:
+            ConfigError: it cannot be opened.
+        """
+        return Gamepad(Path(self.device), "bench.gamepad.device")
+
+    def move(self, remote: RadioRemote, gamepad: Gamepad) -> None:
+        """Hold the remote as the gamepad is held now."""
+        gamepad.poll()
+        remote.levers = gamepad.read_axes(self.axes)
+        remote.deadman = gamepad.is_pressed(self.deadman)
+        remote.button_right = gamepad.is_pressed(self.button_right)
+
+
+def run_gamepad(
+    stop: Stop,
+    wire: CanBus,
+    dbc: str,
+    machine: Machine,
+    settings: GamepadRemote,
+    memory: LoopMemory | None = None,
+) -> None:
+    """Run the remote as a person holds the gamepad.
+
+    A gamepad that is unplugged is a remote out of range: nothing more is sent.
+
+    Args:
+        stop: Returns whether to stop.
+        wire: The bus.
+        dbc: Its description.
+        machine: The machine.
+        settings: Of the gamepad.
+        memory: Not needed: the person looks at the page.
+    """
+    remote, gamepad = RadioRemote(BusDescription(dbc, machine)), settings.open_device()
+    with wire.open(remote.frame_ids) as bus:
+        for _ in remote.iterate_cycles(stop, bus):
+            settings.move(remote, gamepad)
+            if not gamepad.connected:
+                log.warning("the gamepad %s is gone: the remote is silent", settings.device)
+                break
+            if remote.is_ready:
+                bus.send(remote.build_frame())
+    gamepad.close()

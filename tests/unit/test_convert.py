@@ -160,7 +160,8 @@ def test_a_missing_column_is_refused_with_the_nearest_name(
 ) -> None:
     path = logged(tmp_path, lines(), HEADER.replace("Stick Ms", "Stick Mes"))
     with pytest.raises(
-        RecordingError, match=r"dig\.csv: column 'Stick Ms' is missing; did you mean 'Stick Mes'\?"
+        RecordingError,
+        match=r"dig\.csv: column 'Stick Ms' is missing or holds no numbers; did you mean 'Stick Mes'\?",
     ):
         reader.read(path, excavator)
 

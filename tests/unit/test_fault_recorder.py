@@ -160,7 +160,7 @@ def test_a_reward_term_that_is_not_finite_stops_the_run_by_name(
     machine: Machine, tmp_path: Path
 ) -> None:
     loop = make_loop(machine)
-    term, weight = loop.task._terms["command_change"]
+    term, weight = loop.task._terms["command_change"]  # a term of the task's own
     loop.task._terms["command_change"] = (lambda tool: term(tool) / 0.0, weight)
     loop.step(torch.zeros(4, 5))  # 0 / 0
     with pytest.raises(SimulationError, match="reward term command_change was not finite"):

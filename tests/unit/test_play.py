@@ -13,8 +13,9 @@ import torch
 from composed import option
 
 from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.gamepad import Gamepad
 from brokk_rl.play.checkpoint_watch import find_newest
-from brokk_rl.play.levers import Gamepad
+from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.rl.policy import ClassicalPolicy
@@ -241,7 +242,7 @@ def test_a_gamepad_moves_the_levers(tmp_path: Path) -> None:
     events = [(0, 32767, 0x82, 3), (9, 16384, 0x02, 0), (12, -3000, 0x02, 1), (15, 1, 0x01, 4)]
     path = tmp_path / "js0"
     path.write_bytes(b"".join(struct.pack("IhBB", *event) for event in events))
-    pad = Gamepad(path, axes=(0, -3, 1, 7, 2))
+    pad = GamepadLevers(Gamepad(path, "play.gamepad"), axes=(0, -3, 1, 7, 2))
     levers = pad.read()
     assert levers is not None
     # half a stroke less the dead zone; turned round; within the dead zone; never moved
@@ -249,7 +250,7 @@ def test_a_gamepad_moves_the_levers(tmp_path: Path) -> None:
     assert pad.read() is None
     pad.close()
     with pytest.raises(ConfigError, match=r"play.gamepad=.*gone: No such file.*ls /dev/input"):
-        Gamepad(tmp_path / "gone", axes=(0,))
+        Gamepad(tmp_path / "gone", "play.gamepad")
 
 
 def test_a_run_without_checkpoints_is_explained(tmp_path: Path) -> None:

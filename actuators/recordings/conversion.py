@@ -1,0 +1,54 @@
+"""Recordings of logs: all of them, or none where one cannot be used."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from actuators.recordings.log_files import expand_logs
+from actuators.recordings.log_reader import LogReader
+from brokk_rl import record
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+
+log = logging.getLogger(__name__)
+
+
+def find_logs(patterns: str | Sequence[str]) -> list[Path]:
+    """Return the logs that match one or several globs.
+
+    Raises:
+        RecordingError: None matches, or two would become the same recording.
+    """
+    logs = expand_logs(record.find_files(patterns, "log"))
+    by_name: dict[str, Path] = {}
+    for path in logs:
+        if (other := by_name.setdefault(name_log(path), path)) is not path:
+            raise RecordingError(f"{other} and {path} would become the same recording; rename one")
+    return logs
+
+
+def name_log(path: Path) -> str:
+    """Return the first part of the names of a log's recordings."""
+    return path.resolve().name if path.is_dir() else path.stem
+
+
+def write_logs(
+    patterns: str | Sequence[str], reader: LogReader, machine: Machine, folder: Path
+) -> None:
+    """Write `<log>_<piece>.parquet` into a folder; nothing if any log cannot be used.
+
+    Raises:
+        RecordingError: No log matches, one of them cannot be used, or two have the same name.
+        StorageError: A file could not be written.
+    """
+    logs = find_logs(patterns)
+    pieces = {path: reader.read(path, machine) for path in logs}
+    for path, recordings in pieces.items():
+        for number, recording in enumerate(recordings):
+            record.write_recording(recording, folder / f"{name_log(path)}_{number:02d}.parquet")
+        minutes = sum(recording.duration_s for recording in recordings) / 60.0
+        log.info("%s: %d recordings, %.1f minutes", path, len(recordings), minutes)
+    count = sum(map(len, pieces.values()))
+    log.info("%d recordings of %d logs in %s", count, len(logs), folder)

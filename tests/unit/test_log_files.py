@@ -1,0 +1,349 @@
+"""Logs of every kind become the same recording; a damaged one is refused by its place."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+import scipy.io
+from composed import option
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from actuators.recordings.column_map import (
+    AlignedTime,
+    Column,
+    ColumnMap,
+    CommandColumn,
+    JointColumns,
+)
+from actuators.recordings.expression import parse_expression
+from actuators.recordings.log_files import expand_logs, open_log
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+
+NUM = 200
+
+
+@pytest.fixture(scope="module")
+def carriage() -> Machine:
+    """A machine of one joint."""
+    return option("machine", "emps")
+
+
+def make_map(
+    command: str = "u", position: str = "q", time: str = "t", full_minus: float | None = -1.0
+) -> ColumnMap:
+    return ColumnMap(
+        delimiter=",",
+        decimal=".",
+        time=Column(column=time, scale=1.0, offset=0.0),
+        joints={
+            "carriage": JointColumns(
+                command=CommandColumn(
+                    column=command, neutral=0.0, full_plus=1.0, full_minus=full_minus
+                ),
+                position=Column(column=position, scale=1.0, offset=0.0),
+            )
+        },
+        optional={},
+        overrun=0.0,
+        longest_gap_s=0.1,
+        shortest_s=0.5,
+    )
+
+
+def make_signals() -> dict[str, np.ndarray]:
+    """Returns times, commands and positions at the machine's rate, exact in 32 bits."""
+    k = np.arange(NUM)
+    return {"t": k * 0.01, "u": np.round(np.sin(k / 9) * 64) / 128, "q": (k % 32) / 256}
+
+
+def check(recording: Recording) -> None:
+    signals = make_signals()
+    np.testing.assert_allclose(recording.t_s, signals["t"], atol=1e-12)
+    np.testing.assert_array_equal(recording.u[:, 0], signals["u"].astype(np.float32))
+    np.testing.assert_allclose(recording.q[:, 0], signals["q"], atol=1e-6)
+
+
+def write_csv(path: Path, signals: dict[str, np.ndarray]) -> None:
+    rows = [",".join(repr(float(v)) for v in row) for row in zip(*signals.values(), strict=True)]
+    path.write_text("\n".join([",".join(signals), *rows]) + "\n")
+
+
+def write_lists(path: Path) -> None:
+    signals = make_signals()
+    rows = [
+        f'{t!r},"[{u!r}, {q!r}]"'
+        for t, u, q in zip(*(v.tolist() for v in signals.values()), strict=True)
+    ]
+    path.write_text("\n".join(["t,both", *rows]) + "\n")
+
+
+def write_iso(path: Path) -> None:
+    signals = make_signals()
+    base = np.datetime64("2026-03-01T23:59:59", "ns")
+    times = [str(base + np.timedelta64(round(t * 1e9), "ns")) for t in signals["t"].tolist()]
+    rows = [f"{t}Z,{u!r},{q!r}" for t, u, q in zip(times, signals["u"].tolist(), signals["q"].tolist(), strict=True)]  # fmt: skip
+    path.write_text("\n".join(["t,u,q", *rows]) + "\n")
+
+
+def write_kind(path: Path) -> ColumnMap:
+    """Writes the signals as the ending of `path` says, by the library of that format."""
+    signals = make_signals()
+    if path.suffix == ".parquet":
+        pq.write_table(pa.table(signals), path)
+    elif path.suffix == ".npz":
+        np.savez_compressed(path, **signals)
+    elif path.suffix == ".mat":
+        scipy.io.savemat(path, signals)
+    elif path.stem == "lists":
+        write_lists(path)
+        return make_map("both[0]", "both[1]")
+    elif path.stem == "iso":
+        write_iso(path)
+    else:
+        write_csv(path, signals)
+    return make_map()
+
+
+@pytest.mark.parametrize("name", ["a.csv", "lists.csv", "iso.csv", "a.parquet", "a.npz", "a.mat"])
+def test_every_kind_of_file_gives_the_same_recording(
+    tmp_path: Path, carriage: Machine, name: str
+) -> None:
+    reader = write_kind(tmp_path / name)
+    (recording,) = reader.read(tmp_path / name, carriage)
+    check(recording)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_columns_of_a_matrix_are_read_from_archives(
+    tmp_path: Path, carriage: Machine, order: str
+) -> None:
+    signals = make_signals()
+    both = np.array(np.stack([signals["u"], signals["q"]], 1), order=order)
+    np.savez(tmp_path / "a.npz", t=signals["t"], both=both, note=np.array("text"))
+    scipy.io.savemat(tmp_path / "b.mat", {"t": signals["t"], "both": both})
+    for name in ("a.npz", "b.mat"):
+        (recording,) = make_map("both[0]", "both[1]").read(tmp_path / name, carriage)
+        check(recording)
+
+
+def write_lerobot(folder: Path, version: str) -> None:
+    """Writes two episodes as LeRobot lays them out: a file each, or one file for both."""
+    signals = make_signals()
+    (folder / "meta").mkdir(parents=True)
+    names = {"motors": ["slide"]} if version == "v2.1" else ["slide"]
+    feature = {"dtype": "float32", "shape": [1], "names": names}
+    info = {"codebase_version": version, "fps": 100, "features": {"action": feature, "observation.state": feature}}  # fmt: skip
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+    episodes = []
+    for number in range(2):
+        columns = {
+            "timestamp": pa.array(signals["t"]),
+            "action": pa.array([[v] for v in signals["u"]], pa.list_(pa.float32(), 1)),
+            "observation.state": pa.array([[v] for v in signals["q"]], pa.list_(pa.float32())),
+            "episode_index": pa.array([number] * NUM),
+        }
+        episodes.append(pa.table(columns))
+    (folder / "data" / "chunk-000").mkdir(parents=True)
+    if version == "v2.1":
+        for number, table in enumerate(episodes):
+            pq.write_table(table, folder / "data" / "chunk-000" / f"episode_{number:06d}.parquet")
+    else:
+        pq.write_table(pa.concat_tables(episodes), folder / "data/chunk-000/file-000.parquet")
+
+
+@pytest.mark.parametrize("version", ["v2.1", "v3.0"])
+def test_each_episode_of_a_lerobot_dataset_is_a_run(
+    tmp_path: Path, carriage: Machine, version: str
+) -> None:
+    write_lerobot(tmp_path / "set", version)
+    reader = make_map("action[slide]", "observation.state[slide]", "timestamp")
+    recordings = reader.read(tmp_path / "set", carriage)
+    assert [recording.run for recording in recordings] == ["set_000000", "set_000001"]
+    for recording in recordings:
+        check(recording)
+
+
+def test_an_older_lerobot_dataset_is_refused_by_its_version(tmp_path: Path) -> None:
+    write_lerobot(tmp_path / "set", "v1.6")
+    with pytest.raises(RecordingError, match=r"codebase_version is 'v1.6', expected v2.x or v3.x"):
+        open_log(tmp_path / "set")
+
+
+def write_sage(folder: Path, shift_s: float = 0.0) -> None:
+    signals = make_signals()
+    folder.mkdir(parents=True)
+    for name, kind, values, t_s in (
+        ("control", "CONTROL", signals["u"], signals["t"]),
+        ("state_motor", "STATE_MOTOR", signals["q"], signals["t"] + shift_s),
+    ):
+        rows = [f'{kind},{t * 1e6!r},"[{v!r}, 0.5]"' for t, v in zip(t_s.tolist(), values.tolist(), strict=True)]  # fmt: skip
+        text = "\n".join(["type,timestamp,positions", *rows]) + "\n"
+        (folder / f"{name}.csv").write_text(text)
+
+
+def make_sage_map(label: str = "0") -> ColumnMap:
+    return replace(
+        make_map(f"control:positions[{label}]", f"state_motor:positions[{label}]"),
+        time=Column(column="timestamp", scale=1e-6, offset=0.0),
+    )
+
+
+def test_the_two_files_of_a_sage_folder_keep_their_clocks(
+    tmp_path: Path, carriage: Machine
+) -> None:
+    write_sage(tmp_path / "same")
+    (recording,) = make_sage_map().read(tmp_path / "same", carriage)
+    check(recording)
+    write_sage(tmp_path / "late", shift_s=0.005)
+    (late,) = make_sage_map().read(tmp_path / "late", carriage)
+    signals = make_signals()
+    # the piece begins with the later file, half a period after the other one
+    expected = np.interp(signals["t"][:-1] + 0.005, signals["t"] + 0.005, signals["q"])
+    np.testing.assert_allclose(late.q[:, 0], expected, atol=1e-6)
+    np.testing.assert_array_equal(late.u[:, 0], signals["u"][:-1].astype(np.float32))
+
+
+def test_sage_names_its_joints_in_a_list(tmp_path: Path, carriage: Machine) -> None:
+    write_sage(tmp_path / "lift")
+    (tmp_path / "lift" / "joint_list.txt").write_text("slide\njaw\n")
+    (recording,) = make_sage_map("slide").read(tmp_path / "lift", carriage)
+    check(recording)
+
+
+def test_a_folder_of_folders_gives_the_logs_below_it(tmp_path: Path) -> None:
+    for name in ("b", "a"):
+        write_sage(tmp_path / "raw" / name)
+    (tmp_path / "raw" / "notes").mkdir()
+    write_csv(tmp_path / "raw" / "c.csv", make_signals())
+    found = expand_logs([tmp_path / "raw"])
+    assert [path.name for path in found] == ["a", "b", "c.csv"]
+    with pytest.raises(RecordingError, match="no log in this folder"):
+        expand_logs([tmp_path / "raw" / "notes"])
+
+
+def test_arithmetic_stands_in_the_place_of_a_column(tmp_path: Path, carriage: Machine) -> None:
+    signals = make_signals()
+    write_csv(
+        tmp_path / "a.csv",
+        {"t": signals["t"], "target pos": signals["u"] + signals["q"], "q": signals["q"]},
+    )
+    (recording,) = make_map("`target pos` - q").read(tmp_path / "a.csv", carriage)
+    check(recording)
+
+
+@settings(deadline=None)
+@given(
+    a=st.floats(-1e6, 1e6), b=st.floats(-1e6, 1e6), c=st.floats(0.01, 1e6), d=st.integers(-99, 99)
+)
+def test_an_expression_is_what_python_computes(a: float, b: float, c: float, d: int) -> None:
+    text = f"-(a + 2.5*b) / c - {d} * (a - -b)"
+    columns = {"a": np.array([a]), "b": np.array([b]), "c": np.array([c])}
+    expected = -(a + 2.5 * b) / c - d * (a - -b)
+    assert parse_expression(text).evaluate(columns)[0] == pytest.approx(expected, nan_ok=True)
+    assert set(parse_expression(text).names) == {"a", "b", "c"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('true')", "a.b()", "a if b else c", "a ** b", "lambda: a", "[a]",
+        "a @ b", "'a'", "a and b", "3 + 4", "", "a[b()]", "True + a", "(" * 400 + "a" + ")" * 400,
+        "a;b", "a\x00b", "1j * a", "a" * 2000,
+    ],
+)  # fmt: skip
+def test_anything_but_arithmetic_is_refused(text: str) -> None:
+    with pytest.raises(ConfigError, match="expression"):
+        parse_expression(text)
+
+
+@settings(deadline=None, max_examples=300)
+@given(st.text(max_size=60))
+def test_any_text_is_parsed_or_refused(text: str) -> None:
+    try:
+        parse_expression(text)
+    except ConfigError:
+        return
+
+
+def test_a_sensor_clock_with_drift_is_tied_to_the_recorder() -> None:
+    generator = np.random.default_rng(0)
+    true_s = np.arange(6000) * 0.01
+    stamp_s = (true_s - 37.0) * (1.0 - 40e-6)  # runs 40 ppm slow, with another zero
+    recorder_s = true_s + 0.002 + generator.exponential(0.004, len(true_s))
+    time = AlignedTime(column="s", scale=1.0, anchor=Column(column="r", scale=1.0, offset=0.0))
+    aligned_s = time.align(stamp_s, recorder_s)
+    # the transport's shortest time cannot be told from the clock's zero
+    assert np.abs(aligned_s - (true_s + 0.002)).max() < 0.0005
+    assert np.abs(recorder_s - (true_s + 0.002)).max() > 0.01
+
+
+def test_commands_that_go_one_way_only_are_read(tmp_path: Path, carriage: Machine) -> None:
+    signals = make_signals() | {"u": np.abs(make_signals()["u"])}
+    write_csv(tmp_path / "a.csv", signals)
+    (recording,) = make_map(full_minus=None).read(tmp_path / "a.csv", carriage)
+    np.testing.assert_array_equal(recording.u[:, 0], signals["u"].astype(np.float32))
+    other = CommandColumn(column="u", neutral=0.0, full_plus=None, full_minus=1.0)
+    np.testing.assert_array_equal(other.command(np.array([0.0, 0.5])), [0.0, -0.5])
+    write_csv(tmp_path / "b.csv", make_signals())
+    with pytest.raises(RecordingError, match=r"b\.csv: line \d+ \(row \d+\), column 'u': -\S+ lies on the side"):  # fmt: skip
+        make_map(full_minus=None).read(tmp_path / "b.csv", carriage)
+    with pytest.raises(ConfigError, match="expected full_plus or full_minus"):
+        CommandColumn(column="u", neutral=0.0, full_plus=None, full_minus=None)
+
+
+@pytest.mark.parametrize("name", ["a.parquet", "a.npz", "a.mat"])
+@settings(deadline=None, max_examples=25)
+@given(place=st.floats(0.0, 0.999))
+def test_a_cut_off_file_is_refused_by_name(
+    tmp_path_factory: pytest.TempPathFactory, carriage: Machine, name: str, place: float
+) -> None:
+    path = tmp_path_factory.mktemp("cut") / name
+    reader = write_kind(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(place * len(whole))])
+    with pytest.raises(RecordingError, match=str(path)):
+        reader.read(path, carriage)
+
+
+def test_a_damaged_array_is_named(tmp_path: Path, carriage: Machine) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, **make_signals())
+    data = bytearray(path.read_bytes())
+    at = data.index(b"q.npy") + 300
+    data[at : at + 4] = b"\xff\xff\xff\xff"
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"a\.npz: array 'q.npy' is damaged"):
+        make_map().read(path, carriage)
+
+
+def test_a_list_of_another_length_is_refused_by_its_line(tmp_path: Path, carriage: Machine) -> None:
+    write_lists(tmp_path / "a.csv")
+    lines = (tmp_path / "a.csv").read_text().splitlines()
+    lines[70] = lines[70].replace(", ", ", 1.0, ")
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    with pytest.raises(RecordingError, match=r"line 71 \(row 69\), column 'both': .* is not a list of 2 numbers"):  # fmt: skip
+        make_map("both[0]", "both[1]").read(tmp_path / "a.csv", carriage)
+
+
+def test_pickled_objects_are_never_loaded(tmp_path: Path, carriage: Machine) -> None:
+    np.savez(tmp_path / "a.npz", **make_signals(), evil=np.array([{}] * NUM, dtype=object))
+    assert "evil" not in open_log(tmp_path / "a.npz").list_tables()[""]
+    (recording,) = make_map().read(tmp_path / "a.npz", carriage)
+    check(recording)
+
+
+def test_a_folder_of_something_else_is_refused(
+    tmp_path: Path, brokk: Callable[..., object]
+) -> None:
+    with pytest.raises(RecordingError, match="expected a folder of SAGE"):
+        open_log(tmp_path)
