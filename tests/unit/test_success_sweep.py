@@ -40,7 +40,7 @@ def test_a_level_is_passed_by_the_newest_episodes_and_not_by_few_of_them() -> No
     found = rows((10, 0.0), (10, 1.0), (10, 0.5), (10, 1.0), (10, 1.0))
     assert find_passing(found, 0.7, window=20)["seconds"] == 2.0
     assert find_passing(found, 0.95, window=20)["seconds"] == 4.0
-    assert find_passing(found[:5], 0.95, window=20) is None
+    assert find_passing(found[:4], 0.95, window=20) is None
     assert find_passing(rows((19, 1.0)), 0.95, window=20) is None
     # an iteration without an episode repeats older figures, which count for nothing
     assert find_passing(rows((10, 0.0), (0, 1.0), (10, 0.0)), 0.5, window=20) is None
