@@ -114,6 +114,7 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
         RecordingError: there is none, or not even its beginning can be read.
     """
     contents, decoder, ahead_ns = CaptureContents(whole=is_whole(path)), _Decoder(), None
+    seen: list[tuple[str, Message]] = []
     for record in _iterate_records(path):
         if isinstance(record, Metadata) and record.name == FACTS:
             contents.facts = dict(record.metadata)
@@ -129,13 +130,16 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
                 contents.wall_ns = contents.wall_ns or record.log_time
                 ahead_ns = record.log_time - int(t_s * 1e9) if ahead_ns is None else ahead_ns
                 contents.messages.setdefault(topic, TopicMessages()).add(t_s, values)
-            elif topic in views and ahead_ns is not None:
-                view = ((record.log_time - ahead_ns) / 1e9, record.data)
-                contents.views.setdefault(topic, []).append(view)
+            elif topic in views:
+                seen.append((topic, record))
     if not contents.facts:
         raise RecordingError(
             f"{path}: no capture of this framework, or cut off within its first second"
         )
+    for topic, view in seen:
+        # Viewers' messages carry the wall clock alone.
+        t_s = (view.log_time - (ahead_ns or 0)) / 1e9
+        contents.views.setdefault(topic, []).append((t_s, view.data))
     return contents
 
 

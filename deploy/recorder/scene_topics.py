@@ -41,13 +41,13 @@ from deploy.guard.guard import GuardState
 from deploy.guard.shapes import BASE, MachineShapes, read_machine_shapes
 from deploy.page.scene import plan_approach
 from deploy.picture import decode_jpeg, encode_jpeg
+from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import AdviceStatus
 from deploy.runtime.target import NEAR_M
 
-LINKS, CAMERA_POSE = "tf", "tf/camera"
 SHAPES, SHAPE_POINTS = "scene/machine", "scene/machine_points"
 TASK, TASK_POINTS = "scene/task", "scene/task_points"
-PICTURE, LENS, CLOUD, LOG = "camera", "camera/calibration", "camera/points", "log"
+LINKS, LOG = "tf", "log"
 """Topics."""
 BASE_FRAME, TIP_FRAME, CAMERA_FRAME = "base", "tip", "camera"
 PERIOD_S, TASK_PERIOD_S = 0.05, 0.2

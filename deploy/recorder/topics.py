@@ -31,6 +31,8 @@ TYPES = {
     "text": PROTO.TYPE_STRING,
 }
 TIME = "t_s"
+PICTURE, LENS, CLOUD, CAMERA_POSE = "camera", "camera/calibration", "camera/points", "tf/camera"
+"""Topics of the camera, written by `scene_topics`."""
 
 
 @dataclass(frozen=True)
