@@ -68,7 +68,7 @@ CLOUD_TYPE = np.dtype(
 )
 """A point of a cloud."""
 LEVELS = Log_pb2.Log
-SEED, SURFACE_POINTS = 7, 400
+SEED, SURFACE_POINTS = 7, 150
 """Of the points on a shape's surface; dense enough to see it, chosen by hand."""
 WriteMessage = Callable[[str, float, str, bytes, bytes], None]
 Color = tuple[float, float, float, float]
@@ -101,7 +101,8 @@ class SceneTopics:
             self._holes = values["holes"]
         elif topic == "advice":
             valid = values["reason"] == AdviceStatus.VALID.value
-            self._target_m = np.array(values["target_in_base_m"]) if valid else None
+            target_m = values.get("target_in_base_m") if valid else None
+            self._target_m = None if target_m is None else np.array(target_m)
             self._write_task(t_s)
         elif (event := describe_event(topic, values)) is not None:
             level, text = event
