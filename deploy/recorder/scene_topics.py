@@ -244,7 +244,9 @@ class SceneTopics:
             yield "tool path", np.array(plan_approach(tip_m, goal, up)), PINK
 
 
-def describe_event(topic: str, values: dict[str, Any]) -> tuple[int, str] | None:
+def describe_event(
+    topic: str, values: dict[str, Any]
+) -> tuple[Log_pb2.Log.Level.ValueType, str] | None:
     """Return level and words of an event for the log; `None` where a topic is not logged."""
     if topic == "guard":
         latched = values["state"] == GuardState.LATCHED.name
