@@ -38,6 +38,8 @@ STEPS = "steps"
 once to spread the first episodes over time."""
 FAULT = "fault"
 """Entry of `TaskProcess.reasons` for an episode whose world diverged (`World.faults`)."""
+REWARD = "reward/"
+"""Begins the figures of `TaskProcess.episode` that add up one term of the reward each."""
 SUCCESS = "success_strict"
 """Figure of `TaskProcess.episode` by which policies are compared: 1 after success, else 0."""
 
@@ -142,6 +144,15 @@ class MovableTask(Protocol):
 
 
 @runtime_checkable
+class CountedStarts(Protocol):
+    """A task process that says how many of its random starts can be done; optional."""
+
+    def count_starts(self, count: int, seed: int) -> dict[str, float]:
+        """Return shares of the candidates drawn for `count` starts, by condition, the last one all."""
+        ...
+
+
+@runtime_checkable
 class DeployableTask(Protocol):
     """A task process whose policy can leave the trainer; optional."""
 
@@ -171,6 +182,11 @@ def supports_classical_control(process: object) -> TypeGuard[ClassicalTask]:
 def can_move_target(process: object) -> TypeGuard[MovableTask]:
     """Return whether the target of a task process can be moved."""
     return isinstance(process, MovableTask)
+
+
+def can_count_starts(process: object) -> TypeGuard[CountedStarts]:
+    """Return whether a task process says how many of its starts can be done."""
+    return isinstance(process, CountedStarts)
 
 
 def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
