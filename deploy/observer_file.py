@@ -1,8 +1,14 @@
-"""Calibration of the observer: its file, and its alarms in recordings of a healthy machine."""
+"""Calibration of the observer: its file, and its alarms in recordings of a healthy machine.
+
+The file holds a model, the thresholds and the scores of the drift watch. Thresholds and scores come
+from recordings of one machine that the model was not fitted to; the file names their sources.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -16,9 +22,12 @@ from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.guard.limits import GuardLimits, ObserverLimits
 from deploy.guard.observer import Observer
-from deploy.guard.valve_model import SCHEMA, load_observer_file
+from deploy.guard.valve_model import SCHEMA, describe_sources, load_observer_file
 
 FILE, COUNTS = "observer.json", "observed.json"
+FAR = 0.3
+"""Part of full speed above which a window counts for the sensitivity. Chosen by hand: slower motion
+is judged by a longer way."""
 SHIFT_S = 8 * 3600.0
 """A shift, to which alarms are extrapolated."""
 
@@ -41,6 +50,9 @@ class AlarmCounts:
         misfits: Alarms of the drift watch, one a run at most, by joint and effect.
         num_runs: Number of runs.
         scores: Scores of the drift watch, of each joint.
+        num_moving: Windows in which a joint should move far, `(J,)`; see `FAR`.
+        num_found: Of these, those in which a joint that stands still would be found, and one that
+            moves the wrong way, `(2, J)`.
     """
 
     num_joints: int
@@ -49,14 +61,73 @@ class AlarmCounts:
     faults: Counter[str] = field(default_factory=Counter)
     misfits: Counter[str] = field(default_factory=Counter)
     scores: list[list[float]] = field(init=False)
+    num_moving: np.ndarray = field(init=False)
+    num_found: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
         self.scores = [[] for _ in range(self.num_joints)]
+        self.num_moving = np.zeros(self.num_joints, int)
+        self.num_found = np.zeros((2, self.num_joints), int)
+
+    def note(self, observer: Observer, machine: Machine) -> None:
+        """Take in what an observer found in one period, and clear its fault."""
+        for joint, score in enumerate(observer.scores):
+            if score is not None:
+                self.scores[joint].append(score)
+        observer.scores = []
+        seen = observer.window
+        is_far = np.abs(seen.wanted) > FAR * machine.max_speed * observer.window_s
+        self.num_moving += is_far
+        # The difference is once the predicted motion, or twice.
+        for times in (1, 2):
+            self.num_found[times - 1] += is_far & (times * np.abs(seen.wanted) > seen.limit)
+        found = observer.observation
+        if found.joint >= 0:
+            self.faults[f"{machine.joint_names[found.joint]} {found.fault.value}"] += 1
+            observer.clear()
+
+    def describe_sensitivity(self, machine: Machine) -> list[str]:
+        """Return a line for each joint: how much of its motion would show a fault."""
+        lines = []
+        for joint, name in enumerate(machine.joint_names):
+            if number := int(self.num_moving[joint]):
+                still, turned = (f"{found / number:.0%}" for found in self.num_found[:, joint])
+                lines.append(
+                    f"  {name}: of its windows above {FAR:.0%} of full speed {still} would show that it stands still, "
+                    f"{turned} that it moves the wrong way"
+                )
+        return lines
 
     @property
     def faults_a_shift(self) -> float:
         """Alarms extrapolated to a shift."""
         return self.faults.total() * SHIFT_S / max(self.seconds, 1e-9)
+
+
+@spec
+class ThresholdSettings:
+    """Settings by which thresholds are taken from recordings; see `deploy.guard.observer`.
+
+    Attributes:
+        window_s: Time over which measured and predicted motion are compared.
+        share: Difference between them that is borne, of the predicted way.
+        least_slack_s: Least further difference, as the way in so much time at full speed.
+        margin: Slack over the largest difference in the recordings.
+    """
+
+    window_s: float
+    share: float
+    least_slack_s: float
+    margin: float
+
+    def check(self) -> None:
+        if min(self.window_s, self.least_slack_s) <= 0 or not 0 < self.share < 1:
+            raise ConfigError(
+                "observe.thresholds: expected window_s and least_slack_s of more than 0 and share in (0, 1), "
+                f"got {self.window_s}, {self.least_slack_s} and {self.share}"
+            )
+        if not self.margin >= 1:
+            raise ConfigError(f"observe.thresholds.margin: expected 1 or more, got {self.margin}")
 
 
 @spec
@@ -66,11 +137,13 @@ class ObserverCalibration:
     Attributes:
         recordings: Glob or list of globs; recordings that the model was not fitted to.
         path: File of an observer whose alarms are counted; `null`: one is made.
+        thresholds: How the thresholds of a new file are taken.
         limits: Of the guard, whose observer counts.
     """
 
     recordings: str | tuple[str, ...]
     path: str | None
+    thresholds: ThresholdSettings
     limits: GuardLimits
 
     def run(self, machine: Machine, actuator: ModelTables, session: Session) -> list[str]:
@@ -94,34 +167,62 @@ class ObserverCalibration:
             tables = actuator.export_tables(machine)
             content: dict[str, Any] = {"schema": SCHEMA, "machine": machine.name}
             content |= {"fingerprint": machine.fingerprint(), "model": tables}
+            content["sources"] = sorted({_find_source(one) for one in recordings})
             content["scores"] = [[] for _ in machine.joints]
+            content["thresholds"] = find_thresholds(
+                self.thresholds, limits, content, machine, recordings
+            )
         else:
             content = load_observer_file(resolve_package_path(self.path))
             machine.check_fingerprint(content["fingerprint"], self.path)
         counts = count_alarms(limits, content, machine, recordings, session.stream("observe"))
-        lines = [
-            f"{counts.seconds / 60:.0f} minutes of {counts.num_runs} runs: {counts.faults.total()} false alarms, "
-            f"{counts.faults_a_shift:.1f} a shift of 8 h"
-        ]
-        lines += [f"  {name}: {number}" for name, number in counts.faults.most_common()]
+        minutes = f"{counts.seconds / 60:.0f} minutes of {counts.num_runs} runs"
         if self.path is None:
             content["scores"] = [sorted(round(one, 6) for one in own) for own in counts.scores]
             write_json(session.folder / FILE, content)
-            numbers = ", ".join(str(len(own)) for own in counts.scores)
-            lines.append(f"{FILE}: {numbers} scores of the joints for the drift watch")
-        else:
-            lines.append(
-                f"drift watch: alarms in {counts.misfits.total()} of {counts.num_runs} runs"
-            )
-            lines += [f"  {name}: {number}" for name, number in counts.misfits.most_common()]
+            return _describe_file(content, machine, minutes)
+        lines = [
+            f"{minutes}: {counts.faults.total()} false alarms, {counts.faults_a_shift:.1f} a shift of 8 h"
+        ]
+        lines += [f"  {name}: {number}" for name, number in counts.faults.most_common()]
+        lines.append(f"drift watch: alarms in {counts.misfits.total()} of {counts.num_runs} runs")
+        lines += [f"  {name}: {number}" for name, number in counts.misfits.most_common()]
+        lines += counts.describe_sensitivity(machine)
         found = {
             "minutes": counts.seconds / 60,
             "runs": counts.num_runs,
             "faults": dict(counts.faults),
         }
         found |= {"faults_a_shift": counts.faults_a_shift, "misfits": dict(counts.misfits)}
+        found |= {"moving": counts.num_moving.tolist(), "found": counts.num_found.tolist()}
         write_json(session.folder / COUNTS, found)
         return lines
+
+
+def find_thresholds(
+    settings: ThresholdSettings,
+    limits: ObserverLimits,
+    content: Mapping[str, Any],
+    machine: Machine,
+    recordings: Sequence[Recording],
+) -> dict[str, Any]:
+    """Return the thresholds of an observer's file, from recordings of a healthy machine."""
+    thresholds = {"window_s": settings.window_s, "share": settings.share}
+    # No alarm ends a window: all of them count.
+    deaf = dict(content) | {"thresholds": thresholds | {"slack_s": [math.inf] * machine.num_joints}}
+    observer = Observer(limits, deaf, machine, seed=0)
+    needed, seconds = np.zeros(machine.num_joints), 0.0
+    for recording in recordings:
+        observer.forget()
+        seconds += recording.duration_s
+        for _ in _replay(observer, recording, machine):
+            seen = observer.window
+            needed = np.maximum(
+                needed, np.abs(seen.moved - seen.wanted) - settings.share * seen.way
+            )
+    needed_s = np.maximum(settings.margin * needed / machine.max_speed, settings.least_slack_s)
+    slack_s = [round(one, 4) for one in needed_s.tolist()]
+    return thresholds | {"slack_s": slack_s, "minutes": round(seconds / 60, 1)}
 
 
 def count_alarms(
@@ -143,7 +244,9 @@ def count_alarms(
         observer = Observer(limits, content, machine, seed + machine.num_joints * number)
         for part in parts:
             observer.forget()
-            _replay(observer, part, machine, counts)
+            counts.seconds += part.duration_s
+            for _ in _replay(observer, part, machine):
+                counts.note(observer, machine)
         counts.num_runs += 1
         found = observer.observation
         if found.misfit_joint >= 0:
@@ -151,24 +254,31 @@ def count_alarms(
     return counts
 
 
-def _replay(
-    observer: Observer, recording: Recording, machine: Machine, counts: AlarmCounts
-) -> None:
-    counts.seconds += recording.duration_s
+def _replay(observer: Observer, recording: Recording, machine: Machine) -> Iterator[None]:
+    """Show a recording to an observer, and yield after each period."""
     # On a grid of its own: a log's times jitter, and its gaps have been split before.
     times_s = np.arange(recording.num_samples) * machine.period_s
     for row, t_s in enumerate(times_s):
         # The observer gets the flow of the period that has just ended.
         flow = recording.u[max(0, row - 1)]
         observer.update(float(t_s), recording.q[row].astype(float), flow.astype(float))
-        for joint, score in enumerate(observer.scores):
-            if score is not None:
-                counts.scores[joint].append(score)
-        observer.scores = []
-        found = observer.observation
-        if found.joint >= 0:
-            counts.faults[f"{machine.joint_names[found.joint]} {found.fault.value}"] += 1
-            observer.clear()
+        yield
+
+
+def _find_source(recording: Recording) -> str:
+    """Return what a recording was made of, without what was done with it."""
+    return recording.metadata.get("source", "unknown").partition(",")[0]
+
+
+def _describe_file(content: Mapping[str, Any], machine: Machine, minutes: str) -> list[str]:
+    slack_s = content["thresholds"]["slack_s"]
+    pairs = zip(machine.joint_names, slack_s, content["scores"], strict=True)
+    lines = [f"{FILE}: thresholds and scores of {minutes}, {describe_sources(content)}"]
+    for name, slack, scores in pairs:
+        lines.append(
+            f"  {name}: {slack:g} s of full speed, {len(scores)} scores for the drift watch"
+        )
+    return [*lines, f"count its alarms in other recordings: observe.path={FILE}"]
 
 
 def _list_patterns(patterns: str | tuple[str, ...]) -> tuple[str, ...]:

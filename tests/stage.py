@@ -56,7 +56,7 @@ class Air:
         self.inbox: deque[CanFrame] = deque()
         self.sent: list[CanFrame] = []
         self.broken = self.echo = False
-        self.interface, self.channel = "air", "1"
+        self.interface, self.channel = "virtual", "air"
 
     def open(self, frame_ids: Any) -> Air:
         if self.broken:
@@ -227,9 +227,11 @@ def write_nominal_observer(machine: Machine, folder: Path) -> Path:
     model = {"dead_time_s": [machine.dead_time_s] * machine.num_joints}
     model |= dict.fromkeys(("demand", "play", "spool_s", "speed_s"), none)
     model |= {"knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line, "pose": None}
-    content = {"schema": 1, "machine": machine.name, "fingerprint": machine.fingerprint()}
+    content = {"schema": 2, "machine": machine.name, "fingerprint": machine.fingerprint()}
+    content |= {"sources": ["nominal machine"], "model": model, "scores": [[] for _ in ones]}
+    thresholds = {"window_s": 1.0, "share": 0.25, "slack_s": [0.06 for _ in ones], "minutes": 0.0}
     path = folder / "nominal_observer.json"
-    path.write_text(json.dumps(content | {"model": model, "scores": [[] for _ in ones]}))
+    path.write_text(json.dumps(content | {"thresholds": thresholds}))
     return path
 
 

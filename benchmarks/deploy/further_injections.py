@@ -63,7 +63,8 @@ def reboot_gateway(stage: Stage, trial: int) -> None:
 
 
 def leave_bus(stage: Stage, trial: int) -> None:
-    """The PC's controller goes off the bus for 0.15 to 2.5 s."""
+    """The PC's controller goes off the bus for 0.15 to 2.5 s; the dead-man is held all the time."""
+    hold_button(stage)
     end_s = stage.now_s + OFF_S[trial % 6]
     stage.air.broken = True
 
@@ -318,7 +319,15 @@ FURTHER: list[Inject] = [
     write_nonsense,
 ]
 """While somebody else commands."""
-FRESH = (reboot_remote, reboot_gateway, SLOW_CLOCK, FAST_CLOCK, *SENSORS_CUT, forget_stop)
+FRESH = (
+    reboot_remote,
+    reboot_gateway,
+    leave_bus,
+    SLOW_CLOCK,
+    FAST_CLOCK,
+    *SENSORS_CUT,
+    forget_stop,
+)
 """Those after which a stage is of no use any more."""
 LASTING = (reboot_remote, reboot_gateway, leave_bus, stand_still, forget_stop, bounce_estop)
 """Those that are watched to the end: the machine might move again."""

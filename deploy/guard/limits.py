@@ -83,29 +83,17 @@ class EnvelopeLimits:
 
 @spec
 class ObserverLimits:
-    """Limits of the observer; see `deploy.guard.observer`.
+    """Limits of the observer; its thresholds stand in its file, see `deploy.guard.observer`.
 
     Attributes:
         path: Its file, from `brokk mode=observe`: a path, or `package:path`.
-        window_s: Time over which measured and predicted motion are compared.
-        slack_s: Difference between them that noise may make, as the way in so much time at the
-            machine's full speed.
-        share: Further difference, of the predicted way.
         false_alarms: Largest chance of a false alarm of the drift watch in a run.
     """
 
     path: str
-    window_s: float
-    slack_s: float
-    share: float
     false_alarms: float
 
     def check(self) -> None:
-        if min(self.window_s, self.slack_s) <= 0 or not 0 < self.share < 1:
-            raise ConfigError(
-                "guard.observer: expected window_s and slack_s of more than 0 and share in (0, 1), "
-                f"got {self.window_s}, {self.slack_s} and {self.share}"
-            )
         if not 0 < self.false_alarms < 1:
             raise ConfigError(
                 f"guard.observer.false_alarms: expected a chance in (0, 1), got {self.false_alarms}"
@@ -142,7 +130,7 @@ class GuardLimits:
         envelope: Limits of the arm in space; `null`: none. Without the machine's geometry there
             is none either.
         observer: Limits of the observer; `null`: none. For a machine other than that of its file
-            there is none either.
+            there is none either, and where commands are sent that is an error.
     """
 
     max_command: float

@@ -6,7 +6,8 @@ when it exceeds
 
     slack_s * max_speed + share * (way that was predicted),
 
-by the ratio of measured to predicted motion: about none is a joint that stands still, a negative
+thresholds of the observer's file, which `brokk mode=observe` takes from recordings of the very
+machine. The fault is named by the ratio of measured to predicted motion: about none is a joint that stands still, a negative
 one a turned sign, less than one a joint that moves too little. A residual without predicted motion,
 or beyond it, is a joint that moves unasked. A sensor that drifts against the motion looks like a
 weak valve at first.
@@ -64,32 +65,52 @@ NOTHING_OBSERVED = Observation(GuardTrip.NONE, -1, Misfit.NONE, -1)
 """Where nothing was found, or nobody looks."""
 
 
+@dataclass(frozen=True)
+class ObservedWindow:
+    """Motions of the joints in a window, each `(J,)`, rad or m.
+
+    Attributes:
+        moved: Measured motion.
+        wanted: Predicted motion.
+        way: Sum of the predicted steps, without sign.
+        limit: Difference of both above which a fault is named.
+    """
+
+    moved: np.ndarray
+    wanted: np.ndarray
+    way: np.ndarray
+    limit: np.ndarray
+
+
 class Observer:
     """See the module.
 
     Args:
-        limits: Window and thresholds.
-        content: Of the observer's file: tables of the model, scores of the watch.
+        limits: Of the drift watch.
+        content: Of the observer's file: tables of the model, thresholds, scores of the watch.
         machine: Limits, speeds and period.
         seed: Of the drift watch's chance.
 
     Attributes:
         watch: The drift watch.
         scores: Its newest scores; see `DriftWatch.update`.
+        window_s: Length of the window.
     """
 
     def __init__(
         self, limits: ObserverLimits, content: Mapping[str, Any], machine: Machine, seed: int
     ) -> None:
-        self._limits, self._machine = limits, machine
+        thresholds = content["thresholds"]
+        self._share, self._machine = float(thresholds["share"]), machine
+        self.window_s = float(thresholds["window_s"])
         self._predictor = ValvePredictor(content["model"], machine)
         self.watch = DriftWatch(content["scores"], limits.false_alarms, machine, seed)
-        length = round(limits.window_s / machine.period_s)
+        length = round(self.window_s / machine.period_s)
         self._measured, self._predicted = (
             deque[np.ndarray]([], length),
             deque[np.ndarray]([], length),
         )
-        self._slack = limits.slack_s * machine.max_speed
+        self._slack = np.array(thresholds["slack_s"], float) * machine.max_speed
         # Commands that were given before the first look act for so long.
         self._num_blind = round((machine.dead_time_s + BLIND_S) / machine.period_s)
         self._blind = self._num_blind
@@ -148,11 +169,19 @@ class Observer:
         if self._fault is GuardTrip.NONE:
             self._find_fault()
 
+    @property
+    def window(self) -> ObservedWindow:
+        """The motions of the newest window; zeros before the first."""
+        predicted, measured = np.array(self._predicted), np.array(self._measured)
+        way = np.abs(predicted).sum(0)
+        limit = self._slack + self._share * way
+        return ObservedWindow(measured.sum(0), predicted.sum(0), way, limit)
+
     def _find_fault(self) -> None:
         predicted, measured = np.array(self._predicted), np.array(self._measured)
-        wanted, way = predicted.sum(0), np.abs(predicted).sum(0)
-        moved = measured.sum(0)
-        excess = np.abs(moved - wanted) / (self._slack + self._limits.share * way)
+        window = self.window
+        moved, way = window.moved, window.way
+        excess = np.abs(moved - window.wanted) / window.limit
         joint = int(excess.argmax())
         if excess[joint] <= 1.0:
             return

@@ -21,13 +21,10 @@ from brokk_rl.registry import resolve_package_path
 
 BASE = -1
 """Link number of what stands still; link `j` turns with joint `j`."""
-NUM_PIECES = 2
-"""Capsules a link at most: a breaker's housing and its chisel. More make the envelope tighter by
-centimetres, and slower."""
 SHORTEST_M = 1e-9
 """Length below which a link has no direction."""
-SIZES = {"sphere": 1, "capsule": 2, "cylinder": 2, "ellipsoid": 3, "box": 3}
-"""Numbers in `size` by type of geom; one less where `fromto` gives the length."""
+KINDS = ("sphere", "capsule", "cylinder", "ellipsoid", "box")
+"""Types of geoms that can be read."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +92,7 @@ def read_machine_shapes(machine: Machine) -> MachineShapes | None:
         return None
     root = _read_xml(machine)
     boxes: list[RoundedBox] = []
-    world = root.find("worldbody")
-    if world is not None:
+    for world in root.findall("worldbody"):
         _Reader(machine, root).read_body(world, BASE, np.eye(3), np.zeros(3), boxes)
     boxes = _stretch_links(boxes, machine, root)
     arm: list[LinkCapsule] = []
@@ -109,7 +105,10 @@ def read_machine_shapes(machine: Machine) -> MachineShapes | None:
 
 
 def fit_capsules(boxes: list[RoundedBox], end_m: np.ndarray) -> list[LinkCapsule]:
-    """Return at most `NUM_PIECES` capsules of least volume that enclose the boxes of a link.
+    """Return one capsule, or two of less volume, that enclose the boxes of a link.
+
+    Two are enough for a breaker's housing and its chisel. More would make the envelope tighter by
+    centimetres, and slower.
 
     Args:
         boxes: Its shapes.
@@ -173,6 +172,12 @@ def _stretch_links(boxes: list[RoundedBox], machine: Machine, root: ET.Element) 
     for body in root.iter("body"):
         for joint in body.findall("joint"):
             places[joint.get("name")] = _parse_numbers(body.get("pos", "0 0 0"))
+    missing = [name for name in machine.joint_names if name not in places]
+    if missing:
+        raise ConfigError(
+            f"machine {machine.name}: expected its joints in its MJCF, got none of {', '.join(missing)}; "
+            "mend `mjcf` in the machine's file, or switch the envelope off by guard.envelope=null"
+        )
     drawn_m = [places[name] for name in machine.joint_names[1:]]
     tip = next((site for site in root.iter("site") if site.get("name") == "tip"), None)
     drawn_m.append(machine.tip_m if tip is None else _parse_numbers(tip.get("pos", "0 0 0")))
@@ -245,22 +250,26 @@ class _Reader:
         kind = values.get("type", "sphere")
         if kind == "plane":
             return None
-        if kind not in SIZES:
+        if kind not in KINDS:
             raise ConfigError(
-                f"machine {self._machine.name}: expected geoms of {', '.join(SIZES)} in its MJCF for the envelope, "
+                f"machine {self._machine.name}: expected geoms of {', '.join(KINDS)} in its MJCF for the envelope, "
                 f"got {kind}; add simple shapes beside it, or switch the envelope off by guard.envelope=null"
             )
         size = _parse_numbers(values.get("size", ""))
         center_m = _parse_numbers(values.get("pos", "0 0 0"))
         if "fromto" in values:
             ends = _parse_numbers(values["fromto"]).reshape(2, 3)
-            center_m, axis = ends.mean(0), ends[1] - ends[0]
-            size = np.array([*size[:1], np.linalg.norm(axis) / 2])
+            center_m, axis = ends.mean(0), ends[0] - ends[1]
+            half_length_m = np.linalg.norm(axis) / 2
+            # MuJoCo takes the first number alone: boxes and ellipsoids are as wide as they are deep.
+            size = np.array([size[0], half_length_m])
+            if kind in ("box", "ellipsoid"):
+                size = np.array([size[0], size[0], half_length_m])
             rotation = _compute_rotation_to(axis)
         else:
             rotation = self._read_rotation(values)
         if kind == "box" or kind == "ellipsoid":
-            half_m, radius_m = size[:3], 0.0
+            half_m, radius_m = size, 0.0
         elif kind == "cylinder":
             half_m, radius_m = np.array([size[0], size[0], size[1]]), 0.0
         else:
@@ -299,9 +308,10 @@ def _convert_quaternion(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _compute_rotation_to(axis: np.ndarray) -> np.ndarray:
-    """Return a rotation that turns z into the direction of `axis`."""
-    z = axis / max(float(np.linalg.norm(axis)), SHORTEST_M)
-    other = np.eye(3)[int(np.abs(z).argmin())]
-    x = np.cross(other, z)
-    x = x / np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z], 1)
+    """Return the shortest rotation that turns z into the direction of `axis`, as MuJoCo's."""
+    x, y, z = axis
+    across = math.hypot(x, y)
+    half_rad = math.atan2(across, z) / 2
+    turn_x, turn_y = (-y / across, x / across) if across > 0 else (1.0, 0.0)
+    about = math.sin(half_rad)
+    return _convert_quaternion(np.array([math.cos(half_rad), about * turn_x, about * turn_y, 0.0]))

@@ -17,7 +17,7 @@ import numpy as np
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 
-SCHEMA = 1
+SCHEMA = 2
 """Of the observer's file."""
 BEYOND = 1.2
 """Positions, in halves of the travel from its middle, beyond which the pose counts no further."""
@@ -42,6 +42,12 @@ def load_observer_file(path: Path) -> dict[str, Any]:
             f"guard.observer.path: expected a file of schema {SCHEMA}, got {path}; make it again by brokk mode=observe"
         )
     return content
+
+
+def describe_sources(content: Mapping[str, Any]) -> str:
+    """Return in a few words what an observer's file was made from."""
+    first, *others = content["sources"]
+    return f"from {first}" + (f" and {len(others)} others" if others else "")
 
 
 class ValvePredictor:

@@ -20,7 +20,7 @@ class ObserveMode:
     observe: ObserverCalibration
 
     def run(self) -> None:
-        """Write `observer.json`, unless a file is given, and `observed.json`.
+        """Write `observer.json`, or `observed.json` where such a file is given.
 
         Raises:
             ConfigError: the model or the file is not one of this machine.

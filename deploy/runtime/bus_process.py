@@ -14,8 +14,9 @@ import struct
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from brokk_rl.errors import LinkError
+from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import BusReplay, CanBus, CanFrame, OpenBusReplay, OpenCanBus
@@ -25,7 +26,7 @@ from deploy.guard.guard import GuardDecision
 from deploy.guard.limits import GuardLimits
 from deploy.guard.observer import Observer
 from deploy.guard.shapes import read_machine_shapes
-from deploy.guard.valve_model import load_observer_file
+from deploy.guard.valve_model import describe_sources, load_observer_file
 from deploy.runtime.bus_logic import CYCLE_S, BusInputs, BusLogic
 from deploy.runtime.operator_state import StopRequest
 from deploy.runtime.process import CycleTimer, Stop
@@ -40,6 +41,10 @@ FRAME = struct.Struct("<dIBB")
 """Header of a frame in the log's pipe.
 
 Time, identifier, 1 where it was sent from here, and the number of data bytes that follow."""
+DESKS = ("udp_multicast", "virtual", "replay")
+"""Interfaces of buses without a machine: twins and recorded frames."""
+MACHINES = ("machine: ", "capture: ", "log: ")
+"""Beginnings of the sources of recordings that may be of a machine."""
 FRAMES, TEXT = b"F", b"J"
 """First byte of an entry in the log's pipe: frames, or a JSON text with topic and time."""
 
@@ -74,7 +79,8 @@ class BusProcess:
         description = BusDescription(config.dbc, config.machine)
         commands = memory.request is not None
         limits, machine = config.limits, config.machine
-        envelope, observer = build_envelope(limits, machine), build_observer(limits, machine)
+        envelope = build_envelope(limits, machine)
+        observer = build_observer(limits, machine, config.wire.interface, commands)
         self._logic = BusLogic(description, machine, limits, envelope, observer, commands)
         self._joint_names, self._misfit_joint = machine.joint_names, -1
         self._gap_s = config.limits.gap_s
@@ -221,25 +227,58 @@ class BusProcess:
         self._memory.bus_log.put(TEXT + text.encode())
 
 
-def build_observer(limits: GuardLimits, machine: Machine) -> Observer | None:
-    """Return the observer; `None` where it is switched off or its file is of another machine.
+def build_observer(
+    limits: GuardLimits, machine: Machine, interface: str, commands: bool
+) -> Observer | None:
+    """Return the observer, and log its thresholds; see `read_observer_content`."""
+    content = read_observer_content(limits, machine, interface, commands)
+    if content is None or limits.observer is None:
+        return None
+    thresholds, path = content["thresholds"], limits.observer.path
+    pairs = zip(machine.joint_names, thresholds["slack_s"], strict=True)
+    slack = ", ".join(f"{name} {slack_s:g} s" for name, slack_s in pairs)
+    text = "observer: thresholds of %s, %s, %.0f minutes: %s of full speed"
+    log.info(text, path, describe_sources(content), thresholds["minutes"], slack)
+    # Any seed will do: it decides between equal scores alone.
+    return Observer(limits.observer, content, machine, seed=time.monotonic_ns() % 2**32)
+
+
+def read_observer_content(
+    limits: GuardLimits, machine: Machine, interface: str, commands: bool
+) -> dict[str, Any] | None:
+    """Return the observer's file; `None` where it is switched off, or not of this machine.
+
+    Args:
+        limits: Of the guard.
+        machine: The machine.
+        interface: Of the bus.
+        commands: Whether commands may be sent.
 
     Raises:
-        ConfigError: its file cannot be read.
+        ConfigError: the file cannot be read, or is not of this machine where commands are sent.
     """
     if limits.observer is None:
         return None
-    content = load_observer_file(resolve_package_path(limits.observer.path))
+    path = limits.observer.path
+    content = load_observer_file(resolve_package_path(path))
     if content["fingerprint"] != machine.fingerprint():
-        log.warning(
-            "%s was made for machine %s, and differs from %s: there is no observer",
-            limits.observer.path,
-            content["machine"],
-            machine.name,
+        fault = f"made for machine {content['machine']}, which differs from {machine.name}"
+    elif interface not in DESKS and not all(map(is_from_machine, content["sources"])):
+        fault = f"made {describe_sources(content)}, and this bus is that of a machine"
+    else:
+        return content
+    if commands:
+        raise ConfigError(
+            f"guard.observer.path: {path} was {fault}; its thresholds would be wrong. Make a file from "
+            "recordings of this machine by brokk mode=observe, or go without by guard.observer=null"
         )
-        return None
-    # Any seed will do: it decides between equal scores alone.
-    return Observer(limits.observer, content, machine, seed=time.monotonic_ns() % 2**32)
+    log.warning("%s was %s: there is no observer; brokk mode=observe makes a file", path, fault)
+    return None
+
+
+def is_from_machine(source: str) -> bool:
+    """Return whether a recording's source is a machine, as far as it says so: no simulator, no desk."""
+    return source.startswith(MACHINES) and not any(name in source for name in DESKS)
 
 
 def build_envelope(limits: GuardLimits, machine: Machine) -> Envelope | None:

@@ -24,6 +24,7 @@ from deploy.guidance import find_full_angles_rad
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.recorder.capture import CaptureConfig
+from deploy.runtime.bus_process import read_observer_content
 from deploy.runtime.detached_log import detach_logging
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.perception_process import CameraConfig
@@ -103,10 +104,12 @@ class DeploymentLoop(BusAndPolicySettings):
 
         Raises:
             CheckpointError: the policy cannot be used on this machine.
-            ConfigError: bus description or levers do not fit the machine.
+            ConfigError: bus description, levers or the observer's file do not fit the machine.
             LinkError: bus or policy process died.
         """
         self.check_machine(machine)
+        if self.commands:
+            read_observer_content(self.limits, machine, self.wire.interface, commands=True)
         if self.video is not None:
             self.video.require_packages()
         with detach_logging(), tempfile.TemporaryDirectory(prefix="brokk-") as sockets:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections import deque
 from dataclasses import replace
@@ -21,6 +22,8 @@ from deploy.guard.shapes import (
     LinkCapsule,
     MachineShapes,
     RoundedBox,
+    _compute_volume,
+    _fit_capsule,
     fit_capsules,
     read_machine_shapes,
 )
@@ -329,7 +332,14 @@ def test_commands_that_have_come_to_rest_are_forgotten() -> None:
     assert len(envelope._sent) <= horizon_s / period_s + 2
 
 
-def test_capsules_enclose_boxes_and_balls() -> None:
+def list_corners(box: RoundedBox) -> np.ndarray:
+    """Corners of a box, worked by hand."""
+    signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
+    return np.array([box.center_m + box.rotation @ (one * box.half_m) for one in signs])
+
+
+@pytest.mark.parametrize("end_m", [(2.0, 0.0, 0.0), (1.0, 0.7, -0.5)])
+def test_capsules_enclose_boxes_and_balls(end_m: tuple[float, float, float]) -> None:
     draw = np.random.default_rng(3)
     boxes = []
     for number in range(6):
@@ -341,16 +351,19 @@ def test_capsules_enclose_boxes_and_balls() -> None:
                 1, draw.uniform(-0.3, 0.3, 3) + np.array([number, 0, 0]), rotation, half, radius_m
             )
         )
-    capsules = fit_capsules(boxes, np.array([2.0, 0.0, 0.0]))
+    capsules = fit_capsules(boxes, np.array(end_m))
     assert 1 <= len(capsules) <= 2
     for box in boxes:
-        inside = []
+        inside, corners_m = [], list_corners(box)
         for one in capsules:
             along = one.end_m - one.begin_m
-            t = ((box.corners_m - one.begin_m) @ along / (along @ along)).clip(0, 1)
-            off = np.linalg.norm(box.corners_m - one.begin_m - t[:, None] * along, axis=1)
+            t = ((corners_m - one.begin_m) @ along / (along @ along)).clip(0, 1)
+            off = np.linalg.norm(corners_m - one.begin_m - t[:, None] * along, axis=1)
             inside.append((off + box.radius_m <= one.radius_m + 1e-9).all())
         assert any(inside)
+
+
+def test_capsules_are_no_larger_than_needed() -> None:
     # One ball alone: the capsule is the ball.
     ball = RoundedBox(2, np.array([0.3, 0.1, -0.2]), np.eye(3), np.zeros(3), 0.25)
     (one,) = fit_capsules([ball], np.array([1.0, 0.0, 0.0]))
@@ -365,6 +378,120 @@ def test_capsules_enclose_boxes_and_balls() -> None:
         math.hypot(0.1, 0.1)
     )
     assert sorted([thin.begin_m[0], thin.end_m[0]]) == pytest.approx([0.6, 1.4])
+
+    # Two balls along the link: the capsule ends where the smaller one ends.
+    ends_m = np.array([[0.1, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    balls = [
+        RoundedBox(2, at_m, np.eye(3), np.zeros(3), radius_m)
+        for at_m, radius_m in zip(ends_m, (0.2, 0.1), strict=True)
+    ]
+    both = _fit_capsule(balls, np.array([1.0, 0.0, 0.0]))
+    assert (both.radius_m, both.begin_m[0], both.end_m[0]) == pytest.approx((0.2, 0.1, 0.4))
+    # One on top of the other: two capsules would take more room than one.
+    same = [RoundedBox(2, np.zeros(3), np.eye(3), np.full(3, 0.1), 0.0)] * 3
+    assert len(fit_capsules(same, np.array([1.0, 0.0, 0.0]))) == 1
+
+
+def test_the_volume_of_a_capsule_worked_by_hand() -> None:
+    capsule = LinkCapsule(1, np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 5.0]), 0.5)
+    # A cylinder of 2 m and two half balls.
+    expected = math.pi * 0.25 * 2.0 + 4.0 / 3.0 * math.pi * 0.125
+    assert _compute_volume(capsule) == pytest.approx(expected)
+
+
+STICK = """<mujoco>COMPILER<worldbody><geom type="sphere" size="0.2" pos="3 0 0"/>LINKS</worldbody></mujoco>"""
+
+
+def write_stick(path: Path, geoms: dict[int, str], places: dict[int, str], site: str) -> None:
+    """An arm of five links of 1 m along x, the last one to the site `tip`."""
+    links = ""
+    for number, name in enumerate(MACHINE.joint_names):
+        place = places.get(number, "1 0 0")
+        links += f'<body pos="{place}"><joint name="{name}"/>{geoms.get(number, "")}'
+    links += f'<site name="tip" pos="{site}"/>' if site else ""
+    path.write_text(STICK.replace("COMPILER", "").replace("LINKS", links + "</body>" * 5))
+
+
+def test_a_box_is_stretched_along_its_link_worked_by_hand(tmp_path: Path) -> None:
+    path = tmp_path / "stick.xml"
+    # The first link ends where the second joint is: [0.2, 0, 0.6] from the machine's file.
+    body = MACHINE.joints[1].body
+    assert body is not None
+    origin_m = np.array([one.value for one in body.origin_m])
+    length_m, drawn_m = float(np.linalg.norm(origin_m)), 0.5
+    along = origin_m / length_m
+    place = " ".join(map(str, (drawn_m * along).tolist()))
+    # A box at the middle of the link, half of it along x.
+    middle = " ".join(map(str, (0.4 * drawn_m * along).tolist()))
+    geom = f'<geom type="box" size="0.1 0.2 0.3" pos="{middle}"/>'
+    write_stick(path, {0: geom}, {1: place}, "")
+    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
+    assert shapes is not None and shapes.arm == ()
+    base, box = sorted(shapes.body, key=lambda one: one.link)
+    # What stands still is not stretched.
+    assert base.link == -1 and base.center_m == pytest.approx([3.0, 0.0, 0.0])
+    growth = length_m / drawn_m - 1.0
+    assert box.link == 0 and box.center_m == pytest.approx(0.4 * length_m * along)
+    expected = np.array([0.1, 0.2, 0.3]) * (1.0 + growth * along**2)
+    assert box.half_m == pytest.approx(expected) and growth != pytest.approx(0.0, abs=0.1)
+
+
+def test_a_link_without_length_is_not_stretched_and_the_last_one_to_its_tip(tmp_path: Path) -> None:
+    path, cube = tmp_path / "stick.xml", '<geom type="box" size="0.1 0.1 0.1" pos="0.5 0 0"/>'
+    write_stick(path, {0: cube, 4: cube}, {1: "0 0 0"}, "0.5 0 0")
+    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
+    assert shapes is not None
+    (first,) = (one for one in shapes.body if one.link == 0)
+    assert first.center_m == pytest.approx([0.5, 0.0, 0.0]) and first.half_m == pytest.approx(0.1)
+    tip_m = float(np.linalg.norm(MACHINE.tip_m))
+    (last,) = shapes.arm
+    # Drawn half a metre long, with the box at its end.
+    middle_m = (last.begin_m + last.end_m) / 2
+    assert last.link == 4 and middle_m == pytest.approx([tip_m, 0.0, 0.0])
+    # Without a tip in the file the machine's own is taken for drawn.
+    write_stick(path, {4: cube}, {}, "")
+    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
+    assert shapes is not None
+    (last,) = shapes.arm
+    assert (last.begin_m + last.end_m) / 2 == pytest.approx([0.5, 0.0, 0.0])
+
+
+def test_the_first_link_is_an_obstacle_to_the_others() -> None:
+    assert SHAPES is not None
+    assert {box.link for box in SHAPES.body} == {-1, 0}
+    assert {one.link for one in SHAPES.arm} == {1, 2, 3, 4}
+
+
+@pytest.mark.parametrize(
+    ("compiler", "rad_per_unit"),
+    [
+        ("", math.pi / 180.0),
+        ("<compiler/>", math.pi / 180.0),
+        ('<compiler angle="degree"/>', math.pi / 180.0),
+        ('<compiler angle="radian"/>', 1.0),
+    ],
+)
+def test_angles_have_the_unit_of_the_file(
+    tmp_path: Path, compiler: str, rad_per_unit: float
+) -> None:
+    path = tmp_path / "stick.xml"
+    write_stick(path, {0: '<geom type="box" size="1 1 1" euler="0 0 0.7"/>'}, {}, "")
+    path.write_text(path.read_text().replace("<worldbody>", compiler + "<worldbody>"))
+    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
+    assert shapes is not None
+    (box,) = (one for one in shapes.body if one.link == 0)
+    angle_rad = 0.7 * rad_per_unit
+    assert box.rotation[:2, 0] == pytest.approx([math.cos(angle_rad), math.sin(angle_rad)])
+
+
+def test_without_a_file_or_without_links_there_are_no_shapes(tmp_path: Path) -> None:
+    assert read_machine_shapes(replace(MACHINE, mjcf=None)) is None
+    joints = tuple(replace(one, body=None) for one in MACHINE.joints)
+    assert read_machine_shapes(replace(MACHINE, joints=joints, tool_m=None)) is None
+    path = tmp_path / "empty.xml"
+    path.write_text("<mujoco/>")
+    with pytest.raises(ConfigError, match="got none of q1, q2"):
+        read_machine_shapes(replace(MACHINE, mjcf=str(path)))
 
 
 def test_links_are_stretched_as_the_simulator_stretches_them() -> None:
@@ -590,8 +717,11 @@ def test_degrees_quaternions_classes_and_nested_bodies_are_read_as_mujoco_reads_
       <worldbody><geom type="plane" size="1 1 1"/><body name="base" childclass="rod">
         <geom name="a" pos="1 2 3" euler="30 40 50"/><geom name="b" class="thick" quat="0.5 0.1 0.2 0.3"/>
         <body pos="0.1 0.2 0.3" euler="0 90 20"><geom name="c" type="box" size="1 2 3" euler="10 0 0"/>
-          <geom name="d" fromto="0 0 0 1 1 0"/><geom name="e" type="cylinder" size="0.1 0.4"/>
-          <geom name="f" type="sphere" size="0.3"/></body>
+          <geom name="d" fromto="0 0 0 1 2 3"/><geom name="e" type="cylinder" size="0.1 0.4"/>
+          <geom name="f" type="sphere" size="0.3"/>
+          <geom name="g" type="box" size="0.1 0.2" fromto="0 0 0 1 2 3"/>
+          <geom name="h" type="ellipsoid" size="0.1" fromto="0 0 3 0 0 1"/>
+          <geom name="i" type="box" size="0.1" fromto="0 0 1 0 0 3"/></body>
         LINKS</body></worldbody></mujoco>"""
     links = "".join(
         f'<body name="{name}_link" pos="1 0 0"><joint name="{name}"/><geom type="sphere" size="0.1"/>'
@@ -605,14 +735,14 @@ def test_degrees_quaternions_classes_and_nested_bodies_are_read_as_mujoco_reads_
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     found = [box for box in shapes.body if box.link == -1]
-    assert len(found) == 6
-    for name, box in zip("abcdef", found, strict=True):
+    assert len(found) == 9
+    for name, box in zip("abcdefghi", found, strict=True):
         geom = data.geom(name)
         assert box.center_m == pytest.approx(geom.xpos, abs=1e-9)
         turn = geom.xmat.reshape(3, 3)
         size = model.geom(name).size
-        if name == "c" or name == "e":
-            expected = size if name == "c" else np.array([size[0], size[0], size[1]])
+        if name in "ceghi":
+            expected = np.array([size[0], size[0], size[1]]) if name == "e" else size
             assert box.half_m == pytest.approx(expected) and box.radius_m == 0.0
             assert box.rotation == pytest.approx(turn, abs=1e-9)
         else:

@@ -18,6 +18,7 @@ from deploy.guard.drift_watch import Misfit
 from deploy.guard.guard import GuardTrip
 from deploy.guard.observer import NOTHING_OBSERVED, Observer, classify_fault
 from deploy.guard.valve_model import ValvePredictor, load_observer_file
+from deploy.observer_file import ThresholdSettings
 
 MACHINE = option("machine", "brokk170")
 LIMITS = option("guard", "default").observer
@@ -69,14 +70,28 @@ def test_the_numpy_model_is_the_torch_model(fitted: bool) -> None:
             pose_extend={name: tuple(draw.uniform(-0.3, 0.3, 7).tolist()) for name in joints},
             pose_retract={name: tuple(draw.uniform(-0.3, 0.3, 7).tolist()) for name in joints},
         )  # fmt: skip
-    model = config.build(MACHINE, 1, torch.device("cpu"))
-    predictor = ValvePredictor(json.loads(json.dumps(config.export_tables(MACHINE))), MACHINE)
-    length = MACHINE.num_history
-    u_past, q_past = np.zeros((length, 5)), np.tile(HOME, (length, 1))
-    # One joint begins beyond its stop, one runs into it.
-    q_past[:, 3] = MACHINE.upper[3] + 0.05
+    q = HOME.copy()
+    # Two joints begin beyond their stops, one of them far; one runs into it.
+    q[3] = MACHINE.upper[3] + 0.05
+    q[4] = MACHINE.upper[4] + 0.3 * (MACHINE.upper[4] - MACHINE.lower[4])
+    compare_models(MACHINE, config, q)
+
+
+def test_the_numpy_model_is_the_torch_model_without_masses_too() -> None:
+    small, draw = option("machine", "mini_excavator"), np.random.default_rng(6)
+    slopes = {name: tuple(draw.uniform(-0.3, 0.3, 4).tolist()) for name in small.joint_names}
+    config = replace(option("actuator", "valve"), pose_extend=slopes, pose_retract=slopes)
+    compare_models(small, config, np.array(small.home))
+
+
+def compare_models(machine: Any, config: Any, q: np.ndarray) -> None:
+    """Hold both models against each other over 25 s of commands."""
+    model = config.build(machine, 1, torch.device("cpu"))
+    predictor = ValvePredictor(json.loads(json.dumps(config.export_tables(machine))), machine)
+    length, num = machine.num_history, machine.num_joints
+    u_past, q_past = np.zeros((length, num)), np.tile(q, (length, 1))
     largest = 0.0
-    for u in draw_commands(500, 1):
+    for u in draw_commands(500, 1)[:, :num]:
         u_past, before = np.concatenate([u_past[1:], u[None]]), q_past[-1]
         history = History(
             u=torch.as_tensor(u_past[None], dtype=torch.float32),
@@ -87,17 +102,26 @@ def test_the_numpy_model_is_the_torch_model(fitted: bool) -> None:
         assert moved == pytest.approx(after - before, abs=3e-5)
         largest = max(largest, float(np.abs(moved).max()))
         q_past = np.concatenate([q_past[1:], after[None]])
-    assert largest > 0.01
+    assert largest > 0.1 * machine.period_s * machine.max_speed.max()
+
+
+SLACK_S, SHARE = 0.06, 0.25
+SETTINGS = ThresholdSettings(window_s=1.0, share=SHARE, least_slack_s=SLACK_S, margin=1.5)
 
 
 class Joints:
     """A plain machine behind an observer; a fault changes what its sensors say."""
 
     def __init__(
-        self, limits: Any = LIMITS, scores: list[list[float]] | None = None, **change: Any
+        self,
+        slack_s: float | list[float] = SLACK_S,
+        scores: list[list[float]] | None = None,
+        **change: Any,
     ):
+        slacks_s = slack_s if isinstance(slack_s, list) else [slack_s] * 5
+        thresholds = {"window_s": 1.0, "share": SHARE, "slack_s": slacks_s, "minutes": 60.0}
         content = {"model": build_tables(**change), "scores": scores or [[]] * 5}
-        self.observer = Observer(limits, content, MACHINE, 0)
+        self.observer = Observer(LIMITS, content | {"thresholds": thresholds}, MACHINE, 0)
         self.q, self.now_s, self.waiting = HOME.copy(), 20.0, [np.zeros(5)] * 4
         self.offset, self.drift, self.gain = np.zeros(5), np.zeros(5), np.ones(5)
 
@@ -158,7 +182,7 @@ def test_a_sensor_that_drifts_at_rest_is_named() -> None:
     joints.drift[1] = 0.1
     seconds = joints.go((0.0,) * 5, 1.0)
     # The limit is what so much time at full speed would give.
-    assert seconds == pytest.approx(LIMITS.slack_s * SPEED[1] / 0.1, abs=PERIOD_S)
+    assert seconds == pytest.approx(SLACK_S * SPEED[1] / 0.1, abs=PERIOD_S)
     assert joints.observer.observation.joint == 1 and joints.fault is GuardTrip.JOINT_DRIFTS
 
 
@@ -169,12 +193,37 @@ def test_slow_drift_and_small_errors_of_the_model_pass() -> None:
 
 
 def test_the_limit_is_slack_and_share_of_the_way() -> None:
-    for gain, is_fault in ((1.0 - LIMITS.share * 0.98, False), (1.0 - 1.5 * LIMITS.share, True)):
-        joints = Joints(replace(LIMITS, slack_s=1e-4))
+    for gain, is_fault in ((1.0 - SHARE * 0.98, False), (1.0 - 1.5 * SHARE, True)):
+        joints = Joints(1e-4)
         joints.go((0.5, 0.0, 0.0, 0.0, 0.0), 3.0)
         joints.gain[0] = gain
         joints.go((0.5, 0.0, 0.0, 0.0, 0.0), 3.0)
         assert (joints.fault is not GuardTrip.NONE) is is_fault
+
+
+def test_each_joint_has_a_slack_of_its_own() -> None:
+    for joint, is_fault in ((0, False), (2, True)):
+        joints = Joints([0.2, 0.06, 0.06, 0.06, 0.06])
+        joints.go((0.0,) * 5, 3.0)
+        joints.q[joint] += 0.1 * SPEED[joint]
+        joints.go((0.0,) * 5, PERIOD_S)
+        assert (joints.fault is not GuardTrip.NONE) is is_fault
+
+
+def test_the_newest_window_worked_by_hand() -> None:
+    joints, first = Joints([0.2, 0.06, 0.06, 0.06, 0.06]), np.eye(5)[0]
+    before = joints.observer.window
+    assert not before.moved.any() and not before.way.any()
+    joints.gain[0] = 1.1
+    joints.go((0.5, 0.0, 0.0, 0.0, 0.0), 3.0)
+    # To and fro in the last second: the newest 0.2 s are still under way.
+    joints.go((-0.5, 0.0, 0.0, 0.0, 0.0), 0.6)
+    seen = joints.observer.window
+    assert seen.wanted == pytest.approx(0.5 * (0.6 - 0.4) * SPEED * first, abs=1e-9)
+    assert seen.moved == pytest.approx(1.1 * seen.wanted, abs=1e-9)
+    assert seen.way == pytest.approx(0.5 * SPEED * first, abs=1e-9)
+    slack = SPEED * np.array([0.2, 0.06, 0.06, 0.06, 0.06])
+    assert seen.limit == pytest.approx(slack + SHARE * seen.way)
 
 
 def test_a_fault_stays_until_it_is_cleared_and_comes_again() -> None:
@@ -237,7 +286,7 @@ def test_letting_go_without_a_fault_forgets_no_motion() -> None:
 
 def name_fault(measured: list[float], predicted: list[float]) -> GuardTrip:
     """The fault of the second joint by a whole window of its motions, of a full step each."""
-    observer = Joints(replace(LIMITS, slack_s=1e-3)).observer
+    observer = Joints(1e-3).observer
     step = SPEED * PERIOD_S
     for own, model in zip(measured, predicted, strict=True):
         # Only the last motion is judged.
@@ -326,7 +375,7 @@ def test_the_shipped_file_is_that_of_the_machine() -> None:
     assert Observer(LIMITS, content, MACHINE, 0).observation == NOTHING_OBSERVED
 
 
-@pytest.mark.parametrize("text", ["", "[]", '{"schema": 2}', "{"])
+@pytest.mark.parametrize("text", ["", "[]", '{"schema": 1}', "{"])
 def test_a_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "observer.json"
     path.write_text(text)
@@ -338,8 +387,14 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"window_s": 0.0}, {"slack_s": 0.0}, {"share": 0.0}, {"share": 1.0}, {"false_alarms": 1.0}],
+    [{"window_s": 0.0}, {"least_slack_s": 0.0}, {"share": 0.0}, {"share": 1.0}, {"margin": 0.9}],
 )
-def test_limits_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
+def test_thresholds_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=r"observe\.thresholds"):
+        replace(SETTINGS, **change)
+
+
+@pytest.mark.parametrize("chance", [0.0, 1.0])
+def test_a_rate_of_false_alarms_that_makes_no_sense_is_refused(chance: float) -> None:
     with pytest.raises(ConfigError, match=r"guard\.observer"):
-        replace(LIMITS, **change)
+        replace(LIMITS, false_alarms=chance)

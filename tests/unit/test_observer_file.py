@@ -1,0 +1,175 @@
+"""The observer's file: thresholds from a machine's own recordings, and whose file counts on which bus."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import option
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.record import Recording, make_motion, write_recording
+from deploy.observer_file import FILE, ThresholdSettings, count_alarms, find_thresholds
+from deploy.runtime.bus_process import build_observer, is_from_machine, read_observer_content
+
+MACHINE = option("machine", "brokk170")
+GUARD = option("guard", "default")
+SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
+SETTINGS = ThresholdSettings(window_s=1.0, share=0.25, least_slack_s=0.06, margin=1.5)
+
+
+def build_content() -> dict[str, Any]:
+    """A model with a dead time of 0.2 s, speed times command, and no scores."""
+    line, none = [[0.0, 1.0]] * 5, [0.0] * 5
+    model = {"dead_time_s": [0.2] * 5, "play": none, "spool_s": none, "speed_s": none}
+    model |= {"demand": none, "knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line}
+    return {"model": model | {"pose": None}, "scores": [[] for _ in MACHINE.joints]}
+
+
+def record(jump_rad: float, source: str = "machine: socketcan can0, excitation: sine") -> Recording:
+    """A minute of the machine of that model, to and fro; the second joint slips once, at rest."""
+    length, period_s = 1200, MACHINE.period_s
+    u = np.zeros((length, 5))
+    for number in range(0, length, 60):
+        u[number : number + 30] = 0.4 * (1 - 2 * (number // 60 % 2)) * np.array([1, 0, 1, 1, 1])
+    acting = np.concatenate([np.zeros((4, 5)), u[:-4]])
+    steps = acting * SPEED * period_s
+    q = np.array(MACHINE.home) + np.concatenate([np.zeros((1, 5)), steps.cumsum(0)[:-1]])
+    q[600:, 1] += jump_rad
+    motion = make_motion(MACHINE, "one", np.arange(length) * period_s, u, q)
+    return replace(motion, metadata={"run": "one", "source": source})
+
+
+def test_slack_is_the_largest_difference_in_the_recordings_times_the_margin() -> None:
+    found = find_thresholds(SETTINGS, GUARD.observer, build_content(), MACHINE, [record(0.1)])
+    least, second_s = [0.06] * 3, 1.5 * 0.1 / SPEED[1]
+    assert found["slack_s"] == pytest.approx([0.06, second_s, *least], abs=1e-3)
+    assert (found["window_s"], found["share"], found["minutes"]) == (1.0, 0.25, 1.0)
+
+
+def test_thresholds_raise_no_alarm_where_they_come_from_and_one_beyond() -> None:
+    content = build_content()
+    content["thresholds"] = find_thresholds(
+        SETTINGS, GUARD.observer, content, MACHINE, [record(0.1)]
+    )
+    for jump_rad, number in ((0.1, 0), (0.149, 0), (0.151, 1)):
+        counts = count_alarms(GUARD.observer, content, MACHINE, [record(jump_rad)], 0)
+        assert counts.faults.total() == number, jump_rad
+    assert counts.seconds == pytest.approx(60.0, abs=0.1)
+    assert counts.faults_a_shift == pytest.approx(480.0, rel=0.01)
+    # One alarm, cleared, is not found again in what is left of its window.
+    assert list(counts.faults) == ["q2 a joint moves unasked: sensor drifts, or valve leaks"]
+
+
+def test_the_command_writes_a_file_that_names_its_recordings_and_counts_others(
+    brokk: Callable[..., Any],
+) -> None:
+    for name, jump_rad in (("own", 0.05), ("other", 0.2)):
+        write_recording(record(jump_rad), Path(f"{name}.parquet"))
+    brokk("mode=observe", "observe.recordings=own.parquet", "session.out=made")
+    content = json.loads((Path("made") / FILE).read_text())
+    assert content["sources"] == ["machine: socketcan can0"]
+    assert content["thresholds"]["slack_s"][1] >= 1.5 * 0.05 / SPEED[1] - 1e-3
+    path = f"observe.path=made/{FILE}"
+    brokk("mode=observe", path, "observe.recordings=other.parquet", "session.out=counted")
+    counted = json.loads(Path("counted/observed.json").read_text())
+    assert counted["runs"] == 1 and counted["minutes"] == pytest.approx(1.0, abs=0.01)
+    assert any(name.startswith("q2 ") for name in counted["faults"])
+
+
+def test_the_counts_say_what_these_thresholds_would_find() -> None:
+    content = build_content()
+    for slack_s, still, turned in ((0.06, 1.0, 1.0), (0.31, 0.0, 1.0), (0.71, 0.0, 0.0)):
+        content["thresholds"] = {"window_s": 1.0, "share": 0.25, "slack_s": [slack_s] * 5}
+        counts = count_alarms(GUARD.observer, content, MACHINE, [record(0.0)], 0)
+        # A second at 0.4 of full speed: 0.4 s of way, of which 0.1 s are borne.
+        moving = counts.num_moving
+        assert (moving[[0, 2, 3, 4]] > 50).all() and moving[1] == 0
+        shares = counts.num_found[:, 0] / moving[0]
+        assert shares == pytest.approx([still, turned], abs=0.3), slack_s
+        lines = counts.describe_sensitivity(MACHINE)
+        assert len(lines) == 4 and lines[0].startswith("  q1: ")
+
+
+@pytest.mark.parametrize(
+    ("source", "is_real"),
+    [
+        ("machine: socketcan can0", True),
+        ("capture: socketcan can1", True),
+        ("log: monday.csv", True),
+        ("machine: udp_multicast 239.74.163.2", False),
+        ("capture: udp_multicast 239.74.163.2", False),
+        ("simulator: Hydraulic", False),
+        ("simulated site", False),
+        ("nominal machine", False),
+        ("unknown", False),
+    ],
+)
+def test_whose_recordings_these_are(source: str, is_real: bool) -> None:
+    assert is_from_machine(source) is is_real
+
+
+def write_file(path: Path, machine: Any, *sources: str) -> Any:
+    """The limits of a guard whose observer has a file of `machine` from `sources`."""
+    content = build_content() | {"schema": 2, "machine": machine.name, "sources": list(sources)}
+    content["fingerprint"] = machine.fingerprint()
+    slack_s = [0.06, 0.07, 0.08, 0.09, 0.1]
+    content["thresholds"] = {"window_s": 1.0, "share": 0.25, "slack_s": slack_s, "minutes": 30.0}
+    path.write_text(json.dumps(content))
+    return replace(GUARD, observer=replace(GUARD.observer, path=str(path)))
+
+
+@pytest.mark.parametrize("commands", [True, False])
+def test_thresholds_of_a_simulator_or_of_another_machine_count_for_nothing_on_a_machine(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, commands: bool
+) -> None:
+    real, simulated = "machine: socketcan can0", "simulator: Hydraulic"
+    other = option("machine", "mini_excavator")
+    for machine, sources, interface, reason in (
+        (MACHINE, (simulated,), "socketcan", "made from simulator: Hydraulic, and this bus"),
+        (MACHINE, (real, simulated), "socketcan", "can0 and 1 others, and this bus is"),
+        (other, (real,), "socketcan", "made for machine mini_excavator, which differs"),
+        (other, (real,), "udp_multicast", "made for machine mini_excavator, which differs"),
+    ):
+        limits = write_file(tmp_path / "observer.json", machine, *sources)
+        caplog.clear()
+        if commands:
+            with pytest.raises(ConfigError, match=reason) as caught:
+                read_observer_content(limits, MACHINE, interface, commands)
+            assert "mode=observe" in str(caught.value) and "guard.observer=null" in str(
+                caught.value
+            )
+        else:
+            assert build_observer(limits, MACHINE, interface, commands) is None
+            assert reason in caplog.text and "mode=observe" in caplog.text
+    assert read_observer_content(replace(GUARD, observer=None), MACHINE, "socketcan", True) is None
+
+
+def test_the_guard_says_whose_thresholds_it_has(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    for source, interface in (
+        ("machine: socketcan can0", "socketcan"),
+        ("machine: socketcan can0", "udp_multicast"),
+        ("simulator: Hydraulic", "virtual"),
+        ("simulator: Hydraulic", "replay"),
+    ):
+        limits = write_file(tmp_path / "observer.json", MACHINE, source)
+        caplog.clear()
+        assert build_observer(limits, MACHINE, interface, commands=True) is not None
+        assert f"from {source}, 30 minutes: q1 0.06 s, q2 0.07 s" in caplog.text
+
+
+def test_a_loop_that_would_command_a_machine_by_a_simulators_thresholds_does_not_start(
+    brokk: Callable[..., Any],
+) -> None:
+    done = brokk("preset=machine", "deploy=auto", "target=given", "session.out=run")
+    assert done.code == 2 and "recordings of this machine by brokk mode=observe" in done.err
+    assert not Path("run/processes.json").exists()
