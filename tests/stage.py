@@ -22,7 +22,6 @@ import pytest
 from composed import option
 
 from actuators.excite.player import NominalMachine
-from brokk_rl.contracts.link import Connection
 from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
@@ -245,8 +244,6 @@ class Stage:
         folder: Where a session may write.
         again_s: When the operator who is not followed presses the dead-man again.
         watched: Whether the guard has its envelope and its observer.
-        plant: The simulated machine, with the observer's file that ships; without one the nominal
-            machine with its own.
 
     Attributes:
         meddle: Called each millisecond, for what else goes wrong.
@@ -260,7 +257,6 @@ class Stage:
         folder: Path,
         again_s: float | None = None,
         watched: bool = True,
-        plant: Connection | None = None,
     ) -> None:
         self.machine, self.mode, self.ms = machine, mode, 0
         self.memory = LoopMemory.new(machine.num_joints, commands=mode != "listen")
@@ -280,11 +276,12 @@ class Stage:
                 seconds=None,
                 realtime=False,
             )
-            session = Session(out=str(folder), seed=0, device="cpu")
-            self._link = (plant or NominalMachine()).build(machine, 1, session)
+            self._link = NominalMachine().build(
+                machine, 1, Session(out=str(folder), seed=0, device="cpu")
+            )
             self.start_twin()
             limits, wire = option("guard", "default"), self.air
-            if hasattr(limits, "observer") and plant is None:
+            if hasattr(limits, "observer"):
                 observer = replace(
                     limits.observer, path=str(write_nominal_observer(machine, folder))
                 )

@@ -1,7 +1,6 @@
 """Drift watch: does the machine still behave as when its model was made? Pure: numpy, no clock.
 
-Every `BLOCK_S` of a joint's motion gives one score: its residual over the way at full speed. Over
-the way that it went, slow work would look like a change: errors of timing are as large there. A
+Every `BLOCK_S` of a joint's motion gives one score: its residual over the predicted way. A
 conformal test compares it with the joint's scores in recordings that the model was not fitted to,
 and with all before it in this run. The p-values are independent and uniform as long as these
 scores are exchangeable (Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005,
@@ -114,17 +113,21 @@ class DriftWatch:
         for meter in self._meters:
             meter.begin()
 
-    def update(self, measured: np.ndarray, predicted: np.ndarray) -> list[float | None]:
+    def update(
+        self, measured: np.ndarray, predicted: np.ndarray, slack: np.ndarray
+    ) -> list[float | None]:
         """Take in one control period; return the score of each joint whose block is full.
 
         Args:
             measured: Measured motions, `(J,)`.
             predicted: Predicted motions.
+            slack: Sizes of a motion that noise may make.
         """
         scores = []
         for joint, meter in enumerate(self._meters):
             moves = bool(abs(predicted[joint]) > self._moves[joint])
-            score = meter.add(float(measured[joint]), float(predicted[joint]), moves)
+            motion = (float(measured[joint]), float(predicted[joint]), float(slack[joint]))
+            score = meter.add(*motion, moves)
             scores.append(score)
             if score is not None and self._is_watched[joint]:
                 self._bet(joint, score)
@@ -157,12 +160,13 @@ class BlockMeter:
     def begin(self) -> None:
         """Begin a block."""
         self._moving = self._count = 0
-        self._piece = self._residual = 0.0
+        self._piece = self._residual = self._way = 0.0
 
-    def add(self, measured: float, predicted: float, moves: bool) -> float | None:
+    def add(self, measured: float, predicted: float, slack: float, moves: bool) -> float | None:
         """Take in one period; return the score where a block is full."""
         self._note_forms(measured - predicted, predicted)
         self._piece += measured - predicted
+        self._way += abs(predicted)
         self._moving += moves
         self._count += 1
         if self._count % self._steps == 0:
@@ -170,7 +174,7 @@ class BlockMeter:
             self._piece = 0.0
         if self._moving < self._num_moving:
             return None
-        score = self._residual / (self._full * self._num_moving)
+        score = self._residual / (slack + self._way)
         self.begin()
         return score
 

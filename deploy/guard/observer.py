@@ -165,7 +165,7 @@ class Observer:
     def _compare(self, measured: np.ndarray, predicted: np.ndarray) -> None:
         self._measured.append(measured)
         self._predicted.append(predicted)
-        self.scores = self.watch.update(measured, predicted)
+        self.scores = self.watch.update(measured, predicted, self._slack)
         if self._fault is GuardTrip.NONE:
             self._find_fault()
 
