@@ -233,9 +233,7 @@ def main(modules: Sequence[str]) -> int:
     explained = json.loads(EXPLAINED.read_text())
     wrong = 0
     for module in modules:
-        left, count = survivors(
-            module, [str(TESTS / "unit" / name) for name in CORE[module]]
-        )
+        left, count = survivors(module, [str(TESTS / "unit" / name) for name in CORE[module]])
         reasons = explained.get(module, {})
         new = [one for one in left if one not in reasons]
         gone = [one for one in reasons if one not in left]
