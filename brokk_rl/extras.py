@@ -17,6 +17,7 @@ DISTRIBUTION_NAMES = {
     "av": "aiortc",
     "can": "python-can",
     "cv2": "opencv-python-headless",
+    "google": "protobuf",
     "hydra_plugins": "hydra-submitit-launcher",
     "rsl_rl": "rsl-rl-lib",
     "sklearn": "scikit-learn",

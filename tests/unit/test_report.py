@@ -8,7 +8,6 @@ from pathlib import Path
 
 import matplotlib
 import pytest
-from browser import CHROMIUM, FLAGS
 
 from brokk_rl.errors import StorageError
 from brokk_rl.report import Cell, Report
@@ -138,27 +137,3 @@ def test_a_missing_picture_is_said(tmp_path: Path) -> None:
         Report("a").add_picture(tmp_path / "none.png")
     with pytest.raises(StorageError, match="expected one of"):
         Report("a").add_picture(tmp_path / "none.bmp")
-
-
-def test_a_table_of_eight_columns_fits_a_screen_of_1280_pixels(tmp_path: Path) -> None:
-    """As in the study's report: every figure has its interval below."""
-    if CHROMIUM is None:
-        pytest.skip("needs Chromium")
-    from playwright.sync_api import sync_playwright
-
-    page = Report("Wide")
-    row = [*[Cell("-3.72", "-7.75e-05 to -7.02e-05")] * 3, *["0.0312"] * 4]
-    page.add_table(
-        ["a measure", *(f"estimate {k}, of two" for k in range(7))],
-        [[Cell("time with two or more joints moving, share", "12 people"), *row]],
-    )
-    page.write(tmp_path / "wide.html")
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-        view = browser.new_page(viewport={"width": 1280, "height": 800})
-        view.goto(f"file://{tmp_path / 'wide.html'}")
-        widths = view.evaluate(
-            "(e => [e.scrollWidth, e.clientWidth])(document.querySelector('.scroll'))"
-        )
-        browser.close()
-    assert widths[0] <= widths[1]
