@@ -7,6 +7,7 @@ address: the whole control step can be captured in one CUDA graph.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
@@ -15,18 +16,20 @@ from typing import Any, Protocol, Self
 
 import torch
 
-from brokk_rl.contracts.task import Transition
+from brokk_rl.contracts.task import REWARD, Transition
 from brokk_rl.contracts.world import World
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
+from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.classical import ClassicalController
-from tasks.control import DeployedPolicy, ToolPoseControl
+from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm, ToolState
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
-from tasks.starts import move_starts_near
+from tasks.starts import DrawTally, move_starts_near
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
 """Endings of an episode; where several hold in one step, the first of them counts."""
@@ -50,8 +53,10 @@ FORCE_SCALE_N, MAX_SCALED_FORCE = 2000.0, 5.0
 class ToolPoseGoal(Protocol):
     """Targets and criteria by which tool-pose tasks differ."""
 
-    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """Draw valid starts.
+    def starts(
+        self, count: int, seed: int, tally: DrawTally | None = None
+    ) -> dict[str, torch.Tensor]:
+        """Draw valid starts; `tally` counts the candidates.
 
         Returns:
             `q`, `scene`, `target_m` `(count, 3)` and `target_pitch_rad` `(count,)` at least.
@@ -155,7 +160,8 @@ class ToolPoseProcess:
             name: torch.zeros((num_envs, *shape), device=device)
             for name, shape in self._list_state_shapes().items()
         }
-        self.episode = {name: torch.zeros(num_envs, device=device) for name in FIGURES}
+        figures = (*FIGURES, *(f"{REWARD}{name}" for name in self._terms))
+        self.episode = {name: torch.zeros(num_envs, device=device) for name in figures}
 
     def _list_state_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of each entry of `state`, without `N`."""
@@ -187,6 +193,13 @@ class ToolPoseProcess:
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draw valid starts; see `TaskProcess.starts`."""
         return self._judge_starts(self.goal.starts(count, seed))
+
+    def count_starts(self, count: int, seed: int) -> dict[str, float]:
+        """Return shares of drawn candidates; see `brokk_rl.contracts.task.CountedStarts`."""
+        tally = DrawTally("", count)
+        with contextlib.suppress(ConfigError):  # nearly none can be done, as the shares say
+            self.goal.starts(count, seed, tally)
+        return tally.get_shares()
 
     def bring_near(
         self, start: dict[str, torch.Tensor], share: float, height_m: tuple[float, float], seed: int
@@ -283,7 +296,7 @@ class ToolPoseProcess:
         force_n = torch.where(fault, 0.0, world.contact_force_n)
         success = verdict["success"] & ~fault & ~touching
         tool = self._make_tool_state(pose, verdict, force_n, success, failed)
-        reward = torch.where(fault | touching, 0.0, self._sum_reward(tool))
+        reward = self._sum_reward(tool, ~(fault | touching))
         timed_out = state["steps"] >= self.max_episode_steps
         ended = failed | touching | fault
         if options.end_on_success:
@@ -297,13 +310,15 @@ class ToolPoseProcess:
             reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason
         )
 
-    def _sum_reward(self, tool: ToolState) -> torch.Tensor:
-        """Return the weighted sum of all terms, `(N,)`."""
+    def _sum_reward(self, tool: ToolState, is_sound: torch.Tensor) -> torch.Tensor:
+        """Return the weighted sum of all terms where `is_sound`, `(N,)`, else 0; adds up each term."""
         curriculum, reward = self.options.curriculum, torch.zeros_like(tool.reach_m)
         scale = curriculum.scale(self.state["succeeded"]) if curriculum else {}
         for name, (term, weight) in self._terms.items():
-            reward = reward + scale.get(name, 1.0) * weight * term(tool)
-        return reward
+            part = scale.get(name, 1.0) * weight * term(tool)
+            reward = reward + part
+            self.episode[f"{REWARD}{name}"] += torch.where(is_sound, part, 0.0)
+        return torch.where(is_sound, reward, 0.0)
 
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
@@ -352,6 +367,21 @@ class ToolPoseProcess:
         description["masked"] = options.action.mask
         description["stop"] = {"joint_margin": options.limit_margin, "success": success}
         return description
+
+    def mirror(self) -> Mirror:
+        """Return the mirror of observations and actions; see `MirroredTask.mirror`."""
+        policy, privileged = self.state["policy"], self.state["privileged"]
+        signs = policy.new_tensor(compute_joint_signs(self._machine))
+        encoder = self.control.encoder
+        # the mirror is a factor and a shift for each number; two vectors give both
+        shift = encoder.mirror(torch.zeros_like(policy[:1]), signs)[0]
+        factor = encoder.mirror(torch.ones_like(policy[:1]), signs)[0] - shift
+        # of the critic's group only the error along y changes sides
+        across = torch.ones_like(privileged[0])
+        across[1] = -1.0
+        factors = {"guide": list_feature_signs(signs), "privileged": across}
+        groups = {name: (value, torch.zeros_like(value)) for name, value in factors.items()}
+        return Mirror({"policy": (factor, shift)} | groups, signs)
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
         """Return the policy as one module; see `DeployableTask.deployable`."""

@@ -6,18 +6,19 @@ import contextlib
 import io
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.errors import CheckpointError, StorageError
+from brokk_rl.contracts.task import MirroredTask
+from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.logger import TrainingLogger
-from brokk_rl.rl.policy import TrainedPolicy
+from brokk_rl.rl.policy import TrainedPolicy, scale_output
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
@@ -64,17 +65,32 @@ class TrainingRunner(OnPolicyRunner):
         group: TrainingGroup | None = None,
     ) -> None:
         self.group = group or TrainingGroup(device)
+        _require_groups(
+            training.runner["obs_groups"], list(map(str, env.get_observations().keys()))
+        )
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
         self.logger = logger  # type: ignore[assignment]
+        if training.symmetry and isinstance(self.alg, DevicePPO):
+            if not isinstance(env.task, MirroredTask):
+                raise ConfigError(
+                    f"rl.symmetry: the task ({type(env.task).__name__}) has no method mirror; give "
+                    "rl.symmetry=false"
+                )
+            self.alg.use_mirror(env.task.mirror())
+        scale_output(self.alg.actor, training.output_gain)
         if training.teacher and isinstance(self.alg, DevicePPO):
             self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)
 
-    def run(self) -> None:
-        """Train until the budget is spent; save a checkpoint every `save_interval`."""
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Train until the budget is spent; save a checkpoint every `save_interval`.
+
+        Args:
+            until: Asked after each round; training ends early where it returns true.
+        """
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
         while num := self.group.broadcast_first(self._count_iterations(steps)):
@@ -91,10 +107,13 @@ class TrainingRunner(OnPolicyRunner):
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
-            over = self.group.broadcast_first(self._count_iterations(steps)) == 0
+            enough = self.group.broadcast_first(until())
+            over = enough or self.group.broadcast_first(self._count_iterations(steps)) == 0
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
+            if enough:
+                break
 
     def _follow_schedules(self, share_spent: float) -> None:
         """Set the cap of the exploration noise and the teacher's weight, where there are any."""
@@ -338,3 +357,14 @@ def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str)
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
+
+
+def _require_groups(asked: Mapping[str, Sequence[str]], offered: Collection[str]) -> None:
+    """Raise a `ConfigError` where a network wants observations that the task does not give."""
+    for network, names in asked.items():
+        missing = [name for name in names if name not in offered]
+        if missing:
+            raise ConfigError(
+                f"rl.runner.obs_groups.{network}: the task gives no group {', '.join(missing)}; "
+                f"it gives {', '.join(sorted(offered))}: rl.runner.obs_groups.{network}=[policy]"
+            )
