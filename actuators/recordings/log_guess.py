@@ -19,7 +19,7 @@ from actuators.recordings.column_guess import (
 )
 from actuators.recordings.log_files import open_log
 from actuators.recordings.log_signals import index_columns
-from actuators.recordings.log_survey import survey_logs
+from actuators.recordings.log_survey import measure_logs
 from actuators.recordings.log_tables import LogRun
 from actuators.recordings.map_draft import Draft
 from actuators.recordings.text_log import CsvLayout, CsvLog
@@ -114,7 +114,7 @@ def make_draft(guess: LogGuess, paths: Sequence[Path], name: str) -> Draft:
     Raises:
         RecordingError: A log is damaged, or no joint is ever commanded.
     """
-    survey = survey_logs(paths, guess.times, guess.joints, guess.dbc)
+    survey = measure_logs(paths, guess.times, guess.joints, guess.dbc)
     moving, remarks = [], list(guess.remarks)
     for joint in guess.joints:
         numbers = survey.joints[joint.name]

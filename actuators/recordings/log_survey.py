@@ -78,7 +78,7 @@ class LogSurvey:
     minutes: float
 
 
-def survey_logs(
+def measure_logs(
     paths: Sequence[Path],
     times: Mapping[str, TimeGuess],
     joints: Sequence[JointGuess],
