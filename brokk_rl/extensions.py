@@ -118,6 +118,9 @@ def _read(
         raise ConfigError(f"{where}: expected a mapping, as in a file of conf/{group}")
     for place, value in _iterate_leaves(node):
         _check_plain(where, place, value)
+    beside = Path(name).expanduser().parent / str(node.get("mjcf"))
+    if group == "machine" and beside.is_file():
+        node["mjcf"] = str(beside.resolve())
     mine = {
         str(shipped["_target_"]): package
         for shipped, package in _iterate_shipped(options, group)

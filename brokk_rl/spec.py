@@ -57,6 +57,10 @@ def restore_value(hint: Any, value: Any) -> Any:
         for kind in (hint, *typing.get_args(hint)):
             if isinstance(kind, type) and is_dataclass(kind):
                 return restore_spec(kind, value)
+    if isinstance(value, (list, tuple)):
+        for kind in (hint, *typing.get_args(hint)):
+            if typing.get_origin(kind) is tuple:
+                return tuple(restore_value(typing.get_args(kind)[0], item) for item in value)
     return value
 
 

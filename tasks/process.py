@@ -7,6 +7,7 @@ address: the whole control step can be captured in one CUDA graph.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
@@ -17,6 +18,7 @@ import torch
 
 from brokk_rl.contracts.task import Transition
 from brokk_rl.contracts.world import World
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
@@ -26,7 +28,7 @@ from tasks.control import DeployedPolicy, ToolPoseControl
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm, ToolState
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
-from tasks.starts import move_starts_near
+from tasks.starts import DrawTally, move_starts_near
 
 REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
 """Endings of an episode; where several hold in one step, the first of them counts."""
@@ -50,8 +52,10 @@ FORCE_SCALE_N, MAX_SCALED_FORCE = 2000.0, 5.0
 class ToolPoseGoal(Protocol):
     """Targets and criteria by which tool-pose tasks differ."""
 
-    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
-        """Draw valid starts.
+    def starts(
+        self, count: int, seed: int, tally: DrawTally | None = None
+    ) -> dict[str, torch.Tensor]:
+        """Draw valid starts; `tally` counts the candidates.
 
         Returns:
             `q`, `scene`, `target_m` `(count, 3)` and `target_pitch_rad` `(count,)` at least.
@@ -187,6 +191,13 @@ class ToolPoseProcess:
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draw valid starts; see `TaskProcess.starts`."""
         return self._judge_starts(self.goal.starts(count, seed))
+
+    def count_starts(self, count: int, seed: int) -> dict[str, float]:
+        """Return shares of drawn candidates; see `brokk_rl.contracts.task.CountedStarts`."""
+        tally = DrawTally("", count)
+        with contextlib.suppress(ConfigError):  # nearly none can be done, as the shares say
+            self.goal.starts(count, seed, tally)
+        return tally.get_shares()
 
     def bring_near(
         self, start: dict[str, torch.Tensor], share: float, height_m: tuple[float, float], seed: int

@@ -5,6 +5,8 @@ the target into reach, the other joints reach the wanted pose within their limit
 the kinematics when a task is built, so that resets only pick rows.
 """
 
+from __future__ import annotations
+
 import logging
 import time
 from collections.abc import Callable
@@ -74,6 +76,7 @@ def draw_starts(
     reach_m: tuple[float, float],
     depth_m: float,
     task_name: str,
+    tally: DrawTally | None = None,
 ) -> dict[str, torch.Tensor]:
     """Return `count` starts from which the target can be reached.
 
@@ -87,6 +90,7 @@ def draw_starts(
         reach_m: Good working range.
         depth_m: How far below `target_m` the tool must get.
         task_name: Name of the task, for messages.
+        tally: Counts the candidates; `None` makes one.
 
     Returns:
         `q`, `scene`, `target_m`, `target_pitch_rad`.
@@ -101,7 +105,7 @@ def draw_starts(
         return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
 
     drawn: list[dict[str, torch.Tensor]] = []
-    tally = _DrawTally(task_name, count)
+    tally = tally or DrawTally(task_name, count)
     while tally.done < count:
         targets = draw(uniform)
         q, free = draw_arms(arms, machine, controller, targets.object_z_m, generator)
@@ -131,7 +135,7 @@ def draw_starts(
     return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
 
 
-class _DrawTally:
+class DrawTally:
     """Counts of a draw: reports progress, and ends a draw of which nearly nothing can be done."""
 
     def __init__(self, task_name: str, count: int) -> None:
@@ -169,6 +173,15 @@ class _DrawTally:
                 now_s - self._begun_s,
                 100 * self.done / self._candidates,
             )
+
+    def get_shares(self) -> dict[str, float]:
+        """Return the shares of all candidates that meet one condition after the other."""
+        total = max(1, self._candidates)
+        return {
+            "arm in the open": self._free / total,
+            "target in the working range": self._in_range / total,
+            "can be done": self.done / total,
+        }
 
     def _explain(self) -> str:
         """Return the message for a draw that is given up."""

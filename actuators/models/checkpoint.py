@@ -106,7 +106,12 @@ def read_checkpoint(
             f"{path}: holds a '{header.get('kind')}' of schema {header.get('schema')}, expected a '{kind}' of schema {SCHEMA}; "
             "choose the actuator=… it was made for"
         )
-    machine.check_fingerprint(header.get("fingerprint", {}), f"{path}")
+    try:
+        machine.check_fingerprint(header.get("fingerprint", {}), f"{path}")
+    except CheckpointError as error:
+        raise CheckpointError(
+            f"{error} An actuator without weights fits any machine: actuator=lag."
+        ) from error
     for name, value in tensors.items():
         if not bool(torch.isfinite(value).all()):
             raise CheckpointError(

@@ -142,6 +142,15 @@ class MovableTask(Protocol):
 
 
 @runtime_checkable
+class CountedStarts(Protocol):
+    """A task process that says how many of its random starts can be done; optional."""
+
+    def count_starts(self, count: int, seed: int) -> dict[str, float]:
+        """Return shares of the candidates drawn for `count` starts, by condition, the last one all."""
+        ...
+
+
+@runtime_checkable
 class DeployableTask(Protocol):
     """A task process whose policy can leave the trainer; optional."""
 
@@ -171,6 +180,11 @@ def supports_classical_control(process: object) -> TypeGuard[ClassicalTask]:
 def can_move_target(process: object) -> TypeGuard[MovableTask]:
     """Return whether the target of a task process can be moved."""
     return isinstance(process, MovableTask)
+
+
+def can_count_starts(process: object) -> TypeGuard[CountedStarts]:
+    """Return whether a task process says how many of its starts can be done."""
+    return isinstance(process, CountedStarts)
 
 
 def supports_deployment(process: object) -> TypeGuard[DeployableTask]:

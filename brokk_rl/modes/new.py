@@ -78,7 +78,7 @@ class NewPackage:
             f"{folder} holds a machine, a task, an actuator, an effect, a finder and their tests.\n"
             f"  pip install -e {folder}\n"
             f"  python -m pytest {folder / 'tests'}\n"
-            "  brokk mode=list",
+            "  brokk mode=check machine=two_links task=hold actuator=rubber",
             soft_wrap=True,
         )
 

@@ -12,7 +12,7 @@ from brokk_rl.sim import scene
 from tasks.borehole_insertion import BoreholeInsertion
 from tasks.classical import ClassicalController
 from tasks.process import ToolPoseOptions, ToolPoseProcess
-from tasks.starts import CandidateTargets, Uniform, draw_starts
+from tasks.starts import CandidateTargets, DrawTally, Uniform, draw_starts
 
 DOWN_RAD = math.pi / 2
 """Pitch of a tool that points straight down, rad (the paper's 1.57)."""
@@ -33,7 +33,9 @@ class InsertionGoal:
         self._task = task
         self._machine = machine
 
-    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+    def starts(
+        self, count: int, seed: int, tally: DrawTally | None = None
+    ) -> dict[str, torch.Tensor]:
         """Draw valid starts; see `tasks.process.ToolPoseGoal`."""
         task, hole = self._task, self._task.hole
 
@@ -68,6 +70,7 @@ class InsertionGoal:
             task.switch.reach_m,
             task.depth_m,
             "borehole_insertion",
+            tally,
         )
 
     def judge(

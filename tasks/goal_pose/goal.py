@@ -10,7 +10,7 @@ from brokk_rl.sim import scene
 from tasks.classical import ClassicalController
 from tasks.goal_pose import GoalPose
 from tasks.process import ToolPoseOptions, ToolPoseProcess
-from tasks.starts import CandidateTargets, Uniform, draw_starts
+from tasks.starts import CandidateTargets, DrawTally, Uniform, draw_starts
 
 BLOCK_AWAY_M = -20.0
 """Where the block stands along x: behind the machine and out of its reach, so that nothing but the
@@ -33,7 +33,9 @@ class ReachingGoal:
         self._task = task
         self._machine = machine
 
-    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+    def starts(
+        self, count: int, seed: int, tally: DrawTally | None = None
+    ) -> dict[str, torch.Tensor]:
         """Draw valid starts; see `tasks.process.ToolPoseGoal`."""
         task, pose = self._task, self._task.pose
 
@@ -61,6 +63,7 @@ class ReachingGoal:
             task.switch.reach_m,
             0.0,
             "goal_pose",
+            tally,
         )
 
     def judge(
