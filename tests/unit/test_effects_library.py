@@ -18,6 +18,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis.effect_library import load_effects
 
 CPU = torch.device("cpu")
 EFFECTS = """
@@ -251,3 +252,9 @@ def test_wide_machines_differ_as_those_of_the_library_and_more() -> None:
                 assert other[0] <= value[0] <= value[1] <= other[1], (name, key)
             else:
                 assert other == value, (name, key)
+
+
+def test_the_diagnosis_knows_single_effects_beside_options_that_hold_many() -> None:
+    names = [kind.name for kind in load_effects(option("machine", "brokk170"))]
+    assert "backlash" in names
+    assert not {"library", "wide"} & set(names)
