@@ -16,7 +16,7 @@ from typing import Any, Protocol, Self
 
 import torch
 
-from brokk_rl.contracts.task import Transition
+from brokk_rl.contracts.task import REWARD, Transition
 from brokk_rl.contracts.world import World
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -159,7 +159,8 @@ class ToolPoseProcess:
             name: torch.zeros((num_envs, *shape), device=device)
             for name, shape in self._list_state_shapes().items()
         }
-        self.episode = {name: torch.zeros(num_envs, device=device) for name in FIGURES}
+        figures = (*FIGURES, *(f"{REWARD}{name}" for name in self._terms))
+        self.episode = {name: torch.zeros(num_envs, device=device) for name in figures}
 
     def _list_state_shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of each entry of `state`, without `N`."""
@@ -294,7 +295,7 @@ class ToolPoseProcess:
         force_n = torch.where(fault, 0.0, world.contact_force_n)
         success = verdict["success"] & ~fault & ~touching
         tool = self._make_tool_state(pose, verdict, force_n, success, failed)
-        reward = torch.where(fault | touching, 0.0, self._sum_reward(tool))
+        reward = self._sum_reward(tool, ~(fault | touching))
         timed_out = state["steps"] >= self.max_episode_steps
         ended = failed | touching | fault
         if options.end_on_success:
@@ -308,13 +309,15 @@ class ToolPoseProcess:
             reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason
         )
 
-    def _sum_reward(self, tool: ToolState) -> torch.Tensor:
-        """Return the weighted sum of all terms, `(N,)`."""
+    def _sum_reward(self, tool: ToolState, is_sound: torch.Tensor) -> torch.Tensor:
+        """Return the weighted sum of all terms where `is_sound`, `(N,)`, else 0; adds up each term."""
         curriculum, reward = self.options.curriculum, torch.zeros_like(tool.reach_m)
         scale = curriculum.scale(self.state["succeeded"]) if curriculum else {}
         for name, (term, weight) in self._terms.items():
-            reward = reward + scale.get(name, 1.0) * weight * term(tool)
-        return reward
+            part = scale.get(name, 1.0) * weight * term(tool)
+            reward = reward + part
+            self.episode[f"{REWARD}{name}"] += torch.where(is_sound, part, 0.0)
+        return torch.where(is_sound, reward, 0.0)
 
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None

@@ -38,6 +38,8 @@ STEPS = "steps"
 once to spread the first episodes over time."""
 FAULT = "fault"
 """Entry of `TaskProcess.reasons` for an episode whose world diverged (`World.faults`)."""
+REWARD = "reward/"
+"""Begins the figures of `TaskProcess.episode` that add up one term of the reward each."""
 SUCCESS = "success_strict"
 """Figure of `TaskProcess.episode` by which policies are compared: 1 after success, else 0."""
 

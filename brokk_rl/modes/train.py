@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -28,13 +30,16 @@ from brokk_rl.rl.policy import (
 )
 from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
-from brokk_rl.rl.tracking import NoTracking, Tracking
+from brokk_rl.rl.tracking import NoTracking, Tracker, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
-from brokk_rl.session import RESOLVED, Session
+from brokk_rl.session import RESOLVED, Session, read_record
 from brokk_rl.sim.events import Event
-from brokk_rl.spec import spec
+from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
+
+TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
+"""Files of the run folder that a tracker gets at the end."""
 
 
 @spec
@@ -103,39 +108,65 @@ class Train:
         _log_setup(loop, group)
         self.session.seed_all()  # capturing has drawn random numbers
 
-        logger = self._open_logger(loop, group)
-        with group, logger:
-            runner = TrainingRunner(loop, self.rl, self.session.folder, device, logger, group)
-            if checkpoint:
-                runner.load(str(checkpoint))
-                log.info(
-                    "going on from %s: %d control steps, %.0f s",
-                    checkpoint,
-                    logger.env_steps,
-                    logger.seconds,
-                )
-            elif self.start_from:
-                load_initial_weights(runner.alg.actor, self.start_from, self.machine)
-            runner.run()
-        if not group.rank.first:
-            return None
-        facts = {
-            "env_steps": logger.env_steps,
-            "seconds": logger.seconds,
-            "seed": self.session.seed,
-            "device": str(device),
-            "follower": read_follower(self.session.folder),
-        }
-        return self._finish(config, runner, facts)
-
-    def _open_logger(self, loop: ControlLoop, group: TrainingGroup) -> TrainingLogger:
-        """Return the logger of this process; only the first of several writes."""
-        folder = self.session.folder
         tracking = self.tracking if group.rank.first else NoTracking()
-        run_config = {"rl": self.rl.runner, "num_envs": loop.num_envs, "seed": self.session.seed}
+        with contextlib.closing(
+            tracking.open(self.session.folder, self._describe_run())
+        ) as tracker:
+            logger = self._open_logger(loop, group, tracker)
+            with group, logger:
+                runner = TrainingRunner(loop, self.rl, self.session.folder, device, logger, group)
+                if checkpoint:
+                    runner.load(str(checkpoint))
+                    log.info(
+                        "going on from %s: %d control steps, %.0f s",
+                        checkpoint,
+                        logger.env_steps,
+                        logger.seconds,
+                    )
+                elif self.start_from:
+                    load_initial_weights(runner.alg.actor, self.start_from, self.machine)
+                runner.run()
+            if not group.rank.first:
+                return None
+            facts = {
+                "env_steps": logger.env_steps,
+                "seconds": logger.seconds,
+                "seed": self.session.seed,
+                "device": str(device),
+                "follower": read_follower(self.session.folder),
+            }
+            results = self._finish(config, runner, facts)
+            files = [path for name in TRACKED for path in sorted(self.session.folder.glob(name))]
+            tracker.report(flatten_figures(results["policies"], "evaluation"), files)
+        log.info("run folder: %s", self.session.folder)
+        return float(results["success_strict"]["mean"])
+
+    def _describe_run(self) -> dict[str, Any]:
+        """Return what a tracker shows of the run: its parts, commit and whole configuration."""
+        folder = self.session.folder
+        record, resolved = read_record(folder) or {}, folder / RESOLVED
+        return {
+            "machine": self.machine.name,
+            "task": name_spec(self.task),
+            "actuator": name_spec(self.actuator),
+            "effect": ", ".join(self.effect) or "none",
+            "event": ", ".join(self.event) or "none",
+            "follower": name_spec(self.follower),
+            "seed": self.session.seed,
+            "num_envs": self.rl.num_envs,
+            "commit": record.get("commit") or "unknown",
+            "choices": record.get("choices", {}),
+            "fingerprint": self.machine.fingerprint(),
+            "config": yaml.safe_load(resolved.read_text()) if resolved.is_file() else {},
+        }
+
+    def _open_logger(
+        self, loop: ControlLoop, group: TrainingGroup, tracker: Tracker
+    ) -> TrainingLogger:
+        """Return the logger of this process; only the first of several writes."""
         return TrainingLogger(
-            folder,
-            tracking.open(folder, run_config),
+            self.session.folder,
+            tracker,
             lambda: group.pool_statistics(loop.statistics()),
             loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count,
             self.rl.max_fault_rate,
@@ -145,8 +176,8 @@ class Train:
 
     def _finish(
         self, config: ControlLoopConfig, runner: TrainingRunner, facts: dict[str, Any]
-    ) -> float:
-        """Write bundle and curves, evaluate, export; return the strict success."""
+    ) -> dict[str, Any]:
+        """Write bundle and curves, evaluate, export; return the content of `evaluation.json`."""
         folder, loop, actor = self.session.folder, runner.env, runner.alg.get_policy()
         network = self.rl.describe_network()
         contract = write_bundle(
@@ -169,8 +200,7 @@ class Train:
             export_onnx(folder, actor, task, self.machine, contract, answers)
         else:
             log.warning(NOT_DEPLOYABLE.format(task=type(self.task).__name__))
-        log.info("run folder: %s", folder)
-        return float(results["success_strict"]["mean"])
+        return results
 
     def _find_start(self) -> Path | None:
         """Return the checkpoint to go on from.
@@ -185,6 +215,17 @@ class Train:
                 (folder / PROGRESS).unlink(missing_ok=True)
             return None
         return find_checkpoint(Path(self.resume))
+
+
+def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
+    """Return the numbers of nested tables by their path: `evaluation/trained/success_strict/mean`."""
+    found: dict[str, float] = {}
+    for key, value in node.items():
+        if isinstance(value, Mapping):
+            found |= flatten_figures(value, f"{name}/{key}")
+        elif isinstance(value, (int, float)):
+            found[f"{name}/{key}"] = float(value)
+    return found
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl.contracts.task import SUCCESS, Policy
+from brokk_rl.contracts.task import REWARD, SUCCESS, Policy
 from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.rl.vec_env import ControlLoop, Starts
 
@@ -124,6 +124,8 @@ def _summarize(
     summary: dict[str, Any] = {"episodes": len(success)}
     for name in (*SHARES, *figures):
         if name in summary or name in TRAINING_ONLY or name not in figures:
+            continue
+        if name.startswith(REWARD):
             continue
         values = figures[name].cpu().numpy()
         if name in SHARES:

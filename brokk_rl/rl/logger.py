@@ -40,7 +40,7 @@ class TrainingLogger:
 
     Args:
         folder: Run folder.
-        tracker: Where figures go beside `progress.csv`.
+        tracker: Where figures go beside `progress.csv`; its owner closes it.
         statistics: Returns the figures of the episodes finished since its last call; see
             `ControlLoop.statistics`.
         steps_per_iteration: Control steps of all environments (and ranks) in one iteration.
@@ -89,8 +89,6 @@ class TrainingLogger:
     def __exit__(self, *exc: object) -> None:
         self._bar.stop()
         self.flush()
-        if self.writer is not None:
-            self.writer.close()
 
     def init_logging_writer(self) -> None:
         """Do nothing: the tracker is open before the runner exists."""
@@ -163,9 +161,13 @@ class TrainingLogger:
         if not self._num_unwritten or self._quiet:
             return
         rows, self._num_unwritten = self._rows[-self._num_unwritten :], 0
+        columns = list(rows[0])
+        if self._path.exists():  # perhaps of a version with fewer figures
+            with self._path.open(newline="") as file:
+                columns = next(csv.reader(file))
         is_new = not self._path.exists()
         with self._path.open("a", newline="") as file:
-            table = csv.DictWriter(file, fieldnames=list(rows[0]), extrasaction="ignore")
+            table = csv.DictWriter(file, fieldnames=columns, extrasaction="ignore")
             if is_new:
                 table.writeheader()
             table.writerows(rows)

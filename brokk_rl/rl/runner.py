@@ -6,14 +6,14 @@ import contextlib
 import io
 import logging
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.errors import CheckpointError, StorageError
+from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.logger import TrainingLogger
@@ -64,6 +64,9 @@ class TrainingRunner(OnPolicyRunner):
         group: TrainingGroup | None = None,
     ) -> None:
         self.group = group or TrainingGroup(device)
+        _require_groups(
+            training.runner["obs_groups"], list(map(str, env.get_observations().keys()))
+        )
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
             super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
@@ -338,3 +341,14 @@ def set_random_state(state: dict[str, torch.Tensor], device: torch.device | str)
     torch.set_rng_state(state["cpu"].cpu())
     if torch.device(device).type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"].cpu(), device)
+
+
+def _require_groups(asked: Mapping[str, Sequence[str]], offered: Collection[str]) -> None:
+    """Raise a `ConfigError` where a network wants observations that the task does not give."""
+    for network, names in asked.items():
+        missing = [name for name in names if name not in offered]
+        if missing:
+            raise ConfigError(
+                f"rl.runner.obs_groups.{network}: the task gives no group {', '.join(missing)}; "
+                f"it gives {', '.join(sorted(offered))}: rl.runner.obs_groups.{network}=[policy]"
+            )

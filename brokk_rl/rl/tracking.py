@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
+
+import numpy as np
+import yaml
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
@@ -17,6 +21,10 @@ class Tracker(Protocol):
         """Store the figures of one iteration."""
         ...
 
+    def report(self, evaluation: dict[str, float], files: Sequence[Path]) -> None:
+        """Store the figures of the evaluation, and files of the run: policy, pictures, video."""
+        ...
+
     def close(self) -> None:
         """End the tracking run; called on success, failure and interruption alike."""
         ...
@@ -26,7 +34,7 @@ class Tracking(Protocol):
     """A spec in `conf/tracking`: opens a tracking run."""
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Return an open tracking run for the run in `folder`."""
+        """Return an open tracking run for the run in `folder`, described by `config`."""
         ...
 
 
@@ -45,7 +53,7 @@ class TensorBoardTracking:
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
         """Return a tracker that writes `folder/tensorboard`."""
-        return _TensorBoardTracker(folder)
+        return _TensorBoardTracker(folder, config)
 
 
 @spec
@@ -56,7 +64,7 @@ class WandbTracking:
 
     Attributes:
         project: Project name.
-        group: Group of runs, or `null`.
+        group: Group of runs; `null`: the sweep's folder, where there is one.
         tags: Tags.
         mode: `offline`, `online` or `disabled`.
     """
@@ -75,19 +83,35 @@ class _NoTracker:
     def log(self, figures: dict[str, float], step: int) -> None:
         pass
 
+    def report(self, evaluation: dict[str, float], files: Sequence[Path]) -> None:
+        pass
+
     def close(self) -> None:
         pass
 
 
 class _TensorBoardTracker:
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(folder / "tensorboard"))
+        self._writer, self._step = SummaryWriter(str(folder / "tensorboard")), 0
+        for name, value in config.items():
+            text = value if isinstance(value, str) else yaml.safe_dump(value, sort_keys=False)
+            self._writer.add_text(name, f"```\n{text.strip()}\n```")
 
     def log(self, figures: dict[str, float], step: int) -> None:
+        self._step = step
         for name, value in figures.items():
             self._writer.add_scalar(name, value, step)
+
+    def report(self, evaluation: dict[str, float], files: Sequence[Path]) -> None:
+        from PIL import Image
+
+        self.log(evaluation, self._step)
+        for path in files:
+            if path.suffix == ".png":
+                picture = np.asarray(Image.open(path).convert("RGB"))
+                self._writer.add_image(path.stem, picture, self._step, dataformats="HWC")
 
     def close(self) -> None:
         self._writer.close()
@@ -106,7 +130,7 @@ class _WandbTracker:
         try:
             self._run = wandb.init(
                 project=config.project,
-                group=config.group,
+                group=config.group or _find_sweep(folder),
                 tags=list(config.tags),
                 name=folder.name,
                 dir=str(folder),
@@ -124,5 +148,26 @@ class _WandbTracker:
     def log(self, figures: dict[str, float], step: int) -> None:
         self._run.log(figures, step=step)
 
+    def report(self, evaluation: dict[str, float], files: Sequence[Path]) -> None:
+        import wandb
+
+        self._run.summary.update(evaluation)
+        artifact = wandb.Artifact(f"policy-{self._run.id}", type="policy")
+        pictures = {}
+        for path in files:
+            if path.suffix == ".mp4":
+                pictures[path.stem] = wandb.Video(str(path), format="mp4")
+            elif path.suffix == ".png":
+                pictures[path.stem] = wandb.Image(str(path))
+            else:
+                artifact.add_file(str(path))
+        self._run.log(pictures)
+        self._run.log_artifact(artifact)
+
     def close(self) -> None:
         self._run.finish()
+
+
+def _find_sweep(folder: Path) -> str | None:
+    """Return the name of the sweep whose job runs in `folder`, `None` for a run by itself."""
+    return folder.parent.name if (folder.parent / "multirun.yaml").is_file() else None

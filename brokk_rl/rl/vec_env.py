@@ -333,6 +333,9 @@ class ControlLoop(VecEnv):
         parts |= {"follower": self.follower.state, "group": self._groups}
         for prefix, part in parts.items():
             for name, value in part.items():
+                if prefix == "episode" and f"{prefix}.{name}" not in tensors:
+                    value.zero_()  # a figure that the version of the checkpoint did not have
+                    continue
                 value.copy_(tensors[f"{prefix}.{name}"])
         self.world.load_state_dict(state["world"])
 

@@ -17,21 +17,17 @@ import json
 import logging
 import os
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import aioice.ice  # pyright: ignore[reportMissingImports]
-import aiortc.codecs.h264  # pyright: ignore[reportMissingImports]
-from aiortc import (  # pyright: ignore[reportMissingImports]
-    MediaStreamTrack,
-    RTCConfiguration,
-    RTCPeerConnection,
-    RTCRtpSender,
-    RTCSessionDescription,
-)
+import aiortc.codecs  # pyright: ignore[reportMissingImports]
+from aiortc import MediaStreamTrack, RTCConfiguration, RTCPeerConnection, RTCSessionDescription  # pyright: ignore[reportMissingImports]
 
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LoopMemory
+from deploy.video.encoder import LinkEncoder
 from deploy.video.settings import SOCKET, VideoProcessConfig, VideoSettings
 from deploy.video.sources import CameraReader
 
@@ -43,6 +39,9 @@ POLL_S, STOP_POLL_S = 0.003, 0.05
 """Between looks for a new picture, a fifth of a screen's frame; and between looks whether to stop."""
 LONGEST_OFFER = 1 << 16
 """Bytes of an offer; a browser's has 10 kB for two cameras."""
+AGAIN_SHARE, AGAIN_MOST = 0.25, 20.0
+"""Packets that may be sent again: as a share of those sent, and at once. Browsers ask twice for each
+lost packet over 120 ms of round trip, and for late ones in vain: this is enough for 5 % of losses."""
 ANY_ADDRESS = ("0.0.0.0", "::")
 RTP_TIMES = 1 << 32
 """Times of RTP have 32 bits."""
@@ -80,6 +79,29 @@ class CameraTrack(MediaStreamTrack):
         return frame
 
 
+class RetransmissionBudget:
+    """Bounds how much of what a page has not received is sent again.
+
+    aiortc answers every request. A link that carries less than is sent loses many packets, and the
+    answers, lost too, would fill it for good.
+
+    Args:
+        sender: Sends the pictures of one camera.
+    """
+
+    def __init__(self, sender: Any) -> None:
+        self._sender, self._answer, self._balance, self._sent = sender, sender._retransmit, 0.0, 0
+        sender._retransmit = self._retransmit
+
+    async def _retransmit(self, sequence_number: int) -> None:
+        sent = getattr(self._sender, "_RTCRtpSender__packet_count", 0)
+        self._balance += AGAIN_SHARE * (sent - self._sent)
+        self._balance, self._sent = min(self._balance, AGAIN_MOST), sent
+        if self._balance >= 1.0:
+            self._balance -= 1.0
+            await self._answer(sequence_number)
+
+
 class VideoPeer:
     """One page that watches.
 
@@ -98,15 +120,13 @@ class VideoPeer:
         await self._connection.setRemoteDescription(
             RTCSessionDescription(hide_local_names(offer), "offer")
         )
-        capabilities = RTCRtpSender.getCapabilities("video").codecs
-        codecs = [one for one in capabilities if one.mimeType in ("video/H264", "video/rtx")]
         waiting = [one for one in self._connection.getTransceivers() if one.kind == "video"]
         for index, (transceiver, reader) in enumerate(zip(waiting, self._readers, strict=False)):
             track = CameraTrack(reader, self._make_report(index))
             track.sender = transceiver.sender
+            RetransmissionBudget(track.sender)
             transceiver.sender.replaceTrack(track)
             transceiver.direction = "sendonly"
-            transceiver.setCodecPreferences(codecs)
         await self._connection.setLocalDescription(await self._connection.createAnswer())
         return self._connection.localDescription.sdp
 
@@ -144,14 +164,30 @@ def hide_local_names(offer: str) -> str:
     return "".join(one for one in lines if not (one.startswith("a=candidate") and ".local " in one))
 
 
+def offer_h264_only(video: VideoSettings) -> None:
+    """Let aiortc offer H.264 alone, by our encoder.
+
+    aiortc fixes the codecs when it reads an offer, before preferences can be stated, and would
+    choose VP8.
+    """
+    kept, mime = [], ""
+    for one in aiortc.codecs.CODECS["video"]:
+        # An entry for repeated packets follows the codec whose packets it repeats.
+        mime = one.mimeType if one.mimeType != "video/rtx" else mime
+        if mime == "video/H264":
+            kept.append(one)
+    aiortc.codecs.CODECS["video"] = kept
+    aiortc.codecs.H264Encoder = partial(
+        LinkEncoder, video.min_bitrate, video.max_bitrate, len(video.cameras)
+    )
+
+
 def run(stop: Stop, config: VideoProcessConfig, memory: LoopMemory | None = None) -> None:
     """Send pictures until asked to stop."""
     os.nice(NICENESS)
     logging.getLogger("aioice").setLevel(logging.WARNING)
     video = config.video
-    aiortc.codecs.h264.MIN_BITRATE = video.min_bitrate
-    aiortc.codecs.h264.MAX_BITRATE = video.max_bitrate
-    aiortc.codecs.h264.DEFAULT_BITRATE = video.max_bitrate
+    offer_h264_only(video)
     if video.host not in ANY_ADDRESS:
         # aioice offers every address but the loopback; this process offers the one it is told.
         aioice.ice.get_host_addresses = lambda use_ipv4, use_ipv6: [video.host]

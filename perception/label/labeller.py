@@ -32,9 +32,9 @@ from perception.label.cuboid import (
     read_placing,
     trace_rays,
 )
+from perception.label.outline_match import LEAST_SIGMAS, OutlineMatch, match_outline
 from perception.label.refinement import (
     POINTS_PER_MOUTH,
-    measure_edge_offsets,
     prepare_view,
     refine_cuboid,
     refine_mouths,
@@ -44,8 +44,6 @@ from perception.label.refinement import (
 )
 
 FRAMES, OVERLAYS = "frames", "overlays"
-MIN_POINTS = 20
-"""Points of the outline that must be seen to judge a frame by; chosen by hand."""
 LEAST_STEP_M = 0.02
 """Something nearer than the block by less than this is part of it; chosen by hand."""
 PIXELS_PER_SPECK = 400
@@ -85,9 +83,10 @@ class BlockLabelling:
         noise_per_m: Standard deviation of inverse depth, 1/m.
         num_sigma: Depth this many standard deviations off says that something else is there.
         num_refined: Frames, evenly spread, by which the block is refined; 0 takes it as placed.
-        reach_px: How far from the placed outline the picture's edges are looked for.
-        max_outline_px: Largest mean distance between the projected outline and the picture's edges;
-            a frame with more is left out.
+        reach_px: How far from the placed outline the picture's edges are looked for, and how far
+            copies of the outline are shifted to judge its place.
+        max_outline_px: Largest distance of the copy of the outline that fits the picture best; a
+            frame with more is left out.
         min_depth_share: Least part of the block's known depth that must agree with it.
     """
 
@@ -110,8 +109,9 @@ class BlockLabelling:
             )
         if self.max_outline_px >= self.reach_px / 2:
             raise ConfigError(
-                f"label.max_outline_px: unrelated edges lie {self.reach_px / 2:g} px off on "
-                f"average, half of reach_px; expected less than that, got {self.max_outline_px:g}"
+                f"label.max_outline_px: the outline is compared with copies up to reach_px="
+                f"{self.reach_px:g} px away; expected less than half of that, got "
+                f"{self.max_outline_px:g}"
             )
 
     def label(self, folder: Path) -> dict[str, Any]:
@@ -182,7 +182,7 @@ class BlockLabelling:
         for frame in self._read_frames():
             stem = Path(frame.name).name
             entry: dict[str, Any] = dict.fromkeys(
-                ("left_out", "board_px", "outline_px", "depth_share")
+                ("left_out", "board_px", "outline_px", "outline_sigmas", "depth_share")
             )
             entries[stem] = entry
             try:
@@ -208,10 +208,12 @@ class BlockLabelling:
             for frame in self._read_frames(set(poses)):
                 name, pose = Path(frame.name).name, poses[frame.name].world_from_camera
                 label, share = self._build_label(cuboid, frame, pose)
-                outline_px = self._measure_outline_px(cuboid, frame, pose)
-                reason = self._find_fault(outline_px, share)
+                match = self._match_outline(cuboid, frame, pose)
+                outline_px = None if match is None else match.offset_px
+                reason = self._find_fault(match, share)
                 footage.entries[name] |= {
                     "outline_px": outline_px,
+                    "outline_sigmas": None if match is None else match.num_sigmas,
                     "depth_share": share,
                     "left_out": reason,
                 }
@@ -223,13 +225,18 @@ class BlockLabelling:
                     dataset.write_frame(stem, frame.color, None, label=label, truth=truth)
                 progress.advance(task)
 
-    def _find_fault(self, outline_px: float | None, share: float | None) -> str | None:
+    def _find_fault(self, match: OutlineMatch | None, share: float | None) -> str | None:
         """Return why a frame is left out, `None` where it is not."""
-        if outline_px is None:
-            return f"fewer than {MIN_POINTS} points of the block's outline are in view"
-        if outline_px > self.max_outline_px:
+        if match is None:
+            return "too little of the block's outline is in view"
+        if not match.is_significant:
             return (
-                f"the outline is {outline_px:.1f} px off the picture's edges, "
+                "it cannot be told where the outline lies: its best place stands out by "
+                f"{match.num_sigmas:.1f} standard deviations, {LEAST_SIGMAS:g} are needed"
+            )
+        if match.offset_px > self.max_outline_px:
+            return (
+                f"the outline fits the picture best {match.offset_px:.1f} px off, "
                 f"{self.max_outline_px:g} are allowed"
             )
         if share is not None and share < self.min_depth_share:
@@ -239,13 +246,12 @@ class BlockLabelling:
             )
         return None
 
-    def _measure_outline_px(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> float | None:
-        """Return the mean distance from each outline point to its steepest edge within reach."""
-        outline = sample_block_outline(cuboid, frame, pose, self.noise_per_m, self.reach_px)
-        if len(outline.points_m) < MIN_POINTS:
-            return None
-        away = np.abs(measure_edge_offsets(outline, smooth_gray(frame), self.reach_px, np.inf))
-        return float(np.nan_to_num(away, nan=self.reach_px).mean())
+    def _match_outline(self, cuboid: Cuboid, frame: Frame, pose: np.ndarray) -> OutlineMatch | None:
+        """Return the place at which the block's outline fits best; `None` where too little is seen."""
+        # Only what touches a label that may be kept counts as an occluder. Within all of `reach_px`
+        # the block's own top, seen at a slant, would hide its rear edges.
+        outline = sample_block_outline(cuboid, frame, pose, self.noise_per_m, self.max_outline_px)
+        return match_outline(outline, smooth_gray(frame), self.reach_px)
 
     def _build_label(
         self, cuboid: Cuboid, frame: Frame, pose: np.ndarray

@@ -128,7 +128,7 @@ def measure_edge_offsets(
         gray: The picture, `(h, w)` float32.
         reach_px: How far to look.
         attraction: Distance at which an edge counts 1 / e of one at the outline, as a part of the
-            reach; infinite: all alike.
+            reach.
     """
     if not len(outline.points_m):
         return np.zeros(0)

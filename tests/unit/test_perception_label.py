@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ from perception import dataset
 from perception.label import cuboid as label_placing
 from perception.label.camera_pose import Charuco, GivenPoses, TagGrid
 from perception.label.cuboid import compute_pixel_rays, trace_rays
+from perception.label.outline_match import match_outline
+from perception.label.refinement import sample_block_outline, smooth_gray
 
 SIZE_PX = (480, 270)
 EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-1.5, 0.9, 1.2), (-2.4, -0.3, 0.7))
@@ -98,11 +101,45 @@ def test_a_block_in_the_wrong_place_is_left_out_and_said(
     brokk: Callable[..., Any], footage: tuple[Path, list[cuboid.View]]
 ) -> None:
     folder, _ = footage
-    placing = {"corners_m": (CORNERS_M + np.array([0.0, 0.15, 0.1])).tolist(), "thickness_m": 1.2}
-    done, out = labelled(brokk, folder, placing, "label.num_refined=0", "label.max_outline_px=2")
+    # 5 cm at 1.9 m and a focal length of 264 px: 7 px
+    placing = {"corners_m": (CORNERS_M + np.array([0.0, 0.05, 0.0])).tolist(), "thickness_m": 1.2}
+    done, out = labelled(brokk, folder, placing, "label.num_refined=0")
     assert done.code == 2
-    assert "no frame could be labelled: the outline is" in done.err
+    assert "no frame could be labelled: the outline fits the picture best" in done.err
     assert not list(out.glob("frames/*"))
+
+
+@pytest.mark.parametrize("miss_px", [0.0, 6.0])
+def test_an_outline_is_judged_by_the_copy_that_fits_best(miss_px: float) -> None:
+    for number, eye in enumerate(EYES_M):
+        view = cuboid.seen(cuboid.looking(eye, (0.1, 0.0, 0.3)), (960, 540), seed=number)
+        pose = view.world_from_camera
+        block = label_placing.build_cuboid(CORNERS_M, 1.2, pose[:3, 3])
+        outline = sample_block_outline(block, view.frame, pose, 0.003, 3.0)
+        angle = 1.0 + number
+        shift = miss_px * np.array([np.cos(angle), np.sin(angle)])
+        moved = replace(outline, seen_px=outline.seen_px + shift)
+        match = match_outline(moved, smooth_gray(view.frame), 14.0)
+        assert match is not None
+        assert match.is_significant
+        # copies lie 1 px apart, and those within one standard error count as equal
+        assert abs(match.offset_px - miss_px) < 2.1
+
+
+def test_an_outline_on_mere_texture_is_never_kept() -> None:
+    view = cuboid.seen(cuboid.looking(EYES_M[0], (0.1, 0.0, 0.3)), (960, 540))
+    pose = view.world_from_camera
+    block = label_placing.build_cuboid(CORNERS_M, 1.2, pose[:3, 3])
+    outline = sample_block_outline(block, view.frame, pose, 0.003, 3.0)
+    found = []
+    for seed in range(5):
+        grain = np.random.default_rng(seed).uniform(100, 150, (540, 960)).astype(np.float32)
+        match = match_outline(outline, cv2.GaussianBlur(grain, (0, 0), 1.5), 14.0)
+        assert match is not None
+        assert not match.is_significant or match.offset_px > 3.0
+        found.append(match.is_significant)
+    assert not all(found)
+    assert match_outline(outline, np.full((540, 960), 255, np.float32), 14.0) is None
 
 
 def test_a_placing_that_says_too_little_shows_how_it_should_look(tmp_path: Path) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import csv
+import json
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import wandb
@@ -10,7 +14,7 @@ from composed import option
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.rl.tracking import NoTracking, TensorBoardTracking, WandbTracking
+from brokk_rl.rl.tracking import NoTracking, TensorBoardTracking, WandbTracking, _find_sweep
 
 
 def test_without_a_tracker_nothing_is_written(tmp_path: Path) -> None:
@@ -75,3 +79,80 @@ def test_an_environment_that_wandb_refuses_is_explained(
             tracking.open(tmp_path, {})
     else:
         tracking.open(tmp_path, {}).close()
+
+
+SMALL = (
+    "sim=native", "session.device=cpu", "rl.num_envs=8", "rl.num_starts=32", "rl.budget.max_env_steps=512",
+    "evaluation.episodes=4", "evaluation.num_recorded=1", "evaluation.video=false", "session.out=run",
+    "task.episode_s=1.0",
+)  # fmt: skip
+
+
+@pytest.fixture
+def run(brokk: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable:
+    def train(*words: str) -> Path:
+        for name in ("WANDB_CONFIG_DIR", "WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
+            monkeypatch.setenv(name, str(tmp_path / "home"))
+        done = brokk("mode=train", "effect=[backlash]", *SMALL, *words)
+        assert done.code == 0, done.err
+        return tmp_path / "run"
+
+    return train
+
+
+def test_tensorboard_gets_parts_reward_terms_and_the_evaluation(run: Callable[..., Path]) -> None:
+    folder = run("tracking=tensorboard")
+    events = EventAccumulator(str(folder / "tensorboard"), size_guidance={"scalars": 0}).Reload()
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    (last,) = events.Scalars("evaluation/classical/valve_travel")
+    assert last.value == pytest.approx(evaluation["policies"]["classical"]["valve_travel"])
+    assert {"machine/text_summary", "commit/text_summary"} <= set(events.Tags()["tensors"])
+    (text,) = events.Tensors("effect/text_summary")
+    assert b"backlash" in text.tensor_proto.string_val[0]
+    assert "learning_curves" in events.Tags()["images"]
+    tags = events.Tags()["scalars"]
+    for name in ("progress", "success", "failure", "command_change", "peak_contact"):
+        assert f"episode/reward/{name}" in tags
+    # the terms of a reward add up to the return
+    with (folder / "progress.csv").open() as file:
+        rows = [{key: float(value) for key, value in row.items()} for row in csv.DictReader(file)]
+    checked = 0
+    for row in rows:
+        terms = [value for key, value in row.items() if key.startswith("episode/reward/")]
+        assert len(terms) == 5
+        assert sum(terms) == pytest.approx(row["episode/return"], abs=1e-4)
+        checked += row["episodes"] > 0
+    assert checked
+    assert "reward/progress" not in (folder / "evaluation.json").read_text()
+
+
+@pytest.mark.slow
+def test_wandb_gets_the_evaluation_before_the_run_closes(
+    run: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[dict[str, Any]] = []
+    original = wandb.sdk.wandb_run.Run.finish
+    monkeypatch.setattr(
+        wandb.sdk.wandb_run.Run,
+        "finish",
+        lambda self, *rest: (calls.append(dict(self.summary)), original(self, *rest))[1],
+    )
+    configs: list[dict[str, Any]] = []
+    init = wandb.init
+    monkeypatch.setattr(wandb, "init", lambda **given: (configs.append(given), init(**given))[1])
+    folder = run("tracking=wandb")
+    evaluation = json.loads((folder / "evaluation.json").read_text())
+    (summary,), (given,) = calls, configs
+    assert summary["evaluation/trained/valve_travel"] == pytest.approx(evaluation["valve_travel"])
+    assert given["config"]["machine"] == "brokk170" and given["config"]["effect"] == "backlash"
+    assert given["config"]["config"]["rl"]["num_envs"] == 8
+    stored = next((folder / "wandb").glob("offline-run-*/run-*.wandb")).read_bytes()
+    assert b"policy.onnx" in stored and b"learning_curves" in stored
+
+
+def test_the_group_of_a_job_is_its_sweep(tmp_path: Path) -> None:
+    job = tmp_path / "seeds" / "0_seed-1"
+    job.mkdir(parents=True)
+    assert _find_sweep(job) is None
+    (job.parent / "multirun.yaml").touch()
+    assert _find_sweep(job) == "seeds"

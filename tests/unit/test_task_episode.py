@@ -118,7 +118,7 @@ def test_a_draw_of_which_little_can_be_done_goes_on(
     """Tried on a chunk in which one candidate in 200 can be done, then one in 300."""
     monkeypatch.setattr(starts, "MIN_CANDIDATES", 1000)
     free = torch.ones(6000, dtype=torch.bool)
-    tally = starts._DrawTally("a task", 10_000)
+    tally = starts.DrawTally("a task", 10_000)
     done = torch.arange(6000) % 200 == 0
     tally.add(free, done, done)
     done = torch.arange(6000) % 10_000 == 0
@@ -131,7 +131,7 @@ def test_a_long_draw_tells_how_far_it_is(
 ) -> None:
     clock = iter([0.0, 4.0, 6.0, 7.0, 12.0])
     monkeypatch.setattr(starts.time, "monotonic", lambda: next(clock))
-    tally = starts._DrawTally("a task", 1000)
+    tally = starts.DrawTally("a task", 1000)
     some = torch.arange(200) % 2 == 0
     with caplog.at_level(logging.INFO):
         for _ in range(4):

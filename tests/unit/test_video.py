@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ READ_CODE = """name => {
 }"""
 """Returns the width and the red of each pixel of the picture that a camera shows now."""
 ALARMS = "() => [...document.querySelectorAll('#alarms li:not(.over)')].map(one => one.textContent)"
+CODECS = """async () => [...(await window.measured.video.peer.getStats()).values()]
+    .filter(one => one.type === "codec" && !one.mimeType.endsWith("rtx")).map(one => one.mimeType)"""
 SHOWS = (
     "() => (window.measured.video?.cameras ?? []).filter(one => one.shown && one.delay_ms).length"
 )
@@ -101,6 +104,56 @@ def test_who_has_no_token_does_not_reach_the_video_process(tmp_path: Path) -> No
         assert reached == [TOKEN]
 
 
+class Sender:
+    """A sender that remembers what it sends again."""
+
+    def __init__(self) -> None:
+        self.again: list[int] = []
+        self._RTCRtpSender__packet_count = 0
+
+    async def _retransmit(self, sequence_number: int) -> None:
+        self.again.append(sequence_number)
+
+
+def test_what_is_sent_again_is_a_share_of_what_is_sent() -> None:
+    pytest.importorskip("aiortc", reason="the extra video is not installed")
+    from deploy.video.video_process import AGAIN_MOST, AGAIN_SHARE, RetransmissionBudget
+
+    async def ask(sender: Any, sent: int, requests: int) -> int:
+        sender._RTCRtpSender__packet_count += sent
+        before = len(sender.again)
+        for number in range(requests):
+            await sender._retransmit(number)
+        return len(sender.again) - before
+
+    sender = Sender()
+    RetransmissionBudget(sender)
+    assert asyncio.run(ask(sender, 100, 5)) == 5, "few losses are all answered"
+    assert asyncio.run(ask(sender, 0, 500)) == round(100 * AGAIN_SHARE) - 5
+    assert asyncio.run(ask(sender, 10_000, 500)) == AGAIN_MOST, "a pause saves up no flood"
+
+
+@pytest.mark.parametrize("bitrate", [200_000, 2_000_000])
+def test_the_encoder_keeps_the_rate_and_bounds_key_pictures(bitrate: int) -> None:
+    pytest.importorskip("aiortc", reason="the extra video is not installed")
+    from deploy.video.encoder import BURST_S, LinkEncoder
+    from deploy.video.sources import TestPattern
+
+    source, num_cameras, hz = TestPattern(640, 360, 1e6), 2, 15
+    encoder = LinkEncoder(150_000, 3_000_000, num_cameras)
+    encoder.target_bitrate = num_cameras * bitrate
+    sizes = []
+    for number in range(4 * hz):
+        frame, _ = source.read()
+        frame.pts, frame.time_base = number * 90_000 // hz, Fraction(1, 90_000)
+        packets, _ = encoder.encode(frame, force_keyframe=number == 2 * hz)
+        sizes.append(8 * sum(map(len, packets)))
+    assert sum(sizes[hz:]) / 3 == pytest.approx(bitrate, rel=0.25)
+    assert max(sizes) < 1.2 * BURST_S * bitrate
+    encoder.target_bitrate = 1
+    assert encoder.target_bitrate == 150_000
+
+
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
     with chromium() as found:
@@ -146,6 +199,7 @@ def test_pictures_come_with_their_age_and_a_dead_process_is_an_alarm(
             # shown for a fifteenth of a second, and the machine may be busy.
             assert 0.0 < now_s - taken_s < 3.0 and 0.0 < told_s < 3.0
             assert now_s - taken_s == pytest.approx(told_s, abs=1.0)
+        assert page.evaluate(CODECS) == ["video/H264"]
         eventually(lambda: page.evaluate(ALARMS) == [])
         page.keyboard.press("c")
         assert page.locator("figure.large .name").all_inner_texts() == ["front"]
