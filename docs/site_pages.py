@@ -161,3 +161,10 @@ def move_links(markdown: str, source: str, place: str) -> str:
         return f"{match[1]}{link}{anchor}{match[4]}"
 
     return LINK.sub(move, markdown)
+
+
+def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Return a notebook's page with links to pages instead of Markdown files."""
+    if not page.file.src_uri.endswith(".ipynb"):
+        return html
+    return re.sub(r'(href="[^":]+)\.md(#[^"]*)?"', r'\1.html\2"', html)
