@@ -95,7 +95,7 @@ def compute_tool_kinematics(machine: Machine, q: np.ndarray) -> ToolKinematics:
         if joint.kind == "slide":
             at_m = at_m + axes[..., j, :] * q[..., j, None]
         else:
-            rotation = rotation @ _rotate_about_axis(np.array(body.axis), q[..., j])
+            rotation = rotation @ rotate_about_axis(np.array(body.axis), q[..., j])
     tip = at_m + rotation @ machine.tip_m
     axis = rotation @ (machine.tip_m / np.linalg.norm(machine.tip_m))
     hinge = np.array([joint.kind == "hinge" for joint in machine.joints])[:, None]
@@ -106,7 +106,7 @@ def compute_tool_kinematics(machine: Machine, q: np.ndarray) -> ToolKinematics:
     )
 
 
-def _rotate_about_axis(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
+def rotate_about_axis(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     """Return rotations about a unit axis, `(…, 3, 3)`, by Rodrigues' formula."""
     x, y, z = axis
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

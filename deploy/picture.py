@@ -15,6 +15,18 @@ def encode_jpeg(color: np.ndarray, quality: int) -> bytes:
     return data.tobytes()
 
 
+def decode_jpeg(data: bytes) -> np.ndarray:
+    """Return the RGB picture, `(h, w, 3)` uint8, of a JPEG.
+
+    Raises:
+        ValueError: it is none.
+    """
+    found = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) if data else None
+    if found is None:
+        raise ValueError("expected a JPEG")
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB)
+
+
 def shrink_picture(picture: np.ndarray, width: int, height: int) -> np.ndarray:
     """Return a picture, `(h, w)` or `(h, w, 3)`, shrunk to `width` times `height` px.
 

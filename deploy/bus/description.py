@@ -144,9 +144,9 @@ class BusDescription:
                 names.append(signal.name)
         return names
 
-    def unit(self, message: str, signal: str) -> str:
-        """Return the unit of a signal, '' for none."""
-        return self._messages[message].get_signal_by_name(signal).unit or ""
+    def units(self, message: str) -> dict[str, str]:
+        """Return the unit of each signal of `message`, counter and CRC among them; '' for none."""
+        return {signal.name: signal.unit or "" for signal in self._messages[message].signals}
 
     def sent_by(self, node: str) -> list[MessageLayout]:
         """Return the messages of `node`."""

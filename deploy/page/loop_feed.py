@@ -194,7 +194,9 @@ class LoopFeed:
             facts = {"asked_s": self._clock()}
         # The request goes through a pipe: this process may not touch the loop's slots.
         taken = self._memory.requests.put(json.dumps(values | facts).encode())
-        self._log_text("wish", values | {"taken": taken} | facts)
+        # The time of the record is that of the request; the place was measured before.
+        told = {"seen_s" if name == "t_s" else name: value for name, value in facts.items()}
+        self._log_text("wish", values | {"taken": taken} | told)
         if request.kind in ("start", "stop"):
             # guiding stops on the page even where the supervisor has no room for the request
             self._guiding = request.kind == "start"

@@ -40,10 +40,15 @@ from deploy.page.protocol import (
 )
 from deploy.page.scene import measure_insertion, plan_approach, to_vector
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
+from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
 from deploy.runtime.operator_state import ALIVE_S, AdviceStatus, OperatorState
 from deploy.runtime.shared_memory import RecordLayout
 from deploy.runtime.target import NEAR_M
 
+VIEWS = (PICTURE, LENS, CLOUD, CAMERA_POSE)
+"""Topics of the camera."""
+CLOCK_S = 1e-6
+"""Rounding of the times of pictures."""
 MOST_MARKS = 200
 """Marks on the timeline; each state carries them. Chosen by hand."""
 RADIUS_M = 0.05
@@ -62,6 +67,7 @@ class CaptureReplay:
         advice_s: Age from which the advice is.
         borehole_s: Age from which the boreholes are.
         delay_s: Delay of messages that is too long.
+        camera_s: Age from which the camera's picture is stale.
     """
 
     capture: str
@@ -69,9 +75,11 @@ class CaptureReplay:
     advice_s: float
     borehole_s: float
     delay_s: float
+    camera_s: float
 
     def check(self) -> None:
-        if min(self.bus_s, self.advice_s, self.borehole_s, self.delay_s) <= 0:
+        ages_s = (self.bus_s, self.advice_s, self.borehole_s, self.camera_s)
+        if min(*ages_s, self.delay_s) <= 0:
             raise ConfigError("feed: expected ages and delay of more than 0")
 
     def build(self, machine: Machine) -> ReplayFeed:
@@ -82,7 +90,7 @@ class CaptureReplay:
         """
         path = Path(self.capture)
         path = path / "capture.mcap" if path.is_dir() else path
-        contents = read_capture(path)
+        contents = read_capture(path, VIEWS)
         try:
             machine.check_fingerprint(json.loads(contents.facts["fingerprint"]), str(path))
         except (CheckpointError, KeyError, ValueError) as error:
@@ -114,6 +122,8 @@ class ReplayFeed:
         self._begin_s = float(min(topic.t_s[0] for topic in self._topics.values()))
         end_s = float(max(topic.t_s[-1] for topic in self._topics.values()))
         self._duration_s = end_s - self._begin_s
+        self._views = {name: _View(rows) for name, rows in contents.views.items()}
+        self._picture = -1
         self._sources = {}
         for signal in (
             *(f"Position_{name}" for name in machine.joint_names),
@@ -158,6 +168,10 @@ class ReplayFeed:
             SourceAge("advice", None if advice is None else at_s - advice[1], replay.advice_s),
             SourceAge("borehole", self._measure_age("holes", at_s), replay.borehole_s),
         ]
+        if PICTURE in self._views:
+            _, taken_s, picture = self._views[PICTURE].find(at_s)
+            age_s = None if picture is None else at_s - taken_s
+            streams.append(SourceAge("camera", age_s, replay.camera_s))
         return PageState(
             t_s=self._clock(),
             alive=heard_s < ALIVE_S,
@@ -176,8 +190,21 @@ class ReplayFeed:
         )
 
     def read_frame(self, after_s: float) -> Frame | None:
-        """See `PageFeed`."""
-        return None
+        """See `PageFeed`; a jump back shows an earlier picture, at the time of the clock."""
+        if not {PICTURE, LENS, CLOUD} <= self._views.keys():
+            return None
+        # Foxglove's schemas are loaded where there are pictures alone.
+        from deploy.recorder.scene_topics import decode_frame
+
+        index, t_s, picture = self._views[PICTURE].find(self._begin_s + self.position_s)
+        if picture is None or (index == self._picture and after_s >= 0):
+            return None
+        self._picture = index
+        lens, cloud = self._views[LENS].find(t_s)[2], self._views[CLOUD].find(t_s)[2]
+        pose = self._views[CAMERA_POSE].find(t_s)[2] if CAMERA_POSE in self._views else None
+        if lens is None or cloud is None:
+            return None
+        return decode_frame(picture, lens, cloud, pose, self._clock())
 
     def submit(self, request: OperatorRequest) -> bool:
         """See `PageFeed`; moves along the recording."""
@@ -307,6 +334,19 @@ class _Topic:
         """Return number, time and values of the last message at `at_s`, `None` before the first."""
         index = int(np.searchsorted(self.t_s, at_s, side="right")) - 1
         return None if index < 0 else (index, *self.rows[index])
+
+
+class _View:
+    """Messages for viewers, likewise."""
+
+    def __init__(self, rows: list[tuple[float, bytes]]) -> None:
+        self._rows, self._t_s = rows, np.array([t_s for t_s, _ in rows])
+
+    def find(self, at_s: float) -> tuple[int, float, bytes | None]:
+        """Return number, time and data of the last message at `at_s`, `None` before the first."""
+        # Times come from whole nanoseconds of the wall clock; they are off by less than this.
+        index = int(np.searchsorted(self._t_s, at_s + CLOCK_S, side="right")) - 1
+        return (index, 0.0, None) if index < 0 else (index, *self._rows[index])
 
 
 def _list_marks(topics: dict[str, _Topic], begin_s: float) -> tuple[TimelineMark, ...]:

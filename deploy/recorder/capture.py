@@ -1,23 +1,23 @@
 """The log process: writes messages and decisions, and flushes them to the disk twice a second.
 
-MCAP holds every decoded message as a JSON topic of its name, `advice`, `guard`, `fault`, `bus`,
-`holes`, and pictures of the camera as topic `camera` (`foxglove.CompressedImage`). BLF holds the
-raw frames, for any tool that reads it. Times are monotonic ones plus one constant, so that a step
-of the wall clock shows nowhere.
+MCAP holds every decoded message of the bus as a topic of its name, and the decisions of all
+processes, as protobuf messages with complete schemas (`topics`). Beside them stand Foxglove's own
+messages (`scene_topics`), from which Foxglove and Rerun show the session. BLF holds the raw frames,
+for any tool that reads it. Times are monotonic ones plus one constant, so that a step of the wall
+clock shows nowhere.
 """
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import json
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import can
 from can.io.blf import BLFWriter
@@ -26,35 +26,30 @@ from mcap.writer import CompressionType, Writer
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
+from brokk_rl.signals import Frame
 from deploy.bus.description import BusDescription, MessageLayout
 from deploy.bus.protection import MessageFault
-from deploy.picture import encode_jpeg
+from deploy.recorder.topics import TIME, TOPICS, TopicSchema, describe_bus_fields
 from deploy.runtime.bus_process import FRAME, FRAMES
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import LoopMemory, measure_wall_offset_ns
 
+if TYPE_CHECKING:
+    from deploy.recorder.scene_topics import SceneTopics
+
 log = logging.getLogger(__name__)
 
+WriteMessage = Callable[[str, float, str, bytes, bytes], None]
+"""Takes topic, monotonic time, name and data of the schema, and the message."""
 POLL_S = 0.05
 """Between looks into the pipes, which hold minutes. Chosen by hand."""
 FLUSH_S = 0.5
 """Time between two flushes: the longest piece that a power failure costs. Chosen by hand."""
 MCAP, BLF = "capture.mcap", "frames.blf"
-PICTURES = "camera"
-"""Topic of the pictures."""
-JPEG_QUALITY = 80
-"""Chosen by hand: no loss that a person sees."""
 EARLY = 0.9
 """Part of the time between pictures from which one is due: a camera's period is not exact."""
-TIME = {
-    "type": "object",
-    "title": "time",
-    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-}
-BINARY = {"type": "string", "contentEncoding": "base64"}
-"""Of Foxglove's schema of a picture: its viewer shows them."""
 FACTS = "brokk"
 """Name of the metadata record."""
 
@@ -96,8 +91,8 @@ def run(stop: Stop, capture: CaptureConfig, memory: LoopMemory) -> None:
                 for pipe in memory.logs:
                     for data in pipe.take():
                         target.add(data)
-                if (picture := pictures.due()) is not None:
-                    target.add_picture(*picture)
+                if (frame := pictures.due()) is not None:
+                    target.add_frame(frame)
                 target.flush_when_due()
     except OSError as error:
         raise StorageError(
@@ -143,8 +138,10 @@ class CaptureWriter:
             resolve_package_path(capture.dbc).read_bytes(),
         )
         self._blf = DurableBlfWriter(capture.folder / BLF)
+        self._schemas: dict[str, TopicSchema] = {}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
+        self._scene = open_scene(machine, self._write_message, self._offset_ns)
         self._flushed_s = time.monotonic()
 
     def add(self, data: bytes) -> None:
@@ -154,19 +151,15 @@ class CaptureWriter:
                 self._add_frame(t_s, frame_id, sent, payload)
         else:
             values = json.loads(data[1:])
-            self._write(values.pop("topic"), values.pop("t_s"), values)
+            topic, t_s = values.pop("topic"), values.pop("t_s")
+            self._write(topic, t_s, values)
+            if self._scene is not None:
+                self._scene.add(topic, t_s, values)
 
-    def add_picture(self, t_s: float, data: bytes) -> None:
-        """Take a JPEG of the camera."""
-        wall_ns = int(t_s * 1e9) + self._offset_ns
-        stamp = {"sec": wall_ns // 10**9, "nsec": wall_ns % 10**9}
-        values = {
-            "timestamp": stamp,
-            "frame_id": "camera",
-            "format": "jpeg",
-            "data": base64.b64encode(data).decode(),
-        }
-        self._write(PICTURES, t_s, values)
+    def add_frame(self, frame: Frame) -> None:
+        """Take a frame of the camera."""
+        if self._scene is not None:
+            self._scene.add_frame(frame)
 
     def flush_when_due(self) -> None:
         """Flush where it is time to."""
@@ -217,36 +210,47 @@ class CaptureWriter:
             )
         else:
             self._write(layout.name, t_s, values | {"sent": sent}, layout)
+            if self._scene is not None:
+                self._scene.add(layout.name, t_s, values)
 
     def _write(
         self, topic: str, t_s: float, values: dict[str, Any], layout: MessageLayout | None = None
     ) -> None:
+        if topic not in self._schemas:
+            fields = describe_bus_fields(self._description, layout) if layout else TOPICS[topic]
+            self._schemas[topic] = TopicSchema(topic, fields)
+        schema = self._schemas[topic]
+        given = {name: value for name, value in values.items() if value is not None}
+        self._write_message(
+            topic, t_s, schema.name, schema.data, schema.encode({TIME: t_s, **given})
+        )
+
+    def _write_message(
+        self, topic: str, t_s: float, schema: str, schema_data: bytes, data: bytes
+    ) -> None:
+        """Write a protobuf message; the first one of a topic decides its schema."""
         if topic not in self._channels:
-            self._channels[topic] = self._mcap.register_channel(
-                topic, "json", self._schema(topic, layout)
-            )
+            number = self._mcap.register_schema(schema, "protobuf", schema_data)
+            self._channels[topic] = self._mcap.register_channel(topic, "protobuf", number)
             self._sequence[topic] = 0
         self._sequence[topic] += 1
         wall_ns = int(t_s * 1e9) + self._offset_ns
-        text = json.dumps({"t_s": t_s, **values}).encode()
-        self._mcap.add_message(self._channels[topic], wall_ns, text, wall_ns, self._sequence[topic])
+        self._mcap.add_message(self._channels[topic], wall_ns, data, wall_ns, self._sequence[topic])
 
-    def _schema(self, topic: str, layout: MessageLayout | None) -> int:
-        properties: dict[str, Any] = {
-            "t_s": {"type": "number", "description": "monotonic time in s"}
-        }
-        for signal in self._description.signals(layout.name) if layout else ():
-            properties[signal] = {
-                "type": "number",
-                "description": self._description.unit(layout.name, signal) if layout else "",
-            }
-        title = topic
-        if topic == PICTURES:
-            title = "foxglove.CompressedImage"
-            text = {"type": "string"}
-            properties |= {"timestamp": TIME, "data": BINARY, "frame_id": text, "format": text}
-        schema = {"title": title, "type": "object", "properties": properties}
-        return self._mcap.register_schema(title, "jsonschema", json.dumps(schema).encode())
+
+def open_scene(machine: Machine, write: WriteMessage, offset_ns: int) -> SceneTopics | None:
+    """Return what writes the scene for viewers; `None` where Foxglove's schemas are missing.
+
+    A recording is worth more than its pictures: it goes on without them.
+    """
+    try:
+        from deploy.recorder.scene_topics import SceneTopics
+    except ModuleNotFoundError as error:
+        log.warning(
+            "no scene and no pictures in the recording: %s; install brokk-rl[deploy]", error
+        )
+        return None
+    return SceneTopics(machine, write, offset_ns)
 
 
 class PictureSampler:
@@ -261,17 +265,14 @@ class PictureSampler:
         self._slot = slot if rate_hz > 0 else None
         self._apart_s, self._taken, self._next_s = 1.0 / rate_hz if rate_hz else 0.0, 0, 0.0
 
-    def due(self) -> tuple[float, bytes] | None:
-        """Return time and JPEG of the newest picture, if one is due."""
+    def due(self) -> Frame | None:
+        """Return the newest frame, if one is due."""
         now_s = time.monotonic()
         if self._slot is None or now_s < self._next_s or self._slot.number == self._taken:
             return None
         self._taken, self._next_s = self._slot.number, now_s + EARLY * self._apart_s
         record = self._slot.read()
-        if record is None:
-            return None
-        frame = read_frame(record)
-        return frame.t_s, encode_jpeg(frame.color, JPEG_QUALITY)
+        return None if record is None else read_frame(record)
 
 
 def _iterate_frames(data: bytes) -> Iterator[tuple[float, int, bool, bytes]]:

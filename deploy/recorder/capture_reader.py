@@ -24,6 +24,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.record import find_files
 from brokk_rl.spec import spec
 from deploy.recorder.capture import FACTS, DurableBlfWriter
+from deploy.recorder.topics import PACKAGE, TIME, decode_message, load_message_class
 
 log = logging.getLogger(__name__)
 
@@ -90,39 +91,77 @@ class CaptureContents:
     Attributes:
         facts: Metadata of the run: `machine`, `fingerprint`, `dbc`, `started_ns`, …
         messages: By topic.
+        views: Messages for viewers that were asked for, by topic, not decoded: (t_s, data).
         wall_ns: Wall-clock time of the first message.
         whole: Whether the file was closed properly.
     """
 
     facts: dict[str, str] = field(default_factory=dict)
     messages: dict[str, TopicMessages] = field(default_factory=dict)
+    views: dict[str, list[tuple[float, bytes]]] = field(default_factory=dict)
     wall_ns: int = 0
     whole: bool = True
 
 
-def read_capture(path: Path) -> CaptureContents:
+def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
     """Read the capture at `path` as far as it goes.
+
+    Args:
+        path: The capture.
+        views: Topics for viewers that are wanted too.
 
     Raises:
         RecordingError: there is none, or not even its beginning can be read.
     """
-    contents, topics = CaptureContents(whole=is_whole(path)), {}
+    contents, decoder, ahead_ns = CaptureContents(whole=is_whole(path)), _Decoder(), None
+    seen: list[tuple[str, Message]] = []
     for record in _iterate_records(path):
         if isinstance(record, Metadata) and record.name == FACTS:
             contents.facts = dict(record.metadata)
+        elif isinstance(record, Schema):
+            decoder.schemas[record.id] = record
         elif isinstance(record, Channel):
-            topics[record.id] = record.topic
+            decoder.channels[record.id] = record
         elif isinstance(record, Message):
-            values = json.loads(record.data)
-            contents.wall_ns = contents.wall_ns or record.log_time
-            contents.messages.setdefault(topics[record.channel_id], TopicMessages()).add(
-                values.pop("t_s"), values
-            )
+            topic = decoder.channels[record.channel_id].topic
+            values = decoder.decode(record)
+            if values is not None:
+                t_s = values.pop(TIME)
+                contents.wall_ns = contents.wall_ns or record.log_time
+                ahead_ns = record.log_time - int(t_s * 1e9) if ahead_ns is None else ahead_ns
+                contents.messages.setdefault(topic, TopicMessages()).add(t_s, values)
+            elif topic in views:
+                seen.append((topic, record))
     if not contents.facts:
         raise RecordingError(
             f"{path}: no capture of this framework, or cut off within its first second"
         )
+    for topic, view in seen:
+        # Viewers' messages carry the wall clock alone.
+        t_s = (view.log_time - (ahead_ns or 0)) / 1e9
+        contents.views.setdefault(topic, []).append((t_s, view.data))
     return contents
+
+
+class _Decoder:
+    """Decodes messages of this framework: protobuf, and JSON of captures of before."""
+
+    def __init__(self) -> None:
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self._classes: dict[int, Any] = {}
+
+    def decode(self, message: Message) -> dict[str, Any] | None:
+        """Return its values; `None` for a message that is meant for viewers."""
+        channel = self.channels[message.channel_id]
+        if channel.message_encoding == "json":
+            return json.loads(message.data)
+        schema = self.schemas[channel.schema_id]
+        if not schema.name.startswith(f"{PACKAGE}."):
+            return None
+        if schema.id not in self._classes:
+            self._classes[schema.id] = load_message_class(schema.name, schema.data)
+        return decode_message(self._classes[schema.id].FromString(message.data))
 
 
 def is_whole(path: Path) -> bool:

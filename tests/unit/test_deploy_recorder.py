@@ -119,11 +119,11 @@ def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(
     log.__exit__(None)
 
 
-@pytest.mark.parametrize("part", [0.3, 0.5, 0.9, 0.999])
+@pytest.mark.parametrize("part", [0.5, 0.7, 0.9, 0.999])
 def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
     machine: Machine, tmp_path: Path, part: float
 ) -> None:
-    write(tmp_path, machine)
+    write(tmp_path, machine, seconds=6.0)  # the shapes of the machine are most of the first second
     whole = len(capture_reader.read_capture(tmp_path / MCAP).messages["JointPos1"])
     for name in (MCAP, BLF):
         content = (tmp_path / name).read_bytes()

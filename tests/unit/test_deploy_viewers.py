@@ -1,0 +1,269 @@
+"""What other programs read in a capture: schemas, and Foxglove's messages, held against the machine."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import option
+from desk import DBC
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.reader import make_reader
+
+from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.machine import Machine
+from deploy.bus.description import BusDescription
+from deploy.bus.protection import MessageFault
+from deploy.guard.guard import GuardState, GuardTrip
+from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
+from deploy.page.replay import ReplayFeed
+from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
+from deploy.recorder.capture_reader import read_capture
+from deploy.recorder.topics import TOPICS, TopicSchema
+from deploy.runtime.bus_process import FRAME, FRAMES, TEXT
+from deploy.runtime.operator_state import AdviceStatus
+
+BEGIN_S = 700.0
+Q = [0.3, -0.8, 0.6, 1.0, 0.4]
+SAID: dict[str, dict[str, Any]] = {
+    "advice": {
+        "reason": "valid", "u": [0.1, 0.0, -0.2, 0.0, 0.3], "lever_rad": [0.1, 0.2, 0.0, -0.1], "button_right": True,
+        "target_in_base_m": list(TARGETS[0].center_in_base_m), "infer_s": 0.002,
+    },
+    "guard": {"state": "LATCHED", "trip": "remote missing", "cause": "remote missing", "joint": "q2"},
+    "fault": {"frame_id": 4660, "fault": "wrong CRC"},
+    "misfit": {"joint": "q3", "effect": "flow_gain"},
+    "bus": {"down": "no such device"},
+    "wish": {
+        "kind": "target", "value": "1", "taken": False, "asked_s": 1.5, "center_in_base_m": [2.6, 0.0, 0.75],
+        "std_m": 0.002, "seen_s": 1.25,
+    },
+    "drawn": {"advice": 41, "at_s": 2.5, "round_trip_s": 0.001, "page": 2},
+    "refused": {"message": "JointPos1", "fault": "wrong length", "data": "00ff"},
+}  # fmt: skip
+HOLES = [
+    {
+        "name": int(hole.name), "center_in_base_m": list(hole.center_in_base_m), "axis_in_base": [0.0, 0.0, 1.0],
+        "radius_m": hole.radius_m, "std_m": 0.002, "score": 0.75, "seen_t_s": BEGIN_S,
+    }
+    for hole in TARGETS
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A capture of one second with every topic, and two pictures where viewers' messages are written."""
+    folder, bus = tmp_path_factory.mktemp("capture"), BusDescription(DBC, machine)
+    camera = DemoCamera(160, 90, BLOCK_M, TARGETS)
+    with CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 1.0)) as log:
+
+        def say(topic: str, t_s: float, values: dict[str, Any]) -> None:
+            log.add(TEXT + json.dumps({"topic": topic, "t_s": t_s, **values}).encode())
+
+        for k in range(100):
+            t_s, data = BEGIN_S + 0.01 * k, b""
+            values = {f"Position_q{j + 1}": q for j, q in enumerate(Q)}
+            values |= {f"Valid_q{j}": 1 for j in range(1, 6)}
+            for name in ("JointPos1", "JointPos2", "JointPos3"):
+                payload = bus.encode(name, values, k)
+                data += FRAME.pack(t_s, bus.layouts[name].frame_id, 0, len(payload)) + payload
+            log.add(FRAMES + data)
+        say("holes", BEGIN_S + 0.5, {"holes": HOLES})
+        for topic, values in SAID.items():
+            say(topic, BEGIN_S + 1.0, values)
+        for number in range(2):
+            log.add_frame(camera.take_frame(number, BEGIN_S + 0.2 + 0.5 * number))
+    return folder
+
+
+def decode(path: Path) -> Iterator[tuple[str, str, int, Any]]:
+    """Yields topic, schema, time and message as another program would: by the schemas in the file alone."""
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages():
+            assert schema is not None and schema.encoding == "protobuf"
+            pool = descriptor_pool.DescriptorPool()
+            for one in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+                pool.Add(one)
+            build = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+            yield channel.topic, schema.name, message.log_time, build.FromString(message.data)
+
+
+def test_every_decision_comes_back_as_it_was_said(folder: Path) -> None:
+    messages = read_capture(folder / MCAP).messages
+    for topic, values in SAID.items():
+        assert messages[topic][-1][1] == values, topic
+        assert messages[topic][-1][0] == pytest.approx(BEGIN_S + 1.0)
+    assert messages["holes"][0][1]["holes"] == HOLES
+    assert set(SAID) | {"holes"} == set(TOPICS)
+    first = messages["JointPos1"][0][1]
+    assert first["Position_q1"] == pytest.approx(0.3, abs=1e-3) and {"Crc", "Counter"} <= set(first)
+
+
+def test_what_is_missing_stays_missing_and_what_nobody_described_is_refused() -> None:
+    schema = TopicSchema("guard", TOPICS["guard"])
+    said = {"t_s": 1.0, "state": "READY", "trip": "nothing", "cause": "nothing"}
+    assert b"q2" not in schema.encode(said)
+    with pytest.raises(ValueError, match="colour"):
+        schema.encode(said | {"colour": "red"})
+
+
+@pytest.mark.parametrize(
+    ("topic", "field", "choices"),
+    [
+        ("guard", "trip", [one.value for one in GuardTrip]),
+        ("guard", "state", [one.name for one in GuardState]),
+        ("advice", "reason", [one.value for one in AdviceStatus]),
+        ("fault", "fault", [one.value for one in MessageFault]),
+    ],
+)
+def test_a_schema_says_meaning_unit_and_all_values_of_its_fields(
+    topic: str, field: str, choices: list[str]
+) -> None:
+    (file,) = descriptor_pb2.FileDescriptorSet.FromString(
+        TopicSchema(topic, TOPICS[topic]).data
+    ).file
+    comments = {tuple(one.path): one.leading_comments for one in file.source_code_info.location}
+    names = [one.name for one in file.message_type[0].field]
+    assert names[0] == "t_s" and all((4, 0, 2, index) in comments for index in range(len(names)))
+    assert all(choice in comments[4, 0, 2, names.index(field)] for choice in choices)
+
+
+def test_all_topics_in_the_code_are_described() -> None:
+    """What the processes write is what the schemas hold."""
+    sources = [
+        path.read_text()
+        for path in Path(str(resources.files("deploy"))).rglob("*.py")
+        if path.name != "topics.py"
+    ]
+    for topic in TOPICS:
+        assert any(f'"{topic}"' in text for text in sources), topic
+
+
+@pytest.fixture(scope="module")
+def found(folder: Path) -> dict[str, list[Any]]:
+    pytest.importorskip(
+        "foxglove_schemas_protobuf", reason="without it nothing is written for viewers"
+    )
+    found: dict[str, list[Any]] = {}
+    for topic, name, _, message in decode(folder / MCAP):
+        if name.startswith("foxglove."):
+            found.setdefault(topic, []).append(message)
+    return found
+
+
+def test_the_frames_of_the_links_lead_to_the_tip(
+    found: dict[str, list[Any]], machine: Machine
+) -> None:
+    assert 18 <= len(found["tf"]) <= 21, "20 a second"
+    at_m, turn, names = np.zeros(3), np.eye(3), ["base"]
+    for one in found["tf"][-1].transforms:
+        assert one.parent_frame_id == names[-1]
+        names.append(one.child_frame_id)
+        at_m = at_m + turn @ np.array([one.translation.x, one.translation.y, one.translation.z])
+        turn = turn @ rotation(one.rotation)
+    tool = compute_tool_kinematics(machine, np.array(Q))
+    assert names == ["base", *machine.joint_names, "tip"]
+    np.testing.assert_allclose(at_m, tool.tip_in_base_m, atol=2e-3)  # resolution of the bus
+
+
+def test_boreholes_and_path_are_drawn_where_they_are(found: dict[str, list[Any]]) -> None:
+    entities = {one.id: one for one in found["scene/task"][-1].entities}
+    assert set(entities) == {*(f"{part} {n}" for part in ("rim", "axis") for n in (1, 2, 3)), "tool path"}  # fmt: skip
+    for hole in TARGETS:
+        line = entities[f"rim {hole.name}"].lines[0]
+        points_m = np.array([[p.x, p.y, p.z] for p in line.points])
+        off_m = np.linalg.norm(points_m - np.array(hole.center_in_base_m), axis=1)
+        np.testing.assert_allclose(off_m, hole.radius_m, atol=1e-9)
+    chosen, other = (entities[name].lines[0].color for name in ("rim 1", "rim 2"))
+    assert chosen.g > chosen.b and other.b > other.g
+    end = entities["tool path"].lines[0].points[-1]
+    assert (end.x, end.y) == pytest.approx(TARGETS[0].center_in_base_m[:2], abs=1e-6)
+    assert {one.type for one in found["scene/task"][-1].deletions} == {1}
+
+
+def test_shapes_hang_on_the_links_and_events_stand_in_the_log(
+    found: dict[str, list[Any]], machine: Machine
+) -> None:
+    frames = {one.frame_id for one in found["scene/machine"][0].entities}
+    assert frames <= {"base", *machine.joint_names} and {"base", "q3", "q5"} <= frames
+    assert {topic.rpartition("/")[2] for topic in found if "machine_points/" in topic} == frames
+    texts = [(one.level, one.message) for one in found["log"]]
+    assert (4, "guard LATCHED: remote missing (q2)") in texts
+    assert (2, "operator: target 1 (not taken)") in texts
+
+
+def test_points_lie_where_the_depths_say(found: dict[str, list[Any]]) -> None:
+    cloud, pose = found["camera/points"][0], found["tf/camera"][0]
+    offsets = {one.name: one.offset for one in cloud.fields}
+    assert offsets == {"x": 0, "y": 4, "z": 8, "red": 12, "green": 13, "blue": 14, "alpha": 15}
+    data = np.frombuffer(cloud.data, np.uint8).reshape(-1, cloud.point_stride)
+    points_m = data[:, :12].copy().view("<f4").astype(float)
+    turn, at = rotation(pose.rotation), pose.translation
+    height_m = (points_m @ turn.T + np.array([at.x, at.y, at.z]))[:, 2]
+    on_top = np.abs(height_m - BLOCK_M[1][2]) < 0.02
+    on_ground = np.abs(height_m) < 0.05
+    assert on_top.mean() > 0.1 and on_ground.mean() > 0.1
+    assert found["camera"][0].format == "jpeg" and len(found["camera"]) == 2
+    assert found["camera/calibration"][0].width == 160
+
+
+def test_the_replay_shows_the_pictures_again(folder: Path, machine: Machine) -> None:
+    pytest.importorskip("foxglove_schemas_protobuf")
+    now = [0.0]
+    replay = option("feed", "replay", capture=folder)
+    views = ("camera", "camera/calibration", "camera/points", "tf/camera")
+    feed = ReplayFeed(replay, machine, read_capture(folder / MCAP, views), lambda: now[0])
+    assert feed.read_frame(-1.0) is None, "nothing was taken yet"
+    taken = DemoCamera(160, 90, BLOCK_M, TARGETS).take_frame(1, 0.0)
+    now[0] = 0.9
+    again = feed.read_frame(-1.0)
+    assert again is not None and again.t_s == 0.9 and feed.read_frame(0.9) is None
+    assert np.abs(again.color.astype(int) - taken.color).mean() < 8
+    known = np.isfinite(again.depth_m)
+    assert known.sum() > 1000
+    np.testing.assert_allclose(again.depth_m[known], taken.depth_m[known], atol=1e-3)
+    assert again.base_from_camera is not None and taken.base_from_camera is not None
+    np.testing.assert_allclose(again.base_from_camera, taken.base_from_camera, atol=1e-9)
+
+
+def rotation(quaternion: Any) -> np.ndarray:
+    """Returns the matrix of a quaternion, by turning the three unit vectors: v + 2 w (r x v) + 2 r x (r x v)."""
+    r, w = np.array([quaternion.x, quaternion.y, quaternion.z]), quaternion.w
+    assert r @ r + w * w == pytest.approx(1.0)
+    columns = []
+    for v in np.eye(3):
+        columns.append(v + 2.0 * w * np.cross(r, v) + 2.0 * np.cross(r, np.cross(r, v)))
+    return np.stack(columns, 1)
+
+
+def test_the_shipped_layout_names_topics_and_fields_that_exist(folder: Path) -> None:
+    text = (resources.files("deploy") / "recorder" / "foxglove_layout.json").read_text()
+    layout = json.loads(text)
+    bus = BusDescription(DBC, option("machine", "brokk170"))
+    fields: dict[str, set[str]] = {
+        topic: {one.name for one in own} for topic, own in TOPICS.items()
+    }
+    fields |= {layout.name: set(bus.units(layout.name)) for layout in bus.layouts.values()}
+    paths = [
+        path["value"] for panel in layout["configById"].values() for path in panel.get("paths", [])
+    ]
+    assert len(paths) >= 10
+    for path in paths:
+        topic, _, field = path.partition(".")
+        assert field.partition("[")[0] in fields[topic.strip("/")], path
+    panels: set[str] = set()
+
+    def collect(node: Any) -> None:
+        if isinstance(node, str):
+            panels.add(node)
+        else:
+            collect(node["first"])
+            collect(node["second"])
+
+    collect(layout["layout"])
+    assert panels == set(layout["configById"])
