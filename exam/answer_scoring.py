@@ -23,6 +23,9 @@ from exam.metrics import compute_metrics
 
 log = logging.getLogger(__name__)
 
+BULK = ("weighed", "curves", "location", "evidence", "probes")
+"""Parts of an answer that fill pictures and calibration, nine in ten of its bytes, and no score."""
+
 RUN_FILE = "run.json"
 """File beside answers: the engine, and whether it was registered."""
 
@@ -149,7 +152,8 @@ class AnswerScoring:
             said = None
             if (place / answer.ANSWER_FILE).is_file():
                 said = json.loads((place / answer.ANSWER_FILE).read_text())
-                said.pop("weighed", None)  # candidate sets, for calibration: half of the bytes
+                for key in BULK:
+                    said.pop(key, None)
             note = run_cases.read_note(place)
             lines.append(json.dumps({"case": label["case"], "note": note, "answer": said}) + "\n")
         write_text(path, "".join(lines))
