@@ -13,13 +13,13 @@ from typing import Any
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
 from diagnosis import answer
 from exam import dataset, registration, run_cases, score
 from exam.dataset import end_on_interrupt
 from exam.examiner import examine_case
 from exam.metrics import compute_metrics
-from exam.progress import CaseProgress
 
 log = logging.getLogger(__name__)
 
@@ -79,7 +79,7 @@ class AnswerScoring:
         if not todo:
             return found
         with (
-            CaseProgress("repairs examined", len(todo)) as progress,
+            ItemProgress("repairs examined", len(todo)) as progress,
             ProcessPoolExecutor(workers, initializer=end_on_interrupt) as pool,
         ):
             jobs = {}
