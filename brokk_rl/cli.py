@@ -45,8 +45,21 @@ from brokk_rl.task_choice import choose_task
 log = logging.getLogger(__name__)
 
 
-CHECKED_FIRST = ("machine", "sim", "task", "rl", "evaluation")
-"""Nodes whose specs are checked before the mode is imported, and torch with it."""
+CHECKED_FIRST = (
+    "session",
+    "machine",
+    "sim",
+    "task",
+    "rl",
+    "evaluation",
+    "tracking",
+    "excitation",
+    "collect",
+    "identify",
+    "play",
+)
+"""Nodes whose specs are checked before the mode is imported, and torch with it: their modules do
+without."""
 
 
 class FailedJob(BaseException):
@@ -74,6 +87,8 @@ def main() -> int:
     # This must precede the import of torch. Threads that wait actively make an update thirty times
     # slower where other programs run on the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # Pictures are written to files. A notebook hands down a backend that may not be installed here.
+    os.environ["MPLBACKEND"] = "agg"
     # A run that a scheduler stops ends like one that is stopped by hand.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
@@ -158,11 +173,19 @@ def _run(cfg: DictConfig) -> float | None:
 
 
 def _check_values(cfg: DictConfig) -> None:
-    """Build the specs that need no torch, so that their bad values are refused within a second."""
+    """Build the specs that need no torch, so that their bad values are refused within a second.
+
+    Raises:
+        ConfigError: A value is bad, or one that must be given is not.
+    """
     for name in CHECKED_FIRST:
         node = OmegaConf.select(cfg, name, throw_on_missing=False)
-        if isinstance(node, DictConfig) and "_target_" in node and not OmegaConf.missing_keys(node):
-            instantiate(node, _convert_="all")
+        if not isinstance(node, DictConfig):
+            continue
+        given = {"out": "."} if name == "session" else {}  # the command chooses the folder itself
+        if missing := OmegaConf.missing_keys(node) - {"session.out"}:
+            raise ConfigError(_explain_missing_value(min(missing)))
+        instantiate(node, **given, _convert_="all")
 
 
 def _is_first_process() -> bool:
@@ -279,8 +302,7 @@ def explain(error: BaseException) -> str | None:
     if ours:
         return f"{ours}{_locate_node(error)}"
     if missing:
-        key = str(missing.full_key or missing)
-        return f"{key} has no default and must be given: {key}=<value>"
+        return _explain_missing_value(str(missing.full_key or missing))
     lacking = next((e for e in chain if isinstance(e, ModuleNotFoundError) and e.name), None)
     if lacking and (text := _explain_missing_module(lacking, chain)):
         return text
@@ -295,6 +317,10 @@ def explain(error: BaseException) -> str | None:
     ):
         return str(error)
     return None
+
+
+def _explain_missing_value(key: str) -> str:
+    return f"{key} has no default and must be given: {key}=<value>"
 
 
 def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
