@@ -45,8 +45,21 @@ from brokk_rl.task_choice import choose_task
 log = logging.getLogger(__name__)
 
 
-CHECKED_FIRST = ("machine", "sim", "task", "rl", "evaluation")
-"""Nodes whose specs are checked before the mode is imported, and torch with it."""
+CHECKED_FIRST = (
+    "session",
+    "machine",
+    "sim",
+    "task",
+    "rl",
+    "evaluation",
+    "tracking",
+    "excitation",
+    "collect",
+    "identify",
+    "play",
+)
+"""Nodes whose specs are checked before the mode is imported, and torch with it: their modules do
+without."""
 
 
 class FailedJob(BaseException):
@@ -158,11 +171,19 @@ def _run(cfg: DictConfig) -> float | None:
 
 
 def _check_values(cfg: DictConfig) -> None:
-    """Build the specs that need no torch, so that their bad values are refused within a second."""
+    """Build the specs that need no torch, so that their bad values are refused within a second.
+
+    Raises:
+        ConfigError: A value is bad, or one that must be given is not.
+    """
     for name in CHECKED_FIRST:
         node = OmegaConf.select(cfg, name, throw_on_missing=False)
-        if isinstance(node, DictConfig) and "_target_" in node and not OmegaConf.missing_keys(node):
-            instantiate(node, _convert_="all")
+        if not isinstance(node, DictConfig):
+            continue
+        given = {"out": "."} if name == "session" else {}  # the command chooses the folder itself
+        if missing := OmegaConf.missing_keys(node) - {"session.out"}:
+            raise ConfigError(_explain_missing_value(min(missing)))
+        instantiate(node, **given, _convert_="all")
 
 
 def _is_first_process() -> bool:
@@ -279,8 +300,7 @@ def explain(error: BaseException) -> str | None:
     if ours:
         return f"{ours}{_locate_node(error)}"
     if missing:
-        key = str(missing.full_key or missing)
-        return f"{key} has no default and must be given: {key}=<value>"
+        return _explain_missing_value(str(missing.full_key or missing))
     lacking = next((e for e in chain if isinstance(e, ModuleNotFoundError) and e.name), None)
     if lacking and (text := _explain_missing_module(lacking, chain)):
         return text
@@ -295,6 +315,10 @@ def explain(error: BaseException) -> str | None:
     ):
         return str(error)
     return None
+
+
+def _explain_missing_value(key: str) -> str:
+    return f"{key} has no default and must be given: {key}=<value>"
 
 
 def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:

@@ -79,19 +79,20 @@ def find_extra(
     Args:
         module: Name of the missing module.
         importer: Module or target that could not be loaded. Of several extras with the module the
-            one that its work needs is taken, so that one installation is enough.
+            one that its work needs is taken, so that one installation is enough, or the smallest.
         extras: Requirements of each extra, those of the installed distribution by default.
     """
     top = module.partition(".")[0]
     wanted = canonicalize_name(DISTRIBUTION_NAMES.get(top, top))
     holding = []
-    for extra, requirements in (read_extras() if extras is None else extras).items():
+    stated = read_extras() if extras is None else extras
+    for extra, requirements in stated.items():
         if extra and wanted in {canonicalize_name(one.name) for one in requirements}:
             holding.append(extra)
     for prefix, extra in EXTRA_OF_MODULE:
         if importer.startswith(prefix) and extra in holding:
             return extra
-    return holding[0] if holding else None
+    return min(holding, key=lambda one: len(stated[one]), default=None)
 
 
 def explain_missing_module(module: str, importer: str) -> str | None:

@@ -127,6 +127,20 @@ class ObservationEncoder:
         """Return the proposals, `(N, H, J)`, where `has_proposals`."""
         return vector[:, -self.shape[0] * self.shape[1] :].reshape(-1, *self.shape)
 
+    def mirror(self, vector: Any, joint_signs: Any) -> Any:
+        """Return the vector that the mirrored machine sees, `(N, size)`; see `brokk_rl.symmetry`.
+
+        Args:
+            vector: The vector, `(N, size)`.
+            joint_signs: -1 for each joint that moves to the other side, else 1, `(J,)`.
+        """
+        target_m, q, u = self.decode(vector)
+        parts = (target_m[:, :1], -target_m[:, 1:2], target_m[:, 2:])
+        pitch_rad = self.decode_pitch(vector) if self.has_pitch else None
+        proposed = self.decode_proposals(vector) * joint_signs if self.has_proposals else None
+        target_m = self._concat(parts, 1)
+        return self.encode(target_m, q * joint_signs, u * joint_signs, pitch_rad, proposed)
+
     def describe(self) -> dict[str, Any]:
         """Return order and scale of the vector as plain JSON data, for the contract of a policy."""
         lower, upper = self._machine.lower, self._machine.upper

@@ -60,6 +60,9 @@ class Frame:
         name: Path of a frame on disk without its endings, else ''.
         camera_cov: Covariance of the camera's pose, the same error in all frames: of a small motion
             in its own coordinates, `(6, 6)`, m and then rad; `None` for unknown.
+        disparity_std_px: Standard deviation of the error that the pair's disparity has in all
+            frames alike, px: of a constant, and of its slopes per unit of x / z and y / z. 0 for a
+            perfect pair, `None` for one that was not calibrated.
     """
 
     color: np.ndarray
@@ -72,3 +75,4 @@ class Frame:
     baseline_m: float | None = None
     name: str = ""
     camera_cov: np.ndarray | None = None
+    disparity_std_px: float | None = None

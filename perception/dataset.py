@@ -155,8 +155,9 @@ def write_camera(
     base_from_camera: np.ndarray | None,
     baseline_m: float | None,
     dist: Sequence[float] = (),
+    disparity_std_px: float | None = None,
 ) -> None:
-    """Write `camera.yaml`.
+    """Write `camera.yaml`; see `brokk_rl.signals.Frame`.
 
     Raises:
         StorageError: it could not be written.
@@ -167,6 +168,8 @@ def write_camera(
     }
     if baseline_m is not None:
         told["baseline_m"] = float(baseline_m)
+    if disparity_std_px is not None:
+        told["disparity_std_px"] = float(disparity_std_px)
     if base_from_camera is not None:
         told["T_base_cam"] = np.asarray(base_from_camera).tolist()
     _write(folder / CAMERA, yaml.safe_dump(told, sort_keys=False, default_flow_style=None).encode())

@@ -23,8 +23,9 @@ from brokk_rl.contracts.vision import (
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
-from perception import search
+from perception import rectification, search
 from perception.pose.plane_conic import convert_to_gray
+from perception.rectification import RectificationCheck
 
 SAME_ELLIPSE = 0.15
 """Distance and difference in size, as parts of an ellipse's size, below which two ellipses are the
@@ -34,6 +35,10 @@ STRONG_SCORE = 0.5
 inside each other the larger one wins, a weak larger one does not."""
 
 EXPLANATIONS = {
+    rectification.REASON: (
+        "the rows of left and right picture do not correspond, so its depth is wrong",
+        "Calibrate the camera pair.",
+    ),
     "part of the picture that is block": (
         "too little of the picture is block",
         "Is the block in sight, the segmenter the right one?",
@@ -114,6 +119,7 @@ class StagedPerception:
         block_probability: Probability from which a pixel counts as block.
         roi: Search region: the `mask` of the block, or its bounding `box`.
         apart: Holes nearer to each other than this many radii are one; the outer rim wins.
+        rectification: Check of the pair before anything else; `null` for none.
     """
 
     segmenter: SegmenterSpec
@@ -126,6 +132,7 @@ class StagedPerception:
     block_probability: float
     roi: str
     apart: float
+    rectification: RectificationCheck | None
 
     def check(self) -> None:
         if self.roi not in ("mask", "box"):
@@ -159,6 +166,11 @@ class StagedFinder:
         ms: dict[str, float] = {}
         with _time_stage(ms, "frame"):
             frame = rectify(frame)
+        if s.rectification is not None:
+            with _time_stage(ms, "pair"):
+                fault = s.rectification.find_fault(frame)
+            if fault is not None:
+                return FrameDetections([], [fault], [], None, ms)
         with _time_stage(ms, "segment"):
             masks = self._segmenter.segment(frame)
         # The share decides before the dear search begins.

@@ -182,6 +182,20 @@ def compute_features(
     return torch.cat(parts, 1)
 
 
+def list_feature_signs(joint_signs: torch.Tensor) -> torch.Tensor:
+    """Return the factor of each feature in the mirror, `(G,)`, in the order of `compute_features`.
+
+    Of the errors only the tangential one changes sides.
+
+    Args:
+        joint_signs: See `brokk_rl.symmetry.compute_joint_signs`, `(J,)`.
+    """
+    errors = joint_signs.new_tensor([1.0, -1.0, 1.0, 1.0])
+    # pitch error at two scales, reach, phase
+    same = joint_signs.new_ones(4)
+    return torch.cat((joint_signs, joint_signs, errors, errors, errors, same))
+
+
 class DeployedPolicy(torch.nn.Module):
     """The whole policy as it runs on the machine: `(B, O)` observations to `(B, J)` commands.
 

@@ -23,8 +23,9 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
 from brokk_rl.observation import TargetScaling
+from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.classical import ClassicalController
-from tasks.control import DeployedPolicy, ToolPoseControl
+from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm, ToolState
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
@@ -366,6 +367,21 @@ class ToolPoseProcess:
         description["masked"] = options.action.mask
         description["stop"] = {"joint_margin": options.limit_margin, "success": success}
         return description
+
+    def mirror(self) -> Mirror:
+        """Return the mirror of observations and actions; see `MirroredTask.mirror`."""
+        policy, privileged = self.state["policy"], self.state["privileged"]
+        signs = policy.new_tensor(compute_joint_signs(self._machine))
+        encoder = self.control.encoder
+        # the mirror is a factor and a shift for each number; two vectors give both
+        shift = encoder.mirror(torch.zeros_like(policy[:1]), signs)[0]
+        factor = encoder.mirror(torch.ones_like(policy[:1]), signs)[0] - shift
+        # of the critic's group only the error along y changes sides
+        across = torch.ones_like(privileged[0])
+        across[1] = -1.0
+        factors = {"guide": list_feature_signs(signs), "privileged": across}
+        groups = {name: (value, torch.zeros_like(value)) for name, value in factors.items()}
+        return Mirror({"policy": (factor, shift)} | groups, signs)
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
         """Return the policy as one module; see `DeployableTask.deployable`."""

@@ -1,15 +1,15 @@
 """Contract of a task, and of the policies that act in it.
 
 A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes
-of `N` environments at once. That contract is all that training and evaluation need. Three more are
-optional, and `supports_classical_control`, `can_move_target` and `supports_deployment` ask for
-them:
+of `N` environments at once. That contract is all that training and evaluation need. Four more are
+optional:
 
 * `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
   and `policy=classical` works.
 * `MovableTask`: the target may be moved during an episode, as `mode=play` does.
 * `DeployableTask`: the task can write its policy as one module from observation to command. Then
   `mode=export` and the end of `mode=train` write `policy.onnx`.
+* `MirroredTask`: episodes have a mirror image, as `rl.symmetry` needs.
 
 `brokk_rl.checks.check_task` exercises a task against all of this, for our own options and for those
 of extensions.
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from brokk_rl.history import History
     from brokk_rl.machine import Machine
+    from brokk_rl.symmetry import Mirror
 
 STEPS = "steps"
 """Entry of `TaskProcess.state` with the control steps of the running episode. The trainer sets it
@@ -192,6 +193,19 @@ def can_count_starts(process: object) -> TypeGuard[CountedStarts]:
 def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
     """Return whether the policy of a task process can be exported to ONNX."""
     return isinstance(process, DeployableTask)
+
+
+@runtime_checkable
+class MirroredTask(Protocol):
+    """A task process whose episodes have a mirror image; optional, for `rl.symmetry`."""
+
+    def mirror(self) -> Mirror:
+        """Return the mirror of all observation groups and of the action.
+
+        Raises:
+            ConfigError: The machine is not left-right symmetric.
+        """
+        ...
 
 
 class Task(Protocol):

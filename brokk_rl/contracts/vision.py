@@ -85,8 +85,8 @@ class HolePose:
         frame: Coordinates of all of it: `camera` (optical) or `base`.
         score: Confidence that it is a hole, in [0, 1].
         t_s: Time of the frame.
-        shared_m2: Part of `cov_m2` that all frames share: the error of the camera's pose. Averaging
-            over frames does not reduce it. `None` for none.
+        shared_m2: Part of `cov_m2` that all frames share: the errors of the camera's pose and of
+            the pair's disparity. Averaging over frames does not reduce it. `None` for none.
         shared_rad2: The same part of `axis_cov_rad2`.
     """
 
@@ -109,18 +109,21 @@ class HolePose:
             camera_cov: Covariance of that pose, see `Frame`; it adds to the covariances.
         """
         rotation, shift = base_from_camera[:3, :3], base_from_camera[:3, 3]
-        shared_m2 = shared_rad2 = None
         cov_m2 = rotation @ self.cov_m2 @ rotation.T
         axis_cov_rad2 = rotation @ self.axis_cov_rad2 @ rotation.T
+        shared_m2 = None if self.shared_m2 is None else rotation @ self.shared_m2 @ rotation.T
+        shared_rad2 = None if self.shared_rad2 is None else rotation @ self.shared_rad2 @ rotation.T
         if camera_cov is not None:
             # First order: a small motion (shift, turn) of the camera moves the centre by
             # shift - center x turn, and the axis by -axis x turn.
             center_lever = np.hstack([np.eye(3), -_build_cross_matrix(self.center_m)])
             axis_lever = np.hstack([np.zeros((3, 3)), -_build_cross_matrix(self.axis)])
-            shared_m2 = rotation @ center_lever @ camera_cov @ center_lever.T @ rotation.T
-            shared_rad2 = rotation @ axis_lever @ camera_cov @ axis_lever.T @ rotation.T
-            cov_m2 = cov_m2 + shared_m2
-            axis_cov_rad2 = axis_cov_rad2 + shared_rad2
+            of_camera_m2 = rotation @ center_lever @ camera_cov @ center_lever.T @ rotation.T
+            of_camera_rad2 = rotation @ axis_lever @ camera_cov @ axis_lever.T @ rotation.T
+            cov_m2 = cov_m2 + of_camera_m2
+            axis_cov_rad2 = axis_cov_rad2 + of_camera_rad2
+            shared_m2 = of_camera_m2 if shared_m2 is None else shared_m2 + of_camera_m2
+            shared_rad2 = of_camera_rad2 if shared_rad2 is None else shared_rad2 + of_camera_rad2
         return HolePose(
             center_m=rotation @ self.center_m + shift,
             axis=rotation @ self.axis,

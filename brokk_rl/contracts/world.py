@@ -97,6 +97,29 @@ class LoadedWorld(Protocol):
     caller, and kept until written again."""
 
 
+TRACE = ("q", "speed", "acceleration", "reference")
+"""Names of the states from which a world can be played on: joint positions and speeds, the
+solver's first guess of the accelerations, references of the drives."""
+
+
+@runtime_checkable
+class TracedWorld(Protocol):
+    """A world whose states can be recorded (`brokk_rl.sim.fault_recorder`); optional."""
+
+    substeps: int
+    """Physics steps per control period."""
+    trace: dict[str, torch.Tensor]
+    """States by their names in `TRACE`, each `(N, J)`, of one type; refreshed in place."""
+    faults: torch.Tensor
+    """As in `World`."""
+    alarm_names: dict[int, str]
+    """Meaning of each bit of `read_alarms`."""
+
+    def read_alarms(self) -> torch.Tensor:
+        """Return bits that say why a world is a fault, `(N,)` int64; no host synchronisation."""
+        ...
+
+
 class Simulator(Protocol):
     """A spec in `conf/sim`: builds a world.
 

@@ -1,4 +1,4 @@
-"""`brokk mode=bench`: rates of physics, control step and training on this computer."""
+"""`brokk mode=bench`: rates and seconds to success of trainings on this computer."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from rich.table import Table
@@ -24,6 +24,7 @@ from brokk_rl.rl.execution import capture_graph
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingConfig
+from brokk_rl.rl.success_sweep import LEVELS, SuccessSweep, report_sweep, run_sweep, summarise
 from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, read_versions, write_json
@@ -54,23 +55,30 @@ class BenchmarkSizes:
         iterations: Training iterations timed, after one to warm up.
         against: `benchmark.json` of one process with the same numbers of environments, to compare
             several processes with; `null` for no comparison.
+        measure: `rates` of physics, control step and training, or seconds of training until
+            `success`.
+        success: Sizes of the trainings whose time to success is measured.
     """
 
     num_envs: tuple[int, ...]
     seconds: float
     iterations: int
     against: str | None
+    measure: Literal["rates", "success"]
+    success: SuccessSweep
 
     def check(self) -> None:
         if not self.num_envs or min(self.num_envs) < 1:
             raise ConfigError(
                 f"bench.num_envs: expected one or more positive numbers, got {list(self.num_envs)}"
             )
+        if self.measure not in ("rates", "success"):
+            raise ConfigError(f"bench.measure: expected rates or success, got '{self.measure}'")
 
 
 @spec
 class Benchmark:
-    """Measures rates of physics, control step and training, for several numbers of environments.
+    """Measures rates of physics, control step and training, or the seconds until success.
 
     Attributes:
         session: Folder and device.
@@ -98,7 +106,12 @@ class Benchmark:
     """Several processes that `torchrun` starts measure at the same time and train together."""
 
     def run(self) -> float:
-        """Measure; returns the training rate of the last row, that of all processes together."""
+        """Measure.
+
+        Returns:
+            The training rate of the last row, that of all processes together; where the time to
+            success is measured the shortest, infinite where no training passed.
+        """
         alone = _read_single_process(self.bench)
         device = self.session.torch_device()
         plant = ControlLoopConfig(
@@ -109,26 +122,36 @@ class Benchmark:
             effects=self.effect,
             follower=self.follower,
         )
+        if self.bench.measure == "success":
+            return self._measure_success(plant, device)
         with TrainingGroup(device) as group:
             rows = []
             for row in self._rows(plant, device, group):
                 rows.append(_add_comparisons(row, alone.get(row["num_envs"])))
         if group.rank.first:
-            name = (
-                torch.cuda.get_device_name(device)
-                if device.type == "cuda"
-                else f"cpu, {torch.get_num_threads()} threads"
-            )
-            results = {
-                "device": name,
-                "ranks": group.rank.count,
-                **rows[-1],
-                "versions": read_versions(),
-                "rows": rows,
-            }
+            results = _describe_device(device, group) | rows[-1]
+            results |= {"versions": read_versions(), "rows": rows}
             write_json(self.session.folder / "benchmark.json", results)
             _print(rows)
         return float(rows[-1]["train_env_steps_per_s"])
+
+    def _measure_success(self, plant: ControlLoopConfig, device: torch.device) -> float:
+        """Return the shortest median time to the first level, s."""
+
+        def build(num_envs: int) -> ControlLoop:
+            self.session.seed_all()
+            starts = self.session.stream("starts")
+            loop = plant.build(device, num_envs, self.rl.num_starts, starts)
+            loop.capture(self.rl.fuse)
+            return loop
+
+        with TrainingGroup(device) as group:
+            rows = run_sweep(self.bench.success, self.rl, self.session, group, build)
+            if group.rank.first:
+                facts = _describe_device(device, group) | {"versions": read_versions()}
+                report_sweep(rows, self.session.folder, facts)
+        times = [line[f"seconds_to_{LEVELS[0]:.2f}"] for line in summarise(rows)]
+        return min((time_s for time_s in times if time_s is not None), default=float("inf"))
 
     def _rows(
         self, plant: ControlLoopConfig, device: torch.device, group: TrainingGroup
@@ -216,6 +239,13 @@ class Benchmark:
                 if name != "env_steps_per_s":
                     loop.world.load_state_dict(running)
         return {name: median(values) / CALLS for name, values in spent.items()}
+
+
+def _describe_device(device: torch.device, group: TrainingGroup) -> dict[str, Any]:
+    name = f"cpu, {torch.get_num_threads()} threads"
+    if device.type == "cuda":
+        name = torch.cuda.get_device_name(device)
+    return {"device": name, "ranks": group.rank.count}
 
 
 def _sum_over_ranks(rows: list[dict[str, Any]]) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from brokk_rl import distributed
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task, supports_classical_control, supports_deployment
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import CheckpointError
+from brokk_rl.errors import CheckpointError, SimulationError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.rl.distributed import TrainingGroup
@@ -30,13 +30,21 @@ from brokk_rl.rl.policy import (
 )
 from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
+from brokk_rl.rl.success_sweep import LEVELS, find_passing
 from brokk_rl.rl.tracking import NoTracking, Tracker, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session, read_record
 from brokk_rl.sim.events import Event
+from brokk_rl.sim.fault_recorder import REWARD_ALARM
+from brokk_rl.sim.fault_replay import describe_cause
 from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
+
+FAULTS = "faults"
+"""Folder of recorded faults in a run folder."""
+MAX_FAULT_FILES = 8
+"""Faults that one process writes, 100 kB each. Chosen by hand: later ones tell little more."""
 
 TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 """Files of the run folder that a tracker gets at the end."""
@@ -103,6 +111,8 @@ class Train:
         )
         if self.rl.near_starts:
             loop.bring_near(self.rl.near_starts, self.session.stream("starts"))
+        if self.rl.fault_steps:
+            loop.record_faults(self.rl.fault_steps)
         loop.capture(self.rl.fuse)
         group = TrainingGroup(device)
         _log_setup(loop, group)
@@ -128,6 +138,7 @@ class Train:
                 runner.run()
             if not group.rank.first:
                 return None
+            _log_success(logger)
             facts = {
                 "env_steps": logger.env_steps,
                 "seconds": logger.seconds,
@@ -164,10 +175,11 @@ class Train:
         self, loop: ControlLoop, group: TrainingGroup, tracker: Tracker
     ) -> TrainingLogger:
         """Return the logger of this process; only the first of several writes."""
+        faults = FaultLog(loop, self.session.folder / FAULTS, f"rank{group.rank.index}_")
         return TrainingLogger(
             self.session.folder,
             tracker,
-            lambda: group.pool_statistics(loop.statistics()),
+            lambda: group.pool_statistics(faults.read_statistics()),
             loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count,
             self.rl.max_fault_rate,
             self.rl.budget.share_spent,
@@ -226,6 +238,52 @@ def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
         elif isinstance(value, (int, float)):
             found[f"{name}/{key}"] = float(value)
     return found
+
+
+class FaultLog:
+    """Writes the faults of a training with their causes.
+
+    Args:
+        loop: The control loop.
+        folder: For the files; made where there is a fault.
+        prefix: Beginning of the file names; several processes write into one folder.
+    """
+
+    def __init__(self, loop: ControlLoop, folder: Path, prefix: str) -> None:
+        self._loop, self._folder, self._prefix = loop, folder, prefix
+        self._num_written = len(list(folder.glob(f"{prefix}*.npz")))
+
+    def read_statistics(self) -> dict[str, float]:
+        """Return `ControlLoop.statistics`; write the faults since the last call.
+
+        Raises:
+            SimulationError: A reward was not finite: the next update would spoil the policy.
+        """
+        statistics = self._loop.statistics()
+        if self._loop.recorder is None or not self._loop.num_held:
+            return statistics
+        for fault in self._loop.recorder.fetch(MAX_FAULT_FILES - self._num_written):
+            fault.cause = describe_cause(fault, self._loop.machine)
+            self._folder.mkdir(exist_ok=True)
+            path = self._folder / f"{self._prefix}{self._num_written}.npz"
+            fault.save(path)
+            self._num_written += 1
+            command = f"brokk mode=replay machine={fault.machine} replay.fault={path}"
+            log.warning("a world diverged: %s. Play it: %s", fault.cause, command)
+            if REWARD_ALARM in fault.alarms:
+                raise SimulationError(
+                    f"{fault.cause}: expected finite rewards. Look at task.reward; the state stands "
+                    f"in {path} ({command}). The newest checkpoint is from before."
+                )
+        return statistics
+
+
+def _log_success(logger: TrainingLogger) -> None:
+    """Log how many seconds of training the levels of success took."""
+    for level in LEVELS:
+        passed = find_passing(logger.rows, level)
+        text = "not reached" if passed is None else f"after {float(passed['seconds']):.1f} s"
+        log.info("strict success of %.2f while learning: %s", level, text)
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

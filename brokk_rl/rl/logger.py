@@ -67,7 +67,8 @@ class TrainingLogger:
         self._steps, self._max_fault_rate = steps_per_iteration, max_fault_rate
         self._quiet = quiet
         self._path = folder / PROGRESS
-        self._rows: list[dict[str, Any]] = []
+        self.rows: list[dict[str, Any]] = []
+        """Figures of every iteration, as `progress.csv` holds them."""
         self._num_unwritten = 0
         self._last_episode: dict[str, float] = {}
         self._clock = time.perf_counter()
@@ -126,7 +127,8 @@ class TrainingLogger:
                 f"{statistics['fault_rate']:.2%} of the control steps of iteration {it} ended in a "
                 "world that diverged, became NaN or overflowed its contact buffers (limit "
                 f"{self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step "
-                "(sim.substeps) and the sizes of the buffers (sim)."
+                "(sim.substeps) and the sizes of the buffers (sim). The first ones are recorded in "
+                "the folder faults of the run."
             )
         figures = {
             "env_steps": float(self.env_steps),
@@ -145,7 +147,7 @@ class TrainingLogger:
         if figures["episodes"] or not self._last_episode:
             self._last_episode = episode
         figures |= self._last_episode
-        self._rows.append({"iteration": it, **figures})
+        self.rows.append({"iteration": it, **figures})
         self._num_unwritten += 1
         if self.writer is not None:
             self.writer.log(figures, it)
@@ -160,7 +162,7 @@ class TrainingLogger:
         """Append new rows to `progress.csv`; called with every checkpoint so that both agree."""
         if not self._num_unwritten or self._quiet:
             return
-        rows, self._num_unwritten = self._rows[-self._num_unwritten :], 0
+        rows, self._num_unwritten = self.rows[-self._num_unwritten :], 0
         columns = list(rows[0])
         if self._path.exists():  # perhaps of a version with fewer figures
             with self._path.open(newline="") as file:
@@ -184,8 +186,8 @@ class TrainingLogger:
         with self._path.open(newline="") as file:
             rows = list(csv.DictReader(file))
         self._path.unlink()
-        self._rows = [row for row in rows if float(row["env_steps"]) <= self.env_steps]
-        self._num_unwritten = len(self._rows)
+        self.rows = [row for row in rows if float(row["env_steps"]) <= self.env_steps]
+        self._num_unwritten = len(self.rows)
         self.flush()
 
 

@@ -100,6 +100,7 @@ class UntrainedPolicy:
             actor = make_actor(
                 config["actor"], config["obs_groups"], observations, loop.num_actions
             )
+            scale_output(actor, self.training.output_gain)
             return NetworkPolicy(actor, loop)
 
 
@@ -250,6 +251,18 @@ def make_actor(
         )
     actor = actor_class(observations, obs_groups, "actor", num_actions, **arguments)
     return actor.to(observations.device)
+
+
+def scale_output(actor: MLPModel, gain: float) -> None:
+    """Scale the weights of the last layer, so that a fresh network acts almost alike everywhere.
+
+    Andrychowicz et al. 2021 recommend 0.01. A residual policy then begins as the controller that it
+    corrects.
+    """
+    last = [layer for layer in actor.mlp.modules() if isinstance(layer, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        for parameter in last.parameters():
+            parameter.mul_(gain)
 
 
 def observe_once(task: TaskProcess, machine: Machine, device: torch.device) -> TensorDict:

@@ -24,6 +24,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread
+from brokk_rl.symmetry import Mirror
 
 
 class CapturedRollout:
@@ -127,7 +128,7 @@ FIGURES = ("value", "surrogate", "entropy")
 class DevicePPO(PPO):
     """PPO for feed-forward networks.
 
-    On a CPU, and with curiosity or symmetry, it is rsl-rl's own, which acts on one thread.
+    On a CPU, without teacher and mirror, it is rsl-rl's own, which acts on one thread.
 
     It may follow a teacher: the loss then holds the squared distance of the mean action from the
     teacher's, in the states that the student itself meets (Ross et al. 2011; Schmitt et al. 2018).
@@ -146,6 +147,7 @@ class DevicePPO(PPO):
     """`desired_kl`, which may change from update to update."""
     _sums: torch.Tensor
     _teacher: MLPModel | None = None
+    _mirror: Mirror | None = None
     _imitation: torch.Tensor
     """Weight of the distance from the teacher."""
 
@@ -153,6 +155,14 @@ class DevicePPO(PPO):
         """Follow a teacher, with weight 0 until `set_imitation`; call it before the first step."""
         self._teacher = teacher.requires_grad_(False)
         self._imitation = torch.zeros((), device=self.device)
+
+    def use_mirror(self, mirror: Mirror) -> None:
+        """Learn from each step and its mirror image; call it before the first step.
+
+        As rsl-rl's data augmentation (Mittal et al. 2024): advantage, return and old probability are
+        those of the step itself; divergence and entropy count the steps alone.
+        """
+        self._mirror = mirror
 
     def set_imitation(self, weight: float) -> None:
         """Set the weight of the mean squared distance between the actions of both."""
@@ -230,8 +240,9 @@ class DevicePPO(PPO):
         plain = not (
             self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent
         )
-        # rsl-rl's own loss knows no teacher
-        return plain and (torch.device(self.device).type == "cuda" or self._teacher is not None)
+        # rsl-rl's own loss knows neither
+        own = self._teacher is not None or self._mirror is not None
+        return plain and (torch.device(self.device).type == "cuda" or own)
 
     def _batch_size(self) -> int:
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
@@ -342,6 +353,15 @@ class DevicePPO(PPO):
         old_parameters = tuple(parameters)
         if self.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        own, mirror = len(rows), self._mirror
+        if mirror is not None:
+            for name, value in observations.items():
+                observations[name] = torch.cat((value, mirror.apply(name, value)))
+            actions = torch.cat((actions, actions * mirror.action))
+            old_values, returns, advantages, old_log_prob = (
+                torch.cat((value, value))
+                for value in (old_values, returns, advantages, old_log_prob)
+            )
         kind = torch.device(self.device).type
         with torch.autocast(
             device_type=kind, dtype=torch.bfloat16, enabled=self.use_mixed_precision
@@ -351,14 +371,15 @@ class DevicePPO(PPO):
             self.actor.distribution.update(self.actor.mlp(self.actor.get_latent(observations)))  # type: ignore
             log_prob, entropy = (
                 self.actor.get_output_log_prob(actions),
-                self.actor.output_entropy.mean(),
+                self.actor.output_entropy[:own].mean(),
             )
             values = self.critic(observations)  # type: ignore[arg-type]
             if self._is_adaptive:
                 with torch.no_grad():
-                    divergence = self.actor.get_kl_divergence(
-                        old_parameters, self.actor.output_distribution_params
-                    ).mean()
+                    new_parameters = tuple(
+                        value[:own] for value in self.actor.output_distribution_params
+                    )
+                    divergence = self.actor.get_kl_divergence(old_parameters, new_parameters).mean()
             ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
             gain = advantages.squeeze(1)
             clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)

@@ -6,18 +6,19 @@ import contextlib
 import io
 import logging
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
+from brokk_rl.contracts.task import MirroredTask
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.logger import TrainingLogger
-from brokk_rl.rl.policy import TrainedPolicy
+from brokk_rl.rl.policy import TrainedPolicy, scale_output
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
@@ -73,11 +74,23 @@ class TrainingRunner(OnPolicyRunner):
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
         self.logger = logger  # type: ignore[assignment]
+        if training.symmetry and isinstance(self.alg, DevicePPO):
+            if not isinstance(env.task, MirroredTask):
+                raise ConfigError(
+                    f"rl.symmetry: the task ({type(env.task).__name__}) has no method mirror; give "
+                    "rl.symmetry=false"
+                )
+            self.alg.use_mirror(env.task.mirror())
+        scale_output(self.alg.actor, training.output_gain)
         if training.teacher and isinstance(self.alg, DevicePPO):
             self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)
 
-    def run(self) -> None:
-        """Train until the budget is spent; save a checkpoint every `save_interval`."""
+    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+        """Train until the budget is spent; save a checkpoint every `save_interval`.
+
+        Args:
+            until: Asked after each round; training ends early where it returns true.
+        """
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
         while num := self.group.broadcast_first(self._count_iterations(steps)):
@@ -94,10 +107,13 @@ class TrainingRunner(OnPolicyRunner):
             first = False
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
-            over = self.group.broadcast_first(self._count_iterations(steps)) == 0
+            enough = self.group.broadcast_first(until())
+            over = enough or self.group.broadcast_first(self._count_iterations(steps)) == 0
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
+            if enough:
+                break
 
     def _follow_schedules(self, share_spent: float) -> None:
         """Set the cap of the exploration noise and the teacher's weight, where there are any."""

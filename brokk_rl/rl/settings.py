@@ -158,13 +158,19 @@ class TrainingConfig:
         keep_checkpoints: Newest checkpoints kept.
         settling: Last part of the budget, over which `desired_kl` falls to a tenth: large steps
             learn fast, small ones keep it.
+        output_gain: Factor on the initial weights of the actor's last layer; 1 leaves them. With a
+            small one a residual policy begins as the classical controller.
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
             `brokk_rl.rl.exploration:CappedGaussian`.
+        symmetry: Learn from each step and its left-right mirror image, at twice the arithmetic of an
+            update. The machine has to be symmetric.
         teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
         near_starts: Starts near the target, in training only; `null` for those of the task.
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
+        fault_steps: Control steps kept of each world; those of worlds that diverge are written into
+            `faults` of the run folder. 0 records nothing.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
             compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
             less than half of a control step of few worlds, far more.
@@ -180,10 +186,13 @@ class TrainingConfig:
     save_interval: int
     keep_checkpoints: int
     settling: float
+    output_gain: float
     exploration: Exploration | None
+    symmetry: bool
     teacher: Teacher | None
     near_starts: NearStarts | None
     max_fault_rate: float
+    fault_steps: int
     fuse: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
@@ -194,6 +203,8 @@ class TrainingConfig:
             require_number(f"rl.{name}", getattr(self, name), least=1)
         for name in ("settling", "max_fault_rate"):
             require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
+        require_number("rl.fault_steps", self.fault_steps, least=0)
+        require_number("rl.output_gain", self.output_gain, above=0)
         self._check_runner()
         distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}
         if self.exploration and distribution.get("class_name") != CAPPED:
@@ -215,6 +226,11 @@ class TrainingConfig:
             raise ConfigError(
                 "rl.runner.algorithm.rnd_cfg: random network distillation is not supported; "
                 "more exploration comes from rl.runner.actor.distribution_cfg.std_range"
+            )
+        if self.runner.get("algorithm", {}).get("symmetry_cfg") is not None:
+            raise ConfigError(
+                "rl.runner.algorithm.symmetry_cfg: rsl-rl's own is not supported; rl.symmetry=true "
+                "learns from each step and its mirror image"
             )
         for path, bounds in RUNNER_BOUNDS.items():
             value: Any = self.runner

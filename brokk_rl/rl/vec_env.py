@@ -24,7 +24,7 @@ from brokk_rl.contracts.actuator import (
     FollowerModel,
     SensingModel,
 )
-from brokk_rl.contracts.task import FAULT, STEPS, Task, TaskProcess
+from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, World
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -32,6 +32,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
 from brokk_rl.sim.events import Event, build_varied_world
+from brokk_rl.sim.fault_recorder import FaultRecorder
 from brokk_rl.task_description import TaskDescription, describe_task
 
 Starts = dict[str, torch.Tensor]
@@ -161,12 +162,15 @@ class ControlLoop(VecEnv):
         # sums over episodes finished since `statistics` was last asked
         self._totals = torch.zeros(len(self._total_names), device=self.device)
         self._steps = 0
+        self.num_held = 0
+        """Worlds whose fault could be fetched from the recorder when `statistics` was last asked."""
         self._action = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         # addresses that stay: a captured graph writes to them
         self._groups = {
             name: torch.zeros_like(value) for name, value in task.observe(self.history).items()
         }
         self._graph: torch.cuda.CUDAGraph | None = None
+        self.recorder: FaultRecorder | None = None
         self.begin()
 
     @property
@@ -195,9 +199,25 @@ class ControlLoop(VecEnv):
         with self._always_alike():
             start = starts or self._draw()
             self.done.fill_(True)
-            self.world.reset(self.done, start["q"], start["scene"])
+            self._reset_worlds(start)
             self._perceive(start)
             self.done.fill_(False)
+
+    def record_faults(self, num_steps: int) -> None:
+        """Keep the last steps of worlds that diverge, before `capture`; see `FaultRecorder`.
+
+        Args:
+            num_steps: Control steps kept of each world.
+
+        Raises:
+            ConfigError: The simulator shows no states.
+        """
+        terms = {}
+        for name, value in self.task.episode.items():
+            if name.startswith(REWARD):
+                terms[name.removeprefix(REWARD)] = value
+        self.recorder = FaultRecorder(self.world, self.machine, num_steps, terms)
+        self.begin()
 
     def bring_near(self, near: NearStarts, seed: int) -> None:
         """Move part of the starts near their targets, before `capture`.
@@ -287,7 +307,10 @@ class ControlLoop(VecEnv):
 
         Reads back from the device once.
         """
-        values = dict(zip(self._total_names, self._totals.tolist(), strict=True))
+        held = [self.recorder.is_held.sum()[None].float()] if self.recorder else []
+        totals = torch.cat((self._totals, *held)).tolist()  # one read-back
+        self.num_held = int(totals[-1]) if held else 0
+        values = dict(zip(self._total_names, totals, strict=False))
         endings = {}
         for name, value in values.items():
             if name.startswith("end/"):
@@ -313,6 +336,8 @@ class ControlLoop(VecEnv):
         state |= {f"actuator.{name}": value for name, value in self.actuator.state.items()}
         state |= {f"follower.{name}": value for name, value in self.follower.state.items()}
         state |= {f"group.{name}": value for name, value in self._groups.items()}
+        if self.recorder:
+            state["recorder.scene"] = self.recorder.scene
         return {
             "tensors": {name: value.clone() for name, value in state.items()},
             "world": self.world.state_dict(),
@@ -338,6 +363,9 @@ class ControlLoop(VecEnv):
                     continue
                 value.copy_(tensors[f"{prefix}.{name}"])
         self.world.load_state_dict(state["world"])
+        if self.recorder:  # steps before are unknown; older checkpoints hold no scenes
+            scene = tensors.get("recorder.scene", self.recorder.scene)
+            self.recorder.begin(torch.ones_like(self.done), scene)
 
     @contextlib.contextmanager
     def _always_alike(self) -> Iterator[None]:
@@ -351,10 +379,21 @@ class ControlLoop(VecEnv):
 
     def _advance(self) -> None:
         """Run one control step on the device."""
-        self.world.step(self._command())
+        increment = self._command()
+        if self.recorder:
+            self.recorder.record(increment)
+        self.world.step(increment)
         start = self._judge()
-        self.world.reset(self.done, start["q"], start["scene"])
+        if self.recorder:
+            self.recorder.close(self.reward)
+        self._reset_worlds(start)
         self._perceive(start)
+
+    def _reset_worlds(self, start: Starts) -> None:
+        """Put the worlds of finished environments to their starts."""
+        self.world.reset(self.done, start["q"], start["scene"])
+        if self.recorder:
+            self.recorder.begin(self.done, start["scene"])
 
     def _command(self) -> torch.Tensor:
         """Apply the action; return the motion that the drive is to make of each joint, `(N, J)`."""

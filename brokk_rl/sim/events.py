@@ -12,7 +12,7 @@ import inspect
 from typing import TYPE_CHECKING, Any, Literal
 
 from brokk_rl.bounds import require_range
-from brokk_rl.contracts.world import LoadedWorld, Property, Simulator, VariedWorld
+from brokk_rl.contracts.world import LoadedWorld, Property, Simulator, TracedWorld, VariedWorld
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import name_spec, spec
@@ -99,12 +99,20 @@ class EventWorld:
         self.faults, self.supports_graphs = world.faults, world.supports_graphs
         if isinstance(world, LoadedWorld):
             self.joint_load = world.joint_load
+        if isinstance(world, TracedWorld):
+            self.trace, self.alarm_names = world.trace, world.alarm_names
+            self.substeps, self.read_alarms = world.substeps, world.read_alarms
         self._left_s = torch.zeros(len(events), world.num_worlds, device=world.device)
         everywhere = torch.ones_like(world.faults)
         for event in events:
             self._draw(event, everywhere)
         self._restart(everywhere)
         world.apply_properties()
+
+    @property
+    def properties(self) -> dict[str, torch.Tensor]:
+        """Factors by property; see `brokk_rl.contracts.world.VariedWorld`."""
+        return self._world.properties
 
     def step(self, increment: torch.Tensor) -> None:
         """Advance one control period; draw where an interval is over."""

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from typing import ClassVar
+
+import mujoco
 import torch
 from mujoco.batch import Batch, SimulationError
 
@@ -12,6 +16,17 @@ from brokk_rl.sim.model import compile_model, mask_contact_sensors
 from brokk_rl.sim.model_features import check_simulated
 from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
+
+WARNINGS = {
+    mujoco.mjtWarning.mjWARN_INERTIA: "inertia near zero",
+    mujoco.mjtWarning.mjWARN_CONTACTFULL: "the contact buffer is full",
+    mujoco.mjtWarning.mjWARN_CNSTRFULL: "the buffer of constraint rows is full",
+    mujoco.mjtWarning.mjWARN_BADQPOS: "bad position",
+    mujoco.mjtWarning.mjWARN_BADQVEL: "bad speed",
+    mujoco.mjtWarning.mjWARN_BADQACC: "bad acceleration",
+    mujoco.mjtWarning.mjWARN_BADCTRL: "bad command of a drive",
+}
+"""MuJoCo's warnings, in words."""
 
 
 class NativeWorld:
@@ -28,6 +43,9 @@ class NativeWorld:
     """
 
     supports_graphs = False
+    alarm_names: ClassVar[dict[int, str]] = {
+        1 << int(kind): text for kind, text in WARNINGS.items()
+    }
 
     def __init__(
         self,
@@ -41,7 +59,7 @@ class NativeWorld:
         self.model = compile_model(machine, machine.period_s / substeps)
         check_simulated(self.model, machine.name, "native")
         self._batch = Batch(self.model, num_worlds, num_threads)
-        self._substeps = substeps
+        self.substeps = substeps
         self._state, self._warning = (
             torch.from_numpy(self._batch.state),
             torch.from_numpy(self._batch.warning),
@@ -66,6 +84,12 @@ class NativeWorld:
         self._properties = (
             WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
         )
+        self.trace = {
+            "q": self._qpos,
+            "speed": self._qvel,
+            "acceleration": torch.from_numpy(self._batch.bind("qacc_warmstart")),
+            "reference": self._drive.reference,
+        }
         # touch sensors measure in every substep; recording them all catches a peak between two
         # control steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
@@ -81,7 +105,7 @@ class NativeWorld:
         """Advance one control period; see `brokk_rl.contracts.world.World`."""
         self._drive.step(self._qpos, increment, self._act, self._ctrl)
         try:
-            self._batch.rollout(self._substeps, record=("sensordata",), out=self._recorded)
+            self._batch.rollout(self.substeps, record=("sensordata",), out=self._recorded)
         except SimulationError as error:  # those worlds keep the state they had, all others went on
             self.faults[torch.from_numpy(error.ids)] = True
         self.contact_force_n.copy_((self._sensors @ self._is_touch).amax(1))
@@ -89,6 +113,24 @@ class NativeWorld:
         self.faults.logical_or_(self._drive.diverged(self._qvel)).logical_or_(
             self._warning.flatten(1).any(1)
         )
+
+    def read_alarms(self) -> torch.Tensor:
+        """Return bits of MuJoCo's warnings; see `brokk_rl.contracts.world.TracedWorld`."""
+        return (self._warning[:, :, 1] > 0).long() @ torch.tensor(list(self.alarm_names))
+
+    def watch_step(self, increment: torch.Tensor) -> Iterator[tuple[mujoco.MjModel, mujoco.MjData]]:
+        """Yield a copy of the first world after each substep of one control period.
+
+        The worlds themselves stay, but their drives move on.
+
+        Args:
+            increment: As in `step`.
+        """
+        self._drive.step(self._qpos, increment, self._act, self._ctrl)
+        model, data = self._batch.get_model(0), self._batch.get_data(0)
+        for _ in range(self.substeps):
+            mujoco.mj_step(model, data)
+            yield model, data
 
     @property
     def properties(self) -> dict[str, torch.Tensor]:
@@ -105,7 +147,7 @@ class NativeWorld:
 
         Benchmarks compare `step` with it.
         """
-        self._batch.step(nstep=self._substeps)
+        self._batch.step(nstep=self.substeps)
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor, scene: torch.Tensor) -> None:
         """Begin anew in the worlds of `mask`; see `brokk_rl.contracts.world.World`."""

@@ -117,6 +117,15 @@ def make_fused_substep(
 _LOST = int(mjw.OverflowType.ALL & ~(mjw.OverflowType.ITERATIONS | mjw.OverflowType.LS_ITERATIONS))
 
 
+BUFFERS = {
+    mjw.OverflowType.NEFC: "the buffer of constraint rows is full (sim.num_constraints)",
+    mjw.OverflowType.NJMAX_NNZ: "the buffer of the sparse constraint matrix is full",
+    mjw.OverflowType.BROADPHASE: "the buffer of geom pairs is full (sim.num_contacts)",
+    mjw.OverflowType.NARROWPHASE: "the contact buffer is full (sim.num_contacts)",
+}
+"""Buffers of `mujoco_warp` whose names need words."""
+
+
 class WarpWorld:
     """Fulfils `brokk_rl.contracts.world.World` on a GPU (or, for tests, on the CPU).
 
@@ -156,7 +165,12 @@ class WarpWorld:
     ) -> None:
         self.num_worlds, self.device = num_worlds, device
         self.supports_graphs = device.type == "cuda"
-        self._substeps = substeps
+        self.alarm_names: dict[int, str] = {}
+        for kind in mjw.OverflowType:
+            if kind & _LOST and kind != mjw.OverflowType.ALL:
+                name = kind.name or str(int(kind))
+                self.alarm_names[int(kind)] = BUFFERS.get(kind, f"the buffer {name} is full")
+        self.substeps = substeps
         self.model = compile_model(machine, machine.period_s / substeps)
         check_simulated(self.model, machine.name, "fused" if fused else "staged")
         wp.config.log_level = wp.LOG_WARNING
@@ -191,6 +205,12 @@ class WarpWorld:
         }
         self._placement = ScenePlacement(self.model, device, torch.float32)
         self._drive = DriveReferences(self.model, machine, num_worlds, device, torch.float32)
+        self.trace = {
+            "q": self._views["qpos"],
+            "speed": self._views["qvel"],
+            "acceleration": self._views["qacc_warmstart"],
+            "reference": self._drive.reference,
+        }
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)
         self.contact_force_n = torch.zeros(num_worlds, device=device)
         self.faults = torch.zeros(num_worlds, dtype=torch.bool, device=device)
@@ -213,7 +233,7 @@ class WarpWorld:
         self._drive.step(view["qpos"], increment, view["act"], view["ctrl"])
         self.contact_force_n.zero_()
         with self._on_torch_stream():
-            for _ in range(self._substeps):
+            for _ in range(self.substeps):
                 self._substep()
         self.q.copy_(view["qpos"])
         self.faults.logical_or_(self._drive.diverged(view["qvel"])).logical_or_(
@@ -246,6 +266,10 @@ class WarpWorld:
         for name, value in (("geom_size", size), ("geom_pos", pos)):
             ids = self._placement.geom_ids
             view[name].index_copy_(1, ids, torch.where(rows[..., None], value, view[name][:, ids]))
+
+    def read_alarms(self) -> torch.Tensor:
+        """Return bits of full buffers; see `brokk_rl.contracts.world.TracedWorld`."""
+        return (self._views["overflow"] & _LOST).long()
 
     @property
     def properties(self) -> dict[str, torch.Tensor]:

@@ -47,7 +47,7 @@ def load_observer_file(path: Path) -> dict[str, Any]:
 def describe_sources(content: Mapping[str, Any]) -> str:
     """Return in a few words what an observer's file was made from."""
     first, *others = content["sources"]
-    return f"from {first}" + (f" and {len(others)} others" if others else "")
+    return f"from {first}" + (f" and {len(others)} more" if others else "")
 
 
 class ValvePredictor:

@@ -194,7 +194,13 @@ def run(stop: Stop, config: VideoProcessConfig, memory: LoopMemory | None = None
     asyncio.run(_serve(stop, video, Path(config.folder) / SOCKET, memory))
 
 
+def _tell(_: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+    """Log an error of aiortc's own tasks in a line: a page that goes while it connects ends in one."""
+    log.warning("%s", context.get("exception") or context["message"])
+
+
 async def _serve(stop: Stop, video: VideoSettings, path: Path, memory: LoopMemory | None) -> None:
+    asyncio.get_running_loop().set_exception_handler(_tell)
     readers = []
     for name, camera in video.cameras.items():
         readers.append(CameraReader(name, lambda camera=camera: camera.build(memory)))

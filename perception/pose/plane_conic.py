@@ -93,6 +93,7 @@ class PlaneConic:
         matcher_bias_per_m: Standard deviation of a matcher's bias over a whole face in inverse
             depth, 1/m; with a right picture the face is aligned directly.
         bias_per_m: Standard deviation of the remaining bias that no residual shows, 1/m.
+        rig_px: `Frame.disparity_std_px` of a pair that was not calibrated.
         center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
         shape_px: Standard deviation of each of the first waves of a rim, px; they move the centre
             of an incomplete one.
@@ -115,6 +116,7 @@ class PlaneConic:
     matcher_alike: float
     matcher_bias_per_m: float
     bias_per_m: float
+    rig_px: float
     center_px: float
     shape_px: float
     looks: AppearanceGates
@@ -269,16 +271,40 @@ class PlaneConicEstimator:
             return refused
         # A network that marks mouths has decided already; without it the doubt stays.
         doubt = UNDECIDED_SCORE if undecided and masks.hole_mask is None else 1.0
+        own_m2, own_rad2 = (
+            compute_center_covariance(face, circle, s.bias_per_m),
+            face.normal_cov_rad2(),
+        )
+        shared_m2, shared_rad2 = self._compute_rig_covariances(frame, face, circle.center_m)
         return HolePose(
             center_m=circle.center_m,
             axis=face.normal,
             radius_m=circle.radius_m,
-            cov_m2=compute_center_covariance(face, circle, s.bias_per_m),
-            axis_cov_rad2=face.normal_cov_rad2(),
+            cov_m2=own_m2 if shared_m2 is None else own_m2 + shared_m2,
+            axis_cov_rad2=own_rad2 if shared_rad2 is None else own_rad2 + shared_rad2,
             frame="camera",
             score=float(ellipse.score) * doubt,
             t_s=frame.t_s,
+            shared_m2=shared_m2,
+            shared_rad2=shared_rad2,
         )
+
+    def _compute_rig_covariances(
+        self, frame: Frame, face: FacePlane, center_m: np.ndarray
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Return covariances of centre and normal by the pair's error, `None` without one.
+
+        A disparity that is wrong by `c0 + c1 x/z + c2 y/z` shifts the plane in inverse depth by
+        `(c1, c2, c0)` over focal length and baseline. No residual shows it, in any frame.
+        """
+        std_px = self.settings.rig_px if frame.disparity_std_px is None else frame.disparity_std_px
+        if not std_px or frame.baseline_m is None:
+            return None, None
+        std_per_m = std_px / (float(frame.camera_matrix[0, 0]) * frame.baseline_m)
+        shifted = replace(face, cov=np.eye(3) * std_per_m**2)
+        ray = center_m / center_m[2]
+        along_m2 = center_m[2] ** 4 * float(ray @ shifted.cov @ ray)
+        return along_m2 * np.outer(ray, ray), shifted.normal_cov_rad2()
 
     def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray]:
         """Return the grey picture and the pixels of the face, cached for all ellipses of a frame."""

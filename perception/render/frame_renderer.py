@@ -68,8 +68,13 @@ class FrameRenderer:
 
     def prepare(self, folder: Path) -> None:
         """Write the camera file that all frames of a folder share."""
+        rig = self.rig
         dataset.write_camera(
-            folder, self.rig.left.matrix, self.rig.base_from_camera, self.rig.baseline_m
+            folder,
+            rig.left.matrix,
+            rig.base_from_camera,
+            rig.baseline_m,
+            disparity_std_px=rig.disparity_std_px,
         )
 
     def has(self, stem: Path) -> bool:

@@ -14,8 +14,72 @@ from perception.render.ray_tracer import Pinhole
 
 
 @spec
+class PairMisalignment:
+    """Departure of the right camera from its place beside the left one, after rectification.
+
+    Attributes:
+        turn_rad: Pitch, yaw and roll: turns about its x, y and z axes.
+        focal: Relative difference of its focal length.
+        offset_px: Shift of its picture to the right and down.
+        distortion_px: Radial shift at the middle of the picture's left and right border, growing
+            with the cube of the distance from the centre.
+        seed: `null`: a rig with exactly these errors. A number draws one rig, with these as the
+            standard deviations of normal errors.
+    """
+
+    turn_rad: tuple[float, float, float]
+    focal: float
+    offset_px: tuple[float, float]
+    distortion_px: float
+    seed: int | None
+
+    @property
+    def is_none(self) -> bool:
+        """The pair is perfect."""
+        return not any((*self.turn_rad, self.focal, *self.offset_px, self.distortion_px))
+
+    def draw(self) -> PairMisalignment:
+        """Return the errors of one rig: these, or those drawn by the seed."""
+        if self.seed is None:
+            return self
+        chance = np.random.default_rng(self.seed).standard_normal(7)
+        turn = chance[:3] * self.turn_rad
+        offset = chance[4:6] * self.offset_px
+        return PairMisalignment(
+            turn_rad=(float(turn[0]), float(turn[1]), float(turn[2])),
+            focal=float(chance[3] * self.focal),
+            offset_px=(float(offset[0]), float(offset[1])),
+            distortion_px=float(chance[6] * self.distortion_px),
+            seed=None,
+        )
+
+
+@dataclass(frozen=True)
+class MisalignedPinhole(Pinhole):
+    """The right camera of a pair that is not perfect.
+
+    Attributes:
+        error: Its errors, drawn.
+    """
+
+    error: PairMisalignment
+
+    def rays(self, pixel: np.ndarray) -> np.ndarray:
+        """Return directions with z = 1, `(M, 3)` float32, through pixels, `(M, 2)`."""
+        error, half_px = self.error, self.width / 2
+        away = pixel - self.matrix[:2, 2] - error.offset_px
+        # The shift is a fraction of a pixel: to undo it, first order is exact to 1e-4 px.
+        square = (away**2).sum(1, keepdims=True) / half_px**2
+        away = away * (1.0 - error.distortion_px / half_px * square)
+        flat = away / (self.focal_px * (1.0 + error.focal))
+        turn = np.asarray(cv2.Rodrigues(np.asarray(error.turn_rad))[0])
+        rays = np.concatenate([flat, np.ones((len(flat), 1))], 1) @ turn.T
+        return (rays / rays[:, 2:]).astype(np.float32)
+
+
+@spec
 class StereoRig:
-    """A rectified stereo camera, fixed to the machine.
+    """A stereo camera, fixed to the machine.
 
     Attributes:
         width: Pixels.
@@ -25,6 +89,7 @@ class StereoRig:
         position_in_base_m: Left camera's centre of projection in the base frame.
         yaw_rad: Turn of the view about the vertical, from base x towards y.
         pitch_rad: How far it looks down.
+        error: Departure of the pair from perfect rectification.
     """
 
     width: int
@@ -34,6 +99,7 @@ class StereoRig:
     position_in_base_m: tuple[float, float, float]
     yaw_rad: float
     pitch_rad: float
+    error: PairMisalignment
 
     def check(self) -> None:
         if min(self.width, self.height) < 16 or self.focal_px <= 0 or self.baseline_m <= 0:
@@ -51,9 +117,15 @@ class StereoRig:
     @property
     def right(self) -> Pinhole:
         """Its partner."""
-        return Pinhole(
-            self.width, self.height, self.focal_px, np.array([self.baseline_m, 0.0, 0.0])
+        place = self.width, self.height, self.focal_px, np.array([self.baseline_m, 0.0, 0.0])
+        return (
+            Pinhole(*place) if self.error.is_none else MisalignedPinhole(*place, self.error.draw())
         )
+
+    @property
+    def disparity_std_px(self) -> float | None:
+        """Standard deviation of the disparity's offset: 0 for a perfect pair, else not known."""
+        return 0.0 if self.error.is_none else None
 
     @property
     def base_from_camera(self) -> np.ndarray:

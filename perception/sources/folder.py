@@ -65,6 +65,7 @@ class CameraModel:
     baseline_m: float | None
     base_from_camera: np.ndarray | None
     cov: np.ndarray | None = None
+    disparity_std_px: float | None = None
 
 
 def read_camera(path: Path) -> CameraModel:
@@ -87,7 +88,7 @@ def read_camera(path: Path) -> CameraModel:
         )
     where = str(path)
     optional: dict[str, Any] = {}
-    for name in ("baseline_m", "T_base_cam"):
+    for name in ("baseline_m", "T_base_cam", "disparity_std_px"):
         if told.get(name) is not None:
             optional[name] = told[name]
     return CameraModel(
@@ -97,6 +98,9 @@ def read_camera(path: Path) -> CameraModel:
         if "baseline_m" in optional
         else None,
         validation.check_pose(optional["T_base_cam"], where) if "T_base_cam" in optional else None,
+        disparity_std_px=validation.check_disparity_std(optional["disparity_std_px"], where)
+        if "disparity_std_px" in optional
+        else None,
     )
 
 
@@ -185,6 +189,7 @@ class FolderSource:
         return Frame(
             color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
             distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem), camera_cov=camera.cov,
+            disparity_std_px=camera.disparity_std_px,
         )  # fmt: skip
 
     def _depth(

@@ -132,6 +132,7 @@ class SimulatedSource:
         return Frame(
             color=shot.color, depth_m=shot.depth_m, camera_matrix=rig.left.matrix, base_from_camera=rig.base_from_camera,
             t_s=number / self._settings.rate_hz, right=shot.right, baseline_m=rig.baseline_m,
+            disparity_std_px=rig.disparity_std_px,
         )  # fmt: skip
 
     def shot(self, noise: np.random.Generator) -> RenderedFrame:

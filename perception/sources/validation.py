@@ -19,6 +19,9 @@ _FARTHEST_M = 200.0
 _RIGID = 1e-3
 """Largest departure of a rotation from orthonormality: of matrices written with three digits."""
 
+_LARGEST_OFFSET_PX = 10.0
+"""Uncertainty of a disparity from which a pair is not calibrated at all."""
+
 
 def check_matrix(value: Any, where: str) -> np.ndarray:
     """Return a camera matrix, `(3, 3)`, or raises a `FrameError` where it is none."""
@@ -95,6 +98,16 @@ def check_baseline(value: Any, where: str) -> float:
     found = float(_parse_numbers(value, (), f"{where}: baseline_m"))
     if not 1e-3 <= found <= 3.0:
         raise FrameError(f"{where}: baseline_m is {found:g}, expected 0.001 to 3 m; is it in mm?")
+    return found
+
+
+def check_disparity_std(value: Any, where: str) -> float:
+    """Return the standard deviation of a disparity's offset, px, or raises a `FrameError`."""
+    found = float(_parse_numbers(value, (), f"{where}: disparity_std_px"))
+    if not 0.0 <= found <= _LARGEST_OFFSET_PX:
+        raise FrameError(
+            f"{where}: disparity_std_px is {found:g}, expected 0 to {_LARGEST_OFFSET_PX:g} px"
+        )
     return found
 
 

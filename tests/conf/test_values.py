@@ -59,6 +59,14 @@ BAD = {
     ("mode=evaluate", "evaluation.episodes=-5"): "evaluation.episodes",
     ("mode=evaluate", "task.episode_s=-5"): "task.episode_s",
     ("mode=bench", "rl.num_starts=0"): "rl.num_starts",
+    ("session.device=gpu",): "session.device: expected auto, cpu, cuda or cuda:<index>",
+    ("session.seed=-1",): "session.seed",
+    ("tracking=wandb", "tracking.mode=sideways"): "WandbTracking.mode: expected one of 'offline'",
+    ("mode=identify",): "identify.recordings has no default and must be given",
+    ("mode=identify", "identify.recordings=x", "identify.folds=1"): "identify.folds: expected 2",
+    ("mode=collect", "collect.num_runs=0"): "collect.num_runs: expected 1 or more",
+    ("mode=collect", "excitation.sine.share=[2.0,1.0]"): "Sine.share: expected float",
+    ("mode=play", "play.port=0"): "play.port",
 }
 """Words of a command, and what its message must say."""
 PROGRAM = """

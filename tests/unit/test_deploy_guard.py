@@ -67,6 +67,40 @@ class Hand:
         return self
 
 
+class Fence:
+    """An envelope that withholds what moves the first joint, halves the rest, and notes all."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[Any, ...]] = []
+        self.sent: list[tuple[float, tuple[float, ...]]] = []
+
+    def limit_command(self, *asked: Any) -> tuple[tuple[float, ...], bool]:
+        self.asked.append(asked)
+        u = asked[1]
+        return (STILL, True) if u[0] else (tuple(one / 2 for one in u), False)
+
+    def note_sent(self, now_s: float, u: tuple[float, ...]) -> None:
+        self.sent.append((now_s, u))
+
+
+def test_the_envelope_has_the_last_word_and_hears_of_all_that_is_sent() -> None:
+    hand, fence = Hand(), Fence()
+    hand.guard = Guard(LIMITS, BODY, fence)  # type: ignore[arg-type]
+    hand.active()
+    assert fence.asked == [] and [u for _, u in fence.sent] == [STILL] * 3
+    face = (2.0, 0.1, 0.8)
+    for u, expected, trip in (
+        ((0.0, 0.0, 0.08), (0.0, 0.0, 0.04), GuardTrip.NONE),
+        ((0.08, 0.0, 0.0), STILL, GuardTrip.ENVELOPE),
+    ):
+        hand.now_s += DT
+        request = CommandRequest(u, 0.0, face)
+        decision = hand.guard.decide(hand.now_s, True, WELL, request)
+        assert decision == GuardDecision(GuardState.ACTIVE, expected, trip, GuardTrip.NONE)
+        assert fence.asked[-1] == (hand.now_s, u, WELL.q, face)
+        assert fence.sent[-1] == (hand.now_s, expected)
+
+
 def test_nothing_is_sent_until_somebody_arms_it_on_purpose() -> None:
     hand = Hand()
     for seen in (WELL, RELEASED, WELL):
@@ -130,6 +164,8 @@ WRONG = [
     ({"trusted": False}, GuardTrip.CHANNEL_INVALID),
     ({"observed": GuardTrip.JOINT_TURNED}, GuardTrip.JOINT_TURNED),
     ({"observed": GuardTrip.JOINT_STILL}, GuardTrip.JOINT_STILL),
+    ({"observed": GuardTrip.JOINT_WEAK}, GuardTrip.JOINT_WEAK),
+    ({"observed": GuardTrip.JOINT_DRIFTS}, GuardTrip.JOINT_DRIFTS),
     ({"status_age_s": LIMITS.status_s + 0.001}, GuardTrip.STATUS_STALE),
     ({"status_age_s": math.inf}, GuardTrip.STATUS_STALE),
     ({"levers_age_s": LIMITS.levers_s + 0.001}, GuardTrip.LEVERS_STALE),

@@ -371,7 +371,8 @@ def test_classes_of_faults() -> None:
 def test_the_shipped_file_is_that_of_the_machine() -> None:
     content = load_observer_file(SHIPPED)
     assert content["fingerprint"] == MACHINE.fingerprint() and content["machine"] == "brokk170"
-    assert min(len(own) for own in content["scores"]) >= 100
+    assert len(content["scores"]) == 5 and min(content["thresholds"]["slack_s"]) >= SLACK_S
+    assert any("Hydraulic" in one for one in content["sources"])
     assert Observer(LIMITS, content, MACHINE, 0).observation == NOTHING_OBSERVED
 
 

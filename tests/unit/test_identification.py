@@ -15,10 +15,11 @@ import torch
 from composed import option
 
 from actuators.identify import page
+from actuators.identify.request import Identification
 from actuators.identify.results import write_verdict
 from actuators.models.lag import FirstOrderLag
 from actuators.models.linear import Hold
-from actuators.modes.identify import Identification, Identify
+from actuators.modes.identify import Identify
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.history import History

@@ -133,7 +133,7 @@ def test_thresholds_of_a_simulator_or_of_another_machine_count_for_nothing_on_a_
     other = option("machine", "mini_excavator")
     for machine, sources, interface, reason in (
         (MACHINE, (simulated,), "socketcan", "made from simulator: Hydraulic, and this bus"),
-        (MACHINE, (real, simulated), "socketcan", "can0 and 1 others, and this bus is"),
+        (MACHINE, (real, simulated), "socketcan", "can0 and 1 more, and this bus is"),
         (other, (real,), "socketcan", "made for machine mini_excavator, which differs"),
         (other, (real,), "udp_multicast", "made for machine mini_excavator, which differs"),
     ):

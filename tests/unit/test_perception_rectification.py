@@ -1,0 +1,167 @@
+"""Pairs that are not perfect: how they are rendered, noticed, and told in the covariance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from composed import option
+from drawn import K, drawn
+
+from brokk_rl.contracts.vision import HolePose
+from brokk_rl.signals import Frame
+from perception import rectification
+from perception.finder import explain_rejection
+from perception.render.stereo_camera import MisalignedPinhole, PairMisalignment
+
+PERFECT = PairMisalignment(
+    turn_rad=(0.0, 0.0, 0.0), focal=0.0, offset_px=(0.0, 0.0), distortion_px=0.0, seed=None
+)
+BASELINE_M, DEPTH_M = 0.12, 2.0
+
+
+def test_a_misaligned_camera_is_the_one_of_opencv() -> None:
+    error = PairMisalignment(
+        turn_rad=(2e-4, -3e-4, 5e-4),
+        focal=4e-4,
+        offset_px=(0.25, -0.3),
+        distortion_px=0.2,
+        seed=None,
+    )
+    camera = MisalignedPinhole(1920, 1080, 1056.0, np.array([0.12, 0.0, 0.0]), error)
+    pixel = np.random.default_rng(0).uniform([0, 0], [1919, 1079], (200, 2))
+    points = camera.origin_m + 3.0 * camera.rays(pixel).astype(float)
+    into_camera = cv2.Rodrigues(np.array(error.turn_rad))[0].T
+    matrix = camera.matrix.copy()
+    matrix[:2, :2] *= 1.0 + error.focal
+    matrix[:2, 2] += error.offset_px
+    # a shift of `distortion_px` at half the width: x (1 + k r²) with r = 960 / 1056 there
+    k = error.distortion_px / 960.0 * (1056.0 / 960.0) ** 2
+    turn, shift = cv2.Rodrigues(into_camera)[0], -into_camera @ camera.origin_m
+    seen, _ = cv2.projectPoints(points, turn, shift, matrix, np.array([k, 0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(seen[:, 0], pixel, atol=2e-3)
+
+
+def test_drawn_rigs_differ_by_seed_and_scatter_as_they_say() -> None:
+    drifted = option("rig/error", "drifted")
+    rigs = [replace(drifted, seed=number).draw() for number in range(400)]
+    across = np.array([rig.offset_px[0] for rig in rigs])
+    assert across.std() == pytest.approx(drifted.offset_px[0], rel=0.12)
+    assert rigs[3] == replace(drifted, seed=3).draw()
+    assert not drifted.is_none
+    assert option("rig/error", "none").is_none
+
+
+def pair(down_px: float, roll_rad: float, seed: int = 0) -> Frame:
+    """Returns two pictures of a wall; the right one is shifted down and rolled about its middle."""
+    grain = np.random.default_rng(seed).uniform(60, 200, (540, 960)).astype(np.float32)
+    grain = cv2.GaussianBlur(grain, (0, 0), 2.0)
+    matrix = np.array([[528.0, 0.0, 479.5], [0.0, 528.0, 269.5], [0.0, 0.0, 1.0]])
+    disparity = 528.0 * BASELINE_M / DEPTH_M
+    u, v = np.meshgrid(np.arange(960.0), np.arange(540.0))
+    x, y = u - 479.5, v - 269.5 - down_px
+    from_u = np.cos(roll_rad) * x + np.sin(roll_rad) * y + 479.5 + disparity
+    from_v = -np.sin(roll_rad) * x + np.cos(roll_rad) * y + 269.5
+    right = cv2.remap(
+        grain, from_u.astype(np.float32), from_v.astype(np.float32), cv2.INTER_CUBIC,
+        borderMode=cv2.BORDER_REFLECT,
+    )  # fmt: skip
+    noise = np.random.default_rng(seed + 1).normal(0, 1.5, (2, 540, 960))
+    left, right = (
+        (one + n).clip(0, 255).astype(np.uint8)
+        for one, n in zip((grain, right), noise, strict=True)
+    )
+    return Frame(
+        color=np.repeat(left[..., None], 3, 2),
+        depth_m=np.full((540, 960), DEPTH_M, np.float32),
+        camera_matrix=matrix,
+        base_from_camera=None,
+        t_s=0.0,
+        right=np.repeat(right[..., None], 3, 2),
+        baseline_m=BASELINE_M,
+    )
+
+
+def test_pitch_and_roll_of_a_pair_are_measured() -> None:
+    roll_rad = np.radians(0.05)
+    found = rectification.measure_alignment(pair(0.4, roll_rad))
+    assert found is not None
+    # 0.4 px in the middle and at the border: 1 + y² is 1.09 on average
+    assert found.pitch_px == pytest.approx(0.4 / 1.09, abs=0.03)
+    assert found.roll_px == pytest.approx(528.0 * roll_rad, abs=0.03)
+    assert found.focal_px == pytest.approx(0.0, abs=0.03)
+    straight = rectification.measure_alignment(pair(0.0, 0.0))
+    assert straight is not None
+    assert straight.rms_px < 0.02
+
+
+def test_a_pair_that_is_not_rectified_is_refused_and_calibration_is_asked_for() -> None:
+    finder = option("perception", "plane_conic").build()
+    found = finder.find(pair(0.4, 0.0))
+    assert not found.holes
+    (refused,) = found.rejected
+    assert refused.stage == "frame"
+    assert refused.value > refused.limit
+    assert "Calibrate the camera pair" in explain_rejection(refused)
+    assert not any(one.stage == "frame" for one in finder.find(pair(0.0, 0.0)).rejected)
+
+
+def test_without_texture_or_partner_nothing_is_said_of_the_pair() -> None:
+    frame = pair(0.4, 0.0)
+    flat = np.full_like(frame.color, 128)
+    assert rectification.measure_alignment(replace(frame, color=flat, right=flat)) is None
+    assert rectification.measure_alignment(replace(frame, right=None)) is None
+    unknown = np.full_like(frame.depth_m, np.nan)
+    assert rectification.measure_alignment(replace(frame, depth_m=unknown)) is None
+
+
+def test_the_shared_covariance_is_what_a_wrong_disparity_does() -> None:
+    estimator = option("perception/pose", "plane_conic").build()
+    frame, masks, ellipse = drawn()
+    pull_px, std_px = K[0, 0] * BASELINE_M, 0.25
+    frame = replace(frame, baseline_m=BASELINE_M)
+    plain = estimator.estimate(replace(frame, disparity_std_px=0.0), masks, ellipse)
+    told = estimator.estimate(replace(frame, disparity_std_px=std_px), masks, ellipse)
+    assert isinstance(plain, HolePose)
+    assert isinstance(told, HolePose)
+    assert plain.shared_m2 is None
+    assert told.shared_m2 is not None
+    assert told.shared_rad2 is not None
+    np.testing.assert_allclose(told.cov_m2 - plain.cov_m2, told.shared_m2, atol=1e-15)
+    rows, columns = np.mgrid[0:480, 0:640]
+    x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]
+    moved_m2, turned_rad2 = np.zeros((3, 3)), np.zeros((3, 3))
+    for pattern in (np.ones_like(x), x, y):
+        disparity = pull_px / frame.depth_m + std_px * pattern
+        wrong = replace(
+            frame, depth_m=(pull_px / disparity).astype(np.float32), disparity_std_px=0.0
+        )
+        pose = estimator.estimate(wrong, masks, ellipse)
+        assert isinstance(pose, HolePose)
+        moved_m2 += np.outer(pose.center_m - plain.center_m, pose.center_m - plain.center_m)
+        turned_rad2 += np.outer(pose.axis - plain.axis, pose.axis - plain.axis)
+    # relative to the largest entry: the circle on the plane moves a little with it
+    np.testing.assert_allclose(told.shared_m2, moved_m2, atol=0.06 * moved_m2.max())
+    np.testing.assert_allclose(told.shared_rad2, turned_rad2, atol=0.06 * turned_rad2.max())
+
+
+def test_a_pair_that_was_never_calibrated_is_as_uncertain_as_a_real_one() -> None:
+    estimator = option("perception/pose", "plane_conic").build()
+    frame, masks, ellipse = drawn()
+    frame = replace(frame, baseline_m=BASELINE_M)
+    unknown = estimator.estimate(frame, masks, ellipse)
+    told = estimator.estimate(replace(frame, disparity_std_px=0.25), masks, ellipse)
+    assert isinstance(unknown, HolePose)
+    assert isinstance(told, HolePose)
+    np.testing.assert_allclose(unknown.cov_m2, told.cov_m2)
+    # moved into the base, the part that no averaging reduces is still told
+    turn = np.eye(4)
+    turn[:3, :3] = cv2.Rodrigues(np.array([0.3, -0.2, 0.5]))[0]
+    moved = unknown.moved(turn, 1e-6 * np.eye(6))
+    assert unknown.shared_m2 is not None
+    assert moved.shared_m2 is not None
+    own_m2 = turn[:3, :3] @ (unknown.cov_m2 - unknown.shared_m2) @ turn[:3, :3].T
+    np.testing.assert_allclose(moved.cov_m2 - moved.shared_m2, own_m2, atol=1e-12)
+    assert np.trace(moved.shared_m2) > np.trace(unknown.shared_m2)
