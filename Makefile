@@ -4,7 +4,7 @@ BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
 SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode
 
-.PHONY: help play train test test-all mutants figures check setup clean
+.PHONY: help play train test test-all mutants figures docs check setup clean
 
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
@@ -26,6 +26,9 @@ mutants: setup          ## one small change at a time to what decides about the 
 
 figures: setup          ## what the figures of the docs rest on, and which are older than their code
 	$(BIN)/python benchmarks/figures.py
+
+docs: setup             ## the documentation site, in site/; search works once it is served: python -m http.server -d site
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 check: setup            ## format, lint, types
 	$(BIN)/ruff format --check .

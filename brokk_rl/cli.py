@@ -87,6 +87,8 @@ def main() -> int:
     # This must precede the import of torch. Threads that wait actively make an update thirty times
     # slower where other programs run on the same cores.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    # Pictures are written to files. A notebook hands down a backend that may not be installed here.
+    os.environ["MPLBACKEND"] = "agg"
     # A run that a scheduler stops ends like one that is stopped by hand.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -19,6 +19,7 @@ DISTRIBUTION_NAMES = {
     "cv2": "opencv-python-headless",
     "google": "protobuf",
     "hydra_plugins": "hydra-submitit-launcher",
+    "mcap_protobuf": "mcap-protobuf-support",
     "rsl_rl": "rsl-rl-lib",
     "sklearn": "scikit-learn",
     "tensordict": "rsl-rl-lib",
@@ -33,6 +34,8 @@ EXTRA_OF_MODULE = (
     ("perception", "perception"),
     ("diagnosis", "diagnose"),
     ("exam", "diagnose"),
+    ("actuators.recordings", "logs"),
+    ("actuators.modes.import_logs", "logs"),
     ("", "train"),
 )
 """The extra that all of a package's own work needs; the first prefix that fits decides."""

@@ -63,6 +63,8 @@ class Frame:
         disparity_std_px: Standard deviation of the error that the pair's disparity has in all
             frames alike, px: of a constant, and of its slopes per unit of x / z and y / z. 0 for a
             perfect pair, `None` for one that was not calibrated.
+        disparity_error_px: Known error of the disparity between the two pictures, px: a constant,
+            and slopes per unit of x / z and y / z. `depth_m` is free of it, `right` still has it.
     """
 
     color: np.ndarray
@@ -76,3 +78,4 @@ class Frame:
     name: str = ""
     camera_cov: np.ndarray | None = None
     disparity_std_px: float | None = None
+    disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)

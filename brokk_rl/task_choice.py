@@ -31,9 +31,10 @@ MAIN = "config"
 def choose_task(cfg: DictConfig) -> DictConfig:
     """Return the configuration with the policy's task, and `asked` filled in.
 
-    A mode without `asked` names no policy; its configuration is returned as it is.
+    A mode without `asked`, and a training without `start_from`, names no policy; its configuration
+    is returned as it is.
     """
-    if "asked" not in cfg:
+    if "asked" not in cfg or ("start_from" in cfg and cfg.start_from is None):
         return cfg
     settings = HydraConfig.get()
     lines = list(settings.overrides.task)
@@ -89,6 +90,7 @@ def _find_brought(cfg: DictConfig, overrides: list[Override]) -> set[str]:
 def _read_policy_task(cfg: DictConfig) -> str | None:
     """Return the name of the task of the policy or checkpoint that the configuration names."""
     folder = OmegaConf.select(cfg, "policy.folder", default=None)
+    folder = OmegaConf.select(cfg, "start_from", default=folder)
     checkpoint = OmegaConf.select(cfg, "checkpoint", default=None)
     if checkpoint is not None:
         path = Path(str(checkpoint))

@@ -13,15 +13,18 @@ from typing import Any
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
 from diagnosis import answer
 from exam import dataset, registration, run_cases, score
 from exam.dataset import end_on_interrupt
 from exam.examiner import examine_case
 from exam.metrics import compute_metrics
-from exam.progress import CaseProgress
 
 log = logging.getLogger(__name__)
+
+BULK = ("weighed", "curves", "location", "evidence", "probes")
+"""Parts of an answer that fill pictures and calibration, nine in ten of its bytes, and no score."""
 
 RUN_FILE = "run.json"
 """File beside answers: the engine, and whether it was registered."""
@@ -76,7 +79,7 @@ class AnswerScoring:
         if not todo:
             return found
         with (
-            CaseProgress("repairs examined", len(todo)) as progress,
+            ItemProgress("repairs examined", len(todo)) as progress,
             ProcessPoolExecutor(workers, initializer=end_on_interrupt) as pool,
         ):
             jobs = {}
@@ -149,7 +152,8 @@ class AnswerScoring:
             said = None
             if (place / answer.ANSWER_FILE).is_file():
                 said = json.loads((place / answer.ANSWER_FILE).read_text())
-                said.pop("weighed", None)  # candidate sets, for calibration: half of the bytes
+                for key in BULK:
+                    said.pop(key, None)
             note = run_cases.read_note(place)
             lines.append(json.dumps({"case": label["case"], "note": note, "answer": said}) + "\n")
         write_text(path, "".join(lines))

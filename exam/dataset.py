@@ -20,10 +20,10 @@ import numpy as np
 
 from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_text
 from exam.case_distribution import CaseDesign, CaseFault
 from exam.generate import CaseRecorder, Half, HalfPlan, RecordedHalf
-from exam.progress import CaseProgress
 
 LABELS_FILE, HASH_FILE = "labels.sealed.json", "labels.sha256"
 
@@ -132,7 +132,7 @@ class CaseSet:
 
 
 def write_cases(
-    cases: CaseSet, salt: str, workers: int, progress: CaseProgress
+    cases: CaseSet, salt: str, workers: int, progress: ItemProgress
 ) -> list[dict[str, Any]]:
     """Record all cases in blocks and return their labels.
 

@@ -21,10 +21,10 @@ import yaml
 
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis.answer import ANSWER_FILE
-from exam.progress import CaseProgress
 
 log = logging.getLogger(__name__)
 
@@ -111,7 +111,7 @@ def answer_cases(
     folder: Path,
     machine: Machine,
     workers: int,
-    progress: CaseProgress,
+    progress: ItemProgress,
     engine: str | None = None,
 ) -> int:
     """Have every case answered that is not yet; returns how many have no answer in the end.

@@ -131,12 +131,14 @@ def sheet() -> np.ndarray:
     return board.generateImage((100 * spec.columns, 100 * spec.rows))
 
 
-def picture(camera_from_board: np.ndarray, chance: np.random.Generator) -> np.ndarray:
-    """Returns what the camera sees of the board before something grey, RGB, `(720, 1280, 3)` uint8."""
+def picture(
+    camera_from_board: np.ndarray, chance: np.random.Generator, shift_px: float = 0.0
+) -> np.ndarray:
+    """Returns what the camera sees of the board before something grey, RGB, `(720, 1280, 3)` uint8; shifted to the right."""
     printed = sheet()
     width, height = printed.shape[::-1]
     there = corners_m() @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
-    pixel = (there @ MATRIX.T / there[:, 2:])[:, :2]
+    pixel = (there @ MATRIX.T / there[:, 2:])[:, :2] + [shift_px, 0.0]
     paper = np.array(
         [[-0.5, -0.5], [width - 0.5, -0.5], [width - 0.5, height - 0.5], [-0.5, height - 0.5]]
     )

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from rich.progress import Progress
 
 from actuators.excite import plan_report
 from actuators.excite.plan_report import PlanTrack
@@ -27,6 +26,7 @@ from brokk_rl.contracts.link import Connection
 from brokk_rl.contracts.preview import EffectPreview, PreviewResult
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.record import RATE_TOLERANCE
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
@@ -106,14 +106,15 @@ class Collect:
             return
         link = self.link.build(self.machine, settings.num_runs, self.session)
         writer = Writer(self.machine, plan, self._folder, settings, self._metadata(plan))
-        with link as opened, Progress(transient=True) as progress:
-            task = progress.add_task(f"{settings.num_runs} runs", total=run_s)
+        num_periods = round(run_s / self.machine.period_s)
+        title = f"control periods of {settings.num_runs} runs"
+        with link as opened, ItemProgress(title, num_periods) as progress:
             try:
                 for sample in drive(
                     opened, self._runner(plan), self.machine, settings.num_runs, run_s
                 ):
                     writer.add(sample)
-                    progress.advance(task, self.machine.period_s)
+                    progress.advance()
             finally:
                 writer.close()  # what was recorded before an interruption is kept
         log.info(

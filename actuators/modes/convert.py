@@ -6,8 +6,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 
-FOLDER = "recordings"
-
 
 @spec
 class Conversion:
@@ -36,6 +34,5 @@ class Convert:
             RecordingError: no log matches, one of them cannot be used, or two have the same name.
             StorageError: a file could not be written.
         """
-        conversion.write_logs(
-            self.convert.input, self.reader, self.machine, self.session.folder / FOLDER
-        )
+        pieces = conversion.read_logs(self.convert.input, self.reader, self.machine)
+        conversion.write_recordings(pieces, self.session.folder / conversion.FOLDER)

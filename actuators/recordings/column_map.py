@@ -19,7 +19,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.stats import theilslopes
@@ -91,7 +91,8 @@ class AlignedTime:
         blocks = np.array_split(np.arange(len(late_s)), min(CLOCK_POINTS, len(late_s)))
         fastest = [int(rows[np.argmin(late_s[rows])]) for rows in blocks]
         x, y = stamp_s[fastest] - stamp_s[0], late_s[fastest]
-        slope = float(theilslopes(y, x).slope) if len(fastest) > 2 and np.ptp(x) > 0 else 0.0
+        line: Any = theilslopes(y, x) if len(fastest) > 2 and np.ptp(x) > 0 else (0.0,)
+        slope = float(line[0])
         return stamp_s + float(np.median(y - slope * x)) + slope * (stamp_s - stamp_s[0])
 
 
@@ -346,6 +347,27 @@ class ColumnMap:
                 "neutral or full_speed of the column map, or the log"
             )
         return Signal(signal.table, signal.t_s, u.clip(-1.0, 1.0), signal.text)
+
+
+@spec
+class CanColumnMap:
+    """Reads logs of a CAN bus by a DBC file and a map of its signals.
+
+    Attributes:
+        dbc: The DBC file: a path, or `package:path` in an installed package.
+        columns: The map; a signal is `<message>:<signal>`, the time of each message `time`.
+    """
+
+    dbc: str
+    columns: ColumnMap
+
+    def read(self, path: Path, machine: Machine) -> list[Recording]:
+        """Return the pieces of the log at `path`; see `ColumnMap.read`."""
+        from actuators.recordings.can_log import (
+            CanLog,
+        )  # here: a desk without CAN has no python-can
+
+        return self.columns.read_log(CanLog(path, self.dbc), machine)
 
 
 def _scale(signals: RunSignals, column: Column, empty: bool = False) -> Signal:

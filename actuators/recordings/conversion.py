@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from actuators.recordings.log_files import expand_logs
@@ -11,8 +11,12 @@ from actuators.recordings.log_reader import LogReader
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
 
 log = logging.getLogger(__name__)
+
+FOLDER = "recordings"
+"""Folder of the recordings in a run folder."""
 
 
 def find_logs(patterns: str | Sequence[str]) -> list[Path]:
@@ -34,21 +38,27 @@ def name_log(path: Path) -> str:
     return path.resolve().name if path.is_dir() else path.stem
 
 
-def write_logs(
-    patterns: str | Sequence[str], reader: LogReader, machine: Machine, folder: Path
-) -> None:
-    """Write `<log>_<piece>.parquet` into a folder; nothing if any log cannot be used.
+def read_logs(
+    patterns: str | Sequence[str], reader: LogReader, machine: Machine
+) -> dict[Path, list[Recording]]:
+    """Return the pieces of each log.
 
     Raises:
         RecordingError: No log matches, one of them cannot be used, or two have the same name.
+    """
+    return {path: reader.read(path, machine) for path in find_logs(patterns)}
+
+
+def write_recordings(pieces: Mapping[Path, Sequence[Recording]], folder: Path) -> None:
+    """Write `<log>_<piece>.parquet` into a folder for each piece of each log.
+
+    Raises:
         StorageError: A file could not be written.
     """
-    logs = find_logs(patterns)
-    pieces = {path: reader.read(path, machine) for path in logs}
     for path, recordings in pieces.items():
         for number, recording in enumerate(recordings):
             record.write_recording(recording, folder / f"{name_log(path)}_{number:02d}.parquet")
         minutes = sum(recording.duration_s for recording in recordings) / 60.0
         log.info("%s: %d recordings, %.1f minutes", path, len(recordings), minutes)
     count = sum(map(len, pieces.values()))
-    log.info("%d recordings of %d logs in %s", count, len(logs), folder)
+    log.info("%d recordings of %d logs in %s", count, len(pieces), folder)

@@ -7,11 +7,14 @@ from pathlib import Path
 
 from actuators.recordings.array_log import LeRobotLog, MatlabLog, NumpyLog, ParquetLog
 from actuators.recordings.log_tables import LogFile, LogRun
+from actuators.recordings.message_log import BagLog, McapLog
 from actuators.recordings.text_log import CsvLayout, CsvLog
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import ConfigError, RecordingError
 
 TEXT_ENDINGS = (".csv", ".tsv", ".txt")
-ENDINGS = (*TEXT_ENDINGS, ".parquet", ".npz", ".mat")
+CAN_ENDINGS = (".blf", ".asc")
+BAG_ENDINGS = (".db3", ".bag")
+ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *BAG_ENDINGS, ".mcap", ".parquet", ".npz", ".mat")
 """Endings of the files that are logs."""
 SAGE_FILES = ("control.csv", "state_motor.csv")
 """Files of a motion in a folder of SAGE: targets, and what the motors answered."""
@@ -45,21 +48,24 @@ class SageLog(LogFile):
         yield LogRun(self.path.resolve().name, str(self.path), tables)
 
 
-def open_log(path: Path, layout: CsvLayout | None = None) -> LogFile:
+def open_log(path: Path, layout: CsvLayout | None = None, dbc: str | None = None) -> LogFile:
     """Open a log.
 
     Args:
         path: File or folder.
         layout: Signs of a CSV file; `None` to tell them from its beginning.
+        dbc: DBC file of a log of a CAN bus.
 
     Raises:
+        ConfigError: A log of a CAN bus without a DBC file.
         RecordingError: It is no log of a known kind, or its beginning cannot be read.
     """
     if path.is_dir():
         kind = tell_folder(path)
         if kind is None:
             raise RecordingError(
-                f"{path}: expected a folder of SAGE ({', '.join(SAGE_FILES)}) or a LeRobotDataset (meta/info.json)"
+                f"{path}: expected a folder of SAGE ({', '.join(SAGE_FILES)}), a LeRobotDataset (meta/info.json) or a bag "
+                "of ROS 2 (metadata.yaml)"
             )
         return kind(path)
     if not path.exists():
@@ -71,7 +77,23 @@ def open_log(path: Path, layout: CsvLayout | None = None) -> LogFile:
         return NumpyLog(path)
     if ending == ".mat":
         return MatlabLog(path)
+    if ending == ".mcap":
+        return McapLog(path)
+    if ending in BAG_ENDINGS:
+        return BagLog(path)
+    if ending in CAN_ENDINGS:
+        return _open_can_log(path, dbc)
     return CsvLog(path, layout)
+
+
+def _open_can_log(path: Path, dbc: str | None) -> LogFile:
+    from actuators.recordings.can_log import CanLog  # here: a desk without CAN has no python-can
+
+    if dbc is None:
+        raise ConfigError(
+            f"{path}: frames of a CAN bus mean nothing without their DBC file: log.dbc=<file>, or a column map that names it"
+        )
+    return CanLog(path, dbc)
 
 
 def tell_folder(path: Path) -> type[LogFile] | None:
@@ -80,6 +102,8 @@ def tell_folder(path: Path) -> type[LogFile] | None:
         return SageLog
     if (path / "meta" / "info.json").is_file():
         return LeRobotLog
+    if (path / "metadata.yaml").is_file():
+        return BagLog
     return None
 
 

@@ -15,6 +15,7 @@ from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
 from brokk_rl.rl.policy import ClassicalPolicy, ShippedPolicy, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation
@@ -131,9 +132,11 @@ def evaluate_policies(
         loop, fresh = loops[key]
         starts = starts or {key: value.clone() for key, value in loop.starts.items()}
         loop.load_state_dict(fresh)  # every policy meets the same machines and persons
-        evaluated[name] = evaluate_policy(
-            loop, policy.build(loop, session.seed), starts, evaluation.seed, evaluation.num_recorded
-        )
+        actor = policy.build(loop, session.seed)
+        with ItemProgress(f"evaluating {name}", loop.task.max_episode_steps) as progress:
+            evaluated[name] = evaluate_policy(
+                loop, actor, starts, evaluation.seed, evaluation.num_recorded, progress.advance
+            )
     table = {name: result.summary for name, result in evaluated.items()}
     first = next(iter(policies))
     results = {

@@ -26,6 +26,8 @@ from brokk_rl.rl.policy import (
     TrainedPolicy,
     UntrainedPolicy,
     load_initial_weights,
+    locate_bundle,
+    read_bundle,
     write_bundle,
 )
 from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
@@ -38,6 +40,7 @@ from brokk_rl.sim.events import Event
 from brokk_rl.sim.fault_recorder import REWARD_ALARM
 from brokk_rl.sim.fault_replay import describe_cause
 from brokk_rl.spec import name_spec, spec
+from brokk_rl.task_description import apply_behaviour, read_description
 
 log = logging.getLogger(__name__)
 
@@ -69,6 +72,7 @@ class Train:
         start_from: Policy (`policy.folder`) with whose network training begins; `null` for a fresh
             one.
         resume: Run folder, or checkpoint, from which to go on.
+        asked: Keys of the task that were given on the command line, or by an experiment.
     """
 
     session: Session
@@ -84,6 +88,7 @@ class Train:
     evaluation: Evaluation
     start_from: str | None
     resume: str | None
+    asked: tuple[str, ...]
 
     together: ClassVar[bool] = True
     """Several processes that `torchrun` starts train one policy."""
@@ -100,7 +105,7 @@ class Train:
         config = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
-            task=self.task,
+            task=self._choose_task(),
             actuator=self.actuator,
             effects=self.effect,
             events=self.event,
@@ -171,6 +176,20 @@ class Train:
             "config": yaml.safe_load(resolved.read_text()) if resolved.is_file() else {},
         }
 
+    def _choose_task(self) -> Task:
+        """Return the task, with the behaviour of the policy with which training begins.
+
+        Raises:
+            ConfigError: Something was asked for that the policy does not have.
+        """
+        if self.start_from is None:
+            return self.task
+        folder = locate_bundle(self.start_from)
+        own = read_description(folder, read_bundle(folder, self.machine)[0])
+        if own is None:
+            return self.task
+        return apply_behaviour(self.task, own, self.asked, f"start_from={self.start_from}")
+
     def _open_logger(
         self, loop: ControlLoop, group: TrainingGroup, tracker: Tracker
     ) -> TrainingLogger:
@@ -207,7 +226,7 @@ class Train:
             )
         policies["untrained"] = UntrainedPolicy(training=self.rl)
         results = evaluate_policies(config, self.evaluation, self.session, policies)
-        task = self.task.build(self.machine, 1, torch.device("cpu"))
+        task = config.task.build(self.machine, 1, torch.device("cpu"))
         if supports_deployment(task):
             export_onnx(folder, actor, task, self.machine, contract, answers)
         else:

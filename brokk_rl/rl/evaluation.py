@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,7 +79,12 @@ class _Tape:
 
 @torch.no_grad()
 def evaluate_policy(
-    loop: ControlLoop, policy: Policy, starts: Starts, seed: int, num_recorded: int
+    loop: ControlLoop,
+    policy: Policy,
+    starts: Starts,
+    seed: int,
+    num_recorded: int,
+    on_step: Callable[[], None] = lambda: None,
 ) -> PolicyEvaluation:
     """Run one episode from each start.
 
@@ -89,6 +95,7 @@ def evaluate_policy(
             errors and noise.
         seed: Seed of the noise.
         num_recorded: Episodes recorded.
+        on_step: Called after each of at most `loop.task.max_episode_steps` control steps.
     """
     torch.manual_seed(seed)
     loop.begin(starts)
@@ -110,6 +117,7 @@ def evaluate_policy(
         reason = torch.where(ended, loop.reason, reason)
         tape.append(loop, running, num_recorded)
         running &= ~done
+        on_step()
     return PolicyEvaluation(
         summary=_summarize(figures, reason, loop.task.reasons),
         episodes=_collect_episodes(tape, starts, figures[SUCCESS], loop.machine.period_s),

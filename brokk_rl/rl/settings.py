@@ -278,7 +278,7 @@ class Evaluation:
         episodes: Number of episodes, one from each start.
         seed: Seed of starts and noise; the same for every policy and run, so that results can be
             compared.
-        num_recorded: Episodes recorded, of which the video shows one.
+        num_recorded: Episodes recorded, or all if there are fewer; the video shows one of them.
         video: Whether to render a video.
     """
 
@@ -290,11 +290,7 @@ class Evaluation:
     def check(self) -> None:
         require_number("evaluation.episodes", self.episodes, least=1)
         require_number("evaluation.seed", self.seed, least=0)
-        if not 1 <= self.num_recorded <= self.episodes:
-            raise ConfigError(
-                "evaluation: expected 1 <= num_recorded <= episodes, "
-                f"got {self.num_recorded} and {self.episodes}"
-            )
+        require_number("evaluation.num_recorded", self.num_recorded, least=1)
 
 
 def _drop_nulls(value: Any) -> Any:

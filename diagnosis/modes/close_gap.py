@@ -183,7 +183,7 @@ class CloseGap:
             session=replace(self.session, out=str(place)), machine=self.machine, sim=self.sim, task=plant.task,
             actuator=plant.actuator, effect=plant.effects, event={}, follower=self.follower, rl=self.rl, tracking=self.tracking,
             evaluation=self.evaluation, start_from=self.policy.folder if self.warm else None,
-            resume=str(place) if self.resume else None,
+            resume=str(place) if self.resume else None, asked=(),
         ).run()  # fmt: skip
         return place
 

@@ -22,6 +22,7 @@ from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import effect_library
@@ -34,7 +35,6 @@ from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
 from exam.dataset import CaseSet, end_on_interrupt
 from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
 from exam.metrics import compute_metrics
-from exam.progress import CaseProgress
 from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
@@ -191,7 +191,7 @@ class Exam:
             "withheld": settings.withheld,
         }
         cases = CaseSet(recorder, self.questions(salt), halves, self.machine, folder)
-        with CaseProgress("cases made", len(cases.questions)) as progress:
+        with ItemProgress("cases made", len(cases.questions)) as progress:
             labels = dataset.write_cases(cases, salt, settings.workers, progress)
         facts = {
             "schema": 2,
@@ -247,7 +247,7 @@ class Exam:
         state = registration.check_engine(self._folder, self._facts["sealed"])
         facts = {**state.describe(), "labels_sha256": self._facts["labels_sha256"]}
         write_json(self.session.folder / RUN_FILE, {**facts, "candidate": repr(settings.candidate)})
-        with CaseProgress("cases answered", len(cases)) as progress:
+        with ItemProgress("cases answered", len(cases)) as progress:
             failed = run_cases.answer_cases(
                 settings.candidate,
                 cases,
@@ -320,7 +320,7 @@ class Exam:
             self._known,
         )
         with (
-            CaseProgress("cases repaired", len(labels)) as progress,
+            ItemProgress("cases repaired", len(labels)) as progress,
             ProcessPoolExecutor(self.exam.workers, initializer=end_on_interrupt) as pool,
         ):
             progress.skip(len(labels) - len(todo))
@@ -351,7 +351,7 @@ class Exam:
         state = registration.check_engine(self._folder, self._facts["sealed"])
         for name, candidate in usable.items():
             folder = self.session.folder / name
-            with CaseProgress(name, len(cases)) as progress:
+            with ItemProgress(name, len(cases)) as progress:
                 run_cases.answer_cases(
                     candidate, cases, folder, self._known, settings.workers, progress, state.engine
                 )

@@ -17,6 +17,11 @@ from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.calibrate import arm, clock_offset, evaluation, transforms, verdict
+from perception.calibrate.disparity_error import (
+    BoardDisparity,
+    estimate_disparity_error,
+    measure_board_disparity,
+)
 from perception.calibrate.extrinsics import PoseResidual, build_calibration
 from perception.calibrate.hand_eye import (
     MIN_VIEWS,
@@ -139,11 +144,13 @@ class BoardObservation:
         name: Stem of the frame.
         t_s: Its time.
         pose: The board.
+        disparity: Its disparity; `None` without a right picture of it.
     """
 
     name: str
     t_s: float
     pose: BoardPose
+    disparity: BoardDisparity | None
 
 
 @spec
@@ -256,6 +263,10 @@ class BoardCalibration:
             "missing": missing,
             "verdict": self._judge(machine, trajectory, known, q, clock, solution, missing),
         }
+        pairs = [known[k].disparity for k in used]
+        error = estimate_disparity_error([one for one in pairs if one is not None])
+        if error is not None:
+            more["disparity"] = error.to_dict()
         residuals = [*evaluation.list_residuals(views, solution), *refused]
         camera, cov = solution.guess.base_from_camera, solution.cov[:6, :6]
         return build_calibration("board", machine, camera, cov, residuals, self.work_m, more)
@@ -275,7 +286,11 @@ class BoardCalibration:
                     pose = estimate_board_pose(
                         frame, corners_m, corners_px, self.corner_px, self.max_error_px
                     )
-                    found.append(BoardObservation(Path(frame.name).name, frame.t_s, pose))
+                    disparity = measure_board_disparity(
+                        tracker, frame, corners_m, corners_px, pose.camera_from_board[0]
+                    )
+                    name = Path(frame.name).name
+                    found.append(BoardObservation(name, frame.t_s, pose, disparity))
                 except FrameError as error:
                     # The message begins with the path of the frame.
                     name = str(error).split(":")[0].split("/")[-1]

@@ -32,10 +32,14 @@ class CameraExtrinsics:
         base_from_camera: `(4, 4)`, `None` where it is not known.
         cov: Of a small motion of it in its own coordinates, `(6, 6)`, m and then rad; `None` where
             it is not known.
+        disparity_error_px: Known error of the pair's disparity, see `brokk_rl.signals.Frame`.
+        disparity_std_px: Its standard deviation; `None` where it was not measured.
     """
 
     base_from_camera: np.ndarray | None
     cov: np.ndarray | None
+    disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    disparity_std_px: float | None = None
 
 
 def load_extrinsics(given: CameraPlacement, where: str) -> CameraExtrinsics:
@@ -60,7 +64,13 @@ def load_extrinsics(given: CameraPlacement, where: str) -> CameraExtrinsics:
         raise FrameError(
             f"{where}: covariance: expected a covariance of six numbers, (6, 6); calibrate again"
         )
-    return CameraExtrinsics(validation.check_pose(content["T_base_cam"], where), (cov + cov.T) / 2)
+    place = validation.check_pose(content["T_base_cam"], where)
+    disparity = content.get("disparity")
+    if disparity is None:
+        return CameraExtrinsics(place, (cov + cov.T) / 2)
+    error_px = validation.check_disparity_error(disparity["error_px"], where)
+    std_px = validation.check_disparity_std(disparity["std_px"], where)
+    return CameraExtrinsics(place, (cov + cov.T) / 2, error_px, std_px)
 
 
 def read_calibration(path: Path, where: str) -> dict[str, Any]:

@@ -85,6 +85,9 @@ def _show(content: dict[str, Any]) -> None:
     for name, zero in (content.get("joint_zeros") or {}).items():
         if abs(zero["mean"]) > ZERO_SIGMAS * zero["std"]:
             table.add_row(f"zero of {name}", f"{zero['mean']:+.4f} ± {zero['std']:.4f} rad")
+    if disparity := content.get("disparity"):
+        error_px = disparity["error_px"][0]
+        table.add_row("error of the disparity", f"{error_px:+.3f} ± {disparity['std_px']:.3f} px")
     if clock := content.get("clock"):
         trust = "" if clock["trusted"] else ", not trusted: too little motion"
         offset = f"{clock['offset_s']:+.3f} s (correlation {clock['correlation']:.2f}{trust})"

@@ -58,6 +58,7 @@ class StereoPatch:
         right_column: First column of `right` in the picture.
         camera_matrix: Camera matrix of the whole picture, `(3, 3)`.
         pull_px: Focal length times baseline, px m: disparity per inverse depth.
+        error_per_m: Known error of the disparity, as a plane in inverse depth, `(3,)` 1/m.
     """
 
     left: np.ndarray
@@ -67,6 +68,7 @@ class StereoPatch:
     right_column: int
     camera_matrix: np.ndarray
     pull_px: float
+    error_per_m: np.ndarray
 
     def places(self, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return columns `(1, w)` and rows `(h, 1)` of the picture for those of `left`."""
@@ -81,7 +83,7 @@ class StereoPatch:
         """Return the columns of `right`, `(h, w)`, that show the points of a plane at `u`, `v` of the left."""
         return (
             u
-            - self.pull_px * compute_inverse_depth(m, self.camera_matrix, u, v)
+            - self.pull_px * compute_inverse_depth(m + self.error_per_m, self.camera_matrix, u, v)
             - self.right_column
             + 0.5
         ) / self.shrink - 0.5
@@ -148,7 +150,10 @@ def crop_pair(
     one, other = (
         cv2.GaussianBlur(picture.astype(np.float32), (0, 0), SMOOTH_PX) for picture in small
     )
-    return StereoPatch(one, other, shrink, (left, top), first, frame.camera_matrix, pull_px)
+    constant, across, down = frame.disparity_error_px
+    error_per_m = np.array([across, down, constant]) / pull_px
+    place = (left, top), first, frame.camera_matrix
+    return StereoPatch(one, other, shrink, *place, pull_px, error_per_m)
 
 
 def align_plane(

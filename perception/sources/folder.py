@@ -15,6 +15,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
+from perception.calibrate.disparity_error import correct_depth
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.sources import validation
 from perception.stereo import Stereo
@@ -66,6 +67,7 @@ class CameraModel:
     base_from_camera: np.ndarray | None
     cov: np.ndarray | None = None
     disparity_std_px: float | None = None
+    disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def read_camera(path: Path) -> CameraModel:
@@ -149,6 +151,12 @@ class FolderSource:
             self._camera = replace(
                 self._camera, base_from_camera=place.base_from_camera, cov=place.cov
             )
+        if self._camera is not None and place.disparity_std_px is not None:
+            self._camera = replace(
+                self._camera,
+                disparity_std_px=place.disparity_std_px,
+                disparity_error_px=place.disparity_error_px,
+            )
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -186,10 +194,13 @@ class FolderSource:
             )
             validation.check_same_size(color, right, str(paths[dataset.RIGHT]), "the right picture")
         depth = self._depth(stem, color, right, camera)
+        error_px, baseline_m = camera.disparity_error_px, camera.baseline_m
+        if any(error_px) and baseline_m is not None:
+            depth = correct_depth(depth, camera.matrix, baseline_m, error_px)
         return Frame(
             color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
             distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem), camera_cov=camera.cov,
-            disparity_std_px=camera.disparity_std_px,
+            disparity_std_px=camera.disparity_std_px, disparity_error_px=error_px,
         )  # fmt: skip
 
     def _depth(

@@ -11,6 +11,8 @@ import numpy as np
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
+from perception.calibrate.disparity_error import correct_depth
+from perception.calibrate.extrinsics import CameraExtrinsics
 from perception.sources import validation
 
 
@@ -87,22 +89,16 @@ class LiveSource:
         device: Library of the camera.
         name: Name of the camera in messages.
         fresh: Limits of age and waiting time.
-        base_from_camera: Pose of the camera in the base frame, `(4, 4)`; `None` for unknown.
-        camera_cov: Covariance of that pose, see `Frame`.
+        place: Pose of the camera and error of its disparity, as far as they are known.
     """
 
     num_frames = None
 
     def __init__(
-        self,
-        device: CameraDevice,
-        name: str,
-        fresh: Freshness,
-        base_from_camera: np.ndarray | None,
-        camera_cov: np.ndarray | None = None,
+        self, device: CameraDevice, name: str, fresh: Freshness, place: CameraExtrinsics
     ) -> None:
         self._device, self._name, self._fresh = device, name, fresh
-        self._pose, self._pose_cov = base_from_camera, camera_cov
+        self._place = place
         self._lens: LensCalibration | None = None
         self._last_s = -np.inf
 
@@ -157,12 +153,18 @@ class LiveSource:
         validation.check_matrix_fits(
             lens.matrix, capture.color.shape[0], capture.color.shape[1], self._name
         )
+        depth_m = validation.check_depth(capture.depth_m, self._name, self._fresh.least_known)
+        error_px = self._place.disparity_error_px
+        if any(error_px) and lens.baseline_m is not None:
+            depth_m = correct_depth(depth_m, lens.matrix, lens.baseline_m, error_px)
         return Frame(
             color=capture.color,
-            depth_m=validation.check_depth(capture.depth_m, self._name, self._fresh.least_known),
+            depth_m=depth_m,
             camera_matrix=lens.matrix,
-            base_from_camera=self._pose,
-            camera_cov=self._pose_cov,
+            base_from_camera=self._place.base_from_camera,
+            camera_cov=self._place.cov,
+            disparity_std_px=self._place.disparity_std_px,
+            disparity_error_px=error_px,
             t_s=capture.t_s,
             distortion=lens.distortion,
             right=capture.right,

@@ -39,9 +39,7 @@ class RealSense:
     def build(self) -> LiveSource:
         """Return the source, not yet opened."""
         place = load_extrinsics(self.base_from_camera, "source.base_from_camera")
-        return LiveSource(
-            RealSenseDevice(self), "RealSense camera", self.fresh, place.base_from_camera, place.cov
-        )
+        return LiveSource(RealSenseDevice(self), "RealSense camera", self.fresh, place)
 
 
 class RealSenseDevice:

@@ -111,6 +111,17 @@ def check_disparity_std(value: Any, where: str) -> float:
     return found
 
 
+def check_disparity_error(value: Any, where: str) -> tuple[float, float, float]:
+    """Return constant and slopes of a disparity's error, px, or raises a `FrameError`."""
+    found = _parse_numbers(value, (3,), f"{where}: disparity.error_px")
+    if np.abs(found).max() > _LARGEST_OFFSET_PX:
+        raise FrameError(
+            f"{where}: disparity.error_px is {found.tolist()}, expected up to "
+            f"{_LARGEST_OFFSET_PX:g} px"
+        )
+    return float(found[0]), float(found[1]), float(found[2])
+
+
 def convert_color(picture: np.ndarray, where: str) -> np.ndarray:
     """Return a picture as RGB, `(h, w, 3)` uint8; it comes as OpenCV reads it, blue first."""
     if picture.ndim != 3 or picture.shape[2] not in (3, 4):

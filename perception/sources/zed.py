@@ -66,9 +66,7 @@ class Zed:
     def build(self) -> LiveSource:
         """Return the source, not yet opened."""
         place = load_extrinsics(self.base_from_camera, "source.base_from_camera")
-        return LiveSource(
-            ZedDevice(self), "ZED camera", self.fresh, place.base_from_camera, place.cov
-        )
+        return LiveSource(ZedDevice(self), "ZED camera", self.fresh, place)
 
 
 class ZedDevice:

@@ -44,8 +44,8 @@ DOORS = {
     "cv2": ("perception", "deploy.picture"),
     "viser": ("brokk_rl.play",),
     "trimesh": ("brokk_rl.play", "brokk_rl.sim"),
-    "can": ("deploy",),
-    "cantools": ("deploy",),
+    "can": ("deploy", "actuators.recordings.can_log"),
+    "cantools": ("deploy", "actuators.recordings.can_log"),
 }
 CLOSED = {
     "deploy": ("brokk_rl.sim", "brokk_rl.rl", "mujoco", "warp", "rsl_rl"),

@@ -119,3 +119,23 @@ def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
     session = onnxruntime.InferenceSession(str(tmp_path / "export" / "policy.onnx"))
     answers = session.run(None, {"observation": np.array(golden["observation"], np.float32)})[0]
     assert np.abs(answers - np.array(golden["command"])).max() < 1e-3
+
+
+def test_training_that_begins_with_a_policy_keeps_the_task_of_that_policy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The shipped policy corrects the classical controller of its time, not the one of today."""
+    monkeypatch.chdir(tmp_path)
+    begin = [*TRAINED, *SHORT, "actuator=lag", "start_from=tasks:policies/borehole_insertion"]
+    monkeypatch.setattr("sys.argv", ["brokk", *begin, "session.out=run"])
+    assert cli.main() == 0
+    shipped = Path(cli.__file__).parents[1] / "tasks/policies/borehole_insertion"
+    there, here = (
+        json.loads((one / "policy.json").read_text())["task"] for one in (shipped, tmp_path / "run")
+    )
+    assert here == there
+
+    monkeypatch.setattr("sys.argv", ["brokk", *begin, "task.memory=5", "session.out=other"])
+    assert cli.main() == 2
+    message = capsys.readouterr().err
+    assert "start_from" in message and "task.memory=5 was asked for, the policy has 13" in message

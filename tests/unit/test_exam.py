@@ -22,12 +22,12 @@ from small_exam import SMALL
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from diagnosis import answer
 from diagnosis.answer import ANSWER_FILE
 from exam import dataset, registration, run_cases
 from exam.baselines import ConstantAnswer
 from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
-from exam.progress import CaseProgress
 from exam.residual_forest import ResidualForest
 
 
@@ -199,7 +199,7 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
     answers.mkdir()
     assert (
         run_cases.answer_cases(
-            Recorder(ValueError("ran away")), [first], answers, machine, 1, CaseProgress("", 1)
+            Recorder(ValueError("ran away")), [first], answers, machine, 1, ItemProgress("", 1)
         )
         == 1
     )
@@ -209,7 +209,7 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
         answers,
         machine,
         1,
-        CaseProgress("", 1),
+        ItemProgress("", 1),
     )
     score = ("mode=exam", "exam.do=score", f"exam.folder={exam}", f"+exam.answers.it={answers}")
     for expected, missed in (({"value": 2, "of": 2}, 1), ({"value": 1, "of": 2}, 0)):
@@ -323,10 +323,10 @@ def test_a_candidate_gets_a_copy_of_the_case_alone_and_what_failed_is_tried_agai
     (case / "field" / "00.parquet").touch()
     dataset.seal_labels(tmp_path / "exam", {"cases": []}, "salt")
     first, second, third = Recorder(RecordingError("no")), Recorder(None), Recorder(None)
-    assert run_cases.answer_cases(first, [case], answers, machine, 1, CaseProgress("", 1)) == 1
+    assert run_cases.answer_cases(first, [case], answers, machine, 1, ItemProgress("", 1)) == 1
     assert run_cases.read_seconds(answers / "0000") is None
-    assert run_cases.answer_cases(second, [case], answers, machine, 1, CaseProgress("", 1)) == 0
-    assert run_cases.answer_cases(third, [case], answers, machine, 1, CaseProgress("", 1)) == 0
+    assert run_cases.answer_cases(second, [case], answers, machine, 1, ItemProgress("", 1)) == 0
+    assert run_cases.answer_cases(third, [case], answers, machine, 1, ItemProgress("", 1)) == 0
     given, content = second.given[0]
     assert (
         content == ["field", "field/00.parquet"]

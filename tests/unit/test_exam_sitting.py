@@ -18,13 +18,13 @@ from small_exam import SMALL
 
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from diagnosis.answer import Answer, Estimate, Gap, Where
 from diagnosis.responses import Response
 from exam import baselines, dataset, examiner, registration, run_cases
 from exam.examiner import ExaminerSimulator, compute_closed, read_effects
 from exam.generate import UNCHANGED_FOLDER, restrict_machine
 from exam.oracle import JointErrors
-from exam.progress import CaseProgress
 
 
 def test_the_engine_is_its_source_its_weights_and_its_calibration(
@@ -273,7 +273,7 @@ def test_forward_selection_takes_nothing_that_a_repeat_of_the_reference_shows_to
 
 
 def test_progress_tells_the_time_left_by_the_items_of_this_run() -> None:
-    progress = CaseProgress("cases", 10)
+    progress = ItemProgress("cases", 10)
     progress.skip(4)
     assert progress.describe(100.0) == "4 of 10"
     progress.advance()
@@ -294,8 +294,8 @@ def test_an_interrupted_program_leaves_no_note_and_sits_again(
         command=(sys.executable, "-c", program, "{case}", "{out}"), limit_s=10.0, threads=1
     )
     with pytest.raises(KeyboardInterrupt):
-        run_cases.answer_cases(command, [case], answers, machine, 1, CaseProgress("", 1))
+        run_cases.answer_cases(command, [case], answers, machine, 1, ItemProgress("", 1))
     assert not run_cases.is_begun(answers / "case")
     failing = replace(command, command=("sh", "-c", "exit 3 #{case}{out}"))
-    run_cases.answer_cases(failing, [case], answers, machine, 1, CaseProgress("", 1))
+    run_cases.answer_cases(failing, [case], answers, machine, 1, ItemProgress("", 1))
     assert run_cases.is_begun(answers / "case")

@@ -114,6 +114,7 @@ def test_page_and_bring_up_start_with_the_extra_deploy_alone(
         ("scipy.spatial", "perception.ellipse.edges", "perception"),
         ("rsl_rl", "brokk_rl.rl.ppo", "train"),
         ("aiortc", "deploy.video.sender", "video"),
+        ("rosbags.highlevel", "actuators.modes.import_logs.ImportLogs", "logs"),
         ("aiortc", "this run", "video"),
         ("pyzed", "perception.sources", None),
     ],

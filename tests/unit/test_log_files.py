@@ -12,65 +12,22 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
+from carriage import NUM, check, make_map, make_signals
 from composed import option
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from actuators.recordings.column_map import (
-    AlignedTime,
-    Column,
-    ColumnMap,
-    CommandColumn,
-    JointColumns,
-)
+from actuators.recordings.column_map import AlignedTime, Column, ColumnMap, CommandColumn
 from actuators.recordings.expression import parse_expression
 from actuators.recordings.log_files import expand_logs, open_log
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
-from brokk_rl.record import Recording
-
-NUM = 200
 
 
 @pytest.fixture(scope="module")
 def carriage() -> Machine:
     """A machine of one joint."""
     return option("machine", "emps")
-
-
-def make_map(
-    command: str = "u", position: str = "q", time: str = "t", full_minus: float | None = -1.0
-) -> ColumnMap:
-    return ColumnMap(
-        delimiter=",",
-        decimal=".",
-        time=Column(column=time, scale=1.0, offset=0.0),
-        joints={
-            "carriage": JointColumns(
-                command=CommandColumn(
-                    column=command, neutral=0.0, full_plus=1.0, full_minus=full_minus
-                ),
-                position=Column(column=position, scale=1.0, offset=0.0),
-            )
-        },
-        optional={},
-        overrun=0.0,
-        longest_gap_s=0.1,
-        shortest_s=0.5,
-    )
-
-
-def make_signals() -> dict[str, np.ndarray]:
-    """Returns times, commands and positions at the machine's rate, exact in 32 bits."""
-    k = np.arange(NUM)
-    return {"t": k * 0.01, "u": np.round(np.sin(k / 9) * 64) / 128, "q": (k % 32) / 256}
-
-
-def check(recording: Recording) -> None:
-    signals = make_signals()
-    np.testing.assert_allclose(recording.t_s, signals["t"], atol=1e-12)
-    np.testing.assert_array_equal(recording.u[:, 0], signals["u"].astype(np.float32))
-    np.testing.assert_allclose(recording.q[:, 0], signals["q"], atol=1e-6)
 
 
 def write_csv(path: Path, signals: dict[str, np.ndarray]) -> None:

@@ -36,14 +36,14 @@ def test_opencv_finds_every_corner_at_its_place_on_the_page() -> None:
     figure = draw_board(board, 0.03)
     file = io.BytesIO()
     figure.savefig(file, dpi=50.8, format="png")  # 2 px for a millimetre
-    page = cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE)
+    page = np.asarray(cv2.imdecode(np.frombuffer(file.getvalue(), np.uint8), cv2.IMREAD_GRAYSCALE))
     markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
     drawn = cv2.aruco.CharucoBoard(
         (board.columns, board.rows), board.square_m, board.marker_m, markers
     )
     found, numbers, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(page)
     assert len(numbers) == (board.columns - 1) * (board.rows - 1)
-    corners_m = drawn.getChessboardCorners()[numbers[:, 0]][:, :2]
+    corners_m = np.asarray(drawn.getChessboardCorners())[numbers[:, 0]][:, :2]
     # pixel centres lie half a pixel in; the detector refines to a tenth of a pixel
     np.testing.assert_allclose(found[:, 0], 2000 * (corners_m + 0.03) - 0.5, atol=0.6)
 

@@ -261,14 +261,21 @@ def test_uncertainty_at_a_distance_is_that_worked_by_hand() -> None:
     assert compute_point_std_m(cov, 2.0) == pytest.approx(np.sqrt(3 * 0.003**2 + 2 * 0.002**2))
 
 
+BASELINE_M, DISPARITY_ERROR_PX = 0.12, 0.25
+
+
 @pytest.fixture(scope="module")
 def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twenty pictures of the board in poses of the arm, one of them of nothing, and `joints.yaml`."""
+    """Twenty pairs of the board in poses of the arm, one picture of nothing, and `joints.yaml`; the right camera is off."""
     folder, chance = tmp_path_factory.mktemp("board"), np.random.default_rng(0)
+    other, right = np.random.default_rng(1), np.eye(4)
+    right[0, 3] = -BASELINE_M
     poses = board.posed(option("machine", "brokk170"), 20, 0, 0.002, 0.001, 0.0005)
-    dataset.write_camera(folder, board.MATRIX, None, None)
+    dataset.write_camera(folder, board.MATRIX, None, BASELINE_M)
     for number, there in enumerate(poses.camera_from_board):
         dataset.write_picture(folder / f"{number:03d}.color.png", board.picture(there, chance))
+        partner = board.picture(right @ there, other, -DISPARITY_ERROR_PX)
+        dataset.write_picture(folder / f"{number:03d}.right.png", partner)
     dataset.write_picture(folder / "020.color.png", np.full((720, 1280, 3), 90, np.uint8))
     told = {f"{number:03d}": q.tolist() for number, q in enumerate(poses.q)}
     (folder / "joints.yaml").write_text(yaml.safe_dump(told))
@@ -288,6 +295,9 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     away = transforms.compute_motion(np.array(told["T_base_cam"]), board.CAMERA)
     assert away @ np.linalg.solve(np.array(told["covariance"]), away) < 25.0
     assert told["other_half"]["median_m"] < 0.01
+    disparity = told["disparity"]
+    assert disparity["error_px"][0] == pytest.approx(DISPARITY_ERROR_PX, abs=0.1)
+    assert disparity["num_views"] >= 19
     (lost,) = (one for one in told["poses"] if one["name"] == "020")
     assert "corners of the board" in lost["left_out"]
     folder = FrameFolder(

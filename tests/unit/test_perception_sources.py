@@ -18,6 +18,7 @@ from composed import option
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from perception import dataset
+from perception.calibrate.extrinsics import CameraExtrinsics
 from perception.render.stereo_camera import StereoRig
 from perception.sources import realsense, simulator, zed
 from perception.sources.folder import FrameFolder
@@ -273,14 +274,16 @@ FRESH = Freshness(timeout_s=0.3, max_age_s=0.2, least_known=0.01)
 
 def test_a_live_source_gives_each_frame_once_and_no_stale_one() -> None:
     device = Clock([1.0, 1.0, None, 1.1])
-    with LiveSource(device, "camera", FRESH, POSE) as source:
+    with LiveSource(device, "camera", FRESH, CameraExtrinsics(POSE, None)) as source:
         stamps = [frame.t_s for frame in (source.read_latest(), source.read_latest()) if frame]
         assert stamps == [1.0, 1.1]
         with pytest.raises(FrameError, match=r"no new frame for 0.3 s\. Is it plugged in"):
             source.read_latest()
     assert device.closed == 1
     with (
-        LiveSource(Clock([1.0, 1.1], lag_s=0.6), "camera", FRESH, POSE) as source,
+        LiveSource(
+            Clock([1.0, 1.1], lag_s=0.6), "camera", FRESH, CameraExtrinsics(POSE, None)
+        ) as source,
         pytest.raises(FrameError, match=r"up to 0.60 s old, 0.2"),
     ):
         source.read_latest()
@@ -289,11 +292,14 @@ def test_a_live_source_gives_each_frame_once_and_no_stale_one() -> None:
 def test_a_live_source_is_closed_when_opening_fails_and_read_only_when_open() -> None:
     device = Clock([1.0])
     device.opened = False
-    with pytest.raises(FrameError, match="no camera"), LiveSource(device, "camera", FRESH, None):
+    with (
+        pytest.raises(FrameError, match="no camera"),
+        LiveSource(device, "camera", FRESH, CameraExtrinsics(None, None)),
+    ):
         pass
     assert device.closed == 1
     with pytest.raises(FrameError, match="not open"):
-        LiveSource(Clock([1.0]), "camera", FRESH, None).read_latest()
+        LiveSource(Clock([1.0]), "camera", FRESH, CameraExtrinsics(None, None)).read_latest()
 
 
 class StubZed:

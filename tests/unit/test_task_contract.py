@@ -149,6 +149,7 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
         evaluation=evaluation,
         start_from=None,
         resume=None,
+        asked=(),
     )
     with caplog.at_level(logging.INFO):
         assert train.run() is not None

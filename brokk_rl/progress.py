@@ -1,4 +1,4 @@
-"""Progress of the steps of an exam: a bar with the time left, or a line a minute in a log file."""
+"""Progress of long work: a bar with the time left, or a line a minute in a log file."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from rich.progress import (
 log = logging.getLogger(__name__)
 
 SPEED_WINDOW_S = 3600.0
-"""Time over which the speed is estimated, s: a case takes a minute or more."""
+"""Time over which the speed is estimated, s: a case of an exam takes a minute or more."""
 LINE_EVERY_S = 60.0
 """Time between two lines where nobody sees a bar, s."""
 
 
-class CaseProgress:
+class ItemProgress:
     """Progress over a known number of items.
 
     Args:

@@ -1,0 +1,178 @@
+"""`brokk mode=import`: reads the logs of any robot; guesses first, and says how sure it is."""
+
+from __future__ import annotations
+
+import logging
+import re
+from dataclasses import asdict
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from actuators.recordings import conversion, log_guess, map_draft
+from actuators.recordings.column_guess import Guess
+from actuators.recordings.column_names import UNITS
+from actuators.recordings.log_reader import LogReader
+from actuators.recordings.map_draft import Draft
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.machine import Machine
+from brokk_rl.report import Report
+from brokk_rl.session import Session, write_json, write_text
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+MAP_FILE, MACHINE_FILE = "column_map.yaml", "machine.yaml"
+GUESS_FILE, PICTURE_FILE, PAGE_FILE = "import.json", "import.png", "import.html"
+HEAD = ["subject", "guess", "how sure", "evidence"]
+
+
+@spec
+class LogSelection:
+    """Logs to import.
+
+    Attributes:
+        input: Glob, or list of globs, of logs of one kind; a folder stands for the logs in it.
+        name: Name of the machine that is drafted; `null`: that of the folder of the logs.
+        position_unit: Unit of the positions where their names do not say it; `null` to guess.
+        dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
+    """
+
+    input: str | tuple[str, ...]
+    name: str | None
+    position_unit: str | None
+    dbc: str | None
+
+    def check(self) -> None:
+        if self.position_unit is not None and self.position_unit not in UNITS:
+            raise ConfigError(
+                f"log.position_unit: unknown unit '{self.position_unit}'; {list_choices(self.position_unit, UNITS)}"
+            )
+        if self.name is not None and not re.fullmatch(r"[a-z]\w*", self.name):
+            raise ConfigError(
+                f"log.name: expected a letter, then letters, digits and _, got '{self.name}'"
+            )
+
+
+@spec
+class ImportLogs:
+    """Draft a column map and a machine from logs; with both of them, make recordings.
+
+    Attributes:
+        session: Folder.
+        machine: The machine; `null` to draft one.
+        reader: Reads the logs; `null` to draft a column map.
+        log: Logs to import.
+    """
+
+    session: Session
+    machine: Machine | None
+    reader: LogReader | None
+    log: LogSelection
+
+    def check(self) -> None:
+        if (self.machine is None) != (self.reader is None):
+            lacking = "machine" if self.machine is None else "import"
+            raise ConfigError(
+                f"mode=import needs machine=… and import=… to make recordings, or neither to draft both; {lacking}=… is missing"
+            )
+
+    def run(self) -> None:
+        """Write a picture, the guesses, a column map and a machine file, or recordings.
+
+        Raises:
+            RecordingError: No log matches, or one cannot be used; names its place.
+            StorageError: A file could not be written.
+        """
+        if self.machine is not None and self.reader is not None:
+            pieces = conversion.read_logs(self.log.input, self.reader, self.machine)
+            conversion.write_recordings(pieces, self.session.folder / conversion.FOLDER)
+            return
+        paths = conversion.find_logs(self.log.input)
+        guess = log_guess.guess_logs(paths, self.log.position_unit, self.log.dbc)
+        folder = self.session.folder
+        figure = log_guess.draw_guess(guess)
+        figure.savefig(folder / PICTURE_FILE, dpi=110)
+        log.info("picture: %s", folder / PICTURE_FILE)
+        draft = log_guess.make_draft(guess, paths, self.log.name or _name_machine(paths[0]))
+        self._write(draft, paths)
+
+    def _write(self, draft: Draft, paths: list[Path]) -> None:
+        folder, guesses = self.session.folder, draft.list_guesses()
+        write_text(folder / MAP_FILE, map_draft.format_map(draft))
+        write_text(folder / MACHINE_FILE, map_draft.format_machine(draft))
+        unsure = [guess for guess in guesses if guess.sureness == "unsure"]
+        write_json(
+            folder / GUESS_FILE,
+            {
+                "schema": 1,
+                "machine": draft.name,
+                "logs": [str(path) for path in paths],
+                "minutes": draft.survey.minutes,
+                "guesses": [asdict(guess) for guess in guesses],
+                "num_unsure": len(unsure),
+                "remarks": list(draft.remarks),
+            },
+        )
+        command = _format_next(folder, self.log.input)
+        _write_page(draft, guesses, folder, command)
+        _show(draft, guesses, folder, command)
+
+
+def _name_machine(path: Path) -> str:
+    """Return a name for a machine: that of the folder of its logs."""
+    words = re.findall(r"[a-z0-9]+", path.resolve().parent.name.lower())
+    name = "_".join(words)
+    return name if name[:1].isalpha() else f"machine_{name}".rstrip("_")
+
+
+def _format_next(folder: Path, patterns: str | tuple[str, ...]) -> str:
+    """Return the command that makes recordings with the drafts."""
+    given = patterns if isinstance(patterns, str) else f"[{','.join(patterns)}]"
+    return (
+        f"brokk mode=import machine=@{folder / MACHINE_FILE} import=@{folder / MAP_FILE} "
+        f"'log.input={given}' session.out={folder.with_name(f'{folder.name}_recordings')}"
+    )
+
+
+def _summarise(draft: Draft, guesses: list[Guess]) -> str:
+    unsure = sum(guess.sureness == "unsure" for guess in guesses)
+    end = "No guess is unsure."
+    if unsure:
+        end = f"{unsure} guesses are unsure: fill in {map_draft.MISSING} in {MAP_FILE}."
+    return (
+        f"{draft.survey.num_runs} runs, {draft.survey.minutes:.1f} minutes, {len(draft.joints)} joints at "
+        f"{1.0 / draft.survey.period_s:.4g} Hz. {end}"
+    )
+
+
+def _write_page(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
+    is_unsure = any(guess.sureness == "unsure" for guess in guesses)
+    page = Report(f"Logs of {draft.name}", _summarise(draft, guesses), "bad" if is_unsure else "plain")  # fmt: skip
+    page.add_picture(
+        folder / PICTURE_FILE,
+        "Positions (blue) and commands (orange) as the logs have them, in the units of the logs.",
+    )
+    page.add_heading("Guesses")
+    rows = [[guess.subject, guess.value, guess.sureness, guess.reason] for guess in guesses]
+    page.add_table(
+        HEAD, rows, "sure: name and numbers agree; likely: one of them speaks; unsure: fill it in"
+    )
+    if draft.remarks:
+        page.add_list(list(draft.remarks))
+    page.add_heading("Next")
+    page.add_code(command)
+    page.write(folder / PAGE_FILE)
+
+
+def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
+    console = Console()
+    table = Table(box=None, padding=(0, 1, 0, 0))
+    for name in HEAD:
+        table.add_column(name, overflow="fold")
+    for guess in guesses:
+        table.add_row(guess.subject, guess.value, guess.sureness, guess.reason)
+    console.print(table)
+    for text in (*draft.remarks, _summarise(draft, guesses), f"look at {folder / PAGE_FILE}, then:", command):  # fmt: skip
+        console.print(text, markup=False, highlight=False, soft_wrap=True)

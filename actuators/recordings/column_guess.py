@@ -1,0 +1,427 @@
+"""Guesses what the columns of a log mean, and says how sure each guess is.
+
+Names propose, numbers decide. A guess is `sure` where name and numbers agree, `likely` where one of
+them speaks and the other does not contradict, and `unsure` else. An unsure guess is never used: the
+column map that is written has `???` in its place, with the candidates beside it.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from actuators.recordings.column_names import (
+    TIME_UNITS,
+    TIME_WORDS,
+    UNITS,
+    ColumnName,
+    Quantity,
+    Role,
+    name_joint,
+    read_column_name,
+    split_words,
+)
+from actuators.recordings.log_tables import LogRun, Table, join_names
+from brokk_rl.errors import RecordingError
+
+Sureness = Literal["sure", "likely", "unsure"]
+
+RATES_HZ = (1.0, 5000.0)
+"""Slowest and fastest rate of a log of joints; a unit of time that gives another one is wrong."""
+LONGEST_LAG_S = 1.5
+"""Longest lag from command to motion that is tried: more than twice the 0.55 s of the slowest machine known."""
+CLEAR_CORRELATION = 0.8
+"""From here on the numbers confirm a pair: two thirds of the variance are explained."""
+WEAK_CORRELATION = 0.3
+"""Below it the numbers say nothing about a pair."""
+MARGIN = 0.1
+"""A partner that correlates better by so much contradicts a pair."""
+TARGET_SLOPE = (0.5, 1.5)
+"""Position over target: outside of it the target is in another unit, or no target."""
+GRID_ROWS = 20000
+"""Rows on which pairs are compared; correlations change by less than 0.01 beyond."""
+
+
+@dataclass(frozen=True)
+class Guess:
+    """One guess.
+
+    Attributes:
+        subject: What is guessed, `boom: command`.
+        value: The chosen value as text.
+        sureness: How sure it is.
+        reason: Evidence for it.
+        others: Other candidates.
+    """
+
+    subject: str
+    value: str
+    sureness: Sureness
+    reason: str
+    others: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class TimeGuess:
+    """The clock of a table.
+
+    Attributes:
+        column: Its column.
+        scale: Seconds for one of it.
+        anchor: Column of the recorder's clock, to s; `None` without one.
+        guess: How sure it is.
+    """
+
+    column: str
+    scale: float
+    anchor: str | None
+    guess: Guess
+
+
+@dataclass(frozen=True)
+class JointGuess:
+    """The columns of a joint.
+
+    Attributes:
+        name: Name of the joint.
+        command: Full name of the column of its command.
+        position: Full name of the column of its position.
+        kind: Whether the command is a target position, or sets the speed.
+        sign: -1 where larger commands move to smaller positions.
+        lag_s: Lag of the motion behind the command at the best correlation.
+        unit: `rad` or `m`.
+        scale: That unit for one of the log.
+        guesses: How sure each part is.
+    """
+
+    name: str
+    command: str
+    position: str
+    kind: Literal["target", "speed"]
+    sign: int
+    lag_s: float
+    unit: str
+    scale: float
+    guesses: dict[str, Guess]
+
+
+def guess_times(run: LogRun) -> dict[str, TimeGuess]:
+    """Return the clock of each table that has one."""
+    found = {}
+    for name, table in run.tables.items():
+        time = _guess_time(name, table)
+        if time is not None:
+            found[name] = time
+    return found
+
+
+def _guess_time(name: str, table: Table) -> TimeGuess | None:
+    candidates = []
+    for column in table.columns:
+        words = split_words(column)
+        is_named = any(word in TIME_WORDS or word in TIME_UNITS for word in words)
+        values = table.columns[column]
+        if len(values) < 2 or not np.all(np.diff(values) > 0):
+            continue
+        unit = next((TIME_UNITS[word] for word in reversed(words) if word in TIME_UNITS), None)
+        period = float(np.median(np.diff(values)))
+        scales = [s for s in (1.0, 1e-3, 1e-6, 1e-9) if RATES_HZ[0] <= 1.0 / (period * s) <= RATES_HZ[1]]  # fmt: skip
+        if unit is not None and is_named:
+            candidates.append((2 if unit in scales else 0, column, unit, "unit in its name"))
+        elif scales:
+            # Integers that count rows are no clock.
+            is_count = period == 1.0 and not is_named
+            candidates.append((0 if is_count else int(is_named), column, scales[0], ""))
+    if "log_time" in table.columns and "header.stamp" in table.columns:
+        stamp = table.columns["header.stamp"]
+        if np.all(np.diff(stamp) > 0):
+            return _guess_stamped(name, table)
+    named = sorted((c for c in candidates if c[0] > 0), key=lambda c: -c[0])
+    best = named[0] if named else (candidates[0] if len(candidates) == 1 else None)
+    if best is None:
+        return None
+    _, column, scale, source = best
+    rate_hz = 1.0 / (float(np.median(np.diff(table.columns[column]))) * scale)
+    sure: Sureness = "sure" if named and source else ("likely" if named else "unsure")
+    reason = f"only increases; 1 = {scale:g} s ({source or 'the only unit that gives a rate of 1 to 5000 Hz'}): {rate_hz:.4g} Hz"
+    if not source and named and RATES_HZ[0] <= rate_hz / 1000 * 1.0:
+        reason += "; a unit 1000 times longer would do too"
+    others = tuple(c[1] for c in candidates if c[1] != column)
+    subject = f"time of '{name}'" if name else "time"
+    return TimeGuess(column, scale, None, Guess(subject, column, sure, reason, others))
+
+
+def _guess_stamped(name: str, table: Table) -> TimeGuess:
+    """Return the sensor's clock, tied to that of the recorder."""
+    stamp_s, anchor_s = table.columns["header.stamp"], table.columns["log_time"]
+    late_s = anchor_s - stamp_s
+    drift = float(np.polyfit(stamp_s - stamp_s[0], late_s, 1)[0]) if len(stamp_s) > 2 else 0.0
+    reason = (
+        f"the sensor's own clock; behind the recorder's by {np.median(late_s):.4g} s, drift {1e6 * drift:.3g} ppm, "
+        f"scatter of the transport {1000 * (np.quantile(late_s, 0.95) - late_s.min()):.3g} ms"
+    )
+    guess = Guess(f"time of '{name}'", "header.stamp", "sure", reason, ("log_time",))
+    return TimeGuess("header.stamp", 1.0, "log_time", guess)
+
+
+@dataclass(frozen=True)
+class _Family:
+    """Columns that differ by their joint only.
+
+    Attributes:
+        table: Their table.
+        role: Their role.
+        quantity: Their quantity.
+        members: Columns by joint.
+    """
+
+    table: str
+    role: Role | None
+    quantity: Quantity
+    members: Mapping[str, ColumnName]
+
+
+def _list_families(run: LogRun, times: Mapping[str, TimeGuess]) -> list[_Family]:
+    groups: dict[tuple[str, str], dict[str, ColumnName]] = {}
+    for table, content in run.tables.items():
+        if table not in times:
+            continue
+        time = times[table]
+        for column in content.columns:
+            if column in (time.column, time.anchor):
+                continue
+            name = read_column_name(table, column)
+            base = column.partition("[")[0]  # a list is one family, whatever its items are called
+            if base == column:
+                joint = name.joint.split("_")
+                base = " ".join(word for word in split_words(column) if word not in joint)
+                base = re.sub(r"\d+$", "", base)
+            groups.setdefault((table, base), {})[name.joint] = name
+    families = []
+    for (table, _), members in groups.items():
+        first = next(iter(members.values()))
+        families.append(_Family(table, first.role, first.quantity, members))
+    return families
+
+
+def guess_joints(
+    run: LogRun, times: Mapping[str, TimeGuess], position_unit: str | None
+) -> tuple[list[JointGuess], list[str]]:
+    """Return the joints of a run, and remarks on what was left out.
+
+    Args:
+        run: Beginning of a log, with all columns.
+        times: Clock of each table.
+        position_unit: Unit of the positions as a person gives it; `None` to guess it.
+
+    Raises:
+        RecordingError: No command or no position can be proposed.
+    """
+    families = _list_families(run, times)
+    commands = [f for f in families if f.role == "command" and f.quantity != "effort"]
+    positions = [f for f in families if f.role != "command" and f.quantity in ("position", "unknown")]  # fmt: skip
+    named = [f for f in positions if f.quantity == "position" or f.role == "measured"]
+    positions = named or positions
+    if not commands or not positions:
+        lacking = "commands" if not commands else "positions"
+        known = [join_names(t, c) for t, content in run.tables.items() for c in content.columns]
+        raise RecordingError(
+            f"{run.where}: no column is named like {lacking}; write a column map by hand (import=@<file>), its columns are "
+            f"{', '.join(known)}"
+        )
+
+    def rank(pair: tuple[_Family, _Family]) -> tuple[int, int, int]:
+        command, position = pair
+        shared = len(command.members.keys() & position.members.keys())
+        # Of two families of commands the one that says position or nothing is preferred.
+        return shared, int(position.quantity == "position"), int(command.quantity != "velocity")
+
+    command, position = max(((c, p) for c in commands for p in positions), key=rank)
+    shared = [joint for joint in command.members if joint in position.members]
+    remarks = []
+    if shared:
+        pairs = {joint: (command.members[joint], position.members[joint]) for joint in shared}
+        is_named = True
+    elif len(command.members) == len(position.members):
+        is_named = len(command.members) == 1
+        pairs = {}
+        for one, other in zip(command.members.values(), position.members.values(), strict=True):
+            pairs[one.joint or other.joint] = (one, other)
+        remarks.append("commands and positions have different names and are paired in their order")
+    else:
+        raise RecordingError(
+            f"{run.where}: {len(command.members)} commands ({', '.join(c.column for c in command.members.values())}) and "
+            f"{len(position.members)} positions ({', '.join(p.column for p in position.members.values())}) share no names; "
+            "write a column map by hand (import=@<file>)"
+        )
+    rivals = [join_names(f.table, next(iter(f.members.values())).column) for f in commands if f is not command]  # fmt: skip
+    if rivals:
+        remarks.append(f"other commands that were not taken: {', '.join(rivals)}")
+    comparison = _Comparison(run, times, pairs)
+    return [
+        _judge_joint(joint, *pair, comparison, is_named, position_unit)
+        for joint, pair in pairs.items()
+    ], remarks
+
+
+class _Comparison:
+    """Commands and positions of a run on one grid."""
+
+    def __init__(
+        self,
+        run: LogRun,
+        times: Mapping[str, TimeGuess],
+        pairs: Mapping[str, tuple[ColumnName, ColumnName]],
+    ) -> None:
+        clocks = {name: read_times(run.tables[name], time) for name, time in times.items()}
+        used = {name.table for pair in pairs.values() for name in pair}
+        begin_s = max(clocks[table][0] for table in used)
+        end_s = min(clocks[table][-1] for table in used)
+        if end_s <= begin_s:
+            spans = ", ".join(f"{t}: {clocks[t][0]:.6g} to {clocks[t][-1]:.6g} s" for t in used)
+            raise RecordingError(
+                f"{run.where}: the clocks of its tables have no time in common ({spans}); give the offset of one of them in a "
+                "column map (time.<table>.offset)"
+            )
+        slowest_s = max(float(np.median(np.diff(clocks[table]))) for table in used)
+        num_rows = min(GRID_ROWS, max(int((end_s - begin_s) / slowest_s), 2))
+        self.grid_s = np.linspace(begin_s, end_s, num_rows)
+        self.period_s = float(self.grid_s[1] - self.grid_s[0])
+        self.commands, self.positions = {}, {}
+        for joint, (command, position) in pairs.items():
+            for name, store in ((command, self.commands), (position, self.positions)):
+                values = np.asarray(run.tables[name.table].columns[name.column], dtype=float)
+                store[joint] = np.interp(self.grid_s, clocks[name.table], values)
+
+    def correlate(self, command: str, position: str) -> tuple[float, float]:
+        """Return the correlations, at the best lag, of position with target and of speed with command."""
+        u, q = self.commands[command], self.positions[position]
+        speed = np.gradient(q, self.period_s)
+        return self._find_best(u, q)[0], self._find_best(u, speed)[0]
+
+    def find_lag(self, joint: str, is_target: bool) -> float:
+        """Return the lag of the joint's speed behind the command, or behind the target's speed, s."""
+        u = self.commands[joint]
+        speed = np.gradient(self.positions[joint], self.period_s)
+        return self._find_best(np.gradient(u, self.period_s) if is_target else u, speed)[1]
+
+    def _find_best(self, a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
+        """Return the largest correlation, in size, of `b` with `a` before it, and its lag."""
+        if np.ptp(a) == 0 or np.ptp(b) == 0:
+            return 0.0, 0.0
+        most = min(int(LONGEST_LAG_S / self.period_s), len(a) // 4)
+        best = (0.0, 0.0)
+        for lag in range(0, most + 1, max(1, most // 60)):
+            x, y = a[: len(a) - lag], b[lag:]
+            if x.std() > 0 and y.std() > 0:
+                r = float(np.corrcoef(x, y)[0, 1])
+                best = max(best, (r, lag * self.period_s), key=lambda one: abs(one[0]))
+        return best
+
+
+def _judge_joint(
+    joint: str,
+    command: ColumnName,
+    position: ColumnName,
+    comparison: _Comparison,
+    is_named: bool,
+    position_unit: str | None,
+) -> JointGuess:
+    target_r, speed_r = comparison.correlate(joint, joint)
+    u, q = comparison.commands[joint], comparison.positions[joint]
+    slope = float(np.polyfit(u, q, 1)[0]) if np.ptp(u) > 0 else 0.0
+    says_target = command.quantity == "position"
+    is_like_target = TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] and target_r >= CLEAR_CORRELATION
+    is_target = is_like_target and (says_target or target_r > abs(speed_r))
+    is_target = is_target or (says_target and abs(speed_r) < CLEAR_CORRELATION)
+    r = target_r if is_target else speed_r
+    lag_s = comparison.find_lag(joint, is_target)
+    name, full_command = name_joint(joint), join_names(command.table, command.column)
+    full_position = join_names(position.table, position.column)
+    rival, rival_r = "", 0.0
+    for other in comparison.commands:
+        if other != joint:
+            found = comparison.correlate(other, joint)
+            size = abs(found[0 if is_target else 1])
+            rival, rival_r = max((rival, rival_r), (other, size), key=lambda one: one[1])
+    signal = "position" if is_target else "speed"
+    reason = f"correlation of {signal} with command {r:.2f}, {lag_s:.2f} s later"
+    sureness: Sureness = "likely" if is_named else "unsure"
+    if np.ptp(u) == 0:
+        reason = "its command does not change in the beginning of the log"
+    elif rival_r > abs(r) + MARGIN and abs(r) < CLEAR_CORRELATION:
+        sureness = "unsure" if not is_named or rival_r > CLEAR_CORRELATION else "likely"
+        reason += f"; with the command of {rival} {rival_r:.2f}"
+    elif abs(r) >= CLEAR_CORRELATION:
+        sureness = "sure" if is_named else "likely"
+    pairing = "same name" if is_named else "same place in their order"
+    guesses = {
+        "columns": Guess(
+            f"{name}: columns",
+            f"{full_command} → {full_position}",
+            sureness,
+            f"{pairing}; {reason}",
+        )
+    }
+    guesses["kind"] = _judge_kind(name, is_target, says_target, target_r, speed_r)
+    unit, scale, guesses["unit"] = _judge_unit(name, position, q, position_unit)
+    sign = 1 if is_target or r >= 0 else -1
+    return JointGuess(
+        name,
+        full_command,
+        full_position,
+        "target" if is_target else "speed",
+        sign,
+        lag_s,
+        unit,
+        scale,
+        guesses,
+    )
+
+
+def _judge_kind(
+    name: str, is_target: bool, says_target: bool, target_r: float, speed_r: float
+) -> Guess:
+    value = "a target of the position" if is_target else "sets the speed"
+    reason = f"correlation with position {target_r:.2f}, with speed {speed_r:.2f}"
+    clear = abs(target_r if is_target else speed_r) >= CLEAR_CORRELATION
+    if is_target == says_target:
+        return Guess(f"{name}: command", value, "sure" if clear else "likely", reason)
+    return Guess(f"{name}: command", value, "likely" if clear else "unsure", f"{reason}; its name says otherwise")  # fmt: skip
+
+
+def _judge_unit(
+    name: str, position: ColumnName, q: np.ndarray, given: str | None
+) -> tuple[str, float, Guess]:
+    """Return unit of the recording, that unit for one of the log, and how sure it is."""
+    subject = f"{name}: unit"
+    if given is not None:
+        return *UNITS[given], Guess(subject, given, "sure", "as given by log.position_unit")
+    if position.unit is not None:
+        return *UNITS[position.unit], Guess(subject, position.unit, "sure", "unit in its name")
+    largest = float(np.abs(q).max())
+    if largest <= 2 * math.pi:
+        return (
+            "rad",
+            1.0,
+            Guess(subject, "rad", "likely", f"largest value {largest:.3g}, at most a turn"),
+        )
+    reason = f"largest value {largest:.4g}: degrees, per cent, or a length? Give log.position_unit"
+    return "rad", math.pi / 180.0, Guess(subject, "deg", "unsure", reason, ("cm", "mm"))
+
+
+def read_times(table: Table, time: TimeGuess) -> np.ndarray:
+    """Return the times of a table, `(T,)` s, by the recorder's clock where it has one."""
+    return np.asarray(table.columns[time.anchor or time.column]) * (
+        1.0 if time.anchor else time.scale
+    )
+
+
+def list_unsure(guesses: Sequence[Guess]) -> list[Guess]:
+    """Return the guesses that must be confirmed by a person."""
+    return [guess for guess in guesses if guess.sureness == "unsure"]

@@ -1,0 +1,267 @@
+"""Drafts of a column map and of a machine file, made of guesses; each line says what it rests on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from actuators.recordings.column_guess import Guess, JointGuess, TimeGuess
+from actuators.recordings.log_survey import JointSurvey, LogSurvey
+from actuators.recordings.text_log import CsvLayout
+
+MAP = "actuators.recordings.column_map"
+MISSING = "???"
+"""A value that a person must give; the configuration refuses to run without it."""
+QUOTED_MISSING = f'"{MISSING}"'
+"""The same within braces, where YAML takes a bare question mark for something else."""
+HIGHEST_RATE_HZ = 100.0
+"""Rate of a machine made from a faster log: joints of arms and machines show nothing beyond."""
+SHORTEST_S = 5.0
+"""Shortest piece of a log, s: one free run of the diagnosis."""
+GAP_PERIODS = 4
+"""Periods without a sample that split a log; loggers without real time skip up to two."""
+REST_SHARE = 0.05
+"""Share of all rows, at rest and with one command, from which it counts as neutral; by hand: a joint
+that turns round passes through rest within 1 % of the rows."""
+
+
+@dataclass(frozen=True)
+class CommandDraft:
+    """Scale of a command.
+
+    Attributes:
+        neutral: Value without motion.
+        full_plus: Value of full command towards larger positions; `None` without such commands.
+        full_minus: The same towards smaller positions.
+        guess: How sure it is.
+    """
+
+    neutral: float
+    full_plus: float | None
+    full_minus: float | None
+    guess: Guess
+
+
+@dataclass(frozen=True)
+class Draft:
+    """All that was guessed about a kind of log.
+
+    Attributes:
+        name: Name of the machine.
+        times: Clock of each table that is used.
+        joints: Joints whose command changes.
+        survey: Their numbers over all logs.
+        layout: Signs of CSV files.
+        dbc: DBC file of logs of a CAN bus.
+        remarks: Further remarks.
+    """
+
+    name: str
+    times: Mapping[str, TimeGuess]
+    joints: Sequence[JointGuess]
+    survey: LogSurvey
+    layout: CsvLayout
+    dbc: str | None
+    remarks: Sequence[str]
+
+    def list_guesses(self) -> list[Guess]:
+        """Return all guesses, those of the clocks first."""
+        found = [time.guess for time in self.times.values()]
+        for joint in self.joints:
+            found += joint.guesses.values()
+            if joint.kind == "speed":
+                found.append(scale_command(joint, self.survey.joints[joint.name]).guess)
+        return found
+
+
+def scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
+    """Return neutral and full commands of a joint whose command sets its speed."""
+    low, high = survey.lowest_command, survey.highest_command
+    subject = f"{joint.name}: full command"
+    is_unit = -1.001 <= low < -0.5 and 0.5 < high <= 1.001
+    if is_unit:
+        neutral, low, high = 0.0, -1.0, 1.0
+        guess = Guess(
+            subject, "-1 to 1", "sure", f"commands lie within -1 and 1, at rest {survey.rest:g}"
+        )
+    else:
+        is_known = survey.rest_share >= REST_SHARE and low <= survey.rest <= high
+        neutral = survey.rest if is_known else 0.0
+        reason = (
+            f"neutral {neutral:.6g} is the command of {survey.rest_share:.0%} of the rows, all at rest; full commands are the "
+            "largest of the logs"
+        )
+        sureness = "likely"
+        if not is_known and not low <= 0.0 <= high:
+            sureness, reason = "unsure", "no command is frequent at rest, and none is 0"
+        elif not is_known:
+            reason = "neutral 0: no command is frequent at rest; full commands are the largest of the logs"
+        guess = Guess(subject, f"{low:.6g} to {high:.6g}, neutral {neutral:.6g}", sureness, reason)
+    above = high if high > neutral + 1e-9 * max(1.0, abs(neutral)) else None
+    below = low if low < neutral - 1e-9 * max(1.0, abs(neutral)) else None
+    if above is None or below is None:
+        guess = Guess(subject, guess.value, guess.sureness, f"{guess.reason}; commands go one way only")  # fmt: skip
+    if joint.sign < 0:
+        above, below = below, above
+    return CommandDraft(neutral, above, below, guess)
+
+
+def format_map(draft: Draft) -> str:
+    """Return the column map as YAML."""
+    lines = [
+        "# @package reader",
+        f"# Logs of {draft.name}, as guessed from {draft.survey.num_runs} of them.",
+        f"# {MISSING} stands where the guess was unsure: fill it in. Used with machine=@machine.yaml.",
+        f"_target_: {MAP}.ColumnMap",
+        f"delimiter: {_quote(draft.layout.delimiter)}   # of CSV files only",
+        f"decimal: {_quote(draft.layout.decimal)}",
+        "time:",
+    ]
+    for table, time in draft.times.items():
+        lines.append(f"  {_quote(table)}: {_format_time(time)}")
+    if list(draft.times) == [""]:
+        lines[-2:] = [f"time: {_format_time(draft.times[''])}"]
+    lines.append("joints:")
+    for joint in draft.joints:
+        lines += _format_joint(joint, draft.survey.joints[joint.name])
+    period_s = draft.survey.period_s
+    lines += [
+        "optional: {}",
+        "overrun: 0.001        # of full command; rounding",
+        f"longest_gap_s: {_round_up(GAP_PERIODS * period_s):g}   # s; {GAP_PERIODS} periods of {period_s:.4g} s",
+        f"shortest_s: {SHORTEST_S:g}         # s; shorter ones hold no free run worth judging",
+    ]
+    if draft.dbc is not None:
+        head, body = lines[:3], [f"  {line}" for line in lines[3:]]
+        lines = [
+            *head,
+            f"_target_: {MAP}.CanColumnMap",
+            f"dbc: {_quote(draft.dbc)}",
+            "columns:",
+            *body,
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _format_time(time: TimeGuess) -> str:
+    column = MISSING if time.guess.sureness == "unsure" else time.column
+    if time.anchor is not None:
+        anchor = (
+            f"{{_target_: {MAP}.Column, column: {_quote(time.anchor)}, scale: 1.0, offset: 0.0}}"
+        )
+        text = f"{{_target_: {MAP}.AlignedTime, column: {_quote(column)}, scale: {time.scale!r}, anchor: {anchor}}}"
+    else:
+        text = f"{{_target_: {MAP}.Column, column: {_quote(column)}, scale: {time.scale!r}, offset: 0.0}}"
+    return f"{text}   # {_explain(time.guess)}"
+
+
+def _format_joint(joint: JointGuess, survey: JointSurvey) -> list[str]:
+    columns, kind, unit = (joint.guesses[key] for key in ("columns", "kind", "unit"))
+    is_unsure = columns.sureness == "unsure"
+    command = MISSING if is_unsure else joint.command
+    position = MISSING if is_unsure else joint.position
+    scale = QUOTED_MISSING if unit.sureness == "unsure" else repr(joint.scale)
+    lines = [
+        f"  {joint.name}:   # {_explain(columns)}",
+        f"    _target_: {MAP}.JointColumns",
+        f"    # command: {_explain(kind)}",
+    ]
+    if kind.sureness == "unsure":
+        lines.append(f"    command: {QUOTED_MISSING}")
+    elif joint.kind == "target":
+        speed = (
+            QUOTED_MISSING if scale == QUOTED_MISSING else f"{measure_full_speed(joint, survey):g}"
+        )
+        lines.append(
+            f"    command: {{_target_: {MAP}.TargetColumn, column: {_quote(command)}, scale: {scale}, full_speed: {speed}}}"
+            f"   # {joint.unit}/s, the fastest target of the logs"
+        )
+    else:
+        full = scale_command(joint, survey)
+        numbers = [QUOTED_MISSING] * 3
+        if full.guess.sureness != "unsure":
+            numbers = ["null" if v is None else repr(v) for v in (full.neutral, full.full_plus, full.full_minus)]  # fmt: skip
+        lines += [
+            f"    # {_explain(full.guess)}",
+            f"    command: {{_target_: {MAP}.CommandColumn, column: {_quote(command)}, neutral: {numbers[0]}, "
+            f"full_plus: {numbers[1]}, full_minus: {numbers[2]}}}",
+        ]
+    lines.append(
+        f"    position: {{_target_: {MAP}.Column, column: {_quote(position)}, scale: {scale}, offset: 0.0}}"
+        f"   # {joint.unit} for one of the log; {_explain(unit)}"
+    )
+    return lines
+
+
+def measure_full_speed(joint: JointGuess, survey: JointSurvey) -> float:
+    """Return the speed at full command, rad/s or m/s: of the fastest target, else of the fastest motion."""
+    speed = survey.top_target_speed if joint.kind == "target" else survey.top_speed
+    return _round_up(joint.scale * speed)
+
+
+def format_machine(draft: Draft) -> str:
+    """Return the machine as YAML: joints without bodies, limits and speeds as the logs show them."""
+    period_s = max(draft.survey.period_s, 1.0 / HIGHEST_RATE_HZ)
+    period_s = round(period_s, 3) if period_s >= 0.005 else period_s
+    lags_s = sorted(joint.lag_s for joint in draft.joints)
+    dead_time_s = round(max(lags_s[len(lags_s) // 2], period_s), 3)
+    num_history = max(13, math.ceil(4 * dead_time_s / period_s))
+    lines = [
+        f"# {draft.name}, as its logs show it: joints only.",
+        "# It can be recorded, identified and diagnosed, not simulated: bodies and tool are unknown.",
+        "_target_: brokk_rl.machine.Machine",
+        f"name: {draft.name}",
+        f"title: {_quote(f'{draft.name}, {len(draft.joints)} joints, drafted from {draft.survey.minutes:.1f} minutes of logs')}",
+        "mjcf: null",
+        f"period_s: {period_s:g}   # s; median of its logs is {draft.survey.period_s:.4g} s",
+        f"dead_time_s: {dead_time_s:g}   # s; median lag of the joints at the best correlation; mode=inspect estimates it",
+        f"num_history: {num_history}   # samples; four times the dead time, at least 13",
+        "exclusive: []",
+        "tool_m: null",
+        "levers: []",
+        "joints:",
+    ]
+    for joint in draft.joints:
+        survey = draft.survey.joints[joint.name]
+        low, high = joint.scale * survey.lowest, joint.scale * survey.highest
+        if joint.kind == "target":
+            low = min(low, joint.scale * survey.lowest_command)
+            high = max(high, joint.scale * survey.highest_command)
+        speed = measure_full_speed(joint, survey)
+        unit = f"{joint.unit}/s"
+        lines += [
+            "  - _target_: brokk_rl.machine.Joint",
+            f"    name: {joint.name}",
+            "    part: null",
+            f"    kind: {'hinge' if joint.unit == 'rad' else 'slide'}",
+            f"    lower: {_format_dimension(math.floor(1000 * low) / 1000, 'smallest position or target in its logs')}",
+            f"    upper: {_format_dimension(math.ceil(1000 * high) / 1000, 'largest position or target in its logs')}",
+            f"    home: {(low + high) / 2:.3f}   # {joint.unit}; middle of the range",
+            f"    max_speed: {_format_dimension(speed, f'fastest target or motion in its logs, {unit}')}",
+            "    body: null",
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def _format_dimension(value: float, source: str) -> str:
+    return f"{{_target_: brokk_rl.machine.Dimension, value: {value:g}, source: {_quote(source)}, confidence: low}}"
+
+
+def _explain(guess: Guess) -> str:
+    """Return a guess as a comment of one line."""
+    others = f"; candidates: {guess.value}, {', '.join(guess.others)}" if guess.others else ""
+    shown = f" ({guess.value})" if guess.sureness == "unsure" and not guess.others else ""
+    return f"{guess.sureness}{shown}: {guess.reason}{others}".replace("\n", " ")
+
+
+def _quote(text: str) -> str:
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"').replace("\t", "\\t") + '"'
+
+
+def _round_up(value: float) -> float:
+    """Return a number rounded up to two digits."""
+    if value <= 0.0:
+        return 0.0
+    digit = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / digit - 1e-9) * digit:.6g}")

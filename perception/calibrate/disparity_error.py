@@ -1,0 +1,157 @@
+"""Error of a pair's disparity, measured on a board: its size in the left picture tells its distance.
+
+The disparity of a corner at depth z is focal length times baseline over z. A board seen by the left
+camera alone gives the same quotient without the focal length: picture size over true size. What the
+pair shows beyond it is a constant and two slopes across the picture, which stay the same at all
+distances, and a part that grows with the disparity: a wrong baseline, or a board printed too large.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.errors import FrameError
+from brokk_rl.signals import Frame
+from perception.label.camera_pose import BoardTracker
+
+MIN_VIEWS = 8
+"""Views from which four numbers are estimated; chosen by hand."""
+MIN_RANGE = 1.3
+"""Largest disparity over the smallest: at one distance a constant looks like a wrong baseline."""
+SLOPE_STD_PX = 0.25
+"""Prior of the slopes, px for a unit of x/z and y/z: that of `perception.pose.rig_px`."""
+SCALE_STD = 0.002
+"""Prior of the part that grows with the disparity: 0.2 mm of 10 cm on paper; chosen by hand."""
+ROUNDS, TUKEY = 5, 4.685
+"""Rounds of reweighting, and Tukey's biweight, 95 % efficient with Gaussian noise."""
+FLOOR_PX = 0.02
+"""Least standard deviation of a view's mean: corners share a bias of the detector; by hand."""
+
+
+@dataclass(frozen=True)
+class BoardDisparity:
+    """Means over the corners of one view.
+
+    Attributes:
+        excess_px: Measured less expected disparity.
+        expected_px: Expected disparity.
+        x: Coordinate x/z.
+        y: Coordinate y/z.
+    """
+
+    excess_px: float
+    expected_px: float
+    x: float
+    y: float
+
+
+@dataclass(frozen=True)
+class DisparityError:
+    """Error of the disparity: `c0 + c1 x/z + c2 y/z`.
+
+    Attributes:
+        px: `(c0, c1, c2)`.
+        std_px: Largest standard deviation of the three.
+        scale: Part that grows with the disparity; not corrected, since board and baseline are
+            equally likely.
+        num_views: Views that it rests on.
+    """
+
+    px: tuple[float, float, float]
+    std_px: float
+    scale: float
+    num_views: int
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return it as plain data, rounded."""
+        return {
+            "error_px": [round(one, 4) for one in self.px],
+            "std_px": round(self.std_px, 4),
+            "scale": round(self.scale, 6),
+            "num_views": self.num_views,
+        }
+
+
+def measure_board_disparity(
+    tracker: BoardTracker,
+    frame: Frame,
+    corners_m: np.ndarray,
+    corners_px: np.ndarray,
+    camera_from_board: np.ndarray,
+) -> BoardDisparity | None:
+    """Return the disparity of a board in one frame; `None` without a right picture that shows it.
+
+    Args:
+        tracker: Finds the board.
+        frame: A rectified frame.
+        corners_m: Corners on the board, `(n, 3)`, found in the left picture.
+        corners_px: The same in the left picture, `(n, 2)`.
+        camera_from_board: Pose of the board by the left picture, `(4, 4)`.
+    """
+    if frame.right is None or frame.baseline_m is None or frame.distortion is not None:
+        return None
+    try:
+        others_m, others_px = tracker.find_corners(replace(frame, color=frame.right))
+    except FrameError:
+        return None
+    places = {tuple(np.round(one, 6)): px for one, px in zip(others_m, others_px, strict=True)}
+    measured, chosen = [], []
+    for number, one in enumerate(corners_m):
+        other = places.get(tuple(np.round(one, 6)))
+        if other is not None:
+            measured.append(corners_px[number, 0] - other[0])
+            chosen.append(number)
+    if not chosen:
+        return None
+    point = corners_m[chosen] @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
+    expected = frame.camera_matrix[0, 0] * frame.baseline_m / point[:, 2]
+    x, y = (point[:, :2] / point[:, 2:]).mean(0)
+    excess = float(np.mean(np.array(measured) - expected))
+    return BoardDisparity(excess, float(expected.mean()), float(x), float(y))
+
+
+def estimate_disparity_error(views: list[BoardDisparity]) -> DisparityError | None:
+    """Return the error that views of a board at several distances agree on.
+
+    Returns:
+        `None` for fewer than `MIN_VIEWS` views, or for a board that is always as far away.
+    """
+    if len(views) < MIN_VIEWS:
+        return None
+    expected = np.array([one.expected_px for one in views])
+    if expected.max() < MIN_RANGE * expected.min():
+        return None
+    excess = np.array([one.excess_px for one in views])
+    design = np.array([[1.0, one.x, one.y, one.expected_px] for one in views])
+    prior = np.diag([0.0, SLOPE_STD_PX**-2, SLOPE_STD_PX**-2, SCALE_STD**-2])
+    weight, scale_px = np.ones(len(views)), 1.0
+    solution, information = np.zeros(4), prior
+    for _ in range(ROUNDS):
+        information = design.T @ (design * weight[:, None]) / scale_px**2 + prior
+        solution = np.linalg.solve(information, design.T @ (weight * excess) / scale_px**2)
+        away = excess - design @ solution
+        # Four numbers are spent on the fit.
+        spent = len(views) / (len(views) - 4)
+        scale_px = max(1.4826 * float(np.median(np.abs(away))) * spent**0.5, FLOOR_PX)
+        weight = np.maximum(1.0 - (away / (TUKEY * scale_px)) ** 2, 0.0) ** 2
+    std_px = float(np.sqrt(np.diag(np.linalg.inv(information))[:3].max()))
+    constant, across, down, scale = (float(one) for one in solution)
+    return DisparityError((constant, across, down), std_px, scale, len(views))
+
+
+def correct_depth(
+    depth_m: np.ndarray, camera_matrix: np.ndarray, baseline_m: float, error_px: tuple[float, ...]
+) -> np.ndarray:
+    """Return depth, `(h, w)` float32, without an error `(c0, c1, c2)` of its disparity."""
+    height, width = depth_m.shape
+    x = (np.arange(width, dtype=np.float32) - camera_matrix[0, 2]) / camera_matrix[0, 0]
+    y = (np.arange(height, dtype=np.float32) - camera_matrix[1, 2]) / camera_matrix[1, 1]
+    pull_px = camera_matrix[0, 0] * baseline_m
+    constant, across, down = error_px
+    wrong = (constant + across * x)[None, :] + (down * y)[:, None]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right_px = pull_px / depth_m - wrong
+        return np.where(right_px > 0, pull_px / right_px, np.nan).astype(np.float32)

@@ -1,0 +1,61 @@
+"""The documentation site is built without a warning, holds what it links to, and fetches nothing."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+FETCHED = re.compile(r'<(?:script|link|img|iframe|source)\b[^>]*?\b(?:src|href)="(https?:[^"]*)"')
+LINKED = re.compile(r'<a\b[^>]*?\bhref="([^"#]+)(?:#[^"]*)?"')
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [
+        sys.executable,
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "--quiet",
+        "--site-dir",
+        str(folder),
+    ]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1"}
+    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    assert "WARNING" not in built.stderr
+    return folder
+
+
+def test_the_site_fetches_nothing_from_elsewhere(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 80
+    for page in pages:
+        assert FETCHED.findall(page.read_text()) == []
+
+
+def test_each_link_of_the_site_leads_to_a_file(site: Path) -> None:
+    missing = set()
+    for page in site.rglob("*.html"):
+        if page.name == "404.html":
+            continue  # its links begin at the root of a server
+        for link in LINKED.findall(page.read_text()):
+            if not re.match(r"[a-z]+:", link) and not (page.parent / unquote(link)).exists():
+                missing.add((page.relative_to(site).as_posix(), link))
+    assert missing == set()
+
+
+def test_each_config_group_has_its_page(site: Path) -> None:
+    effects = (site / "reference/options/effect.html").read_text()
+    assert "gap_rad" in effects and "taken up at reversals" in effects
+    for group in ("machine", "task", "actuator", "perception_ellipse"):
+        assert (site / f"reference/options/{group}.html").is_file()

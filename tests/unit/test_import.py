@@ -1,0 +1,250 @@
+"""mode=import guesses the columns of a log, says how sure it is, and leaves the unsure to a person."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from composed import option
+
+from actuators.recordings.column_names import read_column_name
+from brokk_rl import record
+from brokk_rl.machine import Machine
+
+RATE_HZ = 50.0
+LAG = 6
+
+
+def make_targets(num: int = 1500) -> np.ndarray:
+    """Returns targets of three joints that move on their own, `(T, 3)` rad."""
+    t_s = np.arange(num)[:, None] / RATE_HZ
+    return 0.4 * np.sin(t_s * [0.9, 1.7, 2.6]) + 0.2 * np.sin(t_s * [2.3, 0.6, 1.1])
+
+
+def delay(values: np.ndarray, num: int = LAG) -> np.ndarray:
+    return np.concatenate([np.repeat(values[:1], num, 0), values[:-num]])
+
+
+def write_table(path: Path, columns: dict[str, np.ndarray]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = [",".join(repr(float(v)) for v in row) for row in zip(*columns.values(), strict=True)]
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n")
+
+
+def write_servo_log(path: Path, swapped: bool = False) -> None:
+    targets = make_targets()
+    positions = delay(targets)[:, [1, 0, 2]] if swapped else delay(targets)
+    columns = {"time_ms": np.arange(len(targets)) * 1000.0 / RATE_HZ}
+    for j, name in enumerate(("hip", "knee", "foot")):
+        columns[f"{name}_target"] = targets[:, j]
+        columns[f"{name}_pos_rad"] = positions[:, j]
+        columns[f"{name}_torque"] = np.sin(targets[:, j])
+    write_table(path, columns)
+
+
+def read_guesses(folder: str) -> dict[str, dict[str, str]]:
+    found = json.loads((Path(folder) / "import.json").read_text())["guesses"]
+    return {guess["subject"]: guess for guess in found}
+
+
+def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
+    brokk: Callable[..., object],
+) -> None:
+    write_servo_log(Path("logs/a.csv"))
+    done = brokk("mode=import", "log.input=logs", "log.name=leg", "session.out=leg")
+    assert done.code == 0, done.err
+    guesses = read_guesses("leg")
+    assert {guess["sureness"] for guess in guesses.values()} <= {"sure", "likely"}
+    assert guesses["knee: columns"]["value"] == "knee_target → knee_pos_rad"
+    assert guesses["knee: command"]["value"] == "a target of the position"
+    assert guesses["time"]["sureness"] == "sure"
+    assert (Path("leg") / "import.png").stat().st_size > 1000
+    options = ("machine=@leg/machine.yaml", "import=@leg/column_map.yaml", "log.input=logs")
+    done = brokk("mode=import", *options, "session.out=out")
+    assert done.code == 0, done.err
+    drafted = yaml.safe_load(Path("leg/machine.yaml").read_text())
+    assert [joint["name"] for joint in drafted["joints"]] == ["hip", "knee", "foot"]
+    assert drafted["period_s"] == pytest.approx(1 / RATE_HZ)
+    assert drafted["dead_time_s"] == pytest.approx(LAG / RATE_HZ, abs=0.021)
+    (path,) = Path("out/recordings").iterdir()
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(path)
+    # the command is the speed of the target in parts of the full speed
+    speed = np.diff(make_targets()[:, 1]) * RATE_HZ
+    full = drafted["joints"][1]["max_speed"]["value"]
+    np.testing.assert_allclose(table["u_knee"].to_numpy()[:-1], speed / full, atol=1e-4)
+    earlier = brokk("mode=convert", *options[:2], "convert.input=logs", "session.out=old")
+    assert earlier.code == 0, earlier.err
+
+
+def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
+    brokk: Callable[..., object],
+) -> None:
+    rows = make_targets()
+    commands, speeds = np.tanh(3 * rows), np.cumsum(delay(np.tanh(3 * rows)), 0) / RATE_HZ
+    columns = {"t": np.arange(len(rows)) / RATE_HZ}
+    for j in range(3):
+        columns[f"valve{j}"] = commands[:, j]
+    for j, k in enumerate((1, 2, 0)):
+        columns[f"angle_{'abc'[j]}_deg"] = 57.3 * speeds[:, k]
+    write_table(Path("a.csv"), columns)
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert done.code == 0, done.err
+    guesses = read_guesses("draft")
+    assert {guesses[f"joint_{j}: columns"]["sureness"] for j in range(3)} == {"unsure"}
+    assert "are unsure: fill in ???" in done.out
+    text = Path("draft/column_map.yaml").read_text()
+    assert 'column: "???"' in text
+    done = brokk(
+        "mode=import", "machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv",
+        "session.out=out",
+    )  # fmt: skip
+    assert done.code == 2
+    assert "has no default and must be given" in done.err
+    assert not list(Path().rglob("*.parquet"))
+
+
+def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(
+    brokk: Callable[..., object],
+) -> None:
+    targets = make_targets()
+    write_table(
+        Path("a.csv"),
+        {
+            "t_s": np.arange(len(targets)) / RATE_HZ,
+            "u": targets[:, 0],
+            "q": 100 + 60 * np.cumsum(targets[:, 0]) / RATE_HZ,
+        },
+    )
+    brokk("mode=import", "log.input=a.csv", "session.out=one")
+    assert read_guesses("one")["joint: unit"]["sureness"] == "unsure"
+    brokk("mode=import", "log.input=a.csv", "log.position_unit=cm", "session.out=two")
+    assert read_guesses("two")["joint: unit"]["sureness"] == "sure"
+    assert "kind: slide" in Path("two/machine.yaml").read_text()
+    done = brokk("mode=import", "log.input=a.csv", "log.position_unit=inch", "session.out=three")
+    assert done.code == 2 and "unknown unit 'inch'" in done.err
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_valve_commands_get_neutral_full_and_sign_from_the_logs(
+    brokk: Callable[..., object], sign: int
+) -> None:
+    generator = np.random.default_rng(0)
+    levels = np.repeat(generator.choice([0.0, 0.0, 0.6, -0.5, 1.0, -1.0], 60), 25)
+    q = np.cumsum(delay(levels, 4)) / RATE_HZ * 0.1
+    pwm = 7.5 + 2.5 * sign * levels
+    t_s = 12.0 + np.arange(len(q)) / RATE_HZ
+    write_table(Path("a.csv"), {"Time": t_s, "Boom Cmd": pwm, "Boom Ms": q})
+    done = brokk("mode=import", "log.input=a.csv", "log.name=digger", "session.out=draft")
+    assert done.code == 0, done.err
+    command = yaml.safe_load(Path("draft/column_map.yaml").read_text())["joints"]["boom"]["command"]
+    expected = {"neutral": 7.5, "full_plus": 7.5 + 2.5 * sign, "full_minus": 7.5 - 2.5 * sign}
+    assert {key: command[key] for key in expected} == pytest.approx(expected)
+
+
+def test_commands_that_go_one_way_only_are_said(brokk: Callable[..., object]) -> None:
+    generator = np.random.default_rng(0)
+    levels = np.repeat(generator.choice([0.0, 0.0, 0.6, 1.0], 60), 25)
+    q = np.cumsum(delay(levels, 4) - 0.4) / RATE_HZ * 0.1  # falls back by its weight
+    write_table(Path("a.csv"), {"t": np.arange(len(q)) / RATE_HZ, "u": 200 * levels, "q": q})
+    done = brokk("mode=import", "log.input=a.csv", "log.name=lift", "session.out=draft")
+    assert done.code == 0, done.err
+    assert "commands go one way only" in done.out
+    assert "full_minus: null" in Path("draft/column_map.yaml").read_text()
+    done = brokk(
+        "mode=import", "machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv",
+        "session.out=out",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+
+
+def test_joints_that_are_never_commanded_are_left_out_and_said(
+    brokk: Callable[..., object],
+) -> None:
+    targets = make_targets()
+    still = np.full(len(targets), 0.5)
+    write_table(
+        Path("a.csv"),
+        {
+            "t": np.arange(len(targets)) / RATE_HZ,
+            "target_a": targets[:, 0],
+            "q_a": delay(targets)[:, 0],
+            "target_b": still,
+            "q_b": still,
+        },
+    )
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert done.code == 0, done.err
+    assert "b is left out: its command never changes" in done.out
+    assert list(yaml.safe_load(Path("draft/column_map.yaml").read_text())["joints"]) == ["a"]
+
+
+def test_a_damaged_log_leaves_no_map(brokk: Callable[..., object]) -> None:
+    write_servo_log(Path("a.csv"))
+    lines = Path("a.csv").read_text().splitlines()
+    lines[900] = lines[900].replace(",", ";", 3)
+    Path("a.csv").write_text("\n".join(lines) + "\n")
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert done.code == 2
+    assert "a.csv: line 901 (row 899): 7 cells, the header has 10" in done.err
+    assert not list(Path().rglob("column_map.yaml"))
+
+
+def test_one_of_machine_and_map_alone_is_refused(brokk: Callable[..., object]) -> None:
+    done = brokk("mode=import", "log.input=a.csv", "machine=brokk170")
+    assert done.code == 2
+    assert "import=… is missing" in done.err
+
+
+def test_a_log_without_commands_lists_its_columns(brokk: Callable[..., object]) -> None:
+    rows = np.arange(100.0)
+    write_table(Path("a.csv"), {"t": rows / 50, "q": np.sin(rows), "vir": rows})
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert done.code == 2
+    assert "no column is named like commands" in done.err and "vir" in done.err
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "expected"),
+    [
+        ("", "Boom Cmd", ("command", "unknown", None, "boom")),
+        ("", "q_wrist_roll_rad", ("measured", "position", "rad", "wrist_roll")),
+        ("", "target_elbow_rad", ("command", "position", "rad", "elbow")),
+        ("", "action[shoulder_pan.pos]", ("command", "position", None, "shoulder_pan")),
+        ("", "observation.state[shoulder_pan.pos]", ("measured", "position", None, "shoulder_pan")),
+        ("control", "positions[3]", ("command", "position", None, "3")),
+        ("state_motor", "torques[3]", ("measured", "effort", None, "3")),
+        ("/joint_states", "position[left_knee]", ("measured", "position", None, "left_knee")),
+        ("", "u2", ("command", "unknown", None, "2")),
+        ("", "jointVelocity_mm", (None, "velocity", "mm", "")),
+    ],
+)
+def test_names_are_read_as_words(table: str, column: str, expected: tuple[str | None, ...]) -> None:
+    name = read_column_name(table, column)
+    assert (name.role, name.quantity, name.unit, name.joint) == expected
+
+
+def test_logs_of_the_model_excavator_give_the_map_that_a_person_wrote(
+    brokk: Callable[..., object], machine: Machine
+) -> None:
+    """A recording of the shipped machine as CSV is guessed column by column."""
+    generator = np.random.default_rng(1)
+    levels = np.repeat(generator.uniform(-1, 1, (60, 5)).round(2), 10, 0)
+    q = np.cumsum(delay(levels, 11) * machine.max_speed * 0.05, 0) * 0.2
+    columns = {"t_s": np.arange(len(q)) * 0.05}
+    columns |= {f"u_q{j + 1}": levels[:, j] for j in range(5)}
+    columns |= {f"q_q{j + 1}_rad": q[:, j] for j in range(5)}
+    write_table(Path("a.csv"), columns)
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert done.code == 0, done.err
+    drafted = yaml.safe_load(Path("draft/column_map.yaml").read_text())
+    shipped = option("import", "brokk170")
+    for (name, joint), expected in zip(drafted["joints"].items(), shipped.joints.values(), strict=True):  # fmt: skip
+        assert joint["command"]["column"] == expected.command.column, name
+        assert joint["position"]["column"] == expected.position.column
+    assert record.name_command_column("q1") in columns

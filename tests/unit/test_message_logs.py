@@ -1,0 +1,300 @@
+"""Messages of MCAP files, ROS bags and CAN logs, as the libraries' own writers wrote them."""
+
+from __future__ import annotations
+
+import json
+import random
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools
+import numpy as np
+import pytest
+from carriage import check, make_map, make_signals
+from composed import option
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.writer import Writer
+
+from actuators.recordings.can_log import CanLog
+from actuators.recordings.column_map import AlignedTime, Column
+from actuators.recordings.log_files import open_log
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.machine import Machine
+
+BEGIN_NS = 1_700_000_000_000_000_000
+JOINT_STATE = """std_msgs/Header header
+string[] name
+float64[] position
+float64[] velocity
+float64[] effort
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+"""
+
+
+@pytest.fixture(scope="module")
+def carriage() -> Machine:
+    """A machine of one joint."""
+    return option("machine", "emps")
+
+
+def make_topic_map(command: str, position: str, time: str = "log_time") -> Any:
+    return make_map(f"/command:{command}", f"/state:{position}", time)
+
+
+def list_rows() -> list[tuple[int, float, float]]:
+    """Returns time in ns, command and position of each row."""
+    signals = make_signals()
+    rows = zip(signals["t"].tolist(), signals["u"].tolist(), signals["q"].tolist(), strict=True)
+    return [(BEGIN_NS + round(t * 1e9), u, q) for t, u, q in rows]
+
+
+def write_json(path: Path) -> Any:
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b"{}")
+        channels = [writer.register_channel(topic, "json", schema) for topic in ("/command", "/state")]  # fmt: skip
+        for time_ns, u, q in list_rows():
+            for channel, content in zip(channels, ({"u": {"raw": [0.0, u]}}, {"q": q, "text": "a"}), strict=True):  # fmt: skip
+                writer.add_message(channel, time_ns, json.dumps(content).encode(), time_ns)
+        writer.finish()
+    return make_topic_map("u.raw[1]", "q")
+
+
+def make_protobuf() -> tuple[bytes, Any]:
+    """Returns schema and class of a message with a nested, repeated joint."""
+    file = descriptor_pb2.FileDescriptorProto(name="arm.proto", package="arm", syntax="proto3")
+    joint = file.message_type.add(name="Joint")
+    joint.field.add(name="name", number=1, type=9, label=1)
+    joint.field.add(name="value", number=2, type=1, label=1)
+    state = file.message_type.add(name="State")
+    state.field.add(name="joints", number=1, type=11, label=3, type_name=".arm.Joint")
+    pool = descriptor_pool.DescriptorPool()
+    pool.Add(file)
+    kind = message_factory.GetMessageClass(pool.FindMessageTypeByName("arm.State"))
+    return descriptor_pb2.FileDescriptorSet(file=[file]).SerializeToString(), kind
+
+
+def write_protobuf(path: Path) -> Any:
+    data, kind = make_protobuf()
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("arm.State", "protobuf", data)
+        channels = [writer.register_channel(topic, "protobuf", schema) for topic in ("/command", "/state")]  # fmt: skip
+        for time_ns, *values in list_rows():
+            for channel, value in zip(channels, values, strict=True):
+                message = kind()
+                message.joints.add(name="jaw", value=9.0)
+                message.joints.add(name="slide", value=value)
+                writer.add_message(channel, time_ns, message.SerializeToString(), time_ns)
+        writer.finish()
+    return make_topic_map("joints[slide].value", "joints[slide].value")
+
+
+def make_joint_state(time_ns: int, value: float, turned: bool) -> dict[str, Any]:
+    names, values = ["jaw", "slide"], [9.0, value]
+    if turned:  # a driver may change the order of its joints
+        names, values = names[::-1], values[::-1]
+    stamp = {"sec": time_ns // 10**9, "nanosec": time_ns % 10**9}
+    header = {"stamp": stamp, "frame_id": ""}
+    return {"header": header, "name": names, "position": values, "velocity": [], "effort": []}
+
+
+def write_ros2(path: Path) -> Any:
+    mcap_ros2 = pytest.importorskip("mcap_ros2.writer")
+    with path.open("wb") as file:
+        writer = mcap_ros2.Writer(file)
+        schema = writer.register_msgdef("sensor_msgs/msg/JointState", JOINT_STATE)
+        for number, (time_ns, *values) in enumerate(list_rows()):
+            for topic, value in zip(("/command", "/state"), values, strict=True):
+                content = make_joint_state(time_ns, value, number % 7 == 3)
+                writer.write_message(topic, schema, content, time_ns, time_ns)
+        writer.finish()
+    return make_topic_map("position[slide]", "position[slide]")
+
+
+def write_bag(path: Path, storage: str) -> Any:
+    rosbag2 = pytest.importorskip("rosbags.rosbag2")
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    types = store.types
+    kind = types["sensor_msgs/msg/JointState"]
+    with rosbag2.Writer(path, version=9, storage_plugin=rosbag2.StoragePlugin[storage]) as writer:
+        topics = ("/command", "/state")
+        connections = [writer.add_connection(topic, kind.__msgtype__, typestore=store) for topic in topics]  # fmt: skip
+        for time_ns, *values in list_rows():
+            for connection, value in zip(connections, values, strict=True):
+                stamp = types["builtin_interfaces/msg/Time"](time_ns // 10**9, time_ns % 10**9)
+                message = kind(
+                    types["std_msgs/msg/Header"](stamp, ""),
+                    ["slide"],
+                    np.array([value]),
+                    np.empty(0),
+                    np.empty(0),
+                )
+                data = store.serialize_cdr(message, kind.__msgtype__)
+                writer.write(connection, time_ns, data)
+    return make_topic_map("position[slide]", "position[slide]", "header.stamp")
+
+
+WRITERS: dict[str, Callable[[Path], Any]] = {
+    "json.mcap": write_json,
+    "protobuf.mcap": write_protobuf,
+    "ros2.mcap": write_ros2,
+    "sqlite": lambda path: write_bag(path, "SQLITE3"),
+    "mcap": lambda path: write_bag(path, "MCAP"),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_messages_of_every_encoding_give_the_same_recording(
+    tmp_path: Path, carriage: Machine, name: str
+) -> None:
+    pytest.importorskip(
+        {"json.mcap": "mcap", "protobuf.mcap": "mcap_protobuf"}.get(name, "rosbags")
+    )
+    reader = WRITERS[name](tmp_path / name)
+    (recording,) = reader.read(tmp_path / name, carriage)
+    # stamps are seconds since 1970, rounded to 0.2 µs; the position steps by 0.12 m within 10 ms
+    check(recording, 1e-5 if reader.time.column == "header.stamp" else 1e-6)
+
+
+def test_the_sensor_clock_of_a_topic_replaces_a_late_recorder(
+    tmp_path: Path, carriage: Machine
+) -> None:
+    generator = random.Random(0)
+    path = tmp_path / "late.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b"{}")
+        channels = [writer.register_channel(topic, "json", schema) for topic in ("/command", "/state")]  # fmt: skip
+        for time_ns, u, q in list_rows():
+            stamp_s = (time_ns - BEGIN_NS) * 1e-9 + 5.0  # seconds since the sensor was switched on
+            for channel, value in zip(channels, (u, q), strict=True):
+                late_ns = time_ns + int(1e6 + 2e6 * generator.random())
+                content = {"header": {"stamp": stamp_s}, "value": value}
+                writer.add_message(channel, late_ns, json.dumps(content).encode(), time_ns)
+        writer.finish()
+    late = make_topic_map("value", "value").read(path, carriage)[0]
+    time = AlignedTime(
+        column="header.stamp", scale=1.0, anchor=Column(column="log_time", scale=1.0, offset=0.0)
+    )
+    aligned = replace(make_topic_map("value", "value"), time=time).read(path, carriage)[0]
+    q = make_signals()["q"].astype(np.float32)
+    steady = slice(2, 25)  # the position steps back at row 32
+    errors = [np.abs(r.q[steady, 0] - np.interp(r.t_s[steady], r.t_s, q[: len(r.t_s)])).max() for r in (late, aligned)]  # fmt: skip
+    assert errors[1] < 0.1 * errors[0]
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.98])
+def test_a_cut_off_mcap_is_refused_by_its_place(
+    tmp_path: Path, carriage: Machine, share: float
+) -> None:
+    path = tmp_path / "a.mcap"
+    reader = write_json(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(RecordingError, match=r"a\.mcap: .*whole up to byte \d+ of \d+"):
+        reader.read(path, carriage)
+
+
+def test_a_flipped_byte_of_an_mcap_is_refused(tmp_path: Path, carriage: Machine) -> None:
+    path = tmp_path / "a.mcap"
+    reader = write_json(path)
+    data = bytearray(path.read_bytes())
+    data[len(data) // 3] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"a\.mcap: "):
+        reader.read(path, carriage)
+
+
+def test_a_message_that_cannot_be_decoded_is_told_by_its_number(
+    tmp_path: Path, carriage: Machine
+) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b"{}")
+        channel = writer.register_channel("/state", "json", schema)
+        for number, (time_ns, u, q) in enumerate(list_rows()):
+            data = b'{"u": 1.0, "q"' if number == 120 else json.dumps({"u": u, "q": q}).encode()
+            writer.add_message(channel, time_ns, data, time_ns)
+        writer.finish()
+    place = r"message 120, 1\.200 s from the first one, topic /state: cannot be decoded"
+    with pytest.raises(RecordingError, match=place):
+        make_map("/state:u", "/state:q", "log_time").read(path, carriage)
+
+
+DBC = """VERSION ""
+NS_ :
+BS_:
+BU_: PC
+BO_ 256 Command: 8 PC
+ SG_ Valve : 0|16@1- (0.0078125,0) [-1|1] "" PC
+BO_ 257 State: 8 PC
+ SG_ Position : 0|16@1- (0.00390625,0) [-1|1] "m" PC
+ SG_ Count : 16|8@1+ (1,0) [0|255] "" PC
+"""
+
+
+def write_can(path: Path) -> None:
+    database = cantools.database.load_string(DBC)
+    with can.Logger(path) as logger:
+        for number, (time_ns, u, q) in enumerate(list_rows()):
+            t_s = (time_ns - BEGIN_NS) * 1e-9 + 100.0
+            values = {"Command": {"Valve": u}, "State": {"Position": q, "Count": number % 256}}
+            for name, content in values.items():
+                message = database.get_message_by_name(name)
+                data = message.encode(content)
+                logger.on_message_received(
+                    can.Message(
+                        timestamp=t_s,
+                        arbitration_id=message.frame_id,
+                        data=data,
+                        is_extended_id=False,
+                    )
+                )
+
+
+@pytest.mark.parametrize("ending", ["blf", "asc"])
+def test_can_logs_are_decoded_by_their_dbc(tmp_path: Path, carriage: Machine, ending: str) -> None:
+    path, dbc = tmp_path / f"a.{ending}", tmp_path / "a.dbc"
+    dbc.write_text(DBC)
+    write_can(path)
+    reader = make_map("Command:Valve", "State:Position", "time")
+    (recording,) = reader.read_log(CanLog(path, str(dbc)), carriage)
+    signals = make_signals()
+    np.testing.assert_allclose(recording.u[:, 0], signals["u"][: recording.num_samples], atol=1e-6)
+    np.testing.assert_allclose(recording.q[:, 0], signals["q"][: recording.num_samples], atol=1e-3)
+    assert recording.num_samples >= len(signals["t"]) - 1
+
+
+def test_a_cut_off_blf_is_refused_by_its_frame(tmp_path: Path, carriage: Machine) -> None:
+    path, dbc = tmp_path / "a.blf", tmp_path / "a.dbc"
+    dbc.write_text(DBC)
+    write_can(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(RecordingError, match=r"a\.blf"):
+        make_map("Command:Valve", "State:Position", "time").read_log(CanLog(path, str(dbc)), carriage)  # fmt: skip
+
+
+def test_a_can_log_without_its_dbc_is_refused(tmp_path: Path) -> None:
+    write_can(tmp_path / "a.asc")
+    with pytest.raises(ConfigError, match=r"log\.dbc=<file>"):
+        open_log(tmp_path / "a.asc")
+    with pytest.raises(ConfigError, match=r"dbc=.*: cannot be read"):
+        CanLog(tmp_path / "a.asc", str(tmp_path / "none.dbc"))
