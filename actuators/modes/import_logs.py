@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from actuators.recordings import conversion, log_guess, map_draft
@@ -35,20 +36,23 @@ class LogSelection:
     Attributes:
         input: Glob, or list of globs, of logs of one kind; a folder stands for the logs in it.
         name: Name of the machine that is drafted; `null`: that of the folder of the logs.
-        position_unit: Unit of the positions where their names do not say it; `null` to guess.
+        position_unit: Unit of the positions where their names do not say it: one for all joints, or
+            a table by joint; `null` to guess.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
     """
 
     input: str | tuple[str, ...]
     name: str | None
-    position_unit: str | None
+    position_unit: str | dict[str, str] | None
     dbc: str | None
 
     def check(self) -> None:
-        if self.position_unit is not None and self.position_unit not in UNITS:
-            raise ConfigError(
-                f"log.position_unit: unknown unit '{self.position_unit}'; {list_choices(self.position_unit, UNITS)}"
-            )
+        given = self.position_unit
+        for unit in given.values() if isinstance(given, dict) else (given,):
+            if unit is not None and unit not in UNITS:
+                raise ConfigError(
+                    f"log.position_unit: unknown unit '{unit}'; {list_choices(unit, UNITS)}"
+                )
         if self.name is not None and not re.fullmatch(r"[a-z]\w*", self.name):
             raise ConfigError(
                 f"log.name: expected a letter, then letters, digits and _, got '{self.name}'"
@@ -172,7 +176,8 @@ def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> Non
     for name in HEAD:
         table.add_column(name, overflow="fold")
     for guess in guesses:
-        table.add_row(guess.subject, guess.value, guess.sureness, guess.reason)
+        cells = (guess.subject, guess.value, guess.sureness, guess.reason)
+        table.add_row(*map(escape, cells))  # `position[foot]` is no style
     console.print(table)
     for text in (*draft.remarks, _summarise(draft, guesses), f"look at {folder / PAGE_FILE}, then:", command):  # fmt: skip
         console.print(text, markup=False, highlight=False, soft_wrap=True)

@@ -210,14 +210,15 @@ def _list_families(run: LogRun, times: Mapping[str, TimeGuess]) -> list[_Family]
 
 
 def guess_joints(
-    run: LogRun, times: Mapping[str, TimeGuess], position_unit: str | None
+    run: LogRun, times: Mapping[str, TimeGuess], position_unit: str | Mapping[str, str] | None
 ) -> tuple[list[JointGuess], list[str]]:
     """Return the joints of a run, and remarks on what was left out.
 
     Args:
         run: Beginning of a log, with all columns.
         times: Clock of each table.
-        position_unit: Unit of the positions as a person gives it; `None` to guess it.
+        position_unit: Unit of the positions as a person gives it, for all joints or by joint; `None`
+            to guess it.
 
     Raises:
         RecordingError: No command or no position can be proposed.
@@ -330,7 +331,7 @@ def _judge_joint(
     position: ColumnName,
     comparison: _Comparison,
     is_named: bool,
-    position_unit: str | None,
+    position_unit: str | Mapping[str, str] | None,
 ) -> JointGuess:
     target_r, speed_r = comparison.correlate(joint, joint)
     u, q = comparison.commands[joint], comparison.positions[joint]
@@ -369,7 +370,8 @@ def _judge_joint(
         )
     }
     guesses["kind"] = _judge_kind(name, is_target, says_target, target_r, speed_r)
-    unit, scale, guesses["unit"] = _judge_unit(name, position, q, position_unit)
+    given = position_unit.get(name) if isinstance(position_unit, Mapping) else position_unit
+    unit, scale, guesses["unit"] = _judge_unit(name, position, q, given)
     sign = 1 if is_target or r >= 0 else -1
     return JointGuess(
         name,

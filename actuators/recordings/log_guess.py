@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,7 +60,9 @@ class LogGuess:
     remarks: list[str]
 
 
-def guess_logs(paths: Sequence[Path], position_unit: str | None, dbc: str | None) -> LogGuess:
+def guess_logs(
+    paths: Sequence[Path], position_unit: str | Mapping[str, str] | None, dbc: str | None
+) -> LogGuess:
     """Return the guesses from the beginnings of the logs.
 
     Raises:

@@ -11,7 +11,7 @@ import json
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,7 @@ Keys = tuple[str | int, ...]
 """Way from a message to a value in it: fields and numbers of items."""
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class TopicMessage:
     """A message before it is decoded.
 
@@ -54,30 +54,55 @@ class MessageReader:
     def __init__(self) -> None:
         self._label_keys: list[Keys] | None = None
         self._leaves: dict[tuple[Any, ...], dict[str, Keys]] = {}
+        self._plans: dict[tuple[Any, ...], list[tuple[Keys, list[str | int]]]] = {}
 
     def find_numbers(self, message: Any) -> dict[str, Keys]:
         """Return the numbers in a message by their names; known from an earlier one of its kind."""
-        if self._label_keys is None:
-            self._label_keys = list(_find_labels(message, ()))
-        labels = tuple(tuple(_follow(message, keys) or ()) for keys in self._label_keys)
+        labels = self._read_labels(message)
         if labels not in self._leaves:
             self._leaves[labels] = dict(_find_leaves(message, "", ()))
         return self._leaves[labels]
 
-    def read(self, message: Any, names: Sequence[str]) -> list[float]:
-        """Return the named numbers, NaN for one that this message lacks."""
-        leaves = self.find_numbers(message)
-        values, parent_keys, parent = [], None, message
-        for name in names:
-            keys = leaves.get(name)
-            if keys is None:
-                values.append(np.nan)
-                continue
-            if keys[:-1] != parent_keys:
-                parent_keys, parent = keys[:-1], _follow(message, keys[:-1])
-            value = _follow(parent, keys[-1:])
-            values.append(_read_time(value) if name.endswith("stamp") else value)
-        return [np.nan if value is None else float(value) for value in values]
+    def read(self, message: Any, names: Sequence[str]) -> list[float | None]:
+        """Return the named numbers, `None` for one that this message lacks."""
+        labels = self._read_labels(message)
+        if labels not in self._plans:
+            self._plans[labels] = _plan_reading(self.find_numbers(message), names)
+        values: list[float | None] = []
+        for parent_keys, keys in self._plans[labels]:
+            parent = _follow(message, parent_keys)
+            try:
+                if isinstance(parent, Mapping) or isinstance(keys[0], int):
+                    several = [parent[key] for key in keys]
+                else:
+                    several = [getattr(parent, str(key)) for key in keys]
+            except (KeyError, IndexError, TypeError, AttributeError):
+                several = [_follow(parent, (key,)) for key in keys]
+            values += several
+        for at, name in enumerate(names):
+            if name.endswith("stamp"):
+                values[at] = _read_time(values[at])
+        return values
+
+    def _read_labels(self, message: Any) -> tuple[Any, ...]:
+        """Return the names of the items of lists, which may differ from message to message."""
+        if self._label_keys is None:
+            self._label_keys = list(_find_labels(message, ()))
+        return tuple(tuple(_follow(message, keys) or ()) for keys in self._label_keys)
+
+
+def _plan_reading(
+    leaves: Mapping[str, Keys], names: Sequence[str]
+) -> list[tuple[Keys, list[str | int]]]:
+    """Return the parents of the named numbers, each with its fields or items, in order of the names."""
+    plan: list[tuple[Keys, list[str | int]]] = []
+    for name in names:
+        keys = leaves.get(name, ("",))  # no field has an empty name
+        if plan and plan[-1][0] == keys[:-1] and type(plan[-1][1][0]) is type(keys[-1]):
+            plan[-1][1].append(keys[-1])
+        else:
+            plan.append((keys[:-1], [keys[-1]]))
+    return plan
 
 
 class MessageLog(LogFile):
@@ -115,7 +140,7 @@ class MessageLog(LogFile):
         readers = {topic: MessageReader() for topic in wanted}
         names = {topic: sorted(set(columns) - {LOG_TIME}) for topic, columns in wanted.items()}
         stores = {topic: StoredColumns([LOG_TIME, *several]) for topic, several in names.items()}
-        rows: dict[str, list[list[float]]] = {topic: [] for topic in wanted}
+        rows: dict[str, list[list[float | None]]] = {topic: [] for topic in wanted}
         counts = dict.fromkeys(wanted, 0)
         begin_ns = None
         for message in self._iterate_safely(wanted):
@@ -127,7 +152,7 @@ class MessageLog(LogFile):
                     break
                 continue
             values = readers[topic].read(message.decode(), names[topic])
-            if values and all(value != value for value in values):
+            if values and values.count(None) == len(values):
                 continue
             rows[topic].append([(message.log_time_ns - begin_ns) * 1e-9, *values])
             counts[topic] += 1
@@ -145,8 +170,8 @@ class MessageLog(LogFile):
             for message in self._iterate(topics):
                 last_ns = message.log_time_ns
                 begin_ns = begin_ns or last_ns
-                place = f"message {count}, {(last_ns - begin_ns) * 1e-9:.3f} s from the first one"
-                yield replace(message, decode=partial(self._decode, message, place))
+                decode = partial(self._decode, message, count, begin_ns)
+                yield TopicMessage(message.topic, last_ns, decode)
                 count += 1
         except RecordingError:
             raise
@@ -158,10 +183,12 @@ class MessageLog(LogFile):
                 f"{self.path}: damaged {where} ({self._explain(error)})"
             ) from error
 
-    def _decode(self, message: TopicMessage, place: str) -> Any:
+    def _decode(self, message: TopicMessage, count: int, begin_ns: int) -> Any:
         try:
             return message.decode()
         except Exception as error:  # a decoder raises what it stumbles over
+            elapsed_s = (message.log_time_ns - begin_ns) * 1e-9
+            place = f"message {count}, {elapsed_s:.3f} s from the first one"
             raise RecordingError(
                 f"{self.path}: {place}, topic {message.topic}: cannot be decoded ({error!r})"
             ) from error
@@ -361,10 +388,10 @@ def _read_time(value: Any) -> float | None:
     return None
 
 
-def _store(columns: StoredColumns, rows: list[list[float]], names: Sequence[str]) -> None:
+def _store(columns: StoredColumns, rows: list[list[float | None]], names: Sequence[str]) -> None:
     """Move gathered rows into the columns."""
     if rows:
-        block = np.array(rows)
+        block = np.array(rows, dtype=float)  # None becomes NaN
         for at, name in enumerate([LOG_TIME, *names]):
             columns.add(name, block[:, at])
         rows.clear()

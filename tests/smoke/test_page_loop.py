@@ -87,6 +87,13 @@ async def _use(host: str, run: Path) -> None:
             await control.send(json.dumps({"kind": "record", "value": value}))
             assert json.loads(await control.recv()) == {"done": "record", "kind": "record"}
             await _shown(state, lambda shown, on=on: shown["recording"]["on"] == on)
+        # The picture that is touched has to be there; the camera's process starts last.
+        await _shown(
+            state,
+            lambda shown: any(
+                one["name"] == "camera" and one["age_s"] is not None for one in shown["streams"]
+            ),
+        )
         x, y = seen_at(FRAME, np.array(TARGETS[1].center_in_base_m))
         await control.send(json.dumps({"kind": "point", "value": f"{x:.4f},{y:.4f}"}))
         assert json.loads(await control.recv()) == {"done": "point", "kind": "point"}

@@ -126,6 +126,8 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(
     brokk("mode=import", "log.input=a.csv", "log.position_unit=cm", "session.out=two")
     assert read_guesses("two")["joint: unit"]["sureness"] == "sure"
     assert "kind: slide" in Path("two/machine.yaml").read_text()
+    brokk("mode=import", "log.input=a.csv", "log.position_unit={joint: mm}", "session.out=by_joint")
+    assert read_guesses("by_joint")["joint: unit"]["value"] == "mm"
     done = brokk("mode=import", "log.input=a.csv", "log.position_unit=inch", "session.out=three")
     assert done.code == 2 and "unknown unit 'inch'" in done.err
 

@@ -518,7 +518,8 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
     assert stop["x"] >= 0 and stop["x"] + stop["width"] <= size[0]
     assert stop["y"] >= 0 and stop["y"] + stop["height"] <= size[1]
     cut = page.evaluate(
-        """() => [...document.querySelectorAll("button, dl, .inserted, #advice, #boreholes, header, header > *")].filter(node =>
+        """() => [...document.querySelectorAll("button, dl, .inserted, #levers, #middle, #advice, #boreholes, header, header > *")]
+        .filter(node =>
         node.scrollHeight > node.clientHeight + 1 || node.scrollWidth > node.clientWidth + 1)
         .map(node => node.id + node.textContent)"""
     )

@@ -41,7 +41,7 @@ export class InsertionView {
     const set = (node, values) => { for (const [key, value] of Object.entries(values)) node.setAttribute(key, typeof value === "number" ? value.toFixed(2) : value); };
     set(this.tip, { transform: `translate(0 ${height(depth_m).toFixed(2)})` });
     const [from, to] = [height(Math.min(0, depth_m)), height(Math.max(0, depth_m))];
-    set(this.fill, { y: from, height: to - from, class: depth_m > 0 ? "fill inside" : "fill" });
+    set(this.fill, { y: from, height: to - from, class: depth_m > 0 && lateral_m <= hole.radius_m ? "fill inside" : "fill" });
     set(this.wanted, { y1: height(wanted_m), y2: height(wanted_m) });
     const out = Math.hypot(center[0], center[1]) + hole.radius_m;
     const range = RANGES_M.find(one => one >= 1.1 * out) ?? RANGES_M.at(-1), scale = RADIUS / range;

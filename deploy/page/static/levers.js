@@ -65,7 +65,8 @@ export class LeverView {
       if (label.text.textContent === text) continue;
       label.text.textContent = text;
       drawIcon(label.icon, meant.length === 1 ? this.parts[meant[0]] : null);
-      label.icon.setAttribute("transform", `translate(${(-3.6 * text.length - 18).toFixed(1)} -11)`);
+      // the icon's 24 units, and a gap, to the left of the text's middle at 10
+      label.icon.setAttribute("transform", `translate(${(-22 - label.text.getComputedTextLength() / 2).toFixed(1)} -11)`);
     }
   }
 }
