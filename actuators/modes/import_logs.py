@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from actuators.recordings import conversion, log_guess, map_draft
@@ -175,7 +176,8 @@ def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> Non
     for name in HEAD:
         table.add_column(name, overflow="fold")
     for guess in guesses:
-        table.add_row(guess.subject, guess.value, guess.sureness, guess.reason)
+        cells = (guess.subject, guess.value, guess.sureness, guess.reason)
+        table.add_row(*map(escape, cells))  # `position[foot]` is no style
     console.print(table)
     for text in (*draft.remarks, _summarise(draft, guesses), f"look at {folder / PAGE_FILE}, then:", command):  # fmt: skip
         console.print(text, markup=False, highlight=False, soft_wrap=True)
