@@ -123,7 +123,7 @@ def write(path: Path, given: Any, scores: dict, noticed: dict) -> None:
                 "frames": score.frames,
                 "refused_by_check": noticed[name, distance_m] if when == "after" else 0,
                 "found": score.found,
-                "position_mm_max": 1000 * max(score.position_m, default=math.nan),
+                "position_mm_max": 1000 * max(score.position_m) if score.position_m else None,
                 "along_sigmas_max": float(sigmas.max()) if len(sigmas) else None,
                 "beyond_3_sigma": int((sigmas > LARGEST_SIGMAS).sum()),
             }
