@@ -180,6 +180,6 @@ def place_worlds(num_worlds: int) -> np.ndarray:
 
 
 def _make_ball(color: tuple[int, int, int]) -> Any:
-    ball = trimesh.creation.icosphere(3, MARK_M)
+    ball: Any = trimesh.creation.icosphere(3, MARK_M)
     ball.visual.vertex_colors = np.tile((*color, 255), (len(ball.vertices), 1))
     return ball

@@ -14,6 +14,7 @@ from typing import Any
 
 import av  # pyright: ignore[reportMissingImports]
 from aiortc.codecs.h264 import H264Encoder  # pyright: ignore[reportMissingImports]
+from av.video.frame import PictureType  # pyright: ignore[reportMissingImports]
 
 CLOCK_HZ = 90_000
 """Rate of the clock of video in RTP (RFC 6184)."""
@@ -39,6 +40,7 @@ class LinkEncoder(H264Encoder):
 
     def __init__(self, min_bitrate: int, max_bitrate: int, num_cameras: int) -> None:
         super().__init__()
+        self.codec: Any = None
         self._least, self._most, self._num_cameras = min_bitrate, max_bitrate, num_cameras
         # In the middle, by ratio: the link is not known yet.
         self._wanted = self._present = round(math.sqrt(min_bitrate * max_bitrate))
@@ -54,11 +56,10 @@ class LinkEncoder(H264Encoder):
         self._wanted = max(self._least, min(bitrate // self._num_cameras, self._most))
 
     def _encode_frame(self, frame: Any, force_keyframe: bool) -> Iterator[bytes]:
-        kinds = av.video.frame.PictureType
         if self.codec is None or self._should_restart(frame):
             self.codec = self._open(frame)
         # Without NONE the kind that the frame had elsewhere would be kept.
-        frame.pict_type = kinds.I if force_keyframe else kinds.NONE
+        frame.pict_type = PictureType.I if force_keyframe else PictureType.NONE
         encoded = b"".join(bytes(packet) for packet in self.codec.encode(frame))
         if encoded:
             yield from self._split_bitstream(encoded)
