@@ -116,8 +116,7 @@ class Train:
         )
         if self.rl.near_starts:
             loop.bring_near(self.rl.near_starts, self.session.stream("starts"))
-        if self.rl.fault_steps:
-            loop.record_faults(self.rl.fault_steps)
+        loop.record_faults(self.rl.count_fault_steps(device.type))
         loop.capture(self.rl.fuse)
         group = TrainingGroup(device)
         _log_setup(loop, group)

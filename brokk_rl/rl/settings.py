@@ -144,6 +144,10 @@ class NearStarts:
         require_range("rl.near_starts.height_m", self.height_m)
 
 
+FAULT_STEPS = 100
+"""Control steps that a training on a CPU keeps of each world: 5 s at 20 Hz."""
+
+
 @spec
 class TrainingConfig:
     """Numbers of a training with rsl-rl's PPO.
@@ -170,7 +174,8 @@ class TrainingConfig:
         max_fault_rate: Share of control steps that may end in a diverged or overflowing world
             before the run stops with an error.
         fault_steps: Control steps kept of each world; those of worlds that diverge are written into
-            `faults` of the run folder. 0 records nothing.
+            `faults` of the run folder. 0 records nothing; `None`: 100 on a CPU, 0 on a GPU, where
+            the recorder was never run.
         fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
             compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
             less than half of a control step of few worlds, far more.
@@ -192,10 +197,16 @@ class TrainingConfig:
     teacher: Teacher | None
     near_starts: NearStarts | None
     max_fault_rate: float
-    fault_steps: int
+    fault_steps: int | None
     fuse: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
+
+    def count_fault_steps(self, device_type: str) -> int:
+        """Return how many control steps of each world a training on `cpu` or `cuda` keeps."""
+        if self.fault_steps is None:
+            return FAULT_STEPS if device_type == "cpu" else 0
+        return self.fault_steps
 
     def check(self) -> None:
         counts = ("num_starts", "save_interval", "keep_checkpoints")
@@ -203,7 +214,8 @@ class TrainingConfig:
             require_number(f"rl.{name}", getattr(self, name), least=1)
         for name in ("settling", "max_fault_rate"):
             require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
-        require_number("rl.fault_steps", self.fault_steps, least=0)
+        if self.fault_steps is not None:
+            require_number("rl.fault_steps", self.fault_steps, least=0)
         require_number("rl.output_gain", self.output_gain, above=0)
         self._check_runner()
         distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}

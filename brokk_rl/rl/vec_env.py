@@ -8,6 +8,7 @@ world allows it (Warp on a GPU) the whole step is captured once in a CUDA graph 
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
@@ -25,7 +26,7 @@ from brokk_rl.contracts.actuator import (
     SensingModel,
 )
 from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
-from brokk_rl.contracts.world import Simulator, World
+from brokk_rl.contracts.world import Simulator, TracedWorld, World
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -36,6 +37,8 @@ from brokk_rl.sim.fault_recorder import FaultRecorder
 from brokk_rl.task_description import TaskDescription, describe_task
 
 Starts = dict[str, torch.Tensor]
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -207,11 +210,13 @@ class ControlLoop(VecEnv):
         """Keep the last steps of worlds that diverge, before `capture`; see `FaultRecorder`.
 
         Args:
-            num_steps: Control steps kept of each world.
-
-        Raises:
-            ConfigError: The simulator shows no states.
+            num_steps: Control steps kept of each world; 0 keeps none.
         """
+        if num_steps == 0:
+            return
+        if not isinstance(self.world, TracedWorld):
+            log.info("%s shows no states: faults are not recorded", type(self.world).__name__)
+            return
         terms = {}
         for name, value in self.task.episode.items():
             if name.startswith(REWARD):

@@ -17,7 +17,7 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 
-from brokk_rl.contracts.world import TRACE, TracedWorld, World
+from brokk_rl.contracts.world import TRACE, TracedWorld
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.scene import SIZE
@@ -123,17 +123,12 @@ class FaultRecorder:
 
     def __init__(
         self,
-        world: World,
+        world: TracedWorld,
         machine: Machine,
         num_steps: int,
         terms: Mapping[str, torch.Tensor] | None = None,
     ) -> None:
-        if not isinstance(world, TracedWorld):
-            raise ConfigError(
-                f"rl.fault_steps: the simulator ({type(world).__name__}) shows no states to "
-                "record; give rl.fault_steps=0"
-            )
-        self._world: TracedWorld = world
+        self._world = world
         self._faults, self._machine, self._terms = world.faults, machine, dict(terms or {})
         self._state = [world.trace[name] for name in TRACE]
         self._properties: dict[str, torch.Tensor] = getattr(world, "properties", {})

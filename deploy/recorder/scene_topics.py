@@ -98,9 +98,9 @@ class SceneTopics:
     def add(self, topic: str, t_s: float, values: dict[str, Any]) -> None:
         """Take a message of another topic: of the bus, or a decision."""
         if topic == "holes":
-            self._holes = values["holes"]
+            self._holes = values.get("holes", [])
         elif topic == "advice":
-            valid = values["reason"] == AdviceStatus.VALID.value
+            valid = values.get("reason") == AdviceStatus.VALID.value
             target_m = values.get("target_in_base_m") if valid else None
             self._target_m = None if target_m is None else np.array(target_m)
             self._write_task(t_s)

@@ -89,8 +89,8 @@ def stack(machine: Machine, inner: Any, specs: list[Any], num: int) -> Any:
     return inner
 
 
-def test_every_fixed_name_has_an_effect_and_beside_them_is_only_the_library() -> None:
-    assert sorted(names("effect")) == sorted([*FIXED, "library"])
+def test_every_fixed_name_has_an_effect_and_beside_them_are_only_libraries() -> None:
+    assert sorted(names("effect")) == sorted([*FIXED, "library", "wide"])
 
 
 @pytest.mark.parametrize("name", FIXED)

@@ -176,6 +176,16 @@ def test_another_machine_and_another_file_are_refused(machine: Machine, tmp_path
         load_fault(tmp_path / "x.npz")
 
 
-def test_a_simulator_that_shows_no_states_is_refused(machine: Machine) -> None:
-    with pytest.raises(ConfigError, match=r"rl\.fault_steps=0"):
-        runs.plant(machine).build(runs.CPU, 4, 64, 0).record_faults(5)
+def test_a_simulator_that_shows_no_states_is_not_recorded(
+    machine: Machine, caplog: pytest.LogCaptureFixture
+) -> None:
+    loop = runs.plant(machine).build(runs.CPU, 4, 64, 0)
+    with caplog.at_level("INFO"):
+        loop.record_faults(5)
+    assert loop.recorder is None and "faults are not recorded" in caplog.text
+
+
+def test_a_recorder_that_was_never_run_on_a_gpu_is_asked_for_there() -> None:
+    training = option("rl", "ppo")
+    assert (training.count_fault_steps("cpu"), training.count_fault_steps("cuda")) == (100, 0)
+    assert replace(training, fault_steps=7).count_fault_steps("cuda") == 7
