@@ -16,6 +16,7 @@ from composed import option
 import brokk_rl.sim
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
+from deploy.guard import shapes
 from deploy.guard.envelope import Envelope, measure_segment_to_box
 from deploy.guard.limits import StayOutBox
 from deploy.guard.shapes import (
@@ -770,3 +771,14 @@ def test_limits_that_make_no_sense_are_refused(change: dict[str, object]) -> Non
 def test_a_stay_out_box_upside_down_is_refused() -> None:
     with pytest.raises(ConfigError, match="lower_m below upper_m"):
         StayOutBox(lower_m=(0.0, 0.0, 1.0), upper_m=(1.0, 1.0, 1.0))
+
+
+@pytest.mark.parametrize(
+    "axis", [(0, 0, 1), (0, 0, -1), (0, 1, 0), (0.6, 0, 0.8), (-0.48, 0.6, -0.64)]
+)
+def test_a_part_that_two_points_place_is_turned_as_mujoco_turns_it(axis: tuple[float, ...]) -> None:
+    quaternion, rotation = np.zeros(4), np.zeros(9)
+    mujoco.mju_quatZ2Vec(quaternion, np.array(axis, float))
+    mujoco.mju_quat2Mat(rotation, quaternion)
+    found = shapes._compute_rotation_to(np.array(axis, float))
+    np.testing.assert_allclose(found, rotation.reshape(3, 3), atol=1e-12)

@@ -17,7 +17,7 @@ from brokk_rl.history import History
 from deploy.guard.drift_watch import Misfit
 from deploy.guard.guard import GuardTrip
 from deploy.guard.observer import NOTHING_OBSERVED, Observer, classify_fault
-from deploy.guard.valve_model import ValvePredictor, load_observer_file
+from deploy.guard.valve_model import ValvePredictor, describe_sources, load_observer_file
 from deploy.observer_file import ThresholdSettings
 
 MACHINE = option("machine", "brokk170")
@@ -399,3 +399,11 @@ def test_thresholds_that_make_no_sense_are_refused(change: dict[str, float]) -> 
 def test_a_rate_of_false_alarms_that_makes_no_sense_is_refused(chance: float) -> None:
     with pytest.raises(ConfigError, match=r"guard\.observer"):
         replace(LIMITS, false_alarms=chance)
+
+
+@pytest.mark.parametrize(
+    ("sources", "words"),
+    [(["a"], "from a"), (["a", "b"], "from a and 1 more"), (["a", "b", "c"], "from a and 2 more")],
+)
+def test_the_sources_of_an_observer_file_are_counted(sources: list[str], words: str) -> None:
+    assert describe_sources({"sources": sources}) == words
