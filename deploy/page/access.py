@@ -27,7 +27,7 @@ POINT = re.compile(r"0?\.\d{1,6},0?\.\d{1,6}")
 """A point of the picture: parts of its width and height, at neither edge."""
 SECONDS = re.compile(r"\d{1,6}(\.\d{1,3})?")
 SPEEDS = ("off", "0.25", "1", "4", "16")
-"""Of a recording that is played."""
+"""Speeds of a recording that is played, over real time."""
 LONGEST = 256
 """Bytes of a request. Chosen by hand: the page's own are below 100."""
 

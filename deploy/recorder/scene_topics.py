@@ -69,7 +69,7 @@ CLOUD_TYPE = np.dtype(
 """A point of a cloud."""
 LEVELS = Log_pb2.Log
 SEED, SURFACE_POINTS = 7, 150
-"""Of the points on a shape's surface; dense enough to see it, chosen by hand."""
+"""Seed and number of the points on a shape's surface: dense enough to see it, chosen by hand."""
 WriteMessage = Callable[[str, float, str, bytes, bytes], None]
 Color = tuple[float, float, float, float]
 Line = tuple[str, np.ndarray, Color]

@@ -21,7 +21,7 @@ CLOCK_HZ = 90_000
 USUAL_HZ = 15
 """Pictures a second until their times say otherwise (paper: video at 15 Hz)."""
 PRESET = "veryfast"
-"""Of x264: 2.7 ms for a picture of 640 x 360 on one core, where the default takes 15.6 ms."""
+"""Preset of x264: 2.7 ms for a picture of 640 x 360 on one core, where the default takes 15.6 ms."""
 BURST_S = 0.15
 """Longest time that one picture takes on a link of just the wanted rate: it bounds key pictures."""
 LESS, MORE, MORE_AFTER_S = 0.85, 1.3, 3.0

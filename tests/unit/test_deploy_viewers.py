@@ -1,4 +1,4 @@
-"""What other programs read in a capture: schemas, and Foxglove's messages, held against the machine."""
+"""Captures as other programs read them: schemas, and Foxglove's messages, held against the machine."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_a_schema_says_meaning_unit_and_all_values_of_its_fields(
 
 
 def test_all_topics_in_the_code_are_described() -> None:
-    """What the processes write is what the schemas hold."""
+    """The schemas hold all that the processes write."""
     sources = [
         path.read_text()
         for path in Path(str(resources.files("deploy"))).rglob("*.py")
