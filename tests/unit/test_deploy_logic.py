@@ -422,6 +422,19 @@ def test_the_observer_gets_positions_and_the_mean_flow_of_its_period() -> None:
     assert probe.seen[-1][2][0] == pytest.approx(0.8, abs=0.01)
 
 
+def test_the_first_period_of_the_observer_has_the_mean_of_its_own_messages() -> None:
+    probe = Probe()
+    probe.due = False
+    loop = Loop(observer=probe)  # type: ignore[arg-type]
+    loop.sender.values["Flow_q1"] = 0.2
+    loop.go(0.1)
+    probe.due = True
+    loop.decide()
+    (_, _, u) = probe.seen[0]
+    assert loop.logic.receiver.flow_number > 2
+    assert u[0] == pytest.approx(0.2, abs=0.005)
+
+
 def test_an_observed_fault_latches_with_its_joint_and_a_released_dead_man_clears_it() -> None:
     probe = Probe()
     loop = Loop(observer=probe).get_active()  # type: ignore[arg-type]
