@@ -9,6 +9,12 @@ from pathlib import Path
 import pytest
 
 
+def forget_package(name: str) -> None:
+    """Forget the modules of a package that another test installed."""
+    for module in [one for one in sys.modules if one.split(".")[0] == name]:
+        del sys.modules[module]
+
+
 def install_package(
     folder: Path, name: str, files: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -16,8 +22,7 @@ def install_package(
 
     Modules of another test's package of the same name are forgotten first.
     """
-    for module in [one for one in sys.modules if one.split(".")[0] == name]:
-        del sys.modules[module]
+    forget_package(name)
     for path, text in {"__init__.py": "", "conf/__init__.py": "", **files}.items():
         (folder / name / path).parent.mkdir(parents=True, exist_ok=True)
         (folder / name / path).write_text(text)

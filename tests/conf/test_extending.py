@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 from composed import option
-from packages import install_package
+from packages import forget_package, install_package
 
 from brokk_rl import extensions
 from brokk_rl.checks import check_actuator, check_task
@@ -31,6 +31,7 @@ TRAINING = next(line for line in PAGE.splitlines() if line.startswith("brokk mod
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project that `mode=new` writes."""
     folder = tmp_path_factory.mktemp("projects")
+    forget_package("mine")
     NewPackage(new=PackageRequest(name="mine", folder=str(folder))).run()
     return folder / "mine"
 
