@@ -143,7 +143,7 @@ def _run(cfg: DictConfig) -> float | None:
     """Instantiate the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
     cfg = _rename_targets(cfg)
-    _check_values(cfg)
+    check_values(cfg)
     cfg = _drop_consumed_groups(choose_task(cfg))
     if "session" not in cfg:
         distributed.check_together(get_class(str(cfg._target_)), sweep)
@@ -172,7 +172,7 @@ def _run(cfg: DictConfig) -> float | None:
         raise
 
 
-def _check_values(cfg: DictConfig) -> None:
+def check_values(cfg: DictConfig) -> None:
     """Build the specs that need no torch, so that their bad values are refused within a second.
 
     Raises:
