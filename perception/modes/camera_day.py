@@ -114,8 +114,9 @@ def _summarize_day(scores: Mapping[str, SessionScore]) -> tuple[str, Tone]:
     if score is None:
         return "The day goes on.", "plain"
     text = f"After calibration {score.num_found} of {score.num_holes} holes are found, "
-    if score.errors:
-        text += f"half of them within {1000 * score.compute_position_m(50):.1f} mm. "
+    median_m = score.compute_position_m(50)
+    if median_m is not None:
+        text += f"half of them within {1000 * median_m:.1f} mm. "
     text += f"{score.num_false} targets are no hole."
     good = score.num_found == score.num_holes and not score.num_false
     return text, "good" if good else "warn"

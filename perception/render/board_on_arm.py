@@ -23,7 +23,7 @@ from perception.render.materials import Material
 from perception.render.printed_board import build_plate
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import add_surroundings
-from perception.render.scene_sequence import SceneView, build_pose, move_solids
+from perception.render.scene_sequence import StagedScene, build_pose, move_solids
 from perception.render.solids import Cylinder, Solid, SolidPose
 from perception.render.stereo_camera import StereoRig, measure_disparity_error
 
@@ -109,7 +109,7 @@ class BoardScenes:
         inner[1:-1] = settings.zero_std_rad
         self._zeros = inner * session.generator("scene/zeros").standard_normal(len(inner))
 
-    def view(self, number: int) -> SceneView:
+    def view(self, number: int) -> StagedScene:
         """Return the scene at the time of frame `number`.
 
         Raises:
@@ -127,7 +127,7 @@ class BoardScenes:
         scene = add_surroundings(
             settings.kind, self._rig, None, solids, target, normal, scenery, ground_m
         )
-        return SceneView(scene, self.base_from_camera, generator)
+        return StagedScene(scene, self.base_from_camera, generator)
 
     def write_records(self, folder: Path, count: int) -> None:
         """Write the recording of the joints, and the numbers that a calibration should find."""

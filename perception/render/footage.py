@@ -15,7 +15,7 @@ from perception.render.drilled_block import DrilledBlock
 from perception.render.printed_board import PrintedPlate, build_plate
 from perception.render.scene_ranges import Range, Scene, SceneRanges, draw_uniform
 from perception.render.scene_sampler import compose_scene, compute_hidden_share
-from perception.render.scene_sequence import SceneView, build_pose, move_light, move_solids
+from perception.render.scene_sequence import StagedScene, build_pose, move_light, move_solids
 from perception.render.stereo_camera import StereoRig
 
 CAMERAS, PLACING = "cameras.yaml", "placing.yaml"
@@ -88,7 +88,7 @@ class FootageScenes:
         self._aim = (face + self._plate.pose.center_m) / 2
         self._ground_m = float((block.corners_m @ rig.down_in_camera).max())
 
-    def view(self, number: int) -> SceneView:
+    def view(self, number: int) -> StagedScene:
         """Return the scene as frame `number` sees it.
 
         Raises:
@@ -118,7 +118,7 @@ class FootageScenes:
             hidden_discs=tuple(compute_hidden_share(solids, block, disc) for disc in block.discs),
             conditions=conditions,
         )
-        return SceneView(moved, self._rig.base_from_camera @ first_from_camera, generator)
+        return StagedScene(moved, self._rig.base_from_camera @ first_from_camera, generator)
 
     def write_records(self, folder: Path, count: int) -> None:
         """Write true camera poses, and clicks in the first frame, as `mode=label` takes them."""

@@ -17,7 +17,7 @@ from perception.render.board_on_arm import BoardOnArm
 from perception.render.footage import Footage
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
-from perception.render.scene_sequence import RandomScenes, SceneSequence, SceneView
+from perception.render.scene_sequence import RandomScenes, SceneSequence, StagedScene
 from perception.render.stereo_camera import StereoRig, draw_dust, take_picture
 from perception.stereo import Stereo
 
@@ -100,7 +100,7 @@ class FrameRenderer:
         """Return whether the frame at `stem` exists and is complete."""
         return dataset.is_whole(stem)
 
-    def shoot(self, stem: Path, view: SceneView) -> None:
+    def shoot(self, stem: Path, view: StagedScene) -> None:
         """Render and write one frame; the same view makes the same files.
 
         Raises:

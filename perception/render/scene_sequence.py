@@ -18,7 +18,7 @@ from perception.render.stereo_camera import StereoRig
 
 
 @dataclass(frozen=True)
-class SceneView:
+class StagedScene:
     """A scene as one frame sees it.
 
     Attributes:
@@ -35,10 +35,12 @@ class SceneView:
 class SceneSequence(Protocol):
     """Scenes by number, and the records that belong to them."""
 
-    base_from_camera: np.ndarray | None
-    """Pose of a camera that stands still, `(4, 4)`; `None` for one that is carried."""
+    @property
+    def base_from_camera(self) -> np.ndarray | None:
+        """Pose of a camera that stands still, `(4, 4)`; `None` for one that is carried."""
+        ...
 
-    def view(self, number: int) -> SceneView:
+    def view(self, number: int) -> StagedScene:
         """Return scene `number`; the same session gives the same."""
         ...
 
@@ -64,11 +66,11 @@ class RandomScenes:
         self._kind, self._rig, self._session = kind, rig, session
         self.base_from_camera = rig.base_from_camera
 
-    def view(self, number: int) -> SceneView:
+    def view(self, number: int) -> StagedScene:
         """Return scene `number`."""
         generator = self._session.generator(f"scene/{number}")
         scene = compose_scene(self._kind, self._rig, generator)
-        return SceneView(scene, self.base_from_camera, generator)
+        return StagedScene(scene, self.base_from_camera, generator)
 
     def write_records(self, folder: Path, count: int) -> None:
         """Write nothing."""
