@@ -75,7 +75,7 @@ def check_story(
         )
 
 
-def hand_on_groups(
+def write_groups(
     folder: Path, groups: Sequence[str], heads: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Write composed groups of a story as files for `group=@<file>`; return them.

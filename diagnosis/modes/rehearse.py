@@ -244,7 +244,7 @@ class Rehearse:
         """
         folder = self.session.folder.resolve()
         heads = {"withheld": "# @package effect\n"}
-        given = story.hand_on_groups(folder, (*HANDED_ON_GROUPS, "withheld"), heads)
+        given = story.write_groups(folder, (*HANDED_ON_GROUPS, "withheld"), heads)
         told = {name: stage.title for name, stage in self.stages.items()}
 
         def write_page() -> None:

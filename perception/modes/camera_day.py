@@ -76,7 +76,7 @@ class CameraDay:
             BrokkError: a stage failed; the day goes on from there with `resume=`.
         """
         folder = self.session.folder.resolve()
-        story.hand_on_groups(folder, GROUPS)
+        story.write_groups(folder, GROUPS)
         titles = {name: stage.title for name, stage in self.stages.items()}
         story.run_story(self.session, self.stages, lambda: write_day(folder, titles))
         Console().print(f"camera day: {self.session.folder / DAY_FILE}", highlight=False)

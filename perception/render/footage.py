@@ -104,7 +104,7 @@ class FootageScenes:
         conditions = scene.conditions | {
             "distance_m": float(np.linalg.norm(motion[:3, :3] @ self._aim + motion[:3, 3])),
             "obliquity_rad": float(
-                np.arccos(np.clip(-block.pose.rotation[:, 2] @ _unit(to_face), -1, 1))
+                np.arccos(np.clip(-block.pose.rotation[:, 2] @ _normalize(to_face), -1, 1))
             ),
             "arm": 0.0,
         }
@@ -156,7 +156,7 @@ class FootageScenes:
         half = self._block.half_m
         signs = np.array([[-1, -1, 1], [1, -1, 1], [-1, 1, 1], [1, 1, 1]])
         points_m = np.concatenate([self._block.pose.point(signs * half), self._plate.corners_m])
-        across = _unit(np.cross(normal, down))
+        across = _normalize(np.cross(normal, down))
         for _ in range(TRIES):
             lean, azimuth = draw_uniform(settings.obliquity_rad, generator), generator.uniform(0, 7)
             side = np.cos(azimuth) * across + np.sin(azimuth) * np.cross(normal, across)
@@ -195,12 +195,12 @@ def _place_board(settings: Footage, block: DrilledBlock, down: np.ndarray) -> Pr
 
 def _look_at(place: np.ndarray, aim: np.ndarray, down: np.ndarray, roll_rad: float) -> np.ndarray:
     """Return a camera at `place` that looks at `aim`, `(4, 4)`."""
-    z = _unit(aim - place)
-    y = _unit(down - z * (z @ down))
+    z = _normalize(aim - place)
+    y = _normalize(down - z * (z @ down))
     x = np.cross(y, z)
     cos, sin = np.cos(roll_rad), np.sin(roll_rad)
     return build_pose(np.stack([cos * x + sin * y, cos * y - sin * x, z], 1), place)
 
 
-def _unit(vector: np.ndarray) -> np.ndarray:
+def _normalize(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
