@@ -33,8 +33,8 @@ GROUPS = ("rig",)
 """Groups that stages can take from the day."""
 PICTURE_PX = 900
 """Width of a picture on the page."""
-BOARD, CALIBRATED, FOOTAGE, LABELS, NETWORK, WORK = (
-    "board", "calibration", "footage", "labels", "network", "work",
+BOARD, CALIBRATED, FOOTAGE, LABELS, NETWORK, SITE = (
+    "board", "calibration", "footage", "labels", "network", "site",
 )  # fmt: skip
 """Stages whose files the page reads."""
 PERCEIVED = {
@@ -95,7 +95,7 @@ def write_day(folder: Path, titles: Mapping[str, str]) -> None:
     scores = {}
     for name in PERCEIVED:
         if (folder / name / "holes.json").is_file():
-            scores[name] = score_session(folder / name / "holes.json", folder / WORK / "frames")
+            scores[name] = score_session(folder / name / "holes.json", folder / SITE / "frames")
     page = Report("A day with a new camera", *_summarize_day(scores))
     page.add_text(
         "Every picture is rendered; no figure here comes from a real camera. The steps and "
