@@ -18,13 +18,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.contracts.target import MotionPlan, TargetReading
-from brokk_rl.contracts.vision import (
-    BoreholeFinder,
-    FinderSpec,
-    HolePose,
-    TrackedHole,
-    TrackerSpec,
-)
+from brokk_rl.contracts.vision import BoreholeFinder, FinderSpec, HolePose, TrackedHole, TrackerSpec
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
@@ -157,7 +151,12 @@ class WatchedHole:
             self._view = self._mount.error.draw(self._generator, "view")
 
     def expose(
-        self, q: np.ndarray, measured_q: np.ndarray, chain_m: np.ndarray, t_s: float, seed: tuple[int, ...]
+        self,
+        q: np.ndarray,
+        measured_q: np.ndarray,
+        chain_m: np.ndarray,
+        t_s: float,
+        seed: tuple[int, ...],
     ) -> _Exposure | None:
         """Return the picture to take, `None` where the hole is out of the picture."""
         rig, window = self._settings.camera.rig, self._settings.window_px
@@ -221,23 +220,29 @@ class PerceivedTargets:
         self._before: np.ndarray | None = None
         self._episodes = np.zeros(num_envs, int)
         self.watched: list[WatchedHole] = []
+        self.ended: list[WatchedHole] = []
+        """Episodes that have ended, in this order."""
         self._every = max(1, round(1.0 / (settings.rate_hz * machine.period_s)))
 
     def reset(self, mask: np.ndarray, start: dict[str, np.ndarray]) -> None:
         """Begin new episodes; see `TargetSensor.reset`."""
-        if mask.all():  # an evaluation begins: the same errors for every policy
-            self.watched, self._episodes[:] = [], 0
-            self._attended[:] = True
         for number in np.flatnonzero(mask):
             stream = (self._seed, int(number), int(self._episodes[number]))
             generator = np.random.default_rng(stream)
             eye = WatchedHole(self._settings, self._mount, start["scene"][number], generator)
             if len(self.watched) <= number:
                 self.watched.append(eye)
-            elif self._attended[number]:
+            else:
+                if self._attended[number]:
+                    self.ended.append(self.watched[number])
                 self.watched[number] = eye
             self._steps[number] = 0
             self._episodes[number] += 1
+
+    def forget(self) -> None:
+        """Forget all episodes; see `TargetSensor.forget`."""
+        self.watched, self.ended = [], []
+        self._episodes[:], self._attended[:] = 0, True
 
     def attend(self, mask: np.ndarray) -> None:
         """Sense in some environments alone; see `TargetSensor.attend`."""
@@ -260,15 +265,15 @@ class PerceivedTargets:
 
     def summarize(self) -> dict[str, Any]:
         """Return figures of the episodes; see `TargetSensor.summarize`."""
-        frames = [frame for eye in self.watched for frame in eye.history]
+        frames = [frame for eye in self.ended for frame in eye.history]
         known = [frame for frame in frames if frame["error_m"] is not None]
-        last = [eye.history[-1] for eye in self.watched if eye.history and eye.hole is not None]
+        last = [eye.history[-1] for eye in self.ended if eye.history and eye.hole is not None]
         errors_m = [float(np.linalg.norm(frame["error_m"])) for frame in last]
         return {
             "frames": len(frames),
             "seen_share": float(np.mean([frame["seen"] for frame in frames])) if frames else None,
             "known_share": len(known) / len(frames) if frames else None,
-            "never_seen": sum(eye.hole is None for eye in self.watched),
+            "never_seen": sum(eye.hole is None for eye in self.ended),
             "last_error_m": {
                 "median": float(np.median(errors_m)) if errors_m else None,
                 "p95": float(np.quantile(errors_m, 0.95)) if errors_m else None,
@@ -290,7 +295,9 @@ class PerceivedTargets:
             else:
                 asked.append((int(number), exposure))
         with use_workers(self._settings.num_processes):
-            found = map_parallel(lambda item: _search(self._settings, self._mount, self._finder, item[1]), asked)
+            found = map_parallel(
+                lambda item: _search(self._settings, self._mount, self._finder, item[1]), asked
+            )
         for (number, exposure), holes in zip(asked, found, strict=True):
             self.watched[number].wait_for(holes, exposure.t_s)
 

@@ -144,11 +144,7 @@ class ToolPoseControl:
         for _ in range(num_times - 1):
             for _ in range(num_parts):
                 guidance = self.controller.guide(
-                    q[:, None],
-                    rest[:, None],
-                    target_m - self.down,
-                    pitch_rad,
-                    self.switch.reach_m,
+                    q[:, None], rest[:, None], target_m - self.down, pitch_rad, self.switch.reach_m
                 )
                 positioning = self.switch.positioning(guidance)
                 u = self.action.command(

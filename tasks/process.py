@@ -22,7 +22,6 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
-from brokk_rl.observation import TargetScaling
 from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.classical import ClassicalController
 from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs

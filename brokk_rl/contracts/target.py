@@ -41,6 +41,10 @@ class TargetSensor(Protocol):
         """Begin new episodes in the environments of `mask`, `(N,)` bool, at the task's starts."""
         ...
 
+    def forget(self) -> None:
+        """Forget all episodes; what follows does not depend on them."""
+        ...
+
     def attend(self, mask: np.ndarray) -> None:
         """Sense in the environments of `mask`, `(N,)` bool, alone; the others do not count."""
         ...
@@ -56,7 +60,7 @@ class TargetSensor(Protocol):
         ...
 
     def summarize(self) -> dict[str, Any]:
-        """Return figures of the episodes since the first `reset` of all environments, JSON data."""
+        """Return figures of the episodes that ended since `forget`, as JSON data."""
         ...
 
 

@@ -98,6 +98,8 @@ def evaluate_policy(
         on_step: Called after each of at most `loop.task.max_episode_steps` control steps.
     """
     torch.manual_seed(seed)
+    if loop.sensor is not None:
+        loop.sensor.forget()
     loop.begin(starts)
     loop.statistics()  # forget episodes of before
     num = loop.num_envs

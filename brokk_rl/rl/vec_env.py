@@ -27,14 +27,7 @@ from brokk_rl.contracts.actuator import (
     SensingModel,
 )
 from brokk_rl.contracts.target import TargetSensor, TargetSensorSpec
-from brokk_rl.contracts.task import (
-    FAULT,
-    REWARD,
-    STEPS,
-    Task,
-    TaskProcess,
-    find_looking_task,
-)
+from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess, find_looking_task
 from brokk_rl.contracts.world import Simulator, TracedWorld, World
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History

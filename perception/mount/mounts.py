@@ -193,15 +193,14 @@ class AxesMountModel:
     def __init__(self, settings: AxesMount, machine: Machine) -> None:
         self._settings, self._machine = settings, machine
         self._axes = tuple(settings.axes.values())
-        self._camera = build_camera_pose(
-            settings.position_m, settings.yaw_rad, settings.pitch_rad
-        )
+        self._camera = build_camera_pose(settings.position_m, settings.yaw_rad, settings.pitch_rad)
         self.error = settings.error
         self.start = np.array([axis.start for axis in self._axes])
         grids = []
         for axis in self._axes:
             grids.append(np.linspace(axis.lower, axis.upper, axis.num_views))
-        self.views = np.array(list(itertools.product(*grids))).reshape(-1, len(self._axes))
+        views = list(itertools.product(*grids))
+        self.views = np.array(views, float).reshape(len(views), len(self._axes))
 
     def locate(self, position: np.ndarray, q: np.ndarray) -> np.ndarray:
         """Return the camera's pose in the base frame; see `CameraMount.locate`."""

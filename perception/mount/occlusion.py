@@ -89,9 +89,7 @@ def compute_visible_share(
     return (distance_m > capsules.radius_m).all(-1).mean(-1)
 
 
-def _measure_distance(
-    p: np.ndarray, u: np.ndarray, r: np.ndarray, v: np.ndarray
-) -> np.ndarray:
+def _measure_distance(p: np.ndarray, u: np.ndarray, r: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Return the distance of segments p to p + u from segments r to r + v, `(…,)`.
 
     Ericson, Real-Time Collision Detection, section 5.1.9.

@@ -157,14 +157,14 @@ class PlacedRig(StereoRig):
         StereoRig.check(self)
         # Its radial shift is that of a whole picture, which a part does not know.
         if not self.error.is_none:
-            raise ConfigError("rig.error: a part of the picture is rendered for rig/error=none only")
+            raise ConfigError(
+                "rig.error: a part of the picture is rendered for rig/error=none only"
+            )
 
     @property
     def left(self) -> Pinhole:
         """The camera in whose coordinates everything is told."""
-        return Pinhole(
-            self.width, self.height, self.focal_px, np.zeros(3), axis_px=self.axis_px
-        )
+        return Pinhole(self.width, self.height, self.focal_px, np.zeros(3), axis_px=self.axis_px)
 
     @property
     def right(self) -> Pinhole:
@@ -195,9 +195,7 @@ def place_rig(
     return PlacedRig(**values)
 
 
-def build_camera_pose(
-    position_m: Sequence[float], yaw_rad: float, pitch_rad: float
-) -> np.ndarray:
+def build_camera_pose(position_m: Sequence[float], yaw_rad: float, pitch_rad: float) -> np.ndarray:
     """Return the pose of a level camera, `(4, 4)`: x right, y down, z forward.
 
     Args:
