@@ -9,6 +9,7 @@ from brokk_rl.observation import TargetScaling
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
+from tasks.termination import Termination
 
 
 @dataclass
@@ -19,8 +20,6 @@ class ToolPoseOptions:
     """
 
     episode_s: float
-    end_on_success: bool
-    limit_margin: float
     depth_m: float
     memory: int
     advice: AdviceConfig | None
@@ -31,6 +30,7 @@ class ToolPoseOptions:
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
     curriculum: RewardCurriculum | None
+    termination: dict[str, Termination | None]
 
     @classmethod
     def of(cls, task: object, **fixed: Any) -> Self:
