@@ -18,6 +18,8 @@ OVER = 4
 CHUNK = 1 << 17
 """Rays at a time, so that their data stay in the cache; chosen by hand."""
 FAR_M = 80.0
+NEAREST_M = 0.05
+"""Nearer points are not in the picture of a camera."""
 NOTHING = -1
 
 
@@ -53,6 +55,14 @@ class Pinhole:
         away = point_m - self.origin_m
         center = self.matrix[:2, 2]
         return self.focal_px * away[..., :2] / away[..., 2:] + center
+
+    def is_inside(self, points_m: np.ndarray, border_px: float) -> bool:
+        """Return whether all points, `(N, 3)`, lie in the picture, so far from its border."""
+        if points_m[:, 2].min() < NEAREST_M:
+            return False
+        pixel = self.project(points_m)
+        last = np.array([self.width, self.height]) - 1 - border_px
+        return bool((pixel >= border_px).all() and (pixel <= last).all())
 
     def rays(self, pixel: np.ndarray) -> np.ndarray:
         """Return directions with z = 1, `(M, 3)` float32, through pixels, `(M, 2)`."""

@@ -145,6 +145,25 @@ class StereoRig:
         return -self.base_from_camera[2, :3]
 
 
+def measure_disparity_error(rig: StereoRig) -> tuple[float, float, float]:
+    """Return the error of a pair's disparity: constant, and slopes over x/z and y/z, px.
+
+    It is fitted to rays over the middle half of the right picture: near the border distortion bends
+    it. Measured disparity less this error is the true one.
+    """
+    ideal = Pinhole(rig.width, rig.height, rig.focal_px, np.zeros(3))
+    columns, rows = np.meshgrid(
+        np.linspace(0.25, 0.75, 32) * (rig.width - 1),
+        np.linspace(0.25, 0.75, 18) * (rig.height - 1),
+    )
+    pixel = np.stack([columns.ravel(), rows.ravel()], 1)
+    wrong_px = ideal.project(rig.right.rays(pixel).astype(float))[:, 0] - pixel[:, 0]
+    flat = (pixel - ideal.matrix[:2, 2]) / rig.focal_px
+    design = np.column_stack([np.ones(len(flat)), flat])
+    constant, across, down = np.linalg.lstsq(design, wrong_px, rcond=None)[0]
+    return float(constant), float(across), float(down)
+
+
 @dataclass(frozen=True)
 class CameraExposure:
     """Settings of one picture of a scene.
