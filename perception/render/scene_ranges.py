@@ -58,7 +58,9 @@ class BlockRanges:
         bar_probability: That a reinforcing bar crosses a hole.
         edge_m: Concrete left between a hole and the edge of the face.
         chips: Pieces broken off each rim.
-        chip_m: Size of each, along the face.
+        chip_m: Radius of each, along the face.
+        dents: Bowls struck into the face beside each rim.
+        dent_m: Radius of each, along the face.
         decoys: Flat dark discs on the face.
         decoy_radius_m: Of the discs.
         decoy_brightness: Of the discs.
@@ -84,6 +86,8 @@ class BlockRanges:
     edge_m: Range
     chips: Count
     chip_m: Range
+    dents: Count
+    dent_m: Range
     decoys: Count
     decoy_radius_m: Range
     decoy_brightness: Range
