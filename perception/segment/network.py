@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from brokk_rl.contracts.vision import Masks
@@ -30,6 +31,8 @@ THRESHOLD = 0.5
 SMALLEST_PIECE = 0.2
 """Least piece of a partly hidden block, as a part of the largest one, that the second run must
 show. Chosen by hand."""
+LEAST_BLOCK = 0.003
+"""Least piece of a block, as a part of the picture; that of `depth_plane`, where it is `min_area`."""
 MAX_CLOSE_RUNS, STABLE = 2, 0.1
 """Largest number of runs on the block alone; change of its box, as a part of its size, below which
 no other one follows. Chosen by hand."""
@@ -151,7 +154,7 @@ class NetworkSegmenter:
         block, holes = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
         self._write_masks(frame, window, block, holes)
         if self._margin is None:
-            return Masks(block, holes)
+            return _drop_specks(block, holes)
         box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
         if box is None:
             part = np.zeros_like(block)
@@ -170,7 +173,7 @@ class NetworkSegmenter:
                 before[2:]
             ):
                 break
-        return Masks(block, holes)
+        return _drop_specks(block, holes)
 
     def _write_masks(
         self, frame: Frame, window: Window, block: np.ndarray, holes: np.ndarray
@@ -179,6 +182,19 @@ class NetworkSegmenter:
         seen = self._infer(as_input(window.take(frame.color, self._size_px)))
         window.put(seen[0], block)
         window.put(seen[1], holes)
+
+
+def _drop_specks(block: np.ndarray, holes: np.ndarray) -> Masks:
+    """Return masks without pieces of block that are too small; no block has no holes."""
+    pieces, numbers, stats, _ = cv2.connectedComponentsWithStats(
+        (block > THRESHOLD).astype(np.uint8)
+    )
+    kept = stats[:, cv2.CC_STAT_AREA] >= LEAST_BLOCK * block.size
+    kept[0] = True  # beside all pieces
+    block = np.where(kept[numbers], block, np.float32(0.0))
+    if not kept[1:pieces].any():
+        holes = np.zeros_like(holes)
+    return Masks(block, holes)
 
 
 def as_input(picture: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from perception.train.samples import Crop, Samples, TrainingViews
 
 STATE = "training.pt"
 """State of an interrupted training."""
-FREE = ("frames", "validation", "hold_out", "max_seconds", "validate_every")
+FREE = ("frames", "negatives", "validation", "hold_out", "max_seconds", "validate_every")
 """Settings that may differ on resuming; frames and validation are compared by content."""
 
 log = logging.getLogger(__name__)
@@ -35,6 +35,8 @@ class SegmenterTraining:
 
     Attributes:
         frames: Folder, or list of folders, of frames with masks, those below them too.
+        negatives: Folder, or list of folders, of pictures without a block, such as photographs;
+            they are learned from, not judged by. `null` for none.
         validation: Folders to judge by; `null` sets a part of `frames` aside.
         hold_out: Without `validation`, one part in so many is kept from the training: a run of
             frames at the end.
@@ -62,6 +64,7 @@ class SegmenterTraining:
     """
 
     frames: str | tuple[str, ...]
+    negatives: str | tuple[str, ...] | None
     validation: str | tuple[str, ...] | None
     hold_out: int
     size_px: tuple[int, int]
@@ -207,7 +210,14 @@ class _Training:
         if not stems:
             raise ConfigError("training.frames: one frame is too few to train on and to judge by")
         both = training_data.read_views([*stems, *unseen], settings.size_px, settings.margin, seed)
-        return both.part(slice(0, len(stems))), both.part(slice(len(stems), None))
+        train, judged = both.part(slice(0, len(stems))), both.part(slice(len(stems), None))
+        if settings.negatives is not None:
+            pictures = training_data.list_pictures(settings.negatives)
+            views = training_data.read_views(
+                pictures, settings.size_px, settings.margin, seed, negatives=True
+            )
+            train = training_data.join_views(train, views)
+        return train, judged
 
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         self._network.train()

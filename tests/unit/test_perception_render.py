@@ -20,6 +20,7 @@ from perception.render.block_sampler import build_frame
 from perception.render.drilled_block import Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.materials import Material
+from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
@@ -62,7 +63,12 @@ def kind(name: str) -> SceneRanges:
 
 def studio(name: str, rig: StereoRig, depth: str = "exact") -> FrameRenderer:
     return FrameRenderer(
-        rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth, pair=True
+        rig=rig,
+        scene=kind(name),
+        stereo=option("stereo", "sgbm"),
+        depth=depth,
+        pair=True,
+        surfaces=NO_PHOTOGRAPHS,
     )  # type: ignore[arg-type]
 
 

@@ -24,6 +24,7 @@ from perception.label.camera_pose import Charuco
 from perception.render.board_on_arm import BoardOnArm
 from perception.render.footage import Footage
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.stereo_camera import StereoRig
 
 SMALL = ("rig.width=640", "rig.height=360", "rig.focal_px=264.0")
@@ -48,7 +49,12 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     kind: BoardOnArm = option("scene", "board_on_arm")
     scenes = kind.open(rig, SESSION)
     studio = FrameRenderer(
-        rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False
+        rig=rig,
+        scene=kind,
+        stereo=option("stereo", "sgbm"),
+        depth="none",
+        pair=False,
+        surfaces=NO_PHOTOGRAPHS,
     )
     corners_m, corners_px, view, _ = find_corners(kind.board, studio, scenes, 3)
     assert len(corners_m) > 20
