@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -18,7 +19,7 @@ from perception.render.scene_sampler import compose_scene, compute_hidden_share
 from perception.render.scene_sequence import StagedScene, build_pose, move_light, move_solids
 from perception.render.stereo_camera import StereoRig
 
-CAMERAS, PLACING = "cameras.yaml", "placing.yaml"
+CAMERAS, PLACING, MEASURED = "cameras.yaml", "placing.yaml", "measured.yaml"
 TRIES = 2000
 """Camera places that are drawn until one shows block and board."""
 BORDER_PX = 8
@@ -121,7 +122,7 @@ class FootageScenes:
         return StagedScene(moved, self._rig.base_from_camera @ first_from_camera, generator)
 
     def write_records(self, folder: Path, count: int) -> None:
-        """Write true camera poses, and clicks in the first frame, as `mode=label` takes them."""
+        """Write true camera poses, clicks for `mode=label`, and holes on the board for `mode=score_camera`."""
         poses = {}
         for number in range(count):
             poses[f"{number:05d}"] = self.view(number).base_from_camera.tolist()
@@ -142,6 +143,27 @@ class FootageScenes:
             "mouths": mouths,
         }
         write_text(folder / PLACING, yaml.safe_dump(placing, sort_keys=False))
+        write_text(folder / MEASURED, yaml.safe_dump(self._measure_holes(), sort_keys=False))
+
+    def _measure_holes(self) -> dict[str, Any]:
+        """Return the holes in the board's frame, as a caliper would measure them."""
+        board, plate = self._settings.board, self._plate
+        size_m = np.array([board.columns, board.rows]) * board.square_m
+        corner = plate.pose.point(np.array([*(-size_m / 2), -plate.half_m[2]]))
+        holes = []
+        for number, hole in enumerate(self._block.holes, 1):
+            center = self._block.pose.point(hole.center_m)
+            local = (center - corner) @ plate.pose.rotation
+            axis = self._block.pose.rotation @ hole.outward @ plate.pose.rotation
+            holes.append(
+                {
+                    "name": f"hole {number}",
+                    "center_m": local.round(6).tolist(),
+                    "axis": axis.round(6).tolist(),
+                    "radius_m": float(hole.radius_m),
+                }
+            )
+        return {"std_m": 0.0, "holes": holes}
 
     def _click(self, points_m: np.ndarray, generator: np.random.Generator) -> list[list[float]]:
         """Return where a person clicks who misses points of the first frame by `click_px`."""

@@ -55,7 +55,7 @@ def read_photograph(path: Path) -> Photograph:
     # Linear light, about: a picture is stored with a gamma of 2.2.
     small = (small / 255.0) ** 2.2
     wide = np.concatenate([small, small[:, ::-1]], 1)
-    levels = [np.concatenate([wide, wide[::-1]]) / max(float(small.mean()), 1e-3)]
+    levels: list[np.ndarray] = [np.concatenate([wide, wide[::-1]]) / max(float(small.mean()), 1e-3)]
     while levels[-1].shape[0] > 1:
         shrunk = cv2.resize(levels[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
         levels.append(shrunk.reshape(shrunk.shape[0], shrunk.shape[1], 3))

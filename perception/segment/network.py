@@ -191,7 +191,7 @@ def _drop_specks(block: np.ndarray, holes: np.ndarray) -> Masks:
     )
     kept = stats[:, cv2.CC_STAT_AREA] >= LEAST_BLOCK * block.size
     kept[0] = True  # beside all pieces
-    block = np.where(kept[numbers], block, np.float32(0.0))
+    block = np.where(kept[np.asarray(numbers, int)], block, np.float32(0.0))
     if not kept[1:pieces].any():
         holes = np.zeros_like(holes)
     return Masks(block, holes)
