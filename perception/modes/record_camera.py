@@ -25,14 +25,14 @@ class RecordCamera:
     Attributes:
         session: Folder to write into.
         capture: The pictures, of a rectified pair.
-        camera: `camera.yaml` of the camera: `K`, `dist`, `baseline_m`.
+        lens: `camera.yaml` of the camera: `K`, `dist`, `baseline_m`.
         every: One in so many frames is kept.
         count: Frames that are kept at most; `null` for all, which a device has no end of.
     """
 
     session: Session
     capture: StereoVideo | ExportedPictures
-    camera: str
+    lens: str
     every: int
     count: int | None
 
@@ -49,7 +49,7 @@ class RecordCamera:
             FrameError: the camera file or a picture cannot be used, or there is none.
             StorageError: a file could not be written.
         """
-        model = read_camera(Path(self.camera))
+        model = read_camera(Path(self.lens))
         folder = self.session.folder / FOLDER
         kept = 0
         for number, frame in enumerate(self.capture.read()):
@@ -77,12 +77,12 @@ class RecordCamera:
     def _check_frame(self, frame: RawFrame, model: CameraModel) -> None:
         """Refuse pictures that do not fit the camera's numbers."""
         height, width = frame.color.shape[:2]
-        validation.check_matrix_fits(model.matrix, height, width, self.camera)
+        validation.check_matrix_fits(model.matrix, height, width, self.lens)
         if frame.right is not None:
             validation.check_same_size(frame.color, frame.right, frame.name, "the right picture")
             if model.baseline_m is None or model.distortion is not None:
                 raise FrameError(
-                    f"{self.camera}: a pair needs baseline_m and rectified pictures (dist 0); "
+                    f"{self.lens}: a pair needs baseline_m and rectified pictures (dist 0); "
                     "export rectified pictures, or record with capture.layout=single"
                 )
         if frame.depth_m is not None:
