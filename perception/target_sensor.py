@@ -19,7 +19,7 @@ import numpy as np
 
 from brokk_rl.contracts.target import MotionPlan, TargetReading
 from brokk_rl.contracts.vision import BoreholeFinder, FinderSpec, HolePose, TrackedHole, TrackerSpec
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.spec import spec
@@ -101,6 +101,7 @@ class WatchedHole:
     Attributes:
         position: Position of the mount, `(A,)`.
         arrives_s: Time from which its pictures are used.
+        num_missed: Last pictures from this position in which nothing was found.
         choice: The last choice of a view, `None` before the first.
         hole: The tracked hole, `None` before the first detection.
         history: What happened at each frame, JSON data.
@@ -122,6 +123,7 @@ class WatchedHole:
         self._view = mount.error.draw(generator, "view")
         self._waiting: deque[tuple[float, Sequence[HolePose], float]] = deque()
         self.position, self.arrives_s = mount.start.copy(), 0.0
+        self.num_missed = 0
         self.choice: ViewChoice | None = None
         self.hole: TrackedHole | None = None
         self.history: list[dict[str, Any]] = []
@@ -149,6 +151,7 @@ class WatchedHole:
         if choice.is_new:
             self.position, self.arrives_s = choice.position, t_s + choice.travel_s
             self._view = self._mount.error.draw(self._generator, "view")
+            self.num_missed = 0
 
     def expose(
         self,
@@ -183,6 +186,8 @@ class WatchedHole:
         """Hand to the tracker what has become known by now."""
         while self._waiting and self._waiting[0][0] <= now_s + 1e-9:
             _, holes, t_s = self._waiting.popleft()
+            if t_s >= self.arrives_s - 1e-9:
+                self.num_missed = 0 if holes else self.num_missed + 1
             tracked = self._tracker.update(holes, t_s)
             near = []
             for hole in tracked:
@@ -322,7 +327,10 @@ class PerceivedTargets:
         for number in due:
             eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             if t_s >= eye.arrives_s - 1e-9:  # one motion at a time
-                eye.move(self._planner.choose(eye.believe(), eye.position, planned[number]), t_s)
+                choice = self._planner.choose(
+                    eye.believe(), eye.position, planned[number], eye.num_missed
+                )
+                eye.move(choice, t_s)
 
 
 def _search(
@@ -339,4 +347,7 @@ def _search(
         base_from_camera=exposure.believed_pose,
         camera_cov=mount.error.covariance,
     )
-    return list(finder.find(frame).in_base_frame(frame).holes)
+    try:
+        return list(finder.find(frame).in_base_frame(frame).holes)
+    except FrameError:  # the arm fills the picture: no depth
+        return []

@@ -21,6 +21,9 @@ from perception.mount.mounts import CameraMount
 from perception.mount.occlusion import ArmShape, compute_visible_share, sample_circle
 from perception.render.stereo_camera import StereoRig
 
+BELIEF_AFTER_MISS = 0.5
+"""Factor on the frames expected from a view after each frame that showed nothing. Chosen by hand."""
+
 
 @dataclass(frozen=True)
 class HoleBelief:
@@ -145,7 +148,9 @@ class ViewPlanner:
         self.settings = settings
         self._machine, self._mount, self._rig, self._arm = machine, mount, rig, arm
 
-    def choose(self, hole: HoleBelief, present: np.ndarray, plan_q: np.ndarray) -> ViewChoice:
+    def choose(
+        self, hole: HoleBelief, present: np.ndarray, plan_q: np.ndarray, num_missed: int = 0
+    ) -> ViewChoice:
         """Return the next view.
 
         Args:
@@ -153,6 +158,8 @@ class ViewPlanner:
             present: Present position of the mount, `(A,)`.
             plan_q: Joint positions of the arm at `num_times` times from now to `horizon_s`,
                 `(T, J)`.
+            num_missed: Last frames from the present view in which nothing was found: something hides
+                the hole that the plan does not know.
         """
         s, mount = self.settings, self._mount
         positions = np.concatenate([present[None], mount.views])
@@ -162,6 +169,7 @@ class ViewPlanner:
         times_s = np.linspace(0.0, s.horizon_s, len(plan_q))
         found = self.predict_detection(hole, poses, plan_q)
         seen = (found * (times_s >= travel_s[:, None])).mean(1)
+        seen[0] *= BELIEF_AFTER_MISS**num_missed
         variance_m2 = self._predict_variance(hole, poses, s.rate_hz * s.horizon_s * seen)
         std_m = np.sqrt(variance_m2)
         best = int(np.argmin(std_m))
