@@ -30,8 +30,8 @@ from perception.mount.occlusion import ArmShape
 from perception.render.stereo_camera import StereoRig, place_rig
 from perception.sources.simulator import SimulatedCamera, make_frame
 
-UP = np.array([0.0, 0.0, 1.0])
-"""Axis of a hole that was never seen: the task drills from above."""
+LEAST_HINT_M = 1e-3
+"""Least error of a pointed place as the choice of a view takes it: nobody points better."""
 
 
 @spec
@@ -135,21 +135,16 @@ class WatchedHole:
 
     def believe(self) -> HoleBelief:
         """Return what is known, for the choice of a view."""
-        drift_m2_s = getattr(self._settings.tracker, "drift_m_sqrt_s", 0.0) ** 2
-        radius_m = self.task_scene[5]
-        if self.hole is None:
-            cov_m2 = max(self._settings.hint_m, 1e-3) ** 2 * np.eye(3)
-            return HoleBelief(self._hint_m, UP, radius_m, cov_m2, drift_m2_s)
-        pose = self.hole.pose
-        shared_m2 = np.zeros((3, 3)) if pose.shared_m2 is None else pose.shared_m2
-        own_m2 = pose.cov_m2 - shared_m2 + 1e-10 * np.eye(3)
-        return HoleBelief(pose.center_m, pose.axis, radius_m, own_m2, drift_m2_s)
+        if self.hole is not None:
+            return HoleBelief.take(self.hole)
+        std_m = max(self._settings.hint_m, LEAST_HINT_M)
+        return HoleBelief.expect(self._hint_m, self.task_scene[5], std_m)
 
     def move(self, choice: ViewChoice, t_s: float) -> None:
         """Send the mount to a chosen view."""
         self.choice = choice
-        if choice.is_new:
-            self.position, self.arrives_s = choice.position, t_s + choice.travel_s
+        if choice.view.is_moving:
+            self.position, self.arrives_s = choice.position, t_s + choice.view.travel_s
             self._view = self._mount.error.draw(self._generator, "view")
             self.num_missed = 0
 
@@ -200,7 +195,9 @@ class WatchedHole:
     def _describe(self, holes: Sequence[HolePose], t_s: float) -> dict[str, Any]:
         known = self.hole
         error_m = None if known is None else known.pose.center_m - self.true_m
+        reason = None if self.choice is None else self.choice.view.explain()
         return {
+            "reason": reason,
             "t_s": round(t_s, 3),
             "seen": len(holes) > 0,
             "view": self._mount.describe(self.position),

@@ -43,7 +43,7 @@ NEAR_M = 0.05
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--count", type=int, default=100)
     parser.add_argument("--distance", type=float, default=1.0, help="m")
@@ -89,14 +89,14 @@ def look(number: int, distance_m: float) -> dict[str, Any]:
     first = camera.sees(base, hint_m, generator)
     fixed = first or any(camera.sees(base, hint_m, generator) for _ in range(NUM_PICTURES - 1))
     position, moving, missed, moves = mount.start, first, 1, 0
-    belief = HoleBelief(hint_m, axis, 0.05, HINT_M**2 * np.eye(3), 0.0)
+    belief = HoleBelief(hint_m, axis, 0.05, HINT_M**2 * np.eye(3))
     plan_q = np.stack([machine.home] * chooser.num_times)
     for _ in range(NUM_PICTURES - 1):
         if moving:
             break
         choice = planner.choose(belief, position, plan_q, missed)
-        moves += choice.is_new
-        missed = 0 if choice.is_new else missed
+        moves += choice.view.is_moving
+        missed = 0 if choice.view.is_moving else missed
         position, missed = choice.position, missed + 1
         moving = camera.sees(mount.locate(position, plan_q[0]), hint_m, generator)
     return {"first": first, "fixed": fixed, "moving": moving, "moves": moves}
