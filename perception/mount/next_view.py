@@ -156,7 +156,8 @@ class ViewPlanner:
         times_s = np.linspace(0.0, s.horizon_s, len(plan_q))
         found = self.predict_detection(hole, poses, plan_q)
         seen = (found * (times_s >= travel_s[:, None])).mean(1)
-        seen[0] *= BELIEF_AFTER_MISS**num_missed
+        # The present view may be one of the mount's own, too.
+        seen[(positions == present).all(-1)] *= BELIEF_AFTER_MISS**num_missed
         variance_m2 = self._predict_variance(hole, poses, s.rate_hz * s.horizon_s * seen)
         std_m = np.sqrt(variance_m2)
         best = int(np.argmin(std_m))
@@ -209,14 +210,16 @@ class ViewPlanner:
     ) -> np.ndarray:
         """Return the expected mean variance of the centre after the frames of each view, `(V,)`."""
         s, rig = self.settings, self._rig
-        rotation = poses[:, -1, :3, :3]
-        center = np.einsum("vji,vj->vi", rotation, hole.center_m - poses[:, -1, :3, 3])
-        depth_m = np.maximum(center[:, 2], 1e-3)
-        across_m2 = (s.center_px * depth_m / rig.focal_px) ** 2
-        along_m2 = (s.disparity_px * depth_m**2 / (rig.focal_px * rig.baseline_m)) ** 2
-        noise = np.stack([across_m2, across_m2, along_m2], 1)
-        information = rotation * (num_frames[:, None] / noise)[:, None, :]
-        information = information @ np.swapaxes(rotation, 1, 2)
+        away_m = hole.center_m - poses[:, -1, :3, 3]
+        # The distance, not the depth: no view is better for having the hole in a corner.
+        range_m = np.linalg.norm(away_m, axis=1)
+        ray = away_m / range_m[:, None]
+        across_m = s.center_px * range_m / rig.focal_px
+        along_m = s.disparity_px * range_m**2 / (rig.focal_px * rig.baseline_m)
+        along = ray[:, :, None] * ray[:, None, :]
+        precision = along / along_m[:, None, None] ** 2
+        precision += (np.eye(3) - along) / across_m[:, None, None] ** 2
+        information = num_frames[:, None, None] * precision
         aged_m2 = hole.cov_m2 + s.drift_m_sqrt_s**2 * s.horizon_s * np.eye(3)
         posterior = np.linalg.inv(np.linalg.inv(aged_m2) + information)
         return np.trace(posterior, axis1=1, axis2=2) / 3

@@ -162,3 +162,27 @@ def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:
         level.light.to_sun, RIG.base_from_camera[:3, :3] @ scene.light.to_sun
     )
     assert any(solid is level.block for solid in level.solids)
+
+
+def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself(
+    machine: Machine,
+) -> None:
+    mount, planner = plan(machine, "hand_placed", move_s=1.0)
+    q = np.stack([machine.home] * 7)
+    before = planner.choose(believe(), mount.start, q, num_missed=0)
+    after = planner.choose(believe(), mount.start, q, num_missed=8)
+    assert not before.view.is_moving
+    assert after.view.is_moving and after.position[0] != mount.start[0]
+
+
+def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) -> None:
+    mount, planner = plan(machine, "mast")
+    for q1 in (-1.2, 0.0, 1.2):
+        q = machine.home.copy()
+        q[0] = q1
+        chosen = planner.choose(believe(), mount.start, np.stack([q] * 7))
+        ahead = mount.locate(chosen.position, q)[:3, 2]
+        camera_m = mount.locate(chosen.position, q)[:3, 3]
+        away = HOLE_M - camera_m
+        bearing = np.arctan2(away[1], away[0]) - np.arctan2(ahead[1], ahead[0])
+        assert abs(np.angle(np.exp(1j * bearing))) < 0.5

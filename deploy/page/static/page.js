@@ -168,7 +168,7 @@ function drawView(view, camera) {
   const seen = say(view.seen_s > 0 ? "hole in sight for" : "no view of the hole").replace("{seen}", seconds(view.seen_s)).replace("{of}", view.horizon_s.toFixed(0));
   const instead = view.is_moving ? `, ${say("instead of")} ${seconds(view.seen_before_s)} s · ${mm(view.std_before_m)} → ${mm(view.std_m)} mm` : "";
   put(text, `${say(view.is_moving ? "camera moves" : "camera stays")}: ${view.name}. ${seen}${instead}`);
-  text.classList.toggle("careful", view.is_moving || view.seen_s === 0);
+  text.classList.toggle("busy", view.is_moving || view.seen_s === 0);
 }
 
 let listed = "";
