@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from brokk_rl import open_loop
+from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
@@ -147,8 +148,8 @@ class SimulatorComparison:
     """A simulator held against recordings.
 
     Attributes:
-        recordings: The recordings.
-        evidence: Its errors there.
+        recordings: The recordings, their commands as speeds.
+        residuals: Its errors there.
         source: Number of the recording of each window.
         row: Row of the first simulated position of each window.
     """
@@ -215,7 +216,8 @@ def compare_simulator(
     windows = open_loop.join_windows(cuts)
     valid_mask = np.ones((len(windows.q), machine.num_joints), dtype=bool)
     simulator = EffectSimulator(actuator, machine, windows, np.array(running), seed)
-    recordings, residuals = [one for one, _ in begun], Residuals(simulator, None, valid_mask)
+    recordings = view_recordings([one for one, _ in begun], machine)
+    residuals = Residuals(simulator, None, valid_mask)
     return SimulatorComparison(recordings, residuals, np.array(source), np.array(row))
 
 

@@ -154,7 +154,10 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[E
             raise ConfigError(
                 f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}"
             ) from error
-        if hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
+        if not hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
+            continue
+        target = getattr(target, "find_variant", lambda _, own=target: own)(machine)
+        if target is not None:
             found[option.name] = EffectType(option.name, target, machine)
     for name in names or ():
         if name not in found:
