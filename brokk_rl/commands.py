@@ -22,10 +22,45 @@ def read_targets(u: np.ndarray, machine: Machine) -> np.ndarray:
     return middle + u * half
 
 
-def command_targets(q: np.ndarray, machine: Machine) -> np.ndarray:
+def scale_targets(q: np.ndarray, machine: Machine) -> np.ndarray:
     """Return the commands of target positions `(…, J)`, rad or m, cut at the ends of the travel."""
     middle, half = (machine.upper + machine.lower) / 2, (machine.upper - machine.lower) / 2
     return np.clip((q - middle) / half, -1.0, 1.0)
+
+
+def find_rest(q: np.ndarray, machine: Machine) -> np.ndarray:
+    """Return the commands `(…, J)` under which joints rest at `q`: the position itself as a target, else 0."""
+    return scale_targets(q, machine) if machine.interface == "position" else np.zeros_like(q)
+
+
+class SpeedProgram:
+    """Commands that carry out a program of speeds, step by step.
+
+    A target begins where the joint is and moves on with the speed that is asked for, within the
+    travel. Valves and drives take the speeds themselves.
+
+    Args:
+        machine: The machine.
+    """
+
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+        self._target: np.ndarray | None = None
+
+    def command(self, speeds: np.ndarray, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the commands of the coming control period, and the speeds that they carry out.
+
+        Args:
+            speeds: Speeds that are asked for, of full speed, `(…, J)` in [-1, 1].
+            q: Measured positions, `(…, J)`.
+        """
+        machine = self._machine
+        if machine.interface != "position":
+            return speeds, speeds
+        before = q if self._target is None else self._target
+        step = machine.max_speed * machine.period_s
+        self._target = np.clip(before + speeds * step, machine.lower, machine.upper)
+        return scale_targets(self._target, machine), (self._target - before) / step
 
 
 def view_speeds(u: np.ndarray, machine: Machine) -> np.ndarray:

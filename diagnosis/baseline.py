@@ -31,18 +31,15 @@ from brokk_rl.scales import choose_horizon_s, scale_time
 from diagnosis import residual_model
 from diagnosis.case import GapCase, estimate_running_s, split_recordings
 from diagnosis.effect_library import EffectSimulator, EffectType, EffectValues
-from diagnosis.free_runs import WindowedRuns
-from diagnosis.refine import drop_windows
-from diagnosis.residuals import (
+from diagnosis.error_covariance import (
     ErrorCovariance,
-    ParameterRay,
-    Residuals,
-    build_rays,
     compute_loss,
-    fit_noise,
-    join_windows,
+    fit_joint_noise,
     weigh_residuals,
 )
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.refine import drop_windows
+from diagnosis.residuals import ParameterRay, Residuals, build_rays
 from diagnosis.responses import (
     MIN_RESPONSE,
     Response,
@@ -359,9 +356,10 @@ def fit_covariances(
     pairs = [(one.residuals.error, one.residuals.increments) for one in left_out]
 
     def fit(j: int) -> ErrorCovariance:
-        error = [join_windows(one[..., j]) for one, _ in pairs]
-        moved = [join_windows(one[..., j]) for _, one in pairs]
-        return fit_noise(np.concatenate(error), np.concatenate(moved))
+        errors, motions = zip(
+            *((error[..., j], moved[..., j]) for error, moved in pairs), strict=True
+        )
+        return fit_joint_noise(errors, motions, machine)
 
     return map_parallel(fit, range(machine.num_joints))
 

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.actuator import CurveFit, Excitation
 from brokk_rl.errors import StorageError
 from brokk_rl.inspection import InspectionThresholds
@@ -94,9 +93,7 @@ class DiagnosisPipeline:
         if doubts := self.case.doubts():
             return self._cannot_tell("; ".join(doubts))
         tell("recordings", 0.3)
-        remarks = sanity.examine_recordings(
-            view_recordings(self.case.field, self.case.machine), self.case.machine, self.thresholds
-        )
+        remarks = sanity.examine_recordings(self.case.field, self.case.machine, self.thresholds)
         told = verdict.judge_case(self.case, self.base, remarks, self._known())
         if failed := gates.list_failures(told):
             return self._cannot_tell(failed, told)

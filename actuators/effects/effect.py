@@ -48,7 +48,8 @@ class EffectSpec:
         pointwise: Whether each command that it returns depends on the same command only, so that
             all commands of a run can be given to it at once.
         recent: Number of newest commands that it looks at, where it changes the newest only and
-            asks for no positions; `None`: any. See `EffectChain.plan_run`.
+            asks for no positions but in `begin`; `None`: any. See `EffectChain.plan_run`.
+        placed: Whether its `begin` asks for the positions of the joints.
         weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
@@ -70,6 +71,7 @@ class EffectSpec:
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
+    placed: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
     alike: ClassVar[bool] = True
@@ -270,9 +272,11 @@ class EffectChain:
         self._fresh.fill_(False)
         return q
 
-    def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun | None:
+    def plan_run(
+        self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
+    ) -> PlannedRun | None:
         """See `brokk_rl.contracts.actuator.PlannedModel`."""
-        return ChainRun.plan(self, u, first)
+        return ChainRun.plan(self, u, first, q)
 
     @property
     def is_plannable(self) -> bool:

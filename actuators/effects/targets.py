@@ -33,6 +33,7 @@ class TargetBacklash(EffectSpec):
     label: ClassVar = "backlash"
     side = "command"
     recent = 2
+    placed = True
     interfaces = frozenset({"position"})
     numbers: ClassVar = {
         # Friction of hobby servos holds targets of 1 to 5 degrees: more than the play of pins.
@@ -40,17 +41,21 @@ class TargetBacklash(EffectSpec):
     }
 
     def begin(self, now: StepInputs) -> Memory:
-        """The target lies against the side in front; one that rests in the middle of the play."""
-        u = now.history.u[:, :-1]
-        return {"sent": u, "held": u[:, -1]}
+        """The target is held where the joint is, as near to it as the play allows."""
+        u, plant = now.history.u[:, :-1], now.plant
+        at = (now.history.q[:, -1] - plant.middle) / plant.half_travel
+        return {"sent": u, "held": _hold(at, u[:, -1], now)}
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """Play operator on the target."""
-        half = 0.5 * now.value["gap_rad"] / now.plant.half_travel
-        u = now.history.u[:, -1]
-        held = torch.minimum(torch.maximum(now.memory["held"], u - half), u + half)
+        held = _hold(now.memory["held"], now.history.u[:, -1], now)
         sent, memory = append_command(now, held)
         return sent, memory | {"held": held}
+
+
+def _hold(held: torch.Tensor, u: torch.Tensor, now: StepInputs) -> torch.Tensor:
+    half = 0.5 * now.value["gap_rad"] / now.plant.half_travel
+    return torch.minimum(torch.maximum(held, u - half), u + half)
 
 
 @spec

@@ -54,6 +54,7 @@ class Servo:
     """
 
     label: ClassVar = "servo"
+    interfaces: ClassVar = frozenset({"position"})
 
     dead_time_s: PerJoint | None
     response_s: PerJoint
@@ -142,8 +143,7 @@ class ServoModel:
         earlier, later = self.read_target(earlier), self.read_target(later)
         q, fresh = history.q[:, -1], self._fresh[:, None]
         speed = (q - history.q[:, -2]) / self._period_s
-        # A moving joint lies at the side of the play that it left behind.
-        held = torch.where(fresh, self.begin_held(earlier, speed), self._state["held"])
+        held = torch.where(fresh, self.begin_held(earlier, q), self._state["held"])
         speed = torch.where(fresh, speed, self._state["speed"])
         first = self.hold(held, earlier)
         second = self.hold(first, later)
@@ -158,7 +158,7 @@ class ServoModel:
         """Dead time, `(N, J)`."""
         return self.parameters["dead_time_s"]
 
-    def plan_run(self, u: torch.Tensor, first: int) -> "ServoRun":
+    def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> "ServoRun":
         """See `brokk_rl.contracts.actuator.PlannedModel`."""
         return ServoRun(self, u, first)
 
@@ -171,10 +171,10 @@ class ServoModel:
         """Return the targets of commands `(…, J)`, rad or m."""
         return self._middle + self._half * u
 
-    def begin_held(self, target: torch.Tensor, speed: torch.Tensor) -> torch.Tensor:
-        """Return the held target of a joint that moves at `speed`, `(N, J)`; in mid-play at rest."""
-        still = 0.02 * self._max_speed  # the commands' own threshold, `brokk_rl.split.COMMANDED`
-        return target - 0.5 * self.parameters["play_rad"] * (speed / still).clamp(-1.0, 1.0)
+    def begin_held(self, target: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
+        """Return the held target of a joint that is at `q`, as near to it as the play allows, `(N, J)`."""
+        value = self.parameters
+        return self.hold(q + value["sag_rad"] + value["sag_slope"] * (q - self._middle), target)
 
     def hold(self, held: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the target behind the play, `(N, J)`."""
@@ -249,10 +249,7 @@ class LoopSolution:
         self, error: torch.Tensor, speed: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return error and speed after the time, each `(N, J)`."""
-        return (
-            self.kept * error + self.gained * speed,
-            self.pulled * error + self.carried * speed,
-        )
+        return (self.kept * error + self.gained * speed, self.pulled * error + self.carried * speed)
 
 
 class ServoRun:
@@ -276,7 +273,7 @@ class ServoRun:
         model, place = self._model, k - self._first
         if self._speed is None or self._held is None:
             self._speed = (q[k - 1] - q[k - 2]) / model.period_s
-            self._held = model.begin_held(self._earlier[place], self._speed)
+            self._held = model.begin_held(self._earlier[place], q[k - 1])
         first = model.hold(self._held, self._earlier[place])
         self._held = model.hold(first, self._later[place])
         moved, self._speed = model.move(q[k - 1], self._speed, first, self._held, self._solutions)
