@@ -56,10 +56,10 @@ MOVES_RAD = 0.15
 """Motion of a joint from which an effect on it counts."""
 NOISE_RAD = 0.0003
 """Noise of the encoders, rad; 14 bits, as in `link=site`."""
-LEAST_START = 4
-"""Periods in which a wrong start of the history acts at least."""
-NUM_TRIES = 20
-"""Sizes of a fault that are drawn at most."""
+ACTS_START, LEAST_START = 0.006, 4
+"""The same of a wrong start of the history: change of the command, and periods."""
+NUM_TRIES = 4
+"""Sizes of a fault that are drawn before another fault takes its place."""
 ACTS, ACTS_SHARE = 0.02, 0.05
 """A fault of the code changes the command by so much in so many periods, else its size is drawn again."""
 
@@ -288,8 +288,12 @@ def make_logs(
     }
     done: dict[int, tuple[dict[str, np.ndarray], dict[str, Any], float]] = {}
     rng = np.random.default_rng(seed + 7)
-    for _ in range(NUM_TRIES):
+    for attempt in range(2 * NUM_TRIES):
         open_cases = [case for case in cases if case["row"] not in done]
+        if attempt >= NUM_TRIES:  # this policy does not care: another fault takes the place
+            for case in open_cases:
+                if case["kind"] == "listed":
+                    case["number"] = int(rng.integers(len(made.LISTED)))
         together = [case for case in open_cases if case["kind"] != "effect"]
         batches = ([together] if together else []) + [
             [case] for case in open_cases if case["kind"] == "effect"
@@ -341,12 +345,13 @@ def acts(case: dict[str, Any], rows: dict[str, np.ndarray], pitch_rad: float) ->
         joints = case["effect"][1]["joints"]
         moved = np.ptp(rows["q"], axis=0) > MOVES_RAD
         return joints == "all" or bool(moved[int(joints[0][1:]) - 1])
+    is_start = case["kind"] == "listed" and made.LISTED[case["number"]] is made.history_zero
+    least = ACTS_START if is_start else ACTS
     loop, before, off = Loop(POLICIES[case["policy"]][0], None), np.zeros(5), 0
     for k in range(NUM_STEPS):
         _, command, _ = loop.step(rows["target"][k], rows["q"][k], before, pitch_rad)
-        off += int(np.abs(command - rows["u"][k]).max() > ACTS)
+        off += int(np.abs(command - rows["u"][k]).max() > least)
         before = rows["u"][k].astype(np.float32).astype(float)
-    is_start = case["kind"] == "listed" and made.LISTED[case["number"]] is made.history_zero
     return off >= (LEAST_START if is_start else ACTS_SHARE * NUM_STEPS)
 
 

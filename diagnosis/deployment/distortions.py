@@ -69,7 +69,7 @@ class Distortion:
     field: str
     text: str
     build: Build
-    values: tuple[float, ...] = 0.0
+    values: tuple[float, ...] = (0.0,)
     is_continuous: bool = False
     parameter: str = ""
 

@@ -273,7 +273,8 @@ class _FaultSearch:
         return FittedDistortion(
             distortion=distortion,
             value=value,
-            begin=int(self._rows[min(begin, len(self._rows) - 1)]),
+            # A mistake from the first judged row on has held from the beginning.
+            begin=int(self._rows[min(begin, len(self._rows) - 1)]) if begin else 0,
             end=int(self._rows[max(begin, end - 1)]),
             explained=float(ok.mean()),
             explained_departed=float(ok[departed].mean()) if departed.any() else 1.0,
