@@ -1,6 +1,6 @@
 """Diagnosis in five functions for a Python program or a notebook, without the command line.
 
-    from brokk_rl import api
+    from diagnosis import api
 
     field = api.load("read/recordings/*", "draft/machine.yaml")
     outcome = api.diagnose(field, "runs/diagnosis", simulator="servo")
