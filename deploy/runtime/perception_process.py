@@ -91,7 +91,7 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
         while not stop():
             began_s = time.monotonic()
             if isinstance(source, AimedSource):
-                aim_camera(source, memory, tracked, began_s)
+                point_camera(source, memory, tracked, began_s)
             try:
                 frame = source.read_latest()
             except FrameError as error:
@@ -113,7 +113,7 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
             time.sleep(max(0.0, began_s + 1.0 / camera.rate_hz - time.monotonic()))
 
 
-def aim_camera(
+def point_camera(
     source: AimedSource, memory: LoopMemory, tracked: Sequence[TrackedHole], t_s: float
 ) -> None:
     """Let a moving camera choose its view of the chosen hole, and publish it with the reason."""
