@@ -74,6 +74,8 @@ class TrainingRunner(OnPolicyRunner):
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
         self.logger = logger  # type: ignore[assignment]
+        if isinstance(self.alg, DevicePPO):
+            self.alg.fuse = training.fuse
         if training.symmetry and isinstance(self.alg, DevicePPO):
             if not isinstance(env.task, MirroredTask):
                 raise ConfigError(
