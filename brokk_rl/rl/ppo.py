@@ -339,11 +339,24 @@ class DevicePPO(PPO):
         with torch.no_grad():
             new = tuple(value[:own] for value in actor.output_distribution_params)
             old = tuple(batch[f"{PARAMETER}{index}"] for index in range(len(new)))
-            divergence = actor.get_kl_divergence(old, new).mean()
+            divergence = self._measure_divergence(old, new)
         if self._teacher is not None:
             distance = (actor.output_mean - batch["wanted"]).square().mean()
             loss = loss + self._imitation * distance
         return loss, torch.stack((value_loss, surrogate_loss, entropy, divergence)).detach()
+
+    def _measure_divergence(
+        self, old: tuple[torch.Tensor, ...], new: tuple[torch.Tensor, ...]
+    ) -> torch.Tensor:
+        """Return the mean divergence of two distributions, given by their parameters.
+
+        Of Gaussians in closed form: torch finds it by a search that torch 2.11 cannot compile.
+        """
+        if not isinstance(self.actor.distribution, GaussianDistribution):
+            return self.actor.get_kl_divergence(old, new).mean()
+        (old_mean, old_std), (new_mean, new_std) = old, new
+        spread, shift = (old_std / new_std).square(), ((old_mean - new_mean) / new_std).square()
+        return (0.5 * (spread + shift - 1.0 - spread.log())).sum(-1).mean()
 
     def _sum_up(self) -> None:
         """Add up gradients and divergence of all processes; the host does not wait for it."""
