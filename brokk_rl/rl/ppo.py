@@ -272,9 +272,6 @@ class DevicePPO(PPO):
             sides.append(mirrored)
             actions = torch.cat((actions, actions * self._mirror.action))
         samples = {"actions": actions}
-        for name, model in (("actor", self.actor), ("critic", self.critic)):
-            inputs = [pad_columns(model.get_latent(side)) for side in sides]  # type: ignore[operator]
-            samples[name] = torch.stack(inputs)
         if (teacher := self._teacher) is not None:
             wanted = [teacher.mlp(teacher.get_latent(side)) for side in sides]  # type: ignore[arg-type]
             samples["wanted"] = torch.stack(wanted).clamp(-1.0, 1.0)
@@ -284,10 +281,19 @@ class DevicePPO(PPO):
             stored[f"{PARAMETER}{index}"] = value
         for name, value in stored.items():
             samples[name] = value.flatten(0, 1)[order][None]
+        models = {"actor": self.actor, "critic": self.critic}
         if self._samples is None:
-            self._samples = samples
+            kind = torch.bfloat16 if self.use_mixed_precision else torch.float32
+            shapes = {
+                name: (len(sides), len(order), model.obs_dim) for name, model in models.items()
+            }
+            inputs = {name: order.new_zeros(shape, dtype=kind) for name, shape in shapes.items()}
+            self._samples = samples | {name: pad_columns(value) for name, value in inputs.items()}
         for name, value in samples.items():
             self._samples[name].copy_(value)
+        for name, model in models.items():
+            for side, values in zip(self._samples[name], sides, strict=True):
+                side[:, : model.obs_dim].copy_(model.get_latent(values))  # type: ignore[operator, arg-type]
 
     def _differentiate(self, first: int) -> None:
         """Differentiate the loss of the mini-batch that begins at row `first` of the samples."""
@@ -316,26 +322,23 @@ class DevicePPO(PPO):
             value.repeat(sides, 1) if sides > 1 else value
             for value in (old_values, returns, advantages, old_log_prob)
         )
-        kind = torch.device(self.device).type
-        with torch.autocast(
-            device_type=kind, dtype=torch.bfloat16, enabled=self.use_mixed_precision
-        ):
-            # not by calling the actor: that would draw actions, and torch's check of their spread
-            # asks the host
-            actor.distribution.update(run_network(actor.mlp, batch["actor"]))  # type: ignore
-            log_prob = actor.get_output_log_prob(batch["actions"])
-            entropy = actor.output_entropy[:own].mean()
-            values = run_network(self.critic.mlp, batch["critic"])
-            ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
-            gain = advantages.squeeze(1)
-            clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-            surrogate_loss = torch.max(-gain * ratio, -gain * clipped).mean()
-            value_loss = (values - returns).square()
-            if self.use_clipped_value_loss:
-                near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
-                value_loss = torch.max(value_loss, (near - returns).square())
-            value_loss = value_loss.mean()
-            loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        # not by calling the actor: that would draw actions, and torch's check of their spread asks
+        # the host
+        mixed = self.use_mixed_precision
+        actor.distribution.update(run_network(actor.mlp, batch["actor"], mixed))  # type: ignore
+        log_prob = actor.get_output_log_prob(batch["actions"])
+        entropy = actor.output_entropy[:own].mean()
+        values = run_network(self.critic.mlp, batch["critic"], mixed)
+        ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
+        gain = advantages.squeeze(1)
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate_loss = torch.max(-gain * ratio, -gain * clipped).mean()
+        value_loss = (values - returns).square()
+        if self.use_clipped_value_loss:
+            near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+            value_loss = torch.max(value_loss, (near - returns).square())
+        value_loss = value_loss.mean()
+        loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         with torch.no_grad():
             new = tuple(value[:own] for value in actor.output_distribution_params)
             old = tuple(batch[f"{PARAMETER}{index}"] for index in range(len(new)))

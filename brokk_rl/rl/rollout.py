@@ -21,19 +21,29 @@ bfloat16 too."""
 
 
 def pad_columns(inputs: torch.Tensor) -> torch.Tensor:
-    """Return `(N, I)` with columns of zeros, so that their number is a multiple of `ALIGNMENT`."""
-    return functional.pad(inputs, (0, -inputs.shape[1] % ALIGNMENT))
+    """Return `(…, I)` with columns of zeros, so that I is a multiple of `ALIGNMENT`."""
+    return functional.pad(inputs, (0, -inputs.shape[-1] % ALIGNMENT))
 
 
-def run_network(network: nn.Sequential, inputs: torch.Tensor) -> torch.Tensor:
-    """Return the output of a network of linear layers for `inputs` that may be padded."""
-    first, *layers = network
+def run_network(
+    network: nn.Sequential, inputs: torch.Tensor, mixed_precision: bool = False
+) -> torch.Tensor:
+    """Return the output of a network of linear layers for `inputs` that may be padded.
+
+    Args:
+        network: The network.
+        inputs: `(N, I)`, or more columns.
+        mixed_precision: Whether the hidden layers use bfloat16. The last one does not: seven bits
+            of an action's mean would be as wide as its noise.
+    """
+    first, *hidden, last = network
     assert isinstance(first, nn.Linear)
-    weight = functional.pad(first.weight, (0, inputs.shape[1] - first.in_features))
-    values = functional.linear(inputs, weight, first.bias)
-    for layer in layers:
-        values = layer(values)
-    return values
+    with torch.autocast(inputs.device.type, torch.bfloat16, enabled=mixed_precision):
+        weight = functional.pad(first.weight, (0, inputs.shape[1] - first.in_features))
+        values = functional.linear(inputs, weight, first.bias)
+        for layer in hidden:
+            values = layer(values)
+    return last(values.float())
 
 
 class CapturedRollout:
@@ -126,11 +136,14 @@ class CapturedRollout:
     ) -> tuple[torch.Tensor, ...]:
         """Return actions, their log-probability, values and parameters of the distribution."""
         actor, critic = self._algorithm.actor, self._algorithm.critic
-        mean = run_network(actor.mlp, pad_columns(actor.get_latent(seen)))  # type: ignore[arg-type]
+        mixed = self._algorithm.use_mixed_precision
+        mean, values = (
+            run_network(model.mlp, pad_columns(model.get_latent(seen)), mixed)  # type: ignore[arg-type]
+            for model in (actor, critic)
+        )
         actor.distribution.update(mean)  # type: ignore[union-attr]
         actions = actor.output_mean + actor.output_std * noise
         log_prob = actor.get_output_log_prob(actions)[:, None]
-        values = run_network(critic.mlp, pad_columns(critic.get_latent(seen)))  # type: ignore[arg-type]
         return (actions, log_prob, values, *actor.output_distribution_params)
 
     @torch.no_grad()

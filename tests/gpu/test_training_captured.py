@@ -27,7 +27,7 @@ from brokk_rl.sim.fault_recorder import load_fault
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
 from brokk_rl.symmetry import Mirror
 
-pytestmark = pytest.mark.gpu
+pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")]
 
 CUDA = torch.device("cuda")
 NUM = 64
@@ -189,9 +189,7 @@ def roll_out(learner: PPO, seed: int) -> TensorDict:
     draws = torch.Generator().manual_seed(seed)
 
     def see() -> TensorDict:
-        return TensorDict(
-            {"policy": torch.randn(NUM, 7, generator=draws).cuda()}, batch_size=[NUM]
-        )
+        return TensorDict({"policy": torch.randn(NUM, 7, generator=draws).cuda()}, batch_size=[NUM])
 
     with torch.inference_mode():
         for _ in range(8):
