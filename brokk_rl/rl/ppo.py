@@ -54,7 +54,7 @@ class DevicePPO(PPO):
     _epoch: Sequence[Callable[[], None]] | None = None
     """What one pass over all mini-batches consists of."""
     _samples: dict[str, torch.Tensor] | None = None
-    """Stored steps in the order of the mini-batches; see `_shuffle`."""
+    """Stored steps in the order of the mini-batches; see `shuffle`."""
     _gathered: torch.Tensor
     """Gradients of all parameters, of which `grad` of each is a view, and at the end the
     divergence."""
@@ -123,7 +123,7 @@ class DevicePPO(PPO):
     def update_on_device(self) -> dict[str, float]:
         """Learn as `update` does, with one read-back; the same numbers up to rounding."""
         order = torch.randperm(self._batch_size() * self.num_mini_batches, device=self.device)
-        self._shuffle(order)
+        self.shuffle(order)
         if self._epoch is None:
             self._prepare()
             self._wanted.fill_(self.desired_kl or 0.0)
@@ -173,8 +173,9 @@ class DevicePPO(PPO):
 
         The optimiser reads its rate from one of them.
         """
-        compiled = torch.compile(self._measure_loss, fullgraph=True, dynamic=False)
-        self._loss = compiled if self.fuse else self._measure_loss
+        self._loss = self._measure_loss
+        if self.fuse and isinstance(self.actor.distribution, GaussianDistribution):
+            self._loss = torch.compile(self._measure_loss, fullgraph=True, dynamic=False)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
         self._wanted = torch.zeros((), device=self.device)
         self._sums = torch.zeros(len(FIGURES), device=self.device)
@@ -254,7 +255,7 @@ class DevicePPO(PPO):
                 module._buffers[name] = value.copy_(module._buffers[name])  # type: ignore[arg-type]
 
     @torch.no_grad()
-    def _shuffle(self, order: torch.Tensor) -> None:
+    def shuffle(self, order: torch.Tensor) -> None:
         """Put the stored steps in `order`, the inputs of the networks ready for use.
 
         Normalisers and teacher do not change while a rollout is learned. Inputs, actions and the
