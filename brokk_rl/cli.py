@@ -78,6 +78,9 @@ def main() -> int:
     if "--version" in sys.argv[1:]:
         sys.stdout.write(f"brokk {brokk_rl.__version__}\n")
         return 0
+    if sys.platform == "win32":
+        sys.stderr.write("error: brokk_rl needs Linux or macOS; on Windows install it in WSL 2\n")
+        return 2
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
     # The launcher options keep the names that submitit gave them; Hydra warns of that three times.
@@ -142,8 +145,8 @@ def run_job(cfg: DictConfig) -> float | None:
 def _run(cfg: DictConfig) -> float | None:
     """Instantiate the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
-    cfg = _rename_targets(cfg)
-    _check_values(cfg)
+    cfg = _upgrade(cfg)
+    check_values(cfg)
     cfg = _drop_consumed_groups(choose_task(cfg))
     if "session" not in cfg:
         distributed.check_together(get_class(str(cfg._target_)), sweep)
@@ -172,7 +175,7 @@ def _run(cfg: DictConfig) -> float | None:
         raise
 
 
-def _check_values(cfg: DictConfig) -> None:
+def check_values(cfg: DictConfig) -> None:
     """Build the specs that need no torch, so that their bad values are refused within a second.
 
     Raises:
@@ -196,13 +199,12 @@ def _is_first_process() -> bool:
         return True
 
 
-def _rename_targets(cfg: DictConfig) -> DictConfig:
-    """Return the configuration with current targets, as `resolved.yaml` of an older run needs it."""
-    text = OmegaConf.to_yaml(cfg)
-    current = registry.rename_targets(text)
-    renamed = cfg if current == text else OmegaConf.create(current)
-    assert isinstance(renamed, DictConfig)
-    return renamed
+def _upgrade(cfg: DictConfig) -> DictConfig:
+    """Return the configuration in current terms, as `resolved.yaml` of an older run needs it."""
+    text = registry.rename_targets(OmegaConf.to_yaml(cfg))
+    content: Any = OmegaConf.to_container(OmegaConf.create(text))
+    registry.upgrade_fields(content)
+    return cfg if content == OmegaConf.to_container(cfg) else DictConfig(content)
 
 
 def _drop_consumed_groups(cfg: DictConfig) -> DictConfig:

@@ -8,6 +8,7 @@ is therefore cheap, and a broken option can be listed too.
 from __future__ import annotations
 
 import ast
+import copy
 import inspect
 import json
 import re
@@ -15,6 +16,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata, resources, util
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -139,6 +141,41 @@ def rename_targets(text: str) -> str:
         return found[1] + renamed.get(found[2], found[2])
 
     return re.sub(r"(_target_['\"]?:\s*['\"]?)([\w.]+)", rename, text)
+
+
+def upgrade_fields(node: Any) -> None:
+    """Write fields of earlier versions as the current ones, so that their `resolved.yaml` still runs.
+
+    Changes the plain data `node` in place, at each `_target_` of `earlier_fields.json`: a field that
+    the earlier version did not have gets the value by which it acted, and a field that moved is put
+    to its new place. Where a true or false became a term, false switches the term off (`null`).
+    """
+    if isinstance(node, list):
+        for value in node:
+            upgrade_fields(value)
+    if not isinstance(node, dict):
+        return
+    for value in node.values():
+        upgrade_fields(value)
+    for change in _load_earlier_fields():
+        if node.get("_target_") not in change["targets"]:
+            continue
+        for name, value in change["added"].items():
+            node.setdefault(name, copy.deepcopy(value))
+        for name in change["moved"].keys() & node.keys():
+            *path, last = change["moved"][name].split(".")
+            place, value = node, node.pop(name)
+            for part in path:
+                place = place[part]
+            if not isinstance(value, bool):
+                place[last] = value
+            elif not value:
+                place[last] = None
+
+
+@lru_cache
+def _load_earlier_fields() -> list[dict[str, Any]]:
+    return json.loads((Path(__file__).parent / "earlier_fields.json").read_text())
 
 
 def _find_folder(package: str, who: str) -> Path:

@@ -58,6 +58,7 @@ class ExportedPolicy:
         """Return why the episode ends now, or `None` while it goes on."""
         stop, limits = self.contract["stop"], self.contract["limits"]
         margin = stop["joint_margin"]
+        margin = -np.inf if margin is None else margin
         if (q < np.add(limits["lower"], margin)).any() or (
             q > np.subtract(limits["upper"], margin)
         ).any():

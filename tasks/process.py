@@ -10,9 +10,9 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from pkgutil import resolve_name
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import torch
 
@@ -22,17 +22,14 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
-from brokk_rl.observation import TargetScaling
 from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.classical import ClassicalController
 from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
-from tasks.noise import MeasuredNoise, ObservationNoise
-from tasks.reward import RewardCurriculum, RewardTerm, ToolState
-from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
+from tasks.options import ToolPoseOptions
 from tasks.starts import DrawTally, move_starts_near
+from tasks.step_state import ToolState
+from tasks.termination import EpisodeTerms
 
-REASONS = ("success", "joint_limit", "start_in_contact", "fault", "time_limit")
-"""Endings of an episode; where several hold in one step, the first of them counts."""
 FIGURES = (
     "success_strict",
     "success_paper",
@@ -74,42 +71,6 @@ class ToolPoseGoal(Protocol):
         ...
 
 
-@dataclass
-class ToolPoseOptions:
-    """Parts of a task's configuration that the process itself uses.
-
-    See the task's spec. The controller's target lies `depth_m` below that of the goal.
-    """
-
-    episode_s: float
-    end_on_success: bool
-    limit_margin: float
-    depth_m: float
-    memory: int
-    advice: AdviceConfig | None
-    noise: ObservationNoise | MeasuredNoise
-    switch: PhaseSwitch
-    action: ActionMapping
-    scaling: TargetScaling
-    classical: ClassicalConfig
-    reward: dict[str, RewardTerm]
-    curriculum: RewardCurriculum | None
-
-    @classmethod
-    def of(cls, task: object, **fixed: Any) -> Self:
-        """Return the options of a task's spec, whose fields have the same names.
-
-        Args:
-            task: The spec.
-            **fixed: Options that the spec does not leave open.
-        """
-        names = []
-        for field in fields(cls):
-            if field.name not in fixed:
-                names.append(field.name)
-        return cls(**fixed, **{name: getattr(task, name) for name in names})
-
-
 class ToolPoseProcess:
     """Episodes in `N` environments; fulfils `TaskProcess`, `ClassicalTask` and `DeployableTask`.
 
@@ -120,8 +81,6 @@ class ToolPoseProcess:
         num_envs: `N`.
         device: Where to compute.
     """
-
-    reasons: tuple[str, ...] = REASONS
 
     def __init__(
         self,
@@ -149,9 +108,11 @@ class ToolPoseProcess:
             depth_m=options.depth_m,
         )
         self._machine = machine
+        self._sensed_m: torch.Tensor | None = None
         self._kinematics = Kinematics(machine, device)
-        self._lower = to_constant(machine.lower) + options.limit_margin
-        self._upper = to_constant(machine.upper) - options.limit_margin
+        self._lower, self._upper = to_constant(machine.lower), to_constant(machine.upper)
+        self._endings = EpisodeTerms(options.termination)
+        self.reasons = self._endings.reasons
         self._terms: dict[str, tuple[Callable[[ToolState], torch.Tensor], float]] = {
             name: (resolve_name(term.function), term.weight)
             for name, term in options.reward.items()
@@ -280,7 +241,7 @@ class ToolPoseProcess:
 
     def step(self, history: History, world: World) -> Transition:
         """Judge a control step; see `TaskProcess.step`."""
-        state, options = self.state, self.options
+        state = self.state
         q = history.q[:, -1]
         pose = self._kinematics.pose(q)
         verdict = self.goal.judge(pose.tip_in_base_m, pose.pitch_rad, self._get_start())
@@ -288,26 +249,19 @@ class ToolPoseProcess:
         # `age` counts since the reset
         state["steps"] += 1
         state["age"] += 1
-        first = state["age"] == 1
-        failed = ((q < self._lower) | (q > self._upper)).any(1)
-        touching = first & (world.contact_force_n > 0)
-        fault = world.faults
         # forces of a diverged world may be NaN, and one NaN would poison the sums over all worlds
-        force_n = torch.where(fault, 0.0, world.contact_force_n)
-        success = verdict["success"] & ~fault & ~touching
-        tool = self._make_tool_state(pose, verdict, force_n, success, failed)
-        reward = self._sum_reward(tool, ~(fault | touching))
-        timed_out = state["steps"] >= self.max_episode_steps
-        ended = failed | touching | fault
-        if options.end_on_success:
-            ended = ended | success
-        ends_by_success = success if options.end_on_success else torch.zeros_like(success)
-        reason = self._find_reason((ends_by_success, failed, touching, fault, timed_out))
-        self._count(tool, history.u, reward, success)
+        force_n = torch.where(world.faults, 0.0, world.contact_force_n)
+        tool = self._make_tool_state(q, pose, verdict, force_n)
+        endings = self._endings.judge(tool, world.faults)
+        reward = self._sum_reward(tool, endings.is_sound)
+        self._count(tool, history.u, reward)
         state["closeness"].copy_(verdict["closeness"])
         state["contact_force_n"].copy_(force_n)
         return Transition(
-            reward=reward, terminated=ended, timed_out=timed_out & ~ended, reason=reason
+            reward=reward,
+            terminated=endings.terminated,
+            timed_out=endings.timed_out,
+            reason=endings.reason,
         )
 
     def _sum_reward(self, tool: ToolState, is_sound: torch.Tensor) -> torch.Tensor:
@@ -365,7 +319,11 @@ class ToolPoseProcess:
             description["advice"] = asdict(options.advice)
         success = self.goal.describe_success()
         description["masked"] = options.action.mask
-        description["stop"] = {"joint_margin": options.limit_margin, "success": success}
+        description["stop"] = {
+            "joint_margin": self._endings.find_joint_margin(),
+            "success": success,
+            "endings": self._endings.describe(),
+        }
         return description
 
     def mirror(self) -> Mirror:
@@ -388,6 +346,17 @@ class ToolPoseProcess:
         pitch_rad = float(self.starts(1, 0)["target_pitch_rad"][0])
         return DeployedPolicy(self.control, network, pitch_rad)
 
+    def take_estimate(self, target_m: torch.Tensor) -> None:
+        """Take estimated targets; see `LookingTask.take_estimate`."""
+        self._sensed_m = target_m
+
+    def plan(
+        self, q: torch.Tensor, target_m: torch.Tensor, num_times: int, step_s: float
+    ) -> torch.Tensor:
+        """Return the controller's plan, `(N, T, J)`; see `LookingTask.plan`."""
+        pitch_rad = self.state["start.target_pitch_rad"]
+        return self.control.plan(q, target_m, pitch_rad, num_times, step_s)
+
     def _get_start(self) -> dict[str, torch.Tensor]:
         start = {}
         for name, value in self.state.items():
@@ -397,15 +366,20 @@ class ToolPoseProcess:
 
     def _make_tool_state(
         self,
+        q: torch.Tensor,
         pose: ToolPose,
         verdict: dict[str, torch.Tensor],
         force_n: torch.Tensor,
-        success: torch.Tensor,
-        failed: torch.Tensor,
     ) -> ToolState:
         state = self.state
         target_m = state["start.target_m"]
         return ToolState(
+            q=q,
+            lower=self._lower,
+            upper=self._upper,
+            steps=state["steps"],
+            max_steps=self.max_episode_steps,
+            is_first=state["age"] == 1,
             tip_m=pose.tip_in_base_m,
             pitch_rad=pose.pitch_rad,
             target_m=target_m - self.control.down,
@@ -418,28 +392,20 @@ class ToolPoseProcess:
             u=state["u"],
             u_before=state["u_before"],
             lateral_m=(target_m - pose.tip_in_base_m)[:, :2].norm(dim=1),
-            success=success,
+            success=verdict["success"],
+            failed=torch.zeros_like(verdict["success"]),  # until the endings are judged
             paper_success=verdict["paper_success"],
-            failed=failed,
             closeness=verdict["closeness"],
             closeness_before=state["closeness"],
         )
 
-    def _find_reason(self, endings: tuple[torch.Tensor, ...]) -> torch.Tensor:
-        """Return the index of the first of `endings` (as in `REASONS`) that holds, else -1."""
-        reason = torch.full_like(self.state["steps"], -1.0)
-        for index in reversed(range(len(REASONS))):
-            reason = torch.where(endings[index], float(index), reason)
-        return reason
-
-    def _count(
-        self, tool: ToolState, given: torch.Tensor, reward: torch.Tensor, success: torch.Tensor
-    ) -> None:
+    def _count(self, tool: ToolState, given: torch.Tensor, reward: torch.Tensor) -> None:
         """Update the figures of the running episode; `given`: commands in force, `(N, H, J)`."""
         episode, period_s = self.episode, self._machine.period_s
         episode["length"] += 1
         episode["return"] += reward
         # time and lateral error stop at the first success
+        success = tool.success
         is_open = episode["success_strict"] == 0
         time_s = torch.where(
             success & is_open, episode["length"] * period_s, episode["time_to_insert_s"]
@@ -456,8 +422,12 @@ class ToolPoseProcess:
         episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
 
     def _estimate_target(self, shift_m: torch.Tensor | None) -> torch.Tensor:
-        """Draw a noisy sample of the target; return the estimate, `(N, 3)`."""
+        """Return the sensed target, or draw a noisy sample and return the estimate, `(N, 3)`."""
         noise, state = self.options.noise, self.state
+        if self._sensed_m is not None:
+            sample = self._sensed_m if shift_m is None else self._sensed_m + shift_m
+            state["estimate_m"].copy_(sample)
+            return sample
         true_m = state["start.target_m"]
         error = (2 * torch.rand_like(true_m) - 1) * noise.sample_m(true_m)
         if noise.target_relative:

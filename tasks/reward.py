@@ -1,4 +1,4 @@
-"""Reward terms: free functions of the state after a control step, `(ToolState) -> (N,)`.
+"""Reward terms: free functions of the state after a control step (`tasks.step_state`) to `(N,)`.
 
 A task lists its terms and their weights in its YAML (`task.reward.<name>.weight=…`). An extension
 names functions of its own there as `package.module:function`. The six terms of the paper's equation
@@ -8,69 +8,17 @@ names functions of its own there as `package.module:function`. The six terms of 
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
 from brokk_rl.bounds import require_number
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+from tasks.step_state import StepState, ToolState
+from tasks.termination import require_function
 
 if TYPE_CHECKING:
     import torch
-
-
-@dataclass
-class ToolState:
-    """State after a control step; `N` environments, `J` joints.
-
-    Attributes:
-        tip_m: Tool point in the base frame, `(N, 3)`.
-        pitch_rad: Pitch of the tool, `(N,)`.
-        target_m: Target point, `(N, 3)`.
-        target_pitch_rad: Wanted pitch, `(N,)`.
-        reach_m: Distance by which the switch decides, `(N,)`.
-        reach_range_m: Good working range (nearest, farthest).
-        positioning: Whether only the exclusive joints could move in this step, `(N,)` bool.
-        contact_force_n: Peak contact force of the step, `(N,)`.
-        peak_force_n: The largest of the episode's steps before, `(N,)`.
-        u: Commands of this step, `(N, J)`.
-        u_before: Commands of the step before, `(N, J)`.
-        lateral_m: Distance of the tool point from the vertical through the target, `(N,)`.
-        success: The task's strict criterion holds, `(N,)` bool.
-        paper_success: The paper's criterion holds, `(N,)` bool.
-        failed: The episode ends by a joint limit, `(N,)` bool.
-        closeness: How near the task is to done, 0 to about 1, `(N,)`.
-        closeness_before: The same one step earlier.
-    """
-
-    tip_m: torch.Tensor
-    pitch_rad: torch.Tensor
-    target_m: torch.Tensor
-    target_pitch_rad: torch.Tensor
-    reach_m: torch.Tensor
-    reach_range_m: tuple[float, float]
-    positioning: torch.Tensor
-    contact_force_n: torch.Tensor
-    peak_force_n: torch.Tensor
-    u: torch.Tensor
-    u_before: torch.Tensor
-    lateral_m: torch.Tensor
-    success: torch.Tensor
-    paper_success: torch.Tensor
-    failed: torch.Tensor
-    closeness: torch.Tensor
-    closeness_before: torch.Tensor
-
-    @property
-    def distance_m(self) -> torch.Tensor:
-        """Distance from the tool point to the target, `(N,)`."""
-        return (self.target_m - self.tip_m).norm(dim=1)
-
-    @property
-    def pitch_error_rad(self) -> torch.Tensor:
-        """Size of the pitch error, `(N,)`."""
-        return (self.target_pitch_rad - self.pitch_rad).abs()
 
 
 @spec
@@ -78,7 +26,8 @@ class RewardTerm:
     """A weighted reward term.
 
     Attributes:
-        function: `package.module:function` from `ToolState` to `(N,)`.
+        function: `package.module:function` from `StepState` to `(N,)`; in a tool-pose task from
+            `ToolState`.
         weight: Factor; negative for a penalty.
     """
 
@@ -87,17 +36,7 @@ class RewardTerm:
 
     def check(self) -> None:
         require_number(f"weight of the reward term '{self.function}'", self.weight)
-        try:
-            found = resolve_name(self.function)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigError(
-                f"reward term '{self.function}' cannot be found ({error}); expected "
-                "package.module:function"
-            ) from error
-        if not callable(found):
-            raise ConfigError(
-                f"reward term '{self.function}' is no function; expected package.module:function"
-            )
+        require_function("reward term", self.function)
 
     def __call__(self, state: ToolState) -> torch.Tensor:
         """Return the weighted term, `(N,)`."""
@@ -189,7 +128,7 @@ def approach_command_change(state: ToolState) -> torch.Tensor:
 # beyond the paper
 
 
-def command_change(state: ToolState) -> torch.Tensor:
+def command_change(state: StepState) -> torch.Tensor:
     """Sum over joints of the change of command since the last step, in all phases."""
     return (state.u - state.u_before).abs().sum(1)
 
@@ -202,22 +141,22 @@ def progress(state: ToolState) -> torch.Tensor:
     return state.closeness - state.closeness_before
 
 
-def success(state: ToolState) -> torch.Tensor:
+def success(state: StepState) -> torch.Tensor:
     """One when the strict criterion is fulfilled."""
     return state.success.float()
 
 
 def failure(state: ToolState) -> torch.Tensor:
-    """One plus the closeness that is given up when the episode ends by a joint limit."""
+    """One plus the closeness that is given up when the episode ends by a failure."""
     return state.failed * (1.0 + state.closeness)
 
 
-def contact(state: ToolState) -> torch.Tensor:
+def contact(state: StepState) -> torch.Tensor:
     """Contact force in kN, saturating at 10 kN: a hydraulic arm can break an obstacle."""
     return (state.contact_force_n / 1000.0).clamp(max=10.0)
 
 
-def peak_contact(state: ToolState) -> torch.Tensor:
+def peak_contact(state: StepState) -> torch.Tensor:
     """Growth of the episode's peak contact force in kN, up to 10 kN.
 
     An episode pays for its hardest blow, not for the time it leans on the rim: a penalty of every
@@ -227,7 +166,7 @@ def peak_contact(state: ToolState) -> torch.Tensor:
     return (peak_n.clamp(max=10_000.0) - state.peak_force_n.clamp(max=10_000.0)) / 1000.0
 
 
-def heavy_contact(state: ToolState) -> torch.Tensor:
+def heavy_contact(state: StepState) -> torch.Tensor:
     """Growth of the episode's peak contact force beyond 10 kN, in kN, up to 100 kN.
 
     What `peak_contact` leaves out: to a policy whose blows are all harder than 10 kN, that term
@@ -238,6 +177,6 @@ def heavy_contact(state: ToolState) -> torch.Tensor:
     return (peak_n.clamp(low, high) - state.peak_force_n.clamp(low, high)) / 1000.0
 
 
-def duration(state: ToolState) -> torch.Tensor:
+def duration(state: StepState) -> torch.Tensor:
     """One in each step."""
-    return state.reach_m.new_ones(state.reach_m.shape)
+    return state.contact_force_n.new_ones(state.contact_force_n.shape)

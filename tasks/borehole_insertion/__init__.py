@@ -16,6 +16,7 @@ from brokk_rl.spec import spec
 from tasks.noise import MeasuredNoise, ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.settings import ActionMapping, AdviceConfig, ArmStarts, ClassicalConfig, PhaseSwitch
+from tasks.termination import Termination, check_terminations
 
 if TYPE_CHECKING:
     import torch
@@ -83,8 +84,6 @@ class BoreholeInsertion:
 
     Attributes:
         episode_s: Time limit.
-        end_on_success: Whether strict success ends the episode.
-        limit_margin: Distance to a joint limit (rad or m) at which the episode ends.
         depth_m: Depth below the rim of the target point (paper: 0.1 m; a little more makes the
             controller pass the strict depth).
         hole: Where the hole may be.
@@ -101,11 +100,10 @@ class BoreholeInsertion:
         classical: The classical controller, baseline and base of residual actions.
         reward: Reward terms by name.
         curriculum: Terms whose weights grow with success; `null` for constant weights.
+        termination: Endings of an episode by name; `null` switches one off.
     """
 
     episode_s: float
-    end_on_success: bool
-    limit_margin: float
     depth_m: float
     hole: BoreholeRanges
     arms: ArmStarts
@@ -119,6 +117,7 @@ class BoreholeInsertion:
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
     curriculum: RewardCurriculum | None
+    termination: dict[str, Termination | None]
 
     behaviour: ClassVar[tuple[str, ...]] = (
         "depth_m",
@@ -135,8 +134,8 @@ class BoreholeInsertion:
     def check(self) -> None:
         require_number("task.episode_s", self.episode_s, above=0)
         require_number("task.memory", self.memory, least=1)
-        for name in ("limit_margin", "depth_m"):
-            require_number(f"task.{name}", getattr(self, name))
+        require_number("task.depth_m", self.depth_m)
+        check_terminations(self.termination)
         if self.curriculum:
             self.curriculum.check_names(self.reward)
 

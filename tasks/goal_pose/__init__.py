@@ -17,6 +17,7 @@ from brokk_rl.spec import spec
 from tasks.noise import ObservationNoise
 from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.settings import ActionMapping, AdviceConfig, ArmStarts, ClassicalConfig, PhaseSwitch
+from tasks.termination import Termination, check_terminations
 
 if TYPE_CHECKING:
     import torch
@@ -70,8 +71,6 @@ class GoalPose:
 
     Attributes:
         episode_s: Time limit.
-        end_on_success: Whether strict success ends the episode.
-        limit_margin: Distance to a joint limit (rad or m) at which the episode ends.
         pose: Which poses are asked for.
         arms: Where the arm may begin.
         tolerance: Criteria of success.
@@ -86,11 +85,10 @@ class GoalPose:
         classical: The classical controller, baseline and base of residual actions.
         reward: Reward terms by name.
         curriculum: Terms whose weights grow with success; `null` for constant weights.
+        termination: Endings of an episode by name; `null` switches one off.
     """
 
     episode_s: float
-    end_on_success: bool
-    limit_margin: float
     pose: PoseRanges
     arms: ArmStarts
     tolerance: PoseCriteria
@@ -103,6 +101,7 @@ class GoalPose:
     classical: ClassicalConfig
     reward: dict[str, RewardTerm]
     curriculum: RewardCurriculum | None
+    termination: dict[str, Termination | None]
 
     behaviour: ClassVar[tuple[str, ...]] = (
         "memory",
@@ -118,7 +117,7 @@ class GoalPose:
     def check(self) -> None:
         require_number("task.episode_s", self.episode_s, above=0)
         require_number("task.memory", self.memory, least=1)
-        require_number("task.limit_margin", self.limit_margin)
+        check_terminations(self.termination)
         if self.curriculum:
             self.curriculum.check_names(self.reward)
         if self.scaling.pitch_rad is None and self.pose.pitch_rad[0] != self.pose.pitch_rad[1]:

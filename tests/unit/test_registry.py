@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -9,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from composed import option as load_option
+from hydra.utils import instantiate
 
 import brokk_rl
 from brokk_rl import registry
 from brokk_rl.modes import doctor
 from brokk_rl.modes.doctor import Doctor, DoctorFinding, DoctorLimits
 from brokk_rl.registry import Option
+from tasks.termination import JointLimit
 
 
 def option(folder: Path, group: str, text: str) -> Option:
@@ -164,3 +168,24 @@ def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
         "extensions",
     ):
         assert topic in done.out
+
+
+def test_fields_of_earlier_versions_become_the_current_ones() -> None:
+    """What moved keeps its value, what was not there gets the value by which the version acted."""
+    terms = load_option("task", "borehole_insertion").termination
+    for ends in (True, False):
+        old = {
+            "_target_": "tasks.borehole_insertion.BoreholeInsertion",
+            "limit_margin": 0.02,
+            "end_on_success": ends,
+        }
+        config: dict[str, Any] = {"jobs": [{"task": old}]}
+        registry.upgrade_fields(config)
+        found = instantiate(old["termination"], _convert_="all")
+        assert found == terms | {
+            "joint_limit": JointLimit(margin=0.02),
+            "success": terms["success"] if ends else None,
+        }
+        again = copy.deepcopy(config)
+        registry.upgrade_fields(again)
+        assert again == config and not {"limit_margin", "end_on_success"} & old.keys()

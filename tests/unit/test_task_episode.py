@@ -17,7 +17,6 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from tasks import starts
 from tasks.classical import ClassicalController
-from tasks.process import REASONS
 from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.starts import try_targets
 
@@ -49,6 +48,11 @@ class Stage:
 
     def step(self) -> Any:
         return self.process.step(self.history, self.world)
+
+
+def terminations(**changes: Any) -> dict[str, Any]:
+    """Returns the endings of the shipped task with changes."""
+    return {**option("task", "borehole_insertion").termination, **changes}
 
 
 @pytest.mark.parametrize("name", TASKS)
@@ -266,7 +270,7 @@ def test_a_start_in_contact_ends_at_once_with_no_reward(machine: Machine) -> Non
     stage.world.contact_force_n.fill_(500.0)
     end = stage.step()
     assert end.terminated.item() and not end.timed_out.item() and end.reward.item() == 0.0
-    assert REASONS[int(end.reason)] == "start_in_contact"
+    assert stage.process.reasons[int(end.reason)] == "start_in_contact"
 
 
 def test_contact_later_in_the_episode_goes_on(machine: Machine) -> None:
@@ -292,7 +296,7 @@ def test_a_joint_at_its_limit_ends_the_episode_as_a_failure(joint: int, machine:
     assert (
         end.terminated.item()
         and not end.timed_out.item()
-        and REASONS[int(end.reason)] == "joint_limit"
+        and stage.process.reasons[int(end.reason)] == "joint_limit"
     )
     assert end.reward.item() < -5.0, "5 (1 + closeness) is lost"
 
@@ -303,7 +307,7 @@ def test_the_time_limit_is_a_time_out_and_no_failure(machine: Machine) -> None:
     assert [bool(end.timed_out) for end in ends] == [False, False, False, True]
     assert (
         not any(bool(end.terminated) for end in ends)
-        and REASONS[int(ends[3].reason)] == "time_limit"
+        and stage.process.reasons[int(ends[3].reason)] == "time_limit"
     )
 
 
@@ -314,7 +318,7 @@ def test_an_episode_that_fails_in_its_last_step_is_no_time_out(machine: Machine)
     assert (
         end.terminated.item()
         and not end.timed_out.item()
-        and REASONS[int(end.reason)] == "joint_limit"
+        and stage.process.reasons[int(end.reason)] == "joint_limit"
     )
 
 
@@ -322,7 +326,7 @@ def test_episodes_put_out_of_step_end_earlier_but_know_their_first_step(machine:
     stage = Stage(machine, episode_s=1.0)
     stage.process.state["steps"].fill_(18.0)  # what rsl-rl does through episode_length_buf
     stage.world.contact_force_n.fill_(500.0)
-    assert REASONS[int(stage.step().reason)] == "start_in_contact"
+    assert stage.process.reasons[int(stage.step().reason)] == "start_in_contact"
     stage.world.contact_force_n.fill_(0.0)
     assert stage.step().timed_out.item()
 
@@ -333,18 +337,22 @@ def test_a_fault_ends_the_episode_without_reward_or_success(machine: Machine) ->
     stage.world.faults.fill_(True)
     end = stage.step()
     assert (
-        end.terminated.item() and end.reward.item() == 0.0 and REASONS[int(end.reason)] == "fault"
+        end.terminated.item()
+        and end.reward.item() == 0.0
+        and stage.process.reasons[int(end.reason)] == "fault"
     )
     assert stage.process.episode["success_strict"].item() == 0.0
 
 
 def test_success_ends_the_episode_only_where_it_shall(machine: Machine) -> None:
-    for ends in (True, False):
-        stage = Stage(machine, end_on_success=ends)
+    for switch in ({}, {"success": None}):
+        stage = Stage(machine, termination=terminations(**switch))
         stage.step()
         stage.target_below_tip(z_m=-0.12)
         end = stage.step()
-        assert bool(end.terminated) is ends and (REASONS[int(end.reason)] == "success") is ends
+        ends = not switch
+        assert bool(end.terminated) is ends
+        assert int(end.reason) == (stage.process.reasons.index("success") if ends else -1)
         assert stage.process.episode["success_strict"].item() == 1.0
 
 
@@ -353,7 +361,7 @@ def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
     task = option("task", "borehole_insertion")
     stage = Stage(
         machine,
-        end_on_success=False,
+        termination=terminations(success=None),
         action=replace(task.action, kind="direct", scale=1.0, limits=False),
     )
     script = [  # command of q1, force, tool from the target
