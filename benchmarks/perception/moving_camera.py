@@ -1,6 +1,6 @@
 """Insertion with perception in the loop: fixed and moving cameras beside the true hole.
 
-    python benchmarks/perception/moving_camera.py <out> --seeds 1 2 3 4 5 --episodes 12
+    python benchmarks/perception/moving_camera.py <out> --seeds 1 2 3 4 5 --episodes 4
 
 Runs `mode=evaluate target=perceived` with a guided person at the levers, for each mount and seed,
 from the same starts. Pictures are rendered at 2 Hz with the arm in them. `true` is the same with the
@@ -26,9 +26,9 @@ TRUE_HOLE = ("target=drawn", "task.noise.target_sample_m=0", "task.noise.target_
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path)
-    parser.add_argument("--mounts", nargs="+", default=["true", "fixed", "tower", "mast"])
+    parser.add_argument("--mounts", nargs="+", default=["true", "fixed_high", "mast"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])
-    parser.add_argument("--episodes", type=int, default=12)
+    parser.add_argument("--episodes", type=int, default=4)
     parser.add_argument("--processes", type=int, default=1)
     arguments = parser.parse_args()
     for seed in arguments.seeds:
