@@ -77,7 +77,8 @@ def film(machine: Machine, scene: list[float]) -> list[Image.Image]:
             if frame is not None and is_fresh:
                 found = finder.find(frame).in_base_frame(frame).holes
                 hole = next(iter(tracker.update(found, t_s)), None)
-            assert view is not None
+            if frame is None or view is None:  # on its way to the first view
+                continue
             pictures.append(draw(machine, q, hole_m, frame, is_fresh, hole, view, t_s))
     return pictures
 
@@ -86,7 +87,7 @@ def draw(
     machine: Machine,
     q: np.ndarray,
     hole_m: np.ndarray,
-    frame: Frame | None,
+    frame: Frame,
     is_fresh: bool,
     hole: TrackedHole | None,
     view: CameraView,
@@ -97,15 +98,14 @@ def draw(
         1, 2, figsize=(7.6, 3.4), width_ratios=(1.35, 1), layout="constrained"
     )
     left.axis("off")
-    if frame is not None:
-        left.imshow(frame.color, alpha=1.0 if is_fresh else 0.35)
-        draw_rim(left, frame, hole)
+    left.imshow(frame.color, alpha=1.0 if is_fresh else 0.35)
+    draw_rim(left, frame, hole)
     std = "not seen yet" if hole is None else f"± {1000 * hole.std_m:.1f} mm"
     left.set_title(f"{t_s:.1f} s   hole {std}" + ("" if is_fresh else "   (moving)"), fontsize=9)
     arm = load_option("target", "perceived").arm.trace(machine, q)
     right.plot(arm[:, 0], arm[:, 1], "-o", color="#d98200", lw=4, ms=4, label="arm")
     right.plot(*hole_m[:2], "o", color="#007a33", ms=9, mfc="none", mew=2, label="hole")
-    if frame is not None and frame.base_from_camera is not None:
+    if frame.base_from_camera is not None:
         pose = frame.base_from_camera
         half = np.arctan(frame.color.shape[1] / 2 / frame.camera_matrix[0, 0])
         heading = np.arctan2(pose[1, 2], pose[0, 2])
