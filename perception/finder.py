@@ -16,6 +16,8 @@ from brokk_rl.contracts.vision import (
     EllipseDetectorSpec,
     FrameDetections,
     HolePose,
+    HoleProposerSpec,
+    Masks,
     PoseEstimatorSpec,
     Rejection,
     SegmenterSpec,
@@ -33,6 +35,12 @@ same rim. Chosen by hand: a rim found in two resolutions differs by a few percen
 STRONG_SCORE = 0.5
 """Part of the best score from which an ellipse counts as strong. Chosen by hand: among strong rims
 inside each other the larger one wins, a weak larger one does not."""
+
+SAME_REGION = 0.6
+"""Distance, as a part of the smaller major semi-axis, below which a proposal shows the region of an
+ellipse. Chosen by hand: the middle of a region with a broken rim is off by up to 0.35."""
+SHAPE_REASONS = ("part of a circle on the face with a rim", "radius, m", "axis ratio on the face")
+"""Reasons that refuse an ellipse and not its region: it may have followed the wrong edges."""
 
 EXPLANATIONS = {
     rectification.REASON: (
@@ -110,6 +118,7 @@ class StagedPerception:
     Attributes:
         segmenter: Marks the block.
         ellipse: Finds ellipses on it.
+        proposer: Proposes further places, by other signs than edges; `null` for none.
         pose: Turns ellipses into holes.
         radius_m: Radius of the holes; limits the size of the ellipses.
         size_slack: Allowed relative error of that size.
@@ -124,6 +133,7 @@ class StagedPerception:
 
     segmenter: SegmenterSpec
     ellipse: EllipseDetectorSpec
+    proposer: HoleProposerSpec | None
     pose: PoseEstimatorSpec
     radius_m: float
     size_slack: float
@@ -154,6 +164,7 @@ class StagedFinder:
     def __init__(self, settings: StagedPerception) -> None:
         self.settings = settings
         self._segmenter, self._detector = settings.segmenter.build(), settings.ellipse.build()
+        self._proposer = settings.proposer.build() if settings.proposer else None
         self._pose = settings.pose.build()
 
     def find(self, frame: Frame) -> FrameDetections:
@@ -182,18 +193,14 @@ class StagedFinder:
             return FrameDetections([], [rejection], [], masks, ms)
         with _time_stage(ms, "ellipse"):
             ellipses = self._detect_ellipses(frame, on_block)
+        proposals: list[Ellipse] = []
+        if self._proposer is not None:
+            with _time_stage(ms, "regions"):
+                proposals = self._proposer.propose(frame, masks)
         with _time_stage(ms, "pose"):
-            found: list[tuple[Ellipse, HolePose]] = []
-            rejected: list[Rejection] = []
-            # Every ellipse is judged alone: holes do not compete until all are known.
-            for ellipse in ellipses:
-                pose = self._pose.estimate(frame, masks, ellipse)
-                if isinstance(pose, Rejection):
-                    rejected.append(pose)
-                else:
-                    found.append((ellipse, pose))
+            found, rejected = self._judge(frame, masks, ellipses, proposals)
             found, doubles = self._remove_inner_rims(found)
-        if not ellipses:
+        if not ellipses and not proposals:
             rejected = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
         # Doubles are holes too; they are told apart from rejected candidates only by their
         # reason.
@@ -212,6 +219,27 @@ class StagedFinder:
     def explain(self, rejection: Rejection) -> str:
         """Return a sentence: the refused candidate, the reason, and a remedy."""
         return explain_rejection(rejection)
+
+    def _judge(
+        self, frame: Frame, masks: Masks, ellipses: Sequence[Ellipse], proposals: Sequence[Ellipse]
+    ) -> tuple[list[tuple[Ellipse, HolePose]], list[Rejection]]:
+        """Return the holes among ellipses and proposals, and why the others are none."""
+        found: list[tuple[Ellipse, HolePose]] = []
+        rejected: list[Rejection] = []
+        decided: list[Ellipse] = []
+        # Every candidate is judged alone: holes do not compete until all are known.
+        for candidate in (*ellipses, *proposals):
+            # A proposal is of use only where no ellipse was judged by its appearance.
+            if candidate in proposals and _is_near_any(candidate, decided):
+                continue
+            pose = self._pose.estimate(frame, masks, candidate)
+            if isinstance(pose, Rejection):
+                rejected.append(pose)
+            else:
+                found.append((candidate, pose))
+            if not isinstance(pose, Rejection) or pose.reason not in SHAPE_REASONS:
+                decided.append(candidate)
+        return found, rejected
 
     def _detect_ellipses(self, frame: Frame, on_block: np.ndarray) -> list[Ellipse]:
         """Return the ellipses of a possible size on the block, each rim once."""
@@ -310,6 +338,14 @@ def _remove_duplicates(ellipses: Sequence[Ellipse]) -> list[Ellipse]:
         if not any(_is_same_ellipse(one, other, size) for other in kept):
             kept.append(one)
     return kept
+
+
+def _is_near_any(one: Ellipse, others: Sequence[Ellipse]) -> bool:
+    """Return whether an ellipse lies on one of the others."""
+    return any(
+        float(np.hypot(one.x - other.x, one.y - other.y)) < SAME_REGION * min(one.a, other.a)
+        for other in others
+    )
 
 
 def _is_same_ellipse(one: Ellipse, other: Ellipse, size: float) -> bool:

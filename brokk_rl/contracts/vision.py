@@ -343,6 +343,22 @@ class EllipseDetectorSpec(Protocol):
         ...
 
 
+class HoleProposer(Protocol):
+    """Proposes places that may be holes by other signs than the edges of a rim."""
+
+    def propose(self, frame: Frame, masks: Masks) -> list[Ellipse]:
+        """Return ellipses of about the place and size of a rim, the likeliest first."""
+        ...
+
+
+class HoleProposerSpec(Protocol):
+    """A spec in `conf/perception/proposer`."""
+
+    def build(self) -> HoleProposer:
+        """Return a proposer."""
+        ...
+
+
 class PoseEstimator(Protocol):
     """Turns an ellipse of a picture into a hole in space."""
 

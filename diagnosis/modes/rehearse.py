@@ -7,25 +7,20 @@ left out.
 from __future__ import annotations
 
 import json
-import logging
-import shutil
-import subprocess
-import sys
 from collections.abc import Mapping
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-import yaml
 from rich.console import Console
 
+from brokk_rl import story
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import BrokkError, ConfigError, RecordingError, list_choices
+from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.report import Cell, Report, Tone
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
-from brokk_rl.session import RESOLVED, Session, read_record, write_text
+from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis import answer, plots, report, retraining
 from diagnosis.answer import Answer
@@ -63,7 +58,7 @@ def write_story(folder: Path, stages: Mapping[str, str], withheld: Mapping[str, 
             figure,
             "Strict success with Wilson's 95 % intervals; all policies meet the same starts.",
         )
-    _add_stages(page, folder, stages)
+    story.add_stages(page, folder, stages)
     _add_simulator(page, _read_json(folder / "simulator" / "identification.json"))
     _add_policy(page, {name: _read_json(folder / name / "evaluation.json") for name in EVALUATED})
     if found:
@@ -117,39 +112,6 @@ def _list_withheld(withheld: Mapping[str, Any]) -> str:
 def _get_joints(node: Mapping[str, Any]) -> list[str]:
     joints = node.get("joints", [])
     return [] if isinstance(joints, str) else list(joints)
-
-
-def _add_stages(page: Report, folder: Path, stages: Mapping[str, str]) -> None:
-    page.add_heading("Stages")
-    rows, whole_s = [], 0.0
-    for name, title in stages.items():
-        record = read_record(folder / name)
-        if record is None:
-            rows.append([name, title, None])
-            continue
-        seconds = _measure_seconds(record)
-        whole_s += seconds or 0.0
-        rows.append(
-            [
-                name,
-                Cell(title, f"{record['outcome']}; {record['mode']}"),
-                None if seconds is None else f"{seconds / 60:.1f}",
-            ]
-        )
-    rows.append(["", "all", f"{whole_s / 60:.1f}"])
-    page.add_table(["stage", "purpose", "minutes"], rows)
-    with page.add_details("The commands"):
-        records = (read_record(folder / name) for name in stages)
-        page.add_code(
-            "\n\n".join(f"brokk {' '.join(record['command'][1:])}" for record in records if record)
-        )
-
-
-def _measure_seconds(record: Mapping[str, Any]) -> float | None:
-    if not record.get("ended"):
-        return None
-    begun, ended = (datetime.fromisoformat(record[key]) for key in ("started", "ended"))
-    return (ended - begun).total_seconds()
 
 
 def _add_simulator(page: Report, found: Mapping[str, Any] | None) -> None:
@@ -237,42 +199,8 @@ def _read_diagnosis(folder: Path) -> Answer | None:
         return None
 
 
-log = logging.getLogger(__name__)
-
-HANDED_ON_FOLDER = "given"
-"""Folder with the files that stages take from the story."""
 HANDED_ON_GROUPS = ("sim", "task", "rl", "evaluation")
 """Groups that a stage can take from the story."""
-FOLDER_PLACEHOLDER = "{folder}"
-
-
-@spec
-class StoryStage:
-    """One command of a story; its run folder is `<story>/<name of the stage>`.
-
-    Attributes:
-        title: Its purpose in words.
-        command: Arguments of `brokk`; `{folder}` stands for the run folder of the story.
-        takes: Groups (`sim`, `task`, `rl`, `evaluation`) and `device` that it takes from the story.
-        links: Links made before it, both ends below the run folder: path and target.
-        needs: A file below the run folder without whose content the story ends before this stage;
-            `null`: nothing.
-        resumes: Whether an interrupted one goes on with `resume=`; otherwise it begins anew.
-    """
-
-    title: str
-    command: tuple[str, ...]
-    takes: tuple[str, ...]
-    links: dict[str, str]
-    needs: str | None
-    resumes: bool
-
-    def check(self) -> None:
-        for name in self.takes:
-            if name not in (*HANDED_ON_GROUPS, "device"):
-                raise ConfigError(
-                    f"a stage takes '{name}', which the story does not have; {list_choices(name, (*HANDED_ON_GROUPS, 'device'))}"
-                )
 
 
 @spec
@@ -298,7 +226,7 @@ class Rehearse:
     rl: TrainingConfig
     evaluation: Evaluation
     withheld: dict[str, Effect]
-    stages: dict[str, StoryStage]
+    stages: dict[str, story.StoryStage]
     resume: str | None
 
     def check(self) -> None:
@@ -306,10 +234,7 @@ class Rehearse:
             raise ConfigError(
                 "mode=rehearse has no story of its own; give one, as in experiment=gap_loop"
             )
-        if self.resume is not None and Path(self.resume).resolve() != self.session.folder.resolve():
-            raise ConfigError(
-                f"resume={self.resume}: a story goes on in its folder; add session.out={self.resume}"
-            )
+        story.check_story(self.session, self.stages, self.resume, HANDED_ON_GROUPS)
 
     def run(self) -> None:
         """Run the stages that are not finished; writes `story.html` after each of them.
@@ -318,68 +243,12 @@ class Rehearse:
             BrokkError: a stage failed; the story goes on from there with `resume=`.
         """
         folder = self.session.folder.resolve()
-        given = self._hand_on(folder)
+        heads = {"withheld": "# @package effect\n"}
+        given = story.write_groups(folder, (*HANDED_ON_GROUPS, "withheld"), heads)
         told = {name: stage.title for name, stage in self.stages.items()}
-        for number, (name, stage) in enumerate(self.stages.items(), 1):
-            if stage.needs is not None and not _has_content(folder / stage.needs):
-                log.warning("the story ends before '%s': %s holds nothing", name, stage.needs)
-                break
-            if (read_record(folder / name) or {}).get("outcome") == "finished":
-                log.info("%d of %d, %s: done already", number, len(self.stages), name)
-                continue
-            log.info("%d of %d, %s: %s", number, len(self.stages), name, stage.title)
-            self._play(name, stage, folder, given)
+
+        def write_page() -> None:
             write_story(folder, told, given["withheld"])
-        write_story(folder, told, given["withheld"])
+
+        story.run_story(self.session, self.stages, write_page)
         Console().print(f"story: {self.session.folder / STORY_FILE}", highlight=False)
-
-    def _hand_on(self, folder: Path) -> dict[str, Any]:
-        """Write the composed groups of the story as files for `group=@<file>`; return them."""
-        composed = yaml.safe_load((folder / RESOLVED).read_text())
-        given = {name: composed[name] for name in (*HANDED_ON_GROUPS, "withheld")}
-        (folder / HANDED_ON_FOLDER).mkdir(exist_ok=True)
-        for name, node in given.items():
-            head = "# @package effect\n" if name == "withheld" else ""
-            write_text(
-                folder / HANDED_ON_FOLDER / f"{name}.yaml",
-                head + yaml.safe_dump(node, sort_keys=False),
-            )
-        return given
-
-    def _play(self, name: str, stage: StoryStage, folder: Path, given: dict[str, Any]) -> None:
-        """Run one stage in a process of its own, as a person would, and waits for it."""
-        place = folder / name
-        for link, target in stage.links.items():
-            path = folder / link
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.unlink(missing_ok=True)
-            path.symlink_to(folder / target)
-        words = [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
-        words += [
-            f"{group}=@{folder / HANDED_ON_FOLDER / group}.yaml"
-            for group in stage.takes
-            if group != "device"
-        ]
-        words += [f"session.device={self.session.device}"] if "device" in stage.takes else []
-        words += [f"session.out={place}"]
-        if place.exists():
-            if stage.resumes:
-                words += [f"resume={place}"]
-            else:
-                shutil.rmtree(place)  # an unfinished stage has no record
-        with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words]) as process:
-            try:
-                code = process.wait()
-            except BaseException:
-                process.terminate()
-                raise
-        if code:
-            raise BrokkError(
-                f"the stage '{name}' failed, see above; what came before it is kept: go on with resume={self.session.out} "
-                f"session.out={self.session.out}"
-            )
-
-
-def _has_content(path: Path) -> bool:
-    """Return whether a YAML file holds anything but comments."""
-    return path.is_file() and bool(yaml.safe_load(path.read_text()))

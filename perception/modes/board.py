@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 
-import cv2
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -12,6 +11,7 @@ from brokk_rl.errors import ConfigError, StorageError
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception.label.camera_pose import Charuco
+from perception.render.printed_board import draw_board_picture
 
 log = logging.getLogger(__name__)
 
@@ -19,10 +19,6 @@ FILE = "board.pdf"
 METRES_PER_INCH = 0.0254
 RULER_M = 0.1
 """Length of the printed ruler, by which the scale of a print is checked."""
-SQUARE_PX = range(100, 1001)
-"""Sides of a square from which the one is taken that puts the edges of its markers on pixels."""
-LARGEST_PX = 5e-3
-"""Such an edge may lie this far from a pixel's, as a part of the square: 0.5 mm of 100 mm."""
 
 
 @spec
@@ -79,7 +75,7 @@ def draw_board(board: Charuco, margin_m: float) -> Figure:
     Raises:
         ConfigError: see `PrintBoard.run`.
     """
-    picture = _draw_picture(board)
+    picture = draw_board_picture(board)
     width_m, height_m = board.columns * board.square_m, board.rows * board.square_m
     page = np.array([width_m + 2 * margin_m, height_m + 2 * margin_m])
     figure = Figure(figsize=tuple((page / METRES_PER_INCH).tolist()))
@@ -98,34 +94,6 @@ def draw_board(board: Charuco, margin_m: float) -> Figure:
     )
     sheet.text(ruler[0], 0.2 * margin_m, text, fontsize=_fit_font(text, width_m))
     return figure
-
-
-def _draw_picture(board: Charuco) -> np.ndarray:
-    """Return the board in pixels, `(h, w)` uint8, with the edges of its markers on theirs."""
-    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    needed, there = board.columns * board.rows // 2, len(markers.bytesList)
-    if needed > there:
-        raise ConfigError(
-            f"board.dictionary={board.dictionary}: it has {there} markers, {board.columns} x "
-            f"{board.rows} squares need {needed}"
-        )
-    # A marker has a black border of one module on each side.
-    modules, ratio = markers.markerSize + 2, board.marker_m / board.square_m
-    misses = {}
-    for side in SQUARE_PX:
-        marker = modules * max(round(side * ratio / modules), 1)
-        is_even = (side - marker) % 2 == 0
-        misses[side] = abs(marker / side - ratio) if is_even else np.inf
-    side = min(misses, key=misses.__getitem__)
-    if misses[side] > LARGEST_PX:
-        raise ConfigError(
-            f"board.marker_m={board.marker_m:g}: its modules fit no pixels; expected three "
-            f"quarters of square_m, {0.75 * board.square_m:g}"
-        )
-    drawn = cv2.aruco.CharucoBoard(
-        (board.columns, board.rows), board.square_m, board.marker_m, markers
-    )
-    return drawn.generateImage((board.columns * side, board.rows * side), marginSize=0)
 
 
 def _fit_font(text: str, width_m: float) -> float:

@@ -39,7 +39,7 @@ class Rendering:
 
 @spec
 class Render:
-    """Render stereo pairs of random scenes with depth and truth; a seed repeats its files."""
+    """Render stereo pairs of scenes with depth and truth; a seed repeats its files."""
 
     session: Session
     resume: str | None
@@ -59,14 +59,14 @@ class Render:
                 f"resume={self.resume}: rendering goes on in its own folder; add "
                 f"session.out={self.resume}"
             )
-        self.studio.prepare(folder)
         numbers = range(self.render.first, self.render.first + self.render.count)
+        scenes = self.studio.prepare(folder, self.session, numbers.stop)
         done = 0
         with Progress(transient=True) as progress:
             for number in progress.track(numbers, description=f"{len(numbers)} frames"):
                 stem = folder / f"{number:05d}"
                 if self.studio.has(stem):
                     continue
-                self.studio.shoot(stem, self.session.generator(f"scene/{number}"))
+                self.studio.shoot(stem, scenes.view(number))
                 done += 1
         log.info("%d frames rendered, %d were there; see %s", done, len(numbers) - done, folder)

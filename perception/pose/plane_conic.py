@@ -19,7 +19,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
-from perception.pose import alignment, appearance, plane, rim
+from perception.pose import alignment, appearance, broken_rim, plane, rim
 from perception.pose.appearance import Interior
 from perception.pose.plane import FacePlane
 from perception.pose.rim import RimCircle
@@ -32,6 +32,8 @@ told from a flat disc; factor on the score of such a hole, and of one in dust.""
 FORGIVEN, AT_FIRST = 0.55, 1.4
 """Least visible part of a circle whose ellipse was too small or too long; and factor on the limits
 for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
+BROKEN = 0.2
+"""Part of a rim that is missing though nothing hides it, from which pieces are broken off."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which occluders of its rim are searched."""
 
@@ -229,6 +231,19 @@ class PlaneConicEstimator:
             s.center_px,
             s.shape_px,
         )
+        # What is missing of a rim is hidden, or broken off.
+        seen = 0.0 if circle is None else circle.coverage
+        row = as_row(ellipse) if circle is None else circle.ellipse
+        if 1.0 - seen - measure_hidden_part(face, row, frame) > BROKEN:
+            chart = rim.build_chart(
+                face.point(np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])),
+                face.m,
+                frame.camera_matrix,
+            )
+            broken = broken_rim.fit_broken_rim(gray, chart, np.zeros(2), s.radius_m, s.center_px)
+            # Its coverage counts the broken parts too.
+            if broken is not None and broken.coverage >= max(seen, FORGIVEN):
+                circle = broken
         # An ellipse of wrong shape may still belong to a rim, but then most of the circle must be
         # seen.
         least = s.coverage if has_good_shape else max(s.coverage, FORGIVEN)

@@ -9,12 +9,15 @@ from typing import Literal
 import numpy as np
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
+from perception.render.board_on_arm import BoardOnArm
+from perception.render.footage import Footage
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
-from perception.render.scene_sampler import compose_scene
+from perception.render.scene_sequence import RandomScenes, SceneSequence, StagedScene
 from perception.render.stereo_camera import StereoRig, draw_dust, take_picture
 from perception.stereo import Stereo
 
@@ -46,7 +49,7 @@ class FrameRenderer:
 
     Attributes:
         rig: The camera pair.
-        scene: Ranges of the scenes.
+        scene: Ranges of random scenes, or a sequence of related ones.
         stereo: Makes the depth.
         depth: `matched` makes depth of the two pictures; `exact` writes the mathematical one;
             `none` leaves it to the reader.
@@ -55,7 +58,7 @@ class FrameRenderer:
     """
 
     rig: StereoRig
-    scene: SceneRanges
+    scene: SceneRanges | Footage | BoardOnArm
     stereo: Stereo
     depth: Literal["matched", "exact", "none"]
     pair: bool
@@ -66,33 +69,60 @@ class FrameRenderer:
                 "studio.pair=false: there is no pair to match; choose studio.depth=exact or none"
             )
 
-    def prepare(self, folder: Path) -> None:
-        """Write the camera file that all frames of a folder share."""
+    def prepare(self, folder: Path, session: Session, count: int) -> SceneSequence:
+        """Return the scenes, and write what their frames share.
+
+        Args:
+            folder: Of the frames; what was recorded along goes into the folder above.
+            session: Its seed decides the scenes.
+            count: Number of frames there will be.
+
+        Raises:
+            ConfigError: the scenes cannot be drawn.
+            StorageError: a file could not be written.
+        """
         rig = self.rig
+        if isinstance(self.scene, SceneRanges):
+            scenes: SceneSequence = RandomScenes(self.scene, rig, session)
+        else:
+            scenes = self.scene.open(rig, session)
         dataset.write_camera(
             folder,
             rig.left.matrix,
-            rig.base_from_camera,
+            scenes.base_from_camera,
             rig.baseline_m,
             disparity_std_px=rig.disparity_std_px,
         )
+        scenes.write_records(folder.parent, count)
+        return scenes
 
     def has(self, stem: Path) -> bool:
         """Return whether the frame at `stem` exists and is complete."""
         return dataset.is_whole(stem)
 
-    def shoot(self, stem: Path, generator: np.random.Generator) -> None:
-        """Draw, renders and writes one frame; the same generator makes the same files.
+    def shoot(self, stem: Path, view: StagedScene) -> None:
+        """Render and write one frame; the same view makes the same files.
 
         Raises:
             StorageError: a file could not be written.
         """
-        shot = self.shot(compose_scene(self.scene, self.rig, generator), generator)
+        shot = self.shot(view.scene, view.generator, view.base_from_camera)
         depth = {"matched": shot.depth_m, "exact": shot.exact_depth_m, "none": None}[self.depth]
         dataset.write_frame(stem, shot.color, depth, shot.right, shot.label, shot.truth)
 
-    def shot(self, scene: Scene, generator: np.random.Generator) -> RenderedFrame:
-        """Return the frame of a scene."""
+    def shot(
+        self,
+        scene: Scene,
+        generator: np.random.Generator,
+        base_from_camera: np.ndarray | None = None,
+    ) -> RenderedFrame:
+        """Return the frame of a scene.
+
+        Args:
+            scene: In the left camera's coordinates.
+            generator: Source of the noise.
+            base_from_camera: Pose of the left camera, `(4, 4)`; `None` for the rig's own.
+        """
         tracer = Tracer(scene.solids, scene.light, scene.sky)
         left = tracer.view(self.rig.left)
         density = draw_dust(scene.exposure.patchiness, generator)
@@ -110,9 +140,11 @@ class FrameRenderer:
             depth = self.stereo.depth_m(color, partner, self.rig.focal_px, self.rig.baseline_m)
         roles = np.array([solid.role for solid in scene.solids] + ["nothing"])[left.solid]
         label = FrameLabel(roles == "block", left.mouth, roles == "arm")
-        return RenderedFrame(color, partner, depth, left.depth_m, label, self._truth(scene))
+        base = self.rig.base_from_camera if base_from_camera is None else base_from_camera
+        truth = self._truth(scene, base)
+        return RenderedFrame(color, partner, depth, left.depth_m, label, truth)
 
-    def _truth(self, scene: Scene) -> SceneTruth:
+    def _truth(self, scene: Scene, base: np.ndarray) -> SceneTruth:
         block = scene.block
         if block is None:
             return SceneTruth(self.scene.name, scene.conditions, (), (), {})
@@ -123,6 +155,7 @@ class FrameRenderer:
                 hole.radius_m,
                 hole.depth_m,
                 hidden,
+                base,
             )
             for hole, hidden in zip(block.holes, scene.hidden, strict=True)
         )
@@ -133,6 +166,7 @@ class FrameRenderer:
                 disc.radius_m,
                 0.0,
                 hidden,
+                base,
             )
             for disc, hidden in zip(block.discs, scene.hidden_discs, strict=True)
         )
@@ -144,9 +178,14 @@ class FrameRenderer:
         return SceneTruth(self.scene.name, scene.conditions, holes, decoys, place)
 
     def _circle(
-        self, center: np.ndarray, axis: np.ndarray, radius_m: float, depth_m: float, hidden: float
+        self,
+        center: np.ndarray,
+        axis: np.ndarray,
+        radius_m: float,
+        depth_m: float,
+        hidden: float,
+        base: np.ndarray,
     ) -> TrueCircle:
-        base = self.rig.base_from_camera
         first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
         first /= np.linalg.norm(first)
         angle = np.linspace(0, 2 * np.pi, 64)[:, None]

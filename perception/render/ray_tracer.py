@@ -8,7 +8,7 @@ rays where edges of solids, rims or shadows cross it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -18,6 +18,8 @@ OVER = 4
 CHUNK = 1 << 17
 """Rays at a time, so that their data stay in the cache; chosen by hand."""
 FAR_M = 80.0
+NEAREST_M = 0.05
+"""Nearer points are not in the picture of a camera."""
 NOTHING = -1
 
 
@@ -30,29 +32,35 @@ class Pinhole:
         height: Pixels.
         focal_px: Focal length.
         origin_m: Centre of projection.
+        axis_px: Pixel of the optical axis; `None`: the picture's middle. A part of a picture has it
+            elsewhere.
     """
 
     width: int
     height: int
     focal_px: float
     origin_m: np.ndarray
+    axis_px: tuple[float, float] | None = field(default=None, kw_only=True)
 
     @property
     def matrix(self) -> np.ndarray:
-        """Camera matrix, `(3, 3)`: axis through the picture's middle, pixel centres at integers."""
-        return np.array(
-            [
-                [self.focal_px, 0, (self.width - 1) / 2],
-                [0, self.focal_px, (self.height - 1) / 2],
-                [0, 0, 1.0],
-            ]
-        )
+        """Camera matrix, `(3, 3)`; pixel centres lie at integers."""
+        x, y = self.axis_px or ((self.width - 1) / 2, (self.height - 1) / 2)
+        return np.array([[self.focal_px, 0, x], [0, self.focal_px, y], [0, 0, 1.0]])
 
     def project(self, point_m: np.ndarray) -> np.ndarray:
         """Return the pixels, `(…, 2)`, of points, `(…, 3)`, in front of the camera."""
         away = point_m - self.origin_m
         center = self.matrix[:2, 2]
         return self.focal_px * away[..., :2] / away[..., 2:] + center
+
+    def is_inside(self, points_m: np.ndarray, border_px: float) -> bool:
+        """Return whether all points, `(N, 3)`, lie in the picture, so far from its border."""
+        if points_m[:, 2].min() < NEAREST_M:
+            return False
+        pixel = self.project(points_m)
+        last = np.array([self.width, self.height]) - 1 - border_px
+        return bool((pixel >= border_px).all() and (pixel <= last).all())
 
     def rays(self, pixel: np.ndarray) -> np.ndarray:
         """Return directions with z = 1, `(M, 3)` float32, through pixels, `(M, 2)`."""

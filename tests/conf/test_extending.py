@@ -24,7 +24,11 @@ from brokk_rl.modes.new import NewPackage, PackageRequest
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/extending.md").read_text()
 SHOWN = dict(re.findall(r"^`mine/(\S+)`:\n\n```\w+\n(.*?)^```", PAGE, re.M | re.S))
-TRAINING = next(line for line in PAGE.splitlines() if line.startswith("brokk mode=train "))
+TRAINING = next(line for line in PAGE.splitlines() if line.startswith("brokk experiment="))
+SHORT = (
+    "rl.num_envs=8", "rl.num_starts=64", "rl.budget.max_seconds=3", "evaluation.episodes=16",
+)  # fmt: skip
+"""Changes of the page's training for a test: some seconds instead of a minute."""
 
 
 @pytest.fixture(scope="module")
@@ -110,7 +114,7 @@ def test_its_options_are_listed(site: Path, brokk: Callable[..., Any]) -> None:
 
 
 def test_all_of_it_trains_together(site: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
-    done = brokk(*shlex.split(TRAINING)[1:])
+    done = brokk(*shlex.split(TRAINING)[1:], *SHORT)
     assert done.code == 0, done.err
     evaluation = json.loads((tmp_path / "runs/mine/evaluation.json").read_text())
     assert evaluation["episodes"] == 16 and "success_strict" in evaluation

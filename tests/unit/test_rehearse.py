@@ -12,9 +12,9 @@ import pytest
 import yaml
 from conftest import Done
 
+from brokk_rl import story
 from diagnosis import retraining
 from diagnosis.answer import Answer, Estimate, Gap, Selected, Where
-from diagnosis.modes import rehearse
 from diagnosis.modes import rehearse as story_page
 
 SHARE = {"mean": 0.5, "ci95": [0.4, 0.6]}
@@ -72,7 +72,7 @@ class Played:
 def played(monkeypatch: pytest.MonkeyPatch) -> Played:
     found = Played()
     monkeypatch.setattr(
-        rehearse, "subprocess", SimpleNamespace(Popen=found)
+        story, "subprocess", SimpleNamespace(Popen=found)
     )  # not for those who import meanwhile
     return found
 

@@ -1,0 +1,201 @@
+"""Stories: modes that run one after another, each in a process and a run folder of its own."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.report import Cell, Report
+from brokk_rl.session import RESOLVED, Session, read_record, write_text
+from brokk_rl.spec import spec
+
+log = logging.getLogger(__name__)
+
+HANDED_ON_FOLDER = "given"
+"""Folder with the files that stages take from the story."""
+FOLDER_PLACEHOLDER = "{folder}"
+DEVICE = "device"
+"""What a stage takes besides groups: the device of the session."""
+
+
+@spec
+class StoryStage:
+    """One command of a story; its run folder is `<story>/<name of the stage>`.
+
+    Attributes:
+        title: Its purpose in words.
+        command: Arguments of `brokk`; `{folder}` stands for the run folder of the story.
+        takes: Groups and `device` that it takes from the story.
+        links: Links made before it, both ends below the run folder: path and target.
+        needs: A file below the run folder without whose content the story ends before this stage;
+            `null`: nothing.
+        resumes: Whether an interrupted one goes on with `resume=`; otherwise it begins anew.
+    """
+
+    title: str
+    command: tuple[str, ...]
+    takes: tuple[str, ...]
+    links: dict[str, str]
+    needs: str | None
+    resumes: bool
+
+
+def check_story(
+    session: Session, stages: Mapping[str, StoryStage], resume: str | None, groups: Sequence[str]
+) -> None:
+    """Refuse a story that cannot be run.
+
+    Args:
+        session: Of the story.
+        stages: The story, in order.
+        resume: Run folder of an interrupted story, the same as that of the session.
+        groups: Groups that stages can take.
+
+    Raises:
+        ConfigError: a stage takes another group, or `resume` is another folder.
+    """
+    for stage in stages.values():
+        for name in stage.takes:
+            if name not in (*groups, DEVICE):
+                raise ConfigError(
+                    f"a stage takes '{name}', which the story does not have; {list_choices(name, (*groups, DEVICE))}"
+                )
+    if resume is not None and Path(resume).resolve() != session.folder.resolve():
+        raise ConfigError(
+            f"resume={resume}: a story goes on in its folder; add session.out={resume}"
+        )
+
+
+def write_groups(
+    folder: Path, groups: Sequence[str], heads: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Write composed groups of a story as files for `group=@<file>`; return them.
+
+    Args:
+        folder: Run folder of the story.
+        groups: Names of the groups.
+        heads: First line of a group's file.
+
+    Raises:
+        StorageError: a file could not be written.
+    """
+    composed = yaml.safe_load((folder / RESOLVED).read_text())
+    given = {name: composed[name] for name in groups}
+    (folder / HANDED_ON_FOLDER).mkdir(exist_ok=True)
+    for name, node in given.items():
+        text = (heads or {}).get(name, "") + yaml.safe_dump(node, sort_keys=False)
+        write_text(folder / HANDED_ON_FOLDER / f"{name}.yaml", text)
+    return given
+
+
+def run_story(
+    session: Session, stages: Mapping[str, StoryStage], write_page: Callable[[], None]
+) -> None:
+    """Run the stages that are not finished.
+
+    Args:
+        session: Folder and device of the story.
+        stages: The story, in order.
+        write_page: Is called after each stage.
+
+    Raises:
+        BrokkError: a stage failed; the story goes on from there with `resume=`.
+    """
+    folder = session.folder.resolve()
+    for number, (name, stage) in enumerate(stages.items(), 1):
+        if stage.needs is not None and not _has_content(folder / stage.needs):
+            log.warning("the story ends before '%s': %s holds nothing", name, stage.needs)
+            break
+        if (read_record(folder / name) or {}).get("outcome") == "finished":
+            log.info("%d of %d, %s: done already", number, len(stages), name)
+            continue
+        log.info("%d of %d, %s: %s", number, len(stages), name, stage.title)
+        _play_stage(session, name, stage, folder)
+        write_page()
+    write_page()
+
+
+def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) -> None:
+    """Run one stage in a process of its own, as a person would, and wait for it."""
+    place = folder / name
+    for link, target in stage.links.items():
+        path = folder / link
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        path.symlink_to(folder / target)
+    words = [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
+    for group in stage.takes:
+        if group != DEVICE:
+            words.append(f"{group}=@{folder / HANDED_ON_FOLDER / group}.yaml")
+    words += [f"session.device={session.device}"] if DEVICE in stage.takes else []
+    words += [f"session.out={place}"]
+    if place.exists():
+        if stage.resumes:
+            words += [f"resume={place}"]
+        else:
+            shutil.rmtree(place)  # an unfinished stage has no record
+    with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words]) as process:
+        try:
+            code = process.wait()
+        except BaseException:
+            process.terminate()
+            raise
+    if code:
+        raise BrokkError(
+            f"the stage '{name}' failed, see above; what came before it is kept: go on with resume={session.out} "
+            f"session.out={session.out}"
+        )
+
+
+def add_stages(page: Report, folder: Path, titles: Mapping[str, str]) -> None:
+    """Add the stages of a story to its page: purpose, outcome, minutes and commands.
+
+    Args:
+        page: The page.
+        folder: Run folder of the story.
+        titles: Purpose of each stage, by name.
+    """
+    page.add_heading("Stages")
+    rows, whole_s = [], 0.0
+    for name, title in titles.items():
+        record = read_record(folder / name)
+        if record is None:
+            rows.append([name, title, None])
+            continue
+        seconds = _measure_seconds(record)
+        whole_s += seconds or 0.0
+        rows.append(
+            [
+                name,
+                Cell(title, f"{record['outcome']}; {record['mode']}"),
+                None if seconds is None else f"{seconds / 60:.1f}",
+            ]
+        )
+    rows.append(["", "all", f"{whole_s / 60:.1f}"])
+    page.add_table(["stage", "purpose", "minutes"], rows)
+    with page.add_details("The commands"):
+        records = (read_record(folder / name) for name in titles)
+        page.add_code(
+            "\n\n".join(f"brokk {' '.join(record['command'][1:])}" for record in records if record)
+        )
+
+
+def _measure_seconds(record: Mapping[str, Any]) -> float | None:
+    if not record.get("ended"):
+        return None
+    begun, ended = (datetime.fromisoformat(record[key]) for key in ("started", "ended"))
+    return (ended - begun).total_seconds()
+
+
+def _has_content(path: Path) -> bool:
+    """Return whether a YAML file holds anything but comments."""
+    return path.is_file() and bool(yaml.safe_load(path.read_text()))

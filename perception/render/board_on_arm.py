@@ -1,0 +1,225 @@
+"""A board on the last link, watched by the camera on the machine, and the recording of the joints."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from brokk_rl import record
+from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.session import Session, write_text
+from brokk_rl.spec import spec
+from perception.calibrate.arm import compute_link_poses
+from perception.label.camera_pose import Charuco
+from perception.render.block_sampler import build_frame
+from perception.render.materials import Material
+from perception.render.printed_board import build_plate
+from perception.render.scene_ranges import SceneRanges
+from perception.render.scene_sampler import add_surroundings
+from perception.render.scene_sequence import StagedScene, build_pose, move_solids
+from perception.render.solids import Cylinder, Solid, SolidPose
+from perception.render.stereo_camera import StereoRig, measure_disparity_error
+
+JOINTS, TRUTH = "joints.parquet", "truth.yaml"
+TRIES = 2000
+"""Poses that are drawn until one shows the board."""
+BORDER_PX = 8
+"""Corners of the board stay as far from the picture's border."""
+FACING = 0.5
+"""Least cosine between the board's normal and the line of sight: 60 degrees."""
+GROUND_M = 0.0
+"""Height of the ground in the base frame."""
+PAINT, STEEL = Material((0.6, 0.36, 0.07), 0.08, 0.002), Material((0.15, 0.15, 0.15), 0.15, 0.001)
+BOOM_M, CHISEL_M = 0.09, 0.04
+"""Radii of the drawn links and of the tool; chosen by hand."""
+
+
+@spec
+class BoardOnArm:
+    """A board on the last link while the arm moves from pose to pose.
+
+    Attributes:
+        name: In truth files and tables.
+        kind: Ranges of surroundings and light; its block is left out.
+        machine: The arm.
+        board: The board, before the tool's tip in the middle pose, where it faces the camera.
+        margin_m: White margin around its print.
+        ahead_m: How far the board is nearer to the camera than the tip.
+        middle: Joint positions of the middle pose, rad or m.
+        spread: Largest departure of each joint from it.
+        move_s: Duration of a move.
+        rest_s: Rest between two moves.
+        rate_hz: Frame rate.
+        clock_s: Time to add to that of a frame to have the recording's.
+        zero_std_rad: Standard deviation of the zeros of the joints between the first and the last;
+            no camera can tell those two.
+        sensor_std_rad: Standard deviation of the measured joint positions.
+    """
+
+    name: str
+    kind: SceneRanges
+    machine: Machine
+    board: Charuco
+    margin_m: float
+    ahead_m: float
+    middle: tuple[float, ...]
+    spread: tuple[float, ...]
+    move_s: float
+    rest_s: float
+    rate_hz: float
+    clock_s: float
+    zero_std_rad: float
+    sensor_std_rad: float
+
+    def check(self) -> None:
+        if not len(self.middle) == len(self.spread) == self.machine.num_joints:
+            raise ConfigError(
+                f"scene: expected middle and spread of {self.machine.num_joints} joints, got "
+                f"{len(self.middle)} and {len(self.spread)}"
+            )
+        if min(self.move_s, self.rest_s, self.rate_hz) <= 0:
+            raise ConfigError("scene: expected move_s, rest_s and rate_hz above 0")
+
+    def open(self, rig: StereoRig, session: Session) -> BoardScenes:
+        """Return the scenes.
+
+        Raises:
+            ConfigError: the board cannot be drawn, or is not seen.
+        """
+        return BoardScenes(self, rig, session)
+
+
+class BoardScenes:
+    """The frames of one recording; see `perception.render.scene_sequence.SceneSequence`."""
+
+    def __init__(self, settings: BoardOnArm, rig: StereoRig, session: Session) -> None:
+        self._settings, self._rig, self._session = settings, rig, session
+        self.base_from_camera = rig.base_from_camera
+        self._camera_from_base = np.linalg.inv(rig.base_from_camera)
+        self._poses: dict[int, np.ndarray] = {}
+        self._link_from_board = self._attach_board()
+        inner = np.zeros(settings.machine.num_joints)
+        inner[1:-1] = settings.zero_std_rad
+        self._zeros = inner * session.generator("scene/zeros").standard_normal(len(inner))
+
+    def view(self, number: int) -> StagedScene:
+        """Return the scene at the time of frame `number`.
+
+        Raises:
+            ConfigError: no pose shows the board.
+        """
+        settings, generator = self._settings, self._session.generator(f"scene/{number}")
+        q = self._read_joints(number / settings.rate_hz + settings.clock_s)
+        plate = build_plate(settings.board, self._compute_board(q), settings.margin_m)
+        solids = (*move_solids(self._draw_arm(q), self._camera_from_base), plate)
+        # The surroundings are drawn by the same numbers for each frame.
+        scenery = self._session.generator("scene/surroundings")
+        target = self._compute_board(np.array(settings.middle))[:3, 3]
+        normal = -target / np.linalg.norm(target)
+        ground_m = float(self.base_from_camera[2, 3]) - GROUND_M
+        scene = add_surroundings(
+            settings.kind, self._rig, None, solids, target, normal, scenery, ground_m
+        )
+        return StagedScene(scene, self.base_from_camera, generator)
+
+    def write_records(self, folder: Path, count: int) -> None:
+        """Write the recording of the joints, and the numbers that a calibration should find."""
+        settings, machine = self._settings, self._settings.machine
+        last_s = (count - 1) / settings.rate_hz + abs(settings.clock_s) + 1.0
+        t_s = np.arange(0.0, last_s, machine.period_s)
+        true = np.stack([self._read_joints(one) for one in t_s])
+        noise = self._session.generator("scene/sensors").standard_normal(true.shape)
+        speed = np.gradient(true, t_s, axis=0)
+        recording = Recording(
+            machine=machine.name,
+            joints=machine.joint_names,
+            units=tuple(joint.unit for joint in machine.joints),
+            rate_hz=1.0 / machine.period_s,
+            t_s=t_s,
+            u=np.clip(speed / machine.max_speed, -1.0, 1.0),
+            q=true - self._zeros + settings.sensor_std_rad * noise,
+            metadata={"source": "rendered"},
+        )
+        record.write_recording(recording, folder / JOINTS)
+        zeros = dict(zip(machine.joint_names, self._zeros.round(6).tolist(), strict=True))
+        truth = {
+            "T_base_cam": self.base_from_camera.round(9).tolist(),
+            "clock_s": settings.clock_s,
+            "joint_zeros": zeros,
+            "disparity_error_px": [round(one, 4) for one in measure_disparity_error(self._rig)],
+        }
+        write_text(folder / TRUTH, yaml.safe_dump(truth, sort_keys=False, default_flow_style=None))
+
+    def _attach_board(self) -> np.ndarray:
+        """Return the board on the link, `(4, 4)`: it faces the camera in the middle pose."""
+        settings = self._settings
+        link = compute_link_poses(settings.machine, np.array([settings.middle])).base_from_link[0]
+        tip = self._camera_from_base[:3, :3] @ link[:3, 3] + self._camera_from_base[:3, 3]
+        middle = tip * (1.0 - settings.ahead_m / np.linalg.norm(tip))
+        size_m = np.array([settings.board.columns, settings.board.rows]) * settings.board.square_m
+        z = middle / np.linalg.norm(middle)
+        x = np.cross([0.0, 1.0, 0.0], z)
+        x /= np.linalg.norm(x)
+        turn = np.stack([x, np.cross(z, x), z], 1)
+        corner = middle - turn[:, :2] @ (size_m / 2)
+        return np.linalg.inv(link) @ self.base_from_camera @ build_pose(turn, corner)
+
+    def _compute_board(self, q: np.ndarray) -> np.ndarray:
+        """Return the board in the camera at true joint positions, `(4, 4)`."""
+        link = compute_link_poses(self._settings.machine, q[None]).base_from_link[0]
+        return self._camera_from_base @ link @ self._link_from_board
+
+    def _read_joints(self, t_s: float) -> np.ndarray:
+        """Return the true joint positions: rests, and moves that start and stop smoothly."""
+        settings = self._settings
+        number, into_s = divmod(max(t_s, 0.0), settings.move_s + settings.rest_s)
+        share = min(max(into_s - settings.rest_s, 0.0) / settings.move_s, 1.0)
+        begin, end = self._draw_pose(int(number)), self._draw_pose(int(number) + 1)
+        return begin + (0.5 - 0.5 * math.cos(math.pi * share)) * (end - begin)
+
+    def _draw_pose(self, number: int) -> np.ndarray:
+        """Return joint positions at which the camera sees the whole board."""
+        if number in self._poses:
+            return self._poses[number]
+        settings, machine = self._settings, self._settings.machine
+        generator = self._session.generator(f"scene/pose/{number}")
+        width = settings.board.columns * settings.board.square_m
+        height = settings.board.rows * settings.board.square_m
+        corners = np.array([[0, 0, 0], [width, 0, 0], [width, height, 0], [0, height, 0]])
+        for _ in range(TRIES):
+            chance = generator.uniform(-1, 1, machine.num_joints)
+            q = np.clip(settings.middle + chance * settings.spread, machine.lower, machine.upper)
+            board = self._compute_board(q)
+            points_m = corners @ board[:3, :3].T + board[:3, 3]
+            sight = points_m.mean(0) / np.linalg.norm(points_m.mean(0))
+            faces = board[:3, 2] @ sight > FACING
+            if faces and self._rig.left.is_inside(points_m, BORDER_PX):
+                self._poses[number] = q
+                return q
+        raise ConfigError(
+            f"scene={settings.name}: no pose about scene.middle={list(settings.middle)} shows the "
+            "board to the camera; choose another pose or rig"
+        )
+
+    def _draw_arm(self, q: np.ndarray) -> list[Solid]:
+        """Return links and tool as cylinders, base frame."""
+        tool = compute_tool_kinematics(self._settings.machine, q[None])
+        points = [*tool.joints_in_base_m[0], tool.tip_in_base_m[0]]
+        solids: list[Solid] = []
+        for number, (begin, end) in enumerate(itertools.pairwise(points)):
+            along = end - begin
+            length_m = float(np.linalg.norm(along))
+            if length_m < CHISEL_M:
+                continue
+            is_tool = number == len(points) - 2
+            pose = SolidPose(build_frame(along, 0.0), (begin + end) / 2)
+            radius_m, material = (CHISEL_M, STEEL) if is_tool else (BOOM_M, PAINT)
+            solids.append(Cylinder("arm", pose, radius_m, length_m / 2, (material,)))
+        return solids

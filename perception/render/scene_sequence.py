@@ -1,0 +1,104 @@
+"""Scenes by number: random ones, each for itself, and what sequences of related scenes share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from brokk_rl.session import Session
+from perception.render.ray_tracer import Light
+from perception.render.scene_ranges import Scene, SceneRanges
+from perception.render.scene_sampler import compose_scene
+from perception.render.solids import SolidPose
+from perception.render.stereo_camera import StereoRig
+
+
+@dataclass(frozen=True)
+class StagedScene:
+    """A scene as one frame sees it.
+
+    Attributes:
+        scene: In the left camera's coordinates.
+        base_from_camera: Pose of the left camera, `(4, 4)`.
+        generator: Source of the frame's noise.
+    """
+
+    scene: Scene
+    base_from_camera: np.ndarray
+    generator: np.random.Generator
+
+
+class SceneSequence(Protocol):
+    """Scenes by number, and the records that belong to them."""
+
+    @property
+    def base_from_camera(self) -> np.ndarray | None:
+        """Pose of a camera that stands still, `(4, 4)`; `None` for one that is carried."""
+        ...
+
+    def view(self, number: int) -> StagedScene:
+        """Return scene `number`; the same session gives the same."""
+        ...
+
+    def write_records(self, folder: Path, count: int) -> None:
+        """Write what was recorded beside the first `count` frames.
+
+        Raises:
+            StorageError: a file could not be written.
+        """
+        ...
+
+
+class RandomScenes:
+    """Scenes that have nothing in common but their kind.
+
+    Args:
+        kind: Ranges to draw from.
+        rig: The camera pair, fixed to the machine.
+        session: Seed of the scenes.
+    """
+
+    def __init__(self, kind: SceneRanges, rig: StereoRig, session: Session) -> None:
+        self._kind, self._rig, self._session = kind, rig, session
+        self.base_from_camera = rig.base_from_camera
+
+    def view(self, number: int) -> StagedScene:
+        """Return scene `number`."""
+        generator = self._session.generator(f"scene/{number}")
+        scene = compose_scene(self._kind, self._rig, generator)
+        return StagedScene(scene, self.base_from_camera, generator)
+
+    def write_records(self, folder: Path, count: int) -> None:
+        """Write nothing."""
+
+
+def build_pose(rotation: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
+    """Return a transform, `(4, 4)`."""
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, shift_m
+    return pose
+
+
+def move_solids(solids: Sequence[Any], motion: np.ndarray) -> tuple[Any, ...]:
+    """Return solids in other coordinates.
+
+    Args:
+        solids: They have a `pose`.
+        motion: From the old coordinates to the new, `(4, 4)`.
+    """
+    moved = []
+    for solid in solids:
+        rotation = motion[:3, :3] @ solid.pose.rotation
+        center_m = motion[:3, :3] @ solid.pose.center_m + motion[:3, 3]
+        moved.append(replace(solid, pose=SolidPose(rotation, center_m)))
+    return tuple(moved)
+
+
+def move_light(light: Light, motion: np.ndarray) -> Light:
+    """Return a light in other coordinates; see `move_solids`."""
+    to_sun = motion[:3, :3] @ light.to_sun
+    return replace(light, to_sun=to_sun, shade=move_solids(light.shade, motion))

@@ -1,0 +1,128 @@
+"""Rendered sequences with a board: geometry against projection by hand, records against kinematics, and the day's page."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from composed import option
+
+from brokk_rl import record
+from brokk_rl.errors import ConfigError
+from brokk_rl.session import Session
+from brokk_rl.signals import Frame
+from perception import dataset
+from perception.benchmark.session_score import score_holes
+from perception.calibrate.arm import compute_link_poses
+from perception.label.camera_pose import Charuco
+from perception.render.board_on_arm import BoardOnArm
+from perception.render.footage import Footage
+from perception.render.frame_renderer import FrameRenderer
+from perception.render.stereo_camera import StereoRig
+
+SMALL = ("rig.width=640", "rig.height=360", "rig.focal_px=264.0")
+SESSION = Session(out=".", seed=4, device="cpu")
+
+
+@pytest.fixture(scope="module")
+def rig() -> StereoRig:
+    return option("rig", "zed_2i_720p")
+
+
+def find_corners(board: Charuco, studio: FrameRenderer, scenes: Any, number: int) -> Any:
+    """Returns the corners that OpenCV finds in a frame, on the board and in the picture, and the staged scene."""
+    view = scenes.view(number)
+    shot = studio.shot(view.scene, view.generator, view.base_from_camera)
+    tracker = board.build()
+    frame = Frame(shot.color, shot.depth_m, studio.rig.left.matrix, None, 0.0, name="0")
+    return *tracker.find_corners(frame), view, shot
+
+
+def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path: Path) -> None:
+    kind: BoardOnArm = option("scene", "board_on_arm")
+    scenes = kind.open(rig, SESSION)
+    studio = FrameRenderer(
+        rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False
+    )
+    corners_m, corners_px, view, _ = find_corners(kind.board, studio, scenes, 3)
+    assert len(corners_m) > 20
+    scenes.write_records(tmp_path, 4)
+    recording = record.read_recording(tmp_path / "joints.parquet", kind.machine)
+    truth = yaml.safe_load((tmp_path / "truth.yaml").read_text())
+    zeros = np.array(list(truth["joint_zeros"].values()))
+    # The board stays on the link: its pose there, from frame 3, predicts frame 1.
+    t_s = np.array([3, 1]) / kind.rate_hz + kind.clock_s
+    q = np.stack([np.interp(t_s, recording.t_s, one) for one in recording.q.T], 1) + zeros
+    link = compute_link_poses(kind.machine, q).base_from_link
+    plates: list[Any] = [scenes.view(number).scene.solids for number in (3, 1)]
+    at = [next(one.pose.center_m for one in solids if one.role == "board") for solids in plates]
+    base = rig.base_from_camera
+    in_base = [base[:3, :3] @ one + base[:3, 3] for one in at]
+    on_link = link[0][:3, :3].T @ (in_base[0] - link[0][:3, 3])
+    predicted = link[1][:3, :3] @ on_link + link[1][:3, 3]
+    # The sensors' noise of 0.5 mrad at 2 m.
+    assert np.linalg.norm(predicted - in_base[1]) < 0.006
+    # And the print lies on the plate: corners of squares project to where OpenCV finds them.
+    plate: Any = next(one for one in view.scene.solids if one.role == "board")
+    size_m = np.array([kind.board.columns, kind.board.rows]) * kind.board.square_m
+    local = corners_m - [*(size_m / 2), plate.half_m[2]]
+    expected = rig.left.project(plate.pose.point(local))
+    # A shadow's edge moves one corner by half a pixel.
+    away_px = expected - corners_px
+    assert np.median(np.linalg.norm(away_px, axis=1)) < 0.15
+    assert np.abs(away_px.mean(0)).max() < 0.05
+
+
+def test_footage_is_of_one_block_in_one_place(
+    brokk: Callable[..., Any], rig: StereoRig, tmp_path: Path
+) -> None:
+    out = tmp_path / "out"
+    done = brokk(
+        "mode=render", "scene=footage", "render.count=2", "studio.depth=none", "studio.pair=false", *SMALL,
+        f"session.out={out}",
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    cameras = yaml.safe_load((out / "cameras.yaml").read_text())
+    placing = yaml.safe_load((out / "placing.yaml").read_text())
+    assert "T_base_cam" not in yaml.safe_load((out / "frames/camera.yaml").read_text())
+    centers, corners = [], []
+    for name, pose in cameras.items():
+        truth = dataset.read_truth(out / "frames" / name)
+        pose = np.array(pose)
+        centers.append([hole.center_in_base_m for hole in truth.holes])
+        local = np.array(truth.block["rotation"]) @ (np.array([-1, -1, 1]) * truth.block["half_m"])
+        corner = local + truth.block["center_m"]
+        corners.append(pose[:3, :3] @ corner + pose[:3, 3])
+        if name == placing["frame"]:
+            matrix = np.array(yaml.safe_load((out / "frames/camera.yaml").read_text())["K"])
+            seen = (matrix @ corner)[:2] / corner[2]
+            assert np.linalg.norm(seen - placing["corners_px"][0]) == pytest.approx(2.0, abs=0.1)
+    np.testing.assert_allclose(centers[0], centers[1], atol=1e-9)
+    np.testing.assert_allclose(corners[0], corners[1], atol=1e-9)
+    assert not np.allclose(cameras["00000"], cameras["00001"])
+    assert dataset.read_label(out / "frames/00001").block.any()
+
+
+def test_footage_needs_a_block() -> None:
+    kind: Footage = option("scene", "footage")
+    with pytest.raises(ConfigError, match="expected a block with a hole"):
+        replace(kind, kind=option("scene", "empty"))
+
+
+def test_a_score_counts_each_hole_once() -> None:
+    cov = (np.eye(3) * 0.002**2).tolist()
+    near, twin, far = ([1.0, 0.0, 2.003], [1.0, 0.0, 2.01], [0.0, 0.0, 2.0])
+    found = [{"center_m": one, "axis": [0, 0, 1], "cov_m2": cov} for one in (near, twin, far)]
+    true = [([1.0, 0.0, 2.0], [0, 0, 1], 2.0), ([5.0, 0.0, 2.0], [0, 0, 1], 5.0)]
+    score = score_holes("00000", found, true)
+    assert (score.num_holes, score.num_found, score.num_false) == (2, 1, 2)
+    assert score.errors[0].position_m == pytest.approx(0.003)
+    assert score.errors[0].sigmas == pytest.approx(1.5)
+    assert score.compute_position_m(50) == pytest.approx(0.003)
+    assert json.dumps(score.count_inside(1.0)) == "0"
