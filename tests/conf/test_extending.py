@@ -109,7 +109,7 @@ def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machin
 
 def test_its_options_are_listed(site: Path, brokk: Callable[..., Any]) -> None:
     out = brokk("mode=list").out
-    for text in ("rubber", "sag", "darkest", "two_links", "hold", "A planar arm of two links."):
+    for text in ("rubber", "sink", "darkest", "two_links", "hold", "A planar arm of two links."):
         assert text in out
 
 
