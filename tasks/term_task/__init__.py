@@ -94,7 +94,7 @@ class StartsNearHome:
 
 
 @spec
-class ObservationTerm:
+class ObservedTerm:
     """A part of an observation group.
 
     Attributes:
@@ -191,8 +191,8 @@ class TermTask:
     episode_s: float
     start: StartsNearHome
     command: dict[str, UniformCommand]
-    observation: dict[str, ObservationTerm | None]
-    privileged: dict[str, ObservationTerm | None]
+    observation: dict[str, ObservedTerm | None]
+    privileged: dict[str, ObservedTerm | None]
     action: JointAction
     reward: dict[str, RewardTerm]
     curriculum: RewardCurriculum | None
@@ -217,6 +217,6 @@ class TermTask:
         return make(self, machine, num_envs, device)
 
 
-def select_terms(terms: Mapping[str, ObservationTerm | None]) -> dict[str, ObservationTerm]:
+def select_terms(terms: Mapping[str, ObservedTerm | None]) -> dict[str, ObservedTerm]:
     """Return the terms that are switched on."""
     return {name: term for name, term in terms.items() if term is not None}

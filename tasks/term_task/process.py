@@ -19,7 +19,7 @@ from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.observation import ObservationPart, PartsEncoder
 from brokk_rl.sim import scene
 from tasks.reward import RewardSum
-from tasks.term_task import JointAction, ObservationTerm, TermState, TermTask, select_terms
+from tasks.term_task import JointAction, ObservedTerm, TermState, TermTask, select_terms
 from tasks.termination import EpisodeTerms
 
 BLOCK_AWAY_M = -20.0
@@ -197,9 +197,7 @@ class TermProcess:
         """Return the policy as one module; see `DeployableTask.deployable`."""
         return TermPolicy(network, self.task.action, self._exclusive)
 
-    def _measure(
-        self, group: str, name: str, term: ObservationTerm, seen: TermState
-    ) -> torch.Tensor:
+    def _measure(self, group: str, name: str, term: ObservedTerm, seen: TermState) -> torch.Tensor:
         """Return the newest sample of a term with its errors, `(N, K)`."""
         value = term(seen)
         if term.noise:

@@ -25,7 +25,7 @@ from tasks.reward import RewardTerm
 from tasks.term_task import (
     HeldCriterion,
     JointAction,
-    ObservationTerm,
+    ObservedTerm,
     StartsNearHome,
     TermState,
     TermTask,
@@ -55,9 +55,9 @@ def penalty(state: TermState) -> torch.Tensor:
     return -error(state).abs()
 
 
-def term(function: str, **changes: Any) -> ObservationTerm:
+def term(function: str, **changes: Any) -> ObservedTerm:
     values: dict[str, Any] = {"samples": 1, "mean": 0.0, "std": 1.0, "noise": 0.0, "bias": 0.0}
-    return ObservationTerm(function=function, **values | changes)
+    return ObservedTerm(function=function, **values | changes)
 
 
 def make(**changes: Any) -> Turn:
