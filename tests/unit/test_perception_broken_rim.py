@@ -40,7 +40,7 @@ def test_the_centre_of_a_broken_rim_is_that_of_its_whole_pieces(broken: float) -
     depths_m = depths_m * (broken > 0)
     chart = rim.build_chart(CENTER, M, K)
     start_m = np.array([0.012, -0.008])
-    found = broken_rim.fit_broken_rim(draw_broken(depths_m), chart, start_m, 0.05, 0.024)
+    found = broken_rim.fit_broken_rim(draw_broken(depths_m), chart, None, start_m, 0.05, 0.024)
     assert found is not None
     assert found.coverage > 0.7
     off = found.center_m - CENTER
