@@ -37,6 +37,8 @@ BESIDE_PX, BESIDE = 0.0, 0.3
 """Range of that comparison beyond an edge: from so many px to a part of the radius."""
 SECTORS, ALIKE_PX2 = 12, 20.0
 """Sectors around the rim, each compared alone; pixels that share their error, by the blur."""
+STRIP = 0.15
+"""Standard deviation of the depth of an edge by that beside it, relative."""
 STEEP = 0.5
 """Least part of the radius along the displacement from which an edge tells its depth."""
 ALIKE_M = 0.02
@@ -52,9 +54,10 @@ MOST_GRIDS = 4
 STRAIGHT, SHALLOW = 1e-6, 0.1
 """Tangent of the obliquity from which the direction of a displacement is known, and from which it
 matters."""
-ON_RIM, SURE_WHOLE = 2.0, 0.5
+ON_RIM, SURE_WHOLE, LEAST_DOUBT = 2.0, 0.5, 0.3
 """Standard deviations within which an edge lies on the rim itself; part of a rim with such edges
-from which its place does not rest on the depth of the others."""
+from which its place hardly rests on the depth of the others; a break of even depth looks as whole,
+so a part of the doubt stays."""
 LEAST_UNLIKE = 0.02
 """Least part of the variance in which both pictures differ: interpolation alone leaves as much."""
 
@@ -189,7 +192,7 @@ def fit_broken_rim(
     center = turn.T @ posterior.mean[:2]
     # Without whole pieces the place along the displacement rests on the depth of the edges.
     whole = edges.measure_whole_part(posterior.mean)
-    doubt_m = slope * edges.depth_std_m * max(1.0 - whole / SURE_WHOLE, 0.0)
+    doubt_m = slope * edges.depth_std_m * max(1.0 - whole / SURE_WHOLE, LEAST_DOUBT)
     spread = posterior.spread + np.diag([0.0, doubt_m**2])
     cov = turn.T @ spread @ turn + np.eye(2) * (center_px * edges.pixel_m) ** 2
     axes = np.column_stack([chart.first, chart.second])
@@ -340,7 +343,9 @@ def _measure_spread(log_odds: np.ndarray) -> float:
     weight = np.exp(log_odds - log_odds.max())
     weight /= weight.sum()
     depths_m = np.array(DEPTHS_M)
-    return float(np.sqrt(weight @ (depths_m - weight @ depths_m) ** 2))
+    mean_m = float(weight @ depths_m)
+    # Beside an edge the break is less deep than at it.
+    return float(np.hypot(np.sqrt(weight @ (depths_m - mean_m) ** 2), STRIP * mean_m))
 
 
 def _sample(picture: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
