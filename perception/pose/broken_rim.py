@@ -319,8 +319,8 @@ def compare_depths(
     away = np.arange(BESIDE_PX, max(BESIDE_PX + 3.0, BESIDE * radius_px)) * max(1, both.shrink)
     places = edge[:, None] + away[None, :, None] * profiles.outward[:, None]
     u, v = places[..., 0], places[..., 1]
-    row = both.row(v).astype(np.float32)
-    mine = _sample(both.left, both.column(u), row)
+    column, row = both.locate(u, v)
+    mine = _sample(both.left, column, row)
     sector = np.arange(len(edge)) * SECTORS // len(edge)
     # Pixels of the patch to a sector, over those that share their error.
     area = 2 * np.pi * radius_px * (away[-1] - away[0] + 1.0) / SECTORS / both.shrink**2
@@ -349,4 +349,6 @@ def _measure_spread(log_odds: np.ndarray) -> float:
 
 
 def _sample(picture: np.ndarray, column: np.ndarray, row: np.ndarray) -> np.ndarray:
-    return cv2.remap(picture, column.astype(np.float32), row, cv2.INTER_LINEAR).astype(float)
+    return cv2.remap(
+        picture, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR
+    ).astype(float)
