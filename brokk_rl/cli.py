@@ -78,6 +78,9 @@ def main() -> int:
     if "--version" in sys.argv[1:]:
         sys.stdout.write(f"brokk {brokk_rl.__version__}\n")
         return 0
+    if sys.platform == "win32":
+        sys.stderr.write("error: brokk_rl needs Linux or macOS; on Windows install it in WSL 2\n")
+        return 2
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
     # The launcher options keep the names that submitit gave them; Hydra warns of that three times.

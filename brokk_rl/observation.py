@@ -165,6 +165,32 @@ class ObservationEncoder:
         } | pitch
 
 
+TARGET_DISTANCE = "target.distance"
+"""Name of the horizontal distance of the target in a range table."""
+RangeTable = dict[str, tuple[float, float]]
+"""Lowest and highest value by name: `target.x`, `target.distance`, `pitch`, `q.<joint>`."""
+
+
+def measure_ranges(
+    encoder: "ObservationEncoder", vectors: np.ndarray, joints: tuple[str, ...]
+) -> RangeTable:
+    """Return the range of targets and positions, in rad and m, over observation vectors.
+
+    Args:
+        encoder: The encoder of the vectors, with numpy arrays.
+        vectors: Observation vectors, `(B, size)`.
+        joints: Names of the joints, `J`.
+    """
+    target_m, q, _ = encoder.decode(vectors)
+    values = {f"target.{letter}": target_m[:, axis] for axis, letter in enumerate("xyz")}
+    values[TARGET_DISTANCE] = np.hypot(target_m[:, 0], target_m[:, 1])
+    if encoder.has_pitch:
+        values["pitch"] = encoder.decode_pitch(vectors)
+    for column, joint in enumerate(joints):
+        values[f"q.{joint}"] = q[:, :, column]
+    return {name: (float(one.min()), float(one.max())) for name, one in values.items()}
+
+
 def restore_encoder(machine: Machine, observation: Mapping[str, Any]) -> ObservationEncoder:
     """Return the numpy encoder that `observation` of a policy's contract describes.
 

@@ -30,8 +30,9 @@ from diagnosis import effect_library
 from diagnosis.case import estimate_running_s
 from diagnosis.detection import Penalties
 from diagnosis.effect_library import EffectSimulator, EffectType
+from diagnosis.error_covariance import ErrorCovariance
 from diagnosis.late_frames import find_smallest_lateness
-from diagnosis.residuals import INCREMENT_SAMPLES, ErrorCovariance, Residuals
+from diagnosis.residuals import INCREMENT_SAMPLES, Residuals
 from diagnosis.response_table import (
     ResponseTable,
     compare_pair,

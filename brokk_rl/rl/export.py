@@ -19,7 +19,7 @@ from rsl_rl.models import MLPModel
 from brokk_rl.contracts.task import DeployableTask
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, restore_encoder
+from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
 from brokk_rl.rl.policy import CONTRACT, GOLDEN, ONNX, TOLERANCE, PlainActor
 from brokk_rl.session import write_json
 
@@ -93,6 +93,10 @@ def export_onnx(
     if contract["observation"]:
         encoder = restore_encoder(machine, contract["observation"])
         recorded["inputs"] = _decode_inputs(encoder, vectors)
+        ranges = measure_ranges(encoder, observations.numpy(), machine.joint_names)
+        contract = contract | {
+            "training_observations": {"count": len(observations), "ranges": ranges}
+        }
     write_json(folder / GOLDEN, recorded)
     parity = {
         "observations": len(off),

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from perception.render.drilled_block import DrilledBlock
 from perception.render.ray_tracer import Light
-from perception.render.solids import Solid
+from perception.render.solids import Solid, SolidPose
 from perception.render.stereo_camera import CameraExposure
 
 Range = tuple[float, float]
@@ -204,6 +205,28 @@ class Scene:
     hidden: tuple[float, ...]
     hidden_discs: tuple[float, ...]
     conditions: dict[str, float]
+
+
+def view_from(scene: Scene, camera_from_reference: np.ndarray) -> Scene:
+    """Return the scene in the coordinates of another left camera; light and exposure stay.
+
+    `hidden` and `conditions` stay those of the first camera.
+
+    Args:
+        scene: The scene.
+        camera_from_reference: Motion from the coordinates of `scene` to the new ones, `(4, 4)`.
+    """
+    turn, shift_m = camera_from_reference[:3, :3], camera_from_reference[:3, 3]
+
+    def move(solid: Any) -> Any:
+        pose = SolidPose(turn @ solid.pose.rotation, turn @ solid.pose.center_m + shift_m)
+        return replace(solid, pose=pose)
+
+    block = None if scene.block is None else move(scene.block)
+    solids = tuple(block if solid is scene.block else move(solid) for solid in scene.solids)
+    shade = tuple(move(solid) for solid in scene.light.shade)
+    light = replace(scene.light, to_sun=turn @ scene.light.to_sun, shade=shade)
+    return replace(scene, solids=solids, block=block, light=light)
 
 
 @spec

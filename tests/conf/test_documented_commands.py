@@ -38,16 +38,16 @@ NOT_COMPOSED = {
     "mode=X": "any mode",
     "group=option": "any group",
     "hydra/launcher=": "Hydra warns of the launcher's schema; brokk silences that",
+    "mine.terms:": "a function that the reader writes",
     "search=": "its sweeper comes with the extra `optuna`",
 }
 """Parts of commands that stand for something that does not compose, and the reason."""
 WITHOUT_VALUES = {
     "mode=identify fit=coupled …": "the values before the dots stand in the line above it",
-    'identify fit=coupled "$B"': "a variable of the shell holds identify.recordings",
     "mode=diagnose …": "the values before the dots stand in the block above it",
-    'mode=identify "$S"': "a variable of the shell holds identify.recordings",
+    '"$': "a variable of the shell holds a value that must be given",
 }
-"""Commands that leave out values that must be given: their groups and fields are checked alone."""
+"""Parts of commands that leave out such values: groups and fields are checked alone."""
 
 
 def find_commands(page: Path) -> Iterator[tuple[str, bool]]:

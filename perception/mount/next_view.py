@@ -1,0 +1,228 @@
+"""Choice of the next view: the expected covariance of the hole after some seconds.
+
+A view is worth what its frames would tell. The frames count from the camera's arrival on, as far as
+the hole is in the picture and the planned motion of the arm leaves it in sight. Each would measure
+the centre with the noise of stereo at that distance. Their information joins that of the present
+estimate, which ages meanwhile. The view with the smallest expected variance is chosen.
+
+Axes: `V` views, `T` times of the plan, `J` joints.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+from perception.mount.mounts import CameraMount
+from perception.mount.occlusion import ArmShape, compute_visible_share, sample_circle
+from perception.render.stereo_camera import StereoRig
+
+
+@dataclass(frozen=True)
+class HoleBelief:
+    """Knowledge about the hole that is looked for.
+
+    Attributes:
+        center_m: Centre of the rim in the base frame, `(3,)`.
+        axis: Unit axis out of the hole, `(3,)`.
+        radius_m: Radius.
+        cov_m2: Covariance of the centre without the error of the camera's pose, `(3, 3)`.
+        drift_m2_s: Variance by which each coordinate ages in a second.
+    """
+
+    center_m: np.ndarray
+    axis: np.ndarray
+    radius_m: float
+    cov_m2: np.ndarray
+    drift_m2_s: float
+
+
+@dataclass(frozen=True)
+class ViewChoice:
+    """A chosen view and the reasons.
+
+    Attributes:
+        position: Position of the mount, `(A,)`.
+        is_new: It is another one than the present.
+        travel_s: Time until the camera stands there.
+        seen_here: Part of the coming seconds in which the present view would see the hole.
+        seen_there: The same of the chosen one.
+        std_m: Standard deviation of one coordinate of the centre now.
+        std_here_m: Expected one after the coming seconds from the present view.
+        std_there_m: The same from the chosen one.
+        horizon_s: The coming seconds.
+        name: The position in words.
+    """
+
+    position: np.ndarray
+    is_new: bool
+    travel_s: float
+    seen_here: float
+    seen_there: float
+    std_m: float
+    std_here_m: float
+    std_there_m: float
+    horizon_s: float
+    name: str
+
+    def explain(self) -> str:
+        """Return where the camera looks and why, in a sentence or two."""
+        if not self.is_new:
+            if self.seen_here > 0:
+                return (
+                    f"Camera stays ({self.name}): the hole is in sight for "
+                    f"{self.seen_here * self.horizon_s:.1f} of the next {self.horizon_s:.0f} s."
+                )
+            return f"Camera stays ({self.name}): no view would see the hole."
+        return (
+            f"Camera moves ({self.name}, {self.travel_s:.1f} s): from here the hole would be seen "
+            f"for {self.seen_here * self.horizon_s:.1f} of the next {self.horizon_s:.0f} s, from "
+            f"there for {self.seen_there * self.horizon_s:.1f} s. Expected "
+            f"{1000 * self.std_there_m:.1f} mm instead of {1000 * self.std_here_m:.1f} mm."
+        )
+
+
+@spec
+class ExpectedCovariance:
+    """Choose the view with the smallest expected variance of the hole's centre.
+
+    Attributes:
+        horizon_s: Time ahead for which frames count; the plan of the arm reaches as far.
+        num_times: Times of the plan that are looked at.
+        rate_hz: Frames a second that the tracker would get.
+        disparity_px: Noise of the disparity of a face, 1 sigma.
+        center_px: Noise of a rim's centre in the picture, 1 sigma.
+        visible: Part of the rim in sight from which on it is found at all, and from which on
+            always.
+        tilt_rad: Largest angle between the hole's axis and the line of sight.
+        margin: Part of the picture along its border in which no hole is found.
+        improvement: Part by which the expected standard deviation must be smaller for the camera to
+            leave its view.
+    """
+
+    horizon_s: float
+    num_times: int
+    rate_hz: float
+    disparity_px: float
+    center_px: float
+    visible: tuple[float, float]
+    tilt_rad: float
+    margin: float
+    improvement: float
+
+    def check(self) -> None:
+        if min(self.horizon_s, self.rate_hz, self.disparity_px, self.center_px) <= 0:
+            raise ConfigError(
+                "next_view: expected horizon_s, rate_hz, disparity_px and center_px above 0"
+            )
+        if self.num_times < 2 or not 0 <= self.visible[0] < self.visible[1] <= 1:
+            raise ConfigError(
+                "next_view: expected num_times of 2 or more and 0 <= visible[0] < visible[1] <= 1"
+            )
+
+    def build(
+        self, machine: Machine, mount: CameraMount, rig: StereoRig, arm: ArmShape
+    ) -> ViewPlanner:
+        """Return the planner of a camera on a mount."""
+        return ViewPlanner(self, machine, mount, rig, arm)
+
+
+class ViewPlanner:
+    """See `ExpectedCovariance`."""
+
+    def __init__(
+        self,
+        settings: ExpectedCovariance,
+        machine: Machine,
+        mount: CameraMount,
+        rig: StereoRig,
+        arm: ArmShape,
+    ) -> None:
+        self.settings = settings
+        self._machine, self._mount, self._rig, self._arm = machine, mount, rig, arm
+
+    def choose(self, hole: HoleBelief, present: np.ndarray, plan_q: np.ndarray) -> ViewChoice:
+        """Return the next view.
+
+        Args:
+            hole: The hole.
+            present: Present position of the mount, `(A,)`.
+            plan_q: Joint positions of the arm at `num_times` times from now to `horizon_s`,
+                `(T, J)`.
+        """
+        s, mount = self.settings, self._mount
+        positions = np.concatenate([present[None], mount.views])
+        travel_s = mount.compute_travel_s(present, positions)
+        poses = mount.locate(positions[:, None], plan_q[None])
+        poses = np.broadcast_to(poses, (len(positions), len(plan_q), 4, 4))
+        times_s = np.linspace(0.0, s.horizon_s, len(plan_q))
+        found = self.predict_detection(hole, poses, plan_q)
+        seen = (found * (times_s >= travel_s[:, None])).mean(1)
+        variance_m2 = self._predict_variance(hole, poses, s.rate_hz * s.horizon_s * seen)
+        std_m = np.sqrt(variance_m2)
+        best = int(np.argmin(std_m))
+        if std_m[best] > (1.0 - s.improvement) * std_m[0]:
+            best = 0
+        return ViewChoice(
+            position=positions[best],
+            is_new=best > 0,
+            travel_s=float(travel_s[best]),
+            seen_here=float(seen[0]),
+            seen_there=float(seen[best]),
+            std_m=float(np.sqrt(np.trace(hole.cov_m2) / 3)),
+            std_here_m=float(std_m[0]),
+            std_there_m=float(std_m[best]),
+            horizon_s=s.horizon_s,
+            name=mount.describe(positions[best]),
+        )
+
+    def predict_detection(
+        self, hole: HoleBelief, poses: np.ndarray, plan_q: np.ndarray
+    ) -> np.ndarray:
+        """Return the probability that a frame shows the hole, `(V, T)`.
+
+        Args:
+            hole: The hole.
+            poses: Poses of the camera, `(V, T, 4, 4)`.
+            plan_q: Joint positions of the arm, `(T, J)`.
+        """
+        s = self.settings
+        rim_m = sample_circle(hole.center_m, hole.axis, hole.radius_m)
+        capsules = self._arm.cover(self._machine, plan_q)
+        share = compute_visible_share(poses[..., :3, 3], rim_m, capsules)
+        least, enough = s.visible
+        chance = np.clip((share - least) / (enough - least), 0.0, 1.0)
+        return chance * self._is_in_picture(hole, poses)
+
+    def _is_in_picture(self, hole: HoleBelief, poses: np.ndarray) -> np.ndarray:
+        """Return whether the hole lies in the picture and is not seen too obliquely, `(V, T)`."""
+        s, rig = self.settings, self._rig
+        away_m = hole.center_m - poses[..., :3, 3]
+        center = np.einsum("...ji,...j->...i", poses[..., :3, :3], away_m)
+        depth_m = np.maximum(center[..., 2], 1e-3)
+        pixel = rig.left.project(np.concatenate([center[..., :2], depth_m[..., None]], -1))
+        size = np.array([rig.width, rig.height])
+        inside = ((pixel > s.margin * size) & (pixel < (1.0 - s.margin) * size)).all(-1)
+        cosine = -(away_m @ hole.axis) / np.linalg.norm(away_m, axis=-1)
+        return inside & (center[..., 2] > 0.05) & (cosine > np.cos(s.tilt_rad))
+
+    def _predict_variance(
+        self, hole: HoleBelief, poses: np.ndarray, num_frames: np.ndarray
+    ) -> np.ndarray:
+        """Return the expected mean variance of the centre after the frames of each view, `(V,)`."""
+        s, rig = self.settings, self._rig
+        rotation = poses[:, -1, :3, :3]
+        center = np.einsum("vji,vj->vi", rotation, hole.center_m - poses[:, -1, :3, 3])
+        depth_m = np.maximum(center[:, 2], 1e-3)
+        across_m2 = (s.center_px * depth_m / rig.focal_px) ** 2
+        along_m2 = (s.disparity_px * depth_m**2 / (rig.focal_px * rig.baseline_m)) ** 2
+        noise = np.stack([across_m2, across_m2, along_m2], 1)
+        information = rotation * (num_frames[:, None] / noise)[:, None, :]
+        information = information @ np.swapaxes(rotation, 1, 2)
+        aged_m2 = hole.cov_m2 + hole.drift_m2_s * s.horizon_s * np.eye(3)
+        posterior = np.linalg.inv(np.linalg.inv(aged_m2) + information)
+        return np.trace(posterior, axis1=1, axis2=2) / 3
