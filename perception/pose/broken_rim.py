@@ -59,7 +59,7 @@ ON_RIM, SURE_WHOLE, LEAST_DOUBT = 2.0, 0.5, 0.3
 from which its place hardly rests on the depth of the others; a break of even depth looks as whole,
 so a part of the doubt stays."""
 LEAST_UNLIKE = 0.02
-"""Least part of the variance in which both pictures differ: interpolation alone leaves as much."""
+"""Part of the variance in which both pictures differ anyway, by interpolation."""
 
 
 @dataclass(frozen=True)
@@ -334,7 +334,7 @@ def compare_depths(
             # Gain and offset are free: what remains is 1 - r² of the variance.
             power = float(other @ other) * float(one @ one)
             unlike = 1.0 - max(float(one @ other), 0.0) ** 2 / max(power, 1e-6)
-            odds[place, number] = -0.5 * area / ALIKE_PX2 * np.log(max(unlike, LEAST_UNLIKE))
+            odds[place, number] = -0.5 * area / ALIKE_PX2 * np.log(unlike + LEAST_UNLIKE)
     return odds - odds.max(axis=1, keepdims=True)
 
 
