@@ -292,7 +292,7 @@ class StagedFinder:
             levels = search.merge_levels_to_box(on_block, levels)
         ellipses, wrong_size = [], []
         for level in levels:
-            for ellipse in level.detect_all(self._detector, gray):
+            for ellipse in level.detect(self._detector, gray):
                 limit_px = level.find_missed_limit(ellipse)
                 if limit_px is None:
                     ellipses.append(ellipse)

@@ -64,11 +64,6 @@ class SearchLevel:
     depth_m: np.ndarray | None = None
     nearest_m: np.ndarray | None = None
 
-    def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        """Return the ellipses of a possible size at their place, in px of the picture `(h, w)`."""
-        found = self.detect_all(detector, gray)
-        return [one for one in found if self.find_missed_limit(one) is None]
-
     def find_missed_limit(self, one: Ellipse) -> float | None:
         """Return the limit that the size of an ellipse misses where it lies, px; `None` for none.
 
@@ -90,8 +85,8 @@ class SearchLevel:
             return float(lowest)
         return float(highest) if one.a > highest else None
 
-    def detect_all(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        """Return the ellipses of the region, whatever their size at their place."""
+    def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
+        """Return the ellipses of the region in px of the picture `(h, w)`, whatever their size there."""
         # Only the bounding box is searched: the cost of the detector is proportional to its area.
         x, y, wide, high = cv2.boundingRect(self.region)
         left, top = x * STEP, y * STEP
