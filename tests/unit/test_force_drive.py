@@ -45,14 +45,14 @@ def run(model: Any, machine: Machine, u: np.ndarray, start: float) -> np.ndarray
 
 def test_a_mass_follows_its_differential_equation(drive: Machine) -> None:
     model = replace(option("actuator", "force"), dead_time_s=0.0, **TRUE).build(drive, 1, CPU)
-    u = np.full(200, 0.2)
+    u = np.full(260, 0.2)
     found = run(model, drive, u, 0.0)
     force = 0.2 * drive.max_force[0] - TRUE["offset_n"] - TRUE["coulomb_n"]
 
     def solve(t_s: float, y: np.ndarray) -> list[float]:
         return [y[1], (force - TRUE["viscous_n_s_m"] * y[1]) / TRUE["mass_kg"]]
 
-    t_s = drive.period_s * np.arange(1, 201)
+    t_s = drive.period_s * np.arange(1, 261)
     solved: Any = solve_ivp(solve, (0.0, t_s[-1]), [0.0, 0.0], t_eval=t_s, max_step=1e-3)
     inside = solved.y[0] < drive.upper[0]
     np.testing.assert_allclose(found[inside], solved.y[0][inside], atol=2e-3)
