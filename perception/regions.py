@@ -46,9 +46,11 @@ AROUND = 2.0
 """Radii around a pixel within which its gradient is compared with the usual one."""
 INSIDE, RING = 0.75, (1.25, 1.75)
 """Radii of the inside of a region, and of the ring of face around it."""
+DARKER_PART = 33.0
+"""Percentile of a ring with which the inside is compared: half of it may lie in the sun."""
 APART = 1.0
 """Least distance of two proposals, in radii."""
-ROUND, ON_FACE = 24, 0.5
+ROUND, ON_FACE = 24, 0.8
 """Places around a region at each of six radii where depth is read; least part of the outer ones
 that lies on the face: the arm may cover the rest."""
 
@@ -330,11 +332,13 @@ def vote_for_centres(drawn: np.ndarray, radius_px: float) -> np.ndarray:
 def average_parts(
     picture: np.ndarray, row: int, column: int, radius_px: float
 ) -> tuple[float, float]:
-    """Return the mean of a picture in the ring around a place, and inside it."""
+    """Return the lower third of a picture in the ring around a place, and its mean inside."""
     reach = int(RING[1] * radius_px) + 1
     top, left = max(0, row - reach), max(0, column - reach)
     part = picture[top : row + reach + 1, left : column + reach + 1]
     y, x = np.ogrid[top : top + part.shape[0], left : left + part.shape[1]]
     radii = np.hypot(y - row, x - column) / radius_px
     ring, inside = part[(radii > RING[0]) & (radii < RING[1])], part[radii < INSIDE]
-    return float(ring.mean()) if ring.size else 0.0, float(inside.mean()) if inside.size else 0.0
+    return float(np.percentile(ring, DARKER_PART)) if ring.size else 0.0, float(
+        inside.mean()
+    ) if inside.size else 0.0

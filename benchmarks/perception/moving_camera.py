@@ -24,7 +24,7 @@ TRUE_HOLE = ("target=drawn", "task.noise.target_sample_m=0", "task.noise.target_
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("out", type=Path)
     parser.add_argument("--mounts", nargs="+", default=["true", "fixed", "tower", "mast"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3, 4, 5])

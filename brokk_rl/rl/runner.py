@@ -74,6 +74,8 @@ class TrainingRunner(OnPolicyRunner):
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
         self.logger = logger  # type: ignore[assignment]
+        if isinstance(self.alg, DevicePPO):
+            self.alg.fuse = training.fuse
         if training.symmetry and isinstance(self.alg, DevicePPO):
             if not isinstance(env.task, MirroredTask):
                 raise ConfigError(
@@ -181,7 +183,7 @@ class TrainingRunner(OnPolicyRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
-        with _allow_tensor_cores(self.env.graph_active):
+        with allow_tensor_cores(self.training.tf32 and self.env.graph_active):
             super().learn(num_learning_iterations, init_at_random_ep_len)
 
     def checkpoint(self) -> None:
@@ -296,7 +298,7 @@ class TrainingRunner(OnPolicyRunner):
 
 
 @contextlib.contextmanager
-def _allow_tensor_cores(allowed: bool) -> Iterator[None]:
+def allow_tensor_cores(allowed: bool) -> Iterator[None]:
     """Let matrix products use TF32 meanwhile.
 
     Only where the control step is a captured graph, whose kernels were chosen before: ten bits of

@@ -175,10 +175,12 @@ class TrainingConfig:
             before the run stops with an error.
         fault_steps: Control steps kept of each world; those of worlds that diverge are written into
             `faults` of the run folder. 0 records nothing; `None`: 100 on a CPU, 0 on a GPU, where
-            the recorder was never run.
-        fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
-            compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
-            less than half of a control step of few worlds, far more.
+            its cost has not been measured.
+        fuse: Let `torch.compile` fuse the small operations around the physics, and on a GPU those of
+            PPO, for half a minute of compiling and a C++ compiler. On a CPU, whose physics takes
+            less than half of a control step of few worlds, it gains most.
+        tf32: Multiply matrices of captured training with ten bits of mantissa (TF32) on a GPU; false:
+            all of float32. `runner.algorithm.use_mixed_precision` takes bfloat16, with seven bits.
         random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at
             once.
         runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`,
@@ -199,6 +201,7 @@ class TrainingConfig:
     max_fault_rate: float
     fault_steps: int | None
     fuse: bool
+    tf32: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
 
