@@ -24,7 +24,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import compute_student_interval, compute_wilson_interval
 from brokk_rl.session import RESOLVED, read_record
 
-RATES = ("success_strict", "success_paper")
+SUCCESS_RATE = "success_strict"
+RATES = (SUCCESS_RATE, "success_paper")
 MEASURES = ("time_to_insert_s", "lateral_error_m", "peak_force_n", "valve_travel")
 HEADINGS = {
     "success_strict": "strict",
@@ -338,7 +339,7 @@ def build_table(columns: Sequence[str], groups: Sequence[dict[str, Any]]) -> Tab
     return table
 
 
-def describe_differences(groups: Sequence[dict[str, Any]]) -> list[str]:
+def describe_differences(groups: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return for each group the values that it does not share with most others.
 
     Where no value of a column is the most frequent, every value counts as unusual.

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 
 if TYPE_CHECKING:
@@ -104,6 +105,36 @@ def compute_tool_kinematics(machine: Machine, q: np.ndarray) -> ToolKinematics:
     return ToolKinematics(
         tip, axis, np.swapaxes(jacobian, -1, -2), np.swapaxes(turn, -1, -2), origins, axes
     )
+
+
+def compute_link_pose(machine: Machine, q: np.ndarray, joint: str) -> np.ndarray:
+    """Return the frame of the link behind a joint in the base frame, `(…, 4, 4)`.
+
+    Args:
+        machine: The machine.
+        q: Joint positions, `(…, J)`, rad or m.
+        joint: Name of the joint.
+
+    Raises:
+        ConfigError: the machine has no such joint, or its geometry is not known.
+    """
+    if joint not in machine.joint_names:
+        raise ConfigError(
+            f"machine '{machine.name}' has no joint '{joint}'; "
+            f"{list_choices(joint, machine.joint_names)}"
+        )
+    q = np.asarray(q, float)
+    pose = np.broadcast_to(np.eye(4), (*q.shape[:-1], 4, 4))
+    for j in range(machine.joint_names.index(joint) + 1):
+        body, step = machine.bodies[j], np.zeros((*q.shape[:-1], 4, 4))
+        step[...] = np.eye(4)
+        step[..., :3, 3] = [dimension.value for dimension in body.origin_m]
+        if machine.joints[j].kind == "slide":
+            step[..., :3, 3] += q[..., j, None] * np.array(body.axis)
+        else:
+            step[..., :3, :3] = rotate_about_axis(np.array(body.axis), q[..., j])
+        pose = pose @ step
+    return pose
 
 
 def rotate_about_axis(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

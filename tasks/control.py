@@ -21,6 +21,8 @@ ERROR_SCALES_M = (0.1, 0.02)
 Chosen by hand."""
 PITCH_SCALE_RAD = 0.1
 """The same for the pitch error. Chosen by hand."""
+PLAN_STEP_S = 0.1
+"""Step of a planned motion: joints turn by 0.05 rad at most. Chosen by hand."""
 REACH_CENTER_M = 2.0
 """Subtracted from the reach; about the middle of the paper's range, 1.7 to 2.4 m."""
 
@@ -116,6 +118,46 @@ class ToolPoseControl:
             guidance=guidance,
             positioning=positioning,
         )
+
+    def plan(
+        self,
+        q: torch.Tensor,
+        target_m: torch.Tensor,
+        pitch_rad: torch.Tensor,
+        num_times: int,
+        step_s: float,
+    ) -> torch.Tensor:
+        """Return the motion that the controller would make of an ideal machine, `(N, T, J)`.
+
+        A learned policy corrects this controller; dead time and valves are left out.
+
+        Args:
+            q: Present joint positions, `(N, J)`.
+            target_m: Targets, `(N, 3)`.
+            pitch_rad: Wanted pitches, `(N,)`.
+            num_times: `T`; the first time is now.
+            step_s: Time between two of them.
+        """
+        rest = torch.zeros_like(q)
+        num_parts = max(1, round(step_s / PLAN_STEP_S))
+        planned = [q]
+        for _ in range(num_times - 1):
+            for _ in range(num_parts):
+                guidance = self.controller.guide(
+                    q[:, None], rest[:, None], target_m - self.down, pitch_rad, self.switch.reach_m
+                )
+                positioning = self.switch.positioning(guidance)
+                u = self.action.command(
+                    rest,
+                    guidance.command,
+                    guidance.lowest,
+                    guidance.highest,
+                    positioning,
+                    self.exclusive,
+                )
+                q = q + self.controller.rate(u) * (step_s / num_parts)
+            planned.append(q)
+        return torch.stack(planned, 1)
 
     def command(
         self,

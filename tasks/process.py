@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
-from pkgutil import resolve_name
-from typing import Any, Protocol, Self
+from dataclasses import asdict
+from typing import Any, Protocol
 
 import torch
 
@@ -22,16 +20,14 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics, ToolPose
 from brokk_rl.machine import Machine
-from brokk_rl.observation import TargetScaling
 from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.classical import ClassicalController
 from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
-from tasks.noise import MeasuredNoise, ObservationNoise
-from tasks.reward import RewardCurriculum, RewardTerm
-from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
+from tasks.options import ToolPoseOptions
+from tasks.reward import RewardSum
 from tasks.starts import DrawTally, move_starts_near
 from tasks.step_state import ToolState
-from tasks.termination import EpisodeTerms, Termination
+from tasks.termination import EpisodeTerms
 
 FIGURES = (
     "success_strict",
@@ -74,41 +70,6 @@ class ToolPoseGoal(Protocol):
         ...
 
 
-@dataclass
-class ToolPoseOptions:
-    """Parts of a task's configuration that the process itself uses.
-
-    See the task's spec. The controller's target lies `depth_m` below that of the goal.
-    """
-
-    episode_s: float
-    depth_m: float
-    memory: int
-    advice: AdviceConfig | None
-    noise: ObservationNoise | MeasuredNoise
-    switch: PhaseSwitch
-    action: ActionMapping
-    scaling: TargetScaling
-    classical: ClassicalConfig
-    reward: dict[str, RewardTerm]
-    curriculum: RewardCurriculum | None
-    termination: dict[str, Termination | None]
-
-    @classmethod
-    def of(cls, task: object, **fixed: Any) -> Self:
-        """Return the options of a task's spec, whose fields have the same names.
-
-        Args:
-            task: The spec.
-            **fixed: Options that the spec does not leave open.
-        """
-        names = []
-        for field in fields(cls):
-            if field.name not in fixed:
-                names.append(field.name)
-        return cls(**fixed, **{name: getattr(task, name) for name in names})
-
-
 class ToolPoseProcess:
     """Episodes in `N` environments; fulfils `TaskProcess`, `ClassicalTask` and `DeployableTask`.
 
@@ -146,19 +107,17 @@ class ToolPoseProcess:
             depth_m=options.depth_m,
         )
         self._machine = machine
+        self._sensed_m: torch.Tensor | None = None
         self._kinematics = Kinematics(machine, device)
         self._lower, self._upper = to_constant(machine.lower), to_constant(machine.upper)
         self._endings = EpisodeTerms(options.termination)
         self.reasons = self._endings.reasons
-        self._terms: dict[str, tuple[Callable[[ToolState], torch.Tensor], float]] = {
-            name: (resolve_name(term.function), term.weight)
-            for name, term in options.reward.items()
-        }
+        self._rewards = RewardSum(options.reward, options.curriculum)
         self.state = {
             name: torch.zeros((num_envs, *shape), device=device)
             for name, shape in self._list_state_shapes().items()
         }
-        figures = (*FIGURES, *(f"{REWARD}{name}" for name in self._terms))
+        figures = (*FIGURES, *(f"{REWARD}{name}" for name in options.reward))
         self.episode = {name: torch.zeros(num_envs, device=device) for name in figures}
 
     def _list_state_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -290,7 +249,8 @@ class ToolPoseProcess:
         force_n = torch.where(world.faults, 0.0, world.contact_force_n)
         tool = self._make_tool_state(q, pose, verdict, force_n)
         endings = self._endings.judge(tool, world.faults)
-        reward = self._sum_reward(tool, endings.is_sound)
+        succeeded = state.get("succeeded", state["steps"])  # read with a curriculum only
+        reward = self._rewards(tool, endings.is_sound, succeeded, self.episode)
         self._count(tool, history.u, reward)
         state["closeness"].copy_(verdict["closeness"])
         state["contact_force_n"].copy_(force_n)
@@ -300,16 +260,6 @@ class ToolPoseProcess:
             timed_out=endings.timed_out,
             reason=endings.reason,
         )
-
-    def _sum_reward(self, tool: ToolState, is_sound: torch.Tensor) -> torch.Tensor:
-        """Return the weighted sum of all terms where `is_sound`, `(N,)`, else 0; adds up each term."""
-        curriculum, reward = self.options.curriculum, torch.zeros_like(tool.reach_m)
-        scale = curriculum.scale(self.state["succeeded"]) if curriculum else {}
-        for name, (term, weight) in self._terms.items():
-            part = scale.get(name, 1.0) * weight * term(tool)
-            reward = reward + part
-            self.episode[f"{REWARD}{name}"] += torch.where(is_sound, part, 0.0)
-        return torch.where(is_sound, reward, 0.0)
 
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
@@ -383,6 +333,17 @@ class ToolPoseProcess:
         pitch_rad = float(self.starts(1, 0)["target_pitch_rad"][0])
         return DeployedPolicy(self.control, network, pitch_rad)
 
+    def take_estimate(self, target_m: torch.Tensor) -> None:
+        """Take estimated targets; see `LookingTask.take_estimate`."""
+        self._sensed_m = target_m
+
+    def plan(
+        self, q: torch.Tensor, target_m: torch.Tensor, num_times: int, step_s: float
+    ) -> torch.Tensor:
+        """Return the controller's plan, `(N, T, J)`; see `LookingTask.plan`."""
+        pitch_rad = self.state["start.target_pitch_rad"]
+        return self.control.plan(q, target_m, pitch_rad, num_times, step_s)
+
     def _get_start(self) -> dict[str, torch.Tensor]:
         start = {}
         for name, value in self.state.items():
@@ -448,8 +409,12 @@ class ToolPoseProcess:
         episode["valve_travel"] += (travel - episode["valve_travel"]) / episode["length"]
 
     def _estimate_target(self, shift_m: torch.Tensor | None) -> torch.Tensor:
-        """Draw a noisy sample of the target; return the estimate, `(N, 3)`."""
+        """Return the sensed target, or draw a noisy sample and return the estimate, `(N, 3)`."""
         noise, state = self.options.noise, self.state
+        if self._sensed_m is not None:
+            sample = self._sensed_m if shift_m is None else self._sensed_m + shift_m
+            state["estimate_m"].copy_(sample)
+            return sample
         true_m = state["start.target_m"]
         error = (2 * torch.rand_like(true_m) - 1) * noise.sample_m(true_m)
         if noise.target_relative:

@@ -1,7 +1,7 @@
 """Contract of a task, and of the policies that act in it.
 
 A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes
-of `N` environments at once. That contract is all that training and evaluation need. Four more are
+of `N` environments at once. That contract is all that training and evaluation need. Five more are
 optional:
 
 * `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
@@ -10,6 +10,7 @@ optional:
 * `DeployableTask`: the task can write its policy as one module from observation to command. Then
   `mode=export` and the end of `mode=train` write `policy.onnx`.
 * `MirroredTask`: episodes have a mirror image, as `rl.symmetry` needs.
+* `LookingTask`: a sensor may estimate the target, as `target=perceived` does.
 
 `brokk_rl.checks.check_task` exercises a task against all of this, for our own options and for those
 of extensions.
@@ -26,6 +27,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
 
 from brokk_rl.contracts.world import World
+from brokk_rl.errors import ConfigError
 
 if TYPE_CHECKING:
     import torch
@@ -161,9 +163,9 @@ class DeployableTask(Protocol):
         """Return `size`, order, scale and filters of the `policy` group, as plain JSON data.
 
         It becomes `observation` in `policy.json`; the machine's computer builds the same vector
-        with `brokk_rl.observation`. Two entries stand elsewhere in that file: `stop`, when an
-        episode ends, and `masked`, `False` where commands may move exclusive and other joints at
-        once.
+        with `brokk_rl.observation`. A task made of terms lists its `parts`. Two entries stand
+        elsewhere in that file: `stop`, when an episode ends, and `masked`, `False` where commands
+        may move exclusive and other joints at once.
         """
         ...
 
@@ -206,6 +208,42 @@ class MirroredTask(Protocol):
             ConfigError: The machine is not left-right symmetric.
         """
         ...
+
+
+@runtime_checkable
+class LookingTask(Protocol):
+    """A task process whose target a sensor estimates (`brokk_rl.contracts.target`); optional."""
+
+    def take_estimate(self, target_m: torch.Tensor) -> None:
+        """Take estimated targets, `(N, 3)`, in the place of drawn errors, from now on."""
+        ...
+
+    def plan(
+        self, q: torch.Tensor, target_m: torch.Tensor, num_times: int, step_s: float
+    ) -> torch.Tensor:
+        """Return the planned motion towards targets, `(N, T, J)`.
+
+        Args:
+            q: Present joint positions, `(N, J)`.
+            target_m: Targets, `(N, 3)`.
+            num_times: `T`; the first time is now.
+            step_s: Time between two of them.
+        """
+        ...
+
+
+def find_looking_task(process: object) -> LookingTask:
+    """Return a task process as one whose target a sensor estimates.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if not isinstance(process, LookingTask):
+        raise ConfigError(
+            f"target: the task ({type(process).__name__}) draws the errors of its target itself; "
+            "give target=drawn, or a task with take_estimate and plan"
+        )
+    return process
 
 
 class Task(Protocol):

@@ -6,6 +6,7 @@ import csv
 import io
 import logging
 from collections.abc import Sequence
+from typing import Any
 
 from brokk_rl.comparison import (
     MEASURES,
@@ -27,6 +28,14 @@ from brokk_rl.comparison import (
     read_progress,
 )
 from brokk_rl.console_table import print_table
+from brokk_rl.seed_statistics import (
+    build_seed_table,
+    choose_baseline,
+    collect_methods,
+    draw_seeds,
+    format_latex,
+    summarise_methods,
+)
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 
@@ -42,9 +51,11 @@ class RunSelection:
 
     Attributes:
         runs: Run folders, folders of such (a sweep), or patterns of either.
+        baseline: Values of the row to which others are compared; `None`: the first.
     """
 
     runs: str | tuple[str, ...]
+    baseline: dict[str, Any] | None
 
 
 @spec
@@ -55,7 +66,7 @@ class Compare:
     compare: RunSelection
 
     def run(self) -> None:
-        """Print the table; write `comparison.{json,csv,png}` and, for training runs, `learning.*`."""
+        """Print tables; write `comparison.*`, of several seeds `seeds.png`, of trainings `learning.*`."""
         patterns = (self.compare.runs,) if isinstance(self.compare.runs, str) else self.compare.runs
         runs = [load_run(folder) for folder in find_runs(patterns)]
         columns = find_differences(runs)
@@ -64,15 +75,31 @@ class Compare:
             results.extend(run.results(columns))
         groups = group_results(results)
         folder = self.session.folder
+        methods = collect_methods(results)
+        summaries = []
+        if methods:
+            baseline = choose_baseline(methods, self.compare.baseline)
+            generator = self.session.generator("compare")
+            summaries = summarise_methods(methods, baseline, generator)
         write_json(
             folder / "comparison.json",
-            {"schema": 1, "columns": columns, "groups": groups, "runs": results},
+            {
+                "schema": 1,
+                "columns": columns,
+                "groups": groups,
+                "runs": results,
+                "methods": summaries,
+            },
         )
         write_text(folder / "comparison.csv", format_csv(columns, results))
         draw_comparison(groups).savefig(folder / "comparison.png", dpi=150)
         self._write_learning(runs, columns)
         table = build_table(columns, groups)
         print_table(table, num_keys=len(table.columns) - len((*RATES, *MEASURES)))
+        if any(summary["ci95"] for summary in summaries):
+            write_text(folder / "comparison.tex", format_latex(summaries))
+            draw_seeds(summaries).savefig(folder / "seeds.png", dpi=150)
+            print_table(build_seed_table(summaries), num_keys=2)
         log.info("%d runs compared in %s", len(runs), folder)
 
     def _write_learning(self, runs: Sequence[EvaluatedRun], columns: Sequence[str]) -> None:

@@ -12,8 +12,10 @@ from rich.table import Table
 
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
+from brokk_rl.contracts.target import TargetSensorSpec
 from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
@@ -50,6 +52,7 @@ class Evaluate:
         effect: Effects around the actuator model, by name.
         event: Changes of the simulated machine, by name.
         follower: Who stands between policy and machine.
+        target: How the loop comes to know its target; `null`: the task draws errors.
         policy: The policy in question.
         rivals: Policies beside it, by name.
         evaluation: How to evaluate.
@@ -65,10 +68,18 @@ class Evaluate:
     effect: dict[str, Effect]
     event: dict[str, Event]
     follower: Follower
+    target: TargetSensorSpec | None
     policy: PolicySpec
     rivals: dict[str, PolicySpec]
     evaluation: Evaluation
     asked: tuple[str, ...]
+
+    def check(self) -> None:
+        if self.target is not None and not hasattr(self.target, "sense"):
+            raise ConfigError(
+                f"target={name_spec(self.target)}: mode=evaluate takes target=drawn or "
+                "target=perceived; the others are for mode=deploy"
+            )
 
     def run(self) -> float:
         """Evaluate; return the strict success of the policy."""
@@ -80,6 +91,7 @@ class Evaluate:
             effects=self.effect,
             events=self.event,
             follower=self.follower,
+            target=self.target,
         )
         policies = {name_spec(self.policy): self.policy} | self.rivals
         results = evaluate_policies(config, self.evaluation, self.session, policies, self.asked)

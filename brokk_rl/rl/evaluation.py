@@ -98,6 +98,8 @@ def evaluate_policy(
         on_step: Called after each of at most `loop.task.max_episode_steps` control steps.
     """
     torch.manual_seed(seed)
+    if loop.sensor is not None:
+        loop.sensor.forget()
     loop.begin(starts)
     loop.statistics()  # forget episodes of before
     num = loop.num_envs
@@ -117,9 +119,14 @@ def evaluate_policy(
         reason = torch.where(ended, loop.reason, reason)
         tape.append(loop, running, num_recorded)
         running &= ~done
+        if loop.sensor is not None:
+            loop.sensor.attend(running.cpu().numpy())
         on_step()
+    summary = _summarize(figures, reason, loop.task.reasons)
+    if loop.sensor is not None:
+        summary["target"] = loop.sensor.summarize()
     return PolicyEvaluation(
-        summary=_summarize(figures, reason, loop.task.reasons),
+        summary=summary,
         episodes=_collect_episodes(tape, starts, figures[SUCCESS], loop.machine.period_s),
     )
 

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, cast
 
+import numpy as np
 import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
@@ -25,13 +26,15 @@ from brokk_rl.contracts.actuator import (
     FollowerModel,
     SensingModel,
 )
-from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
+from brokk_rl.contracts.target import TargetSensor, TargetSensorSpec
+from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess, find_looking_task
 from brokk_rl.contracts.world import Simulator, TracedWorld, World
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
+from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.fault_recorder import FaultRecorder
 from brokk_rl.task_description import TaskDescription, describe_task
@@ -53,6 +56,7 @@ class ControlLoopConfig:
         effects: Effects around the actuator model, by name.
         follower: Who stands between policy and machine.
         events: Changes of the simulated machine, by name.
+        target: How the loop comes to know its target; `None`: the task draws errors.
     """
 
     machine: Machine
@@ -62,6 +66,7 @@ class ControlLoopConfig:
     effects: dict[str, Effect]
     follower: Follower
     events: dict[str, Event] = field(default_factory=dict)
+    target: TargetSensorSpec | None = None
 
     def build(
         self,
@@ -89,6 +94,7 @@ class ControlLoopConfig:
         model = self.actuator.build(self.machine, num, device)
         for effect in self.effects.values():
             model = effect.wrap(model, self.machine, num, device)
+        model = accept_speeds(model, self.machine, num, device)
         follower = self.follower.build(self.machine, num, device)
         process = self.task.build(self.machine, num, device)
         # with all threads, four processes on a computer of 64 cores had no starts after three
@@ -98,7 +104,10 @@ class ControlLoopConfig:
                 drawn = process.starts(pool, seed)
             starts = {key: value.to(device) for key, value in drawn.items()}
         description = describe_task(self.task)
-        return ControlLoop(self.machine, world, model, follower, process, starts, description)
+        sensor = self.target.sense(self.machine, num, seed) if self.target else None
+        return ControlLoop(
+            self.machine, world, model, follower, process, starts, description, sensor
+        )
 
 
 class ControlLoop(VecEnv):
@@ -112,6 +121,7 @@ class ControlLoop(VecEnv):
         task: Task process.
         starts: Valid starts from which resets draw, each entry `(pool, …)`.
         description: Description of the task, for checkpoints and policies made here.
+        sensor: Estimates the targets; `None`: the task draws their errors.
     """
 
     def __init__(
@@ -123,8 +133,11 @@ class ControlLoop(VecEnv):
         task: TaskProcess,
         starts: Starts,
         description: TaskDescription,
+        sensor: TargetSensor | None = None,
     ) -> None:
         self.machine, self.world, self.task = machine, world, task
+        self.sensor = sensor
+        self._looking = find_looking_task(task) if sensor else None
         self.description = description
         self.actuator, self.follower = actuator, follower
         self.num_envs = world.num_worlds
@@ -165,6 +178,7 @@ class ControlLoop(VecEnv):
         # sums over episodes finished since `statistics` was last asked
         self._totals = torch.zeros(len(self._total_names), device=self.device)
         self._steps = 0
+        self._is_known = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
         self.num_held = 0
         """Worlds whose fault could be fetched from the recorder when `statistics` was last asked."""
         self._action = torch.zeros(self.num_envs, self.num_actions, device=self.device)
@@ -252,6 +266,8 @@ class ControlLoop(VecEnv):
         Raises:
             ConfigError: There is nothing here with which to compile.
         """
+        if self.sensor is not None:  # it works on the host
+            return
         graphs = self.device.type == "cuda" and self.world.supports_graphs
         if fuse := fuse and (graphs or self.device.type == "cpu"):
             for name in ("_command", "_judge", "_perceive"):
@@ -404,7 +420,10 @@ class ControlLoop(VecEnv):
         """Apply the action; return the motion that the drive is to make of each joint, `(N, J)`."""
         # histories hold what was given, as the machine's log does: it is all that policy and
         # actuator model can know
-        self.end_u.copy_(self.follower.step(self.task.command(self._action)))
+        u = self.task.command(self._action)
+        if self.sensor is not None:
+            u = u * self._is_known[:, None]
+        self.end_u.copy_(self.follower.step(u))
         self.truth.push_u(self.end_u)
         if self._sensing:
             self.history.push_u(self.end_u)
@@ -441,9 +460,30 @@ class ControlLoop(VecEnv):
             self.history.push_q(q)
             self.history.reset(self.done, q)
         self.task.reset(self.done, start)
+        if self.sensor is not None:
+            self._sense(self.sensor, start)
         shift_m = self._misplacing.misplacement(self.truth.q[:, -1]) if self._misplacing else None
         for name, value in self.task.observe(self.history, shift_m).items():
             self._groups[name].copy_(value)
+
+    def _sense(self, sensor: TargetSensor, start: Starts) -> None:
+        """Give the task the targets that the sensor estimates."""
+        assert self._looking is not None
+        task = self._looking
+
+        def plan(target_m: np.ndarray, num_times: int, step_s: float) -> np.ndarray:
+            wanted = torch.as_tensor(target_m, dtype=torch.float32, device=self.device)
+            return task.plan(self.history.q[:, -1], wanted, num_times, step_s).cpu().numpy()
+
+        done = self.done.cpu().numpy()
+        if done.any():
+            sensor.reset(done, {name: value.cpu().numpy() for name, value in start.items()})
+        q, measured = self.truth.q[:, -1].cpu().numpy(), self.history.q[:, -1].cpu().numpy()
+        reading = sensor.read(q, measured, plan)
+        self._is_known.copy_(torch.as_tensor(reading.is_known, device=self.device))
+        task.take_estimate(
+            torch.as_tensor(reading.target_m, dtype=torch.float32, device=self.device)
+        )
 
     def _draw(self) -> Starts:
         rows = torch.randint(len(self.starts["q"]), (self.num_envs,), device=self.device)

@@ -96,6 +96,16 @@ class PlaneChart:
         )[0]
 
 
+def build_chart(origin: np.ndarray, m: np.ndarray, camera_matrix: np.ndarray) -> PlaneChart:
+    """Return coordinates on the plane `m · P = 1` about one of its points, `(3,)`."""
+    normal = m / np.linalg.norm(m)
+    # The axis that is least parallel to the normal, so that the cross product is well
+    # conditioned.
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    return PlaneChart(origin, first, np.cross(normal, first), m, camera_matrix)
+
+
 @dataclass(frozen=True)
 class _CircleFit:
     """Result of `_fit_circle`.
@@ -138,29 +148,24 @@ def fit_rim_circle(
         shape_px: Standard deviation of each of the `WAVES` of a rim, px.
     """
     ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
-    normal = m / np.linalg.norm(m)
-    # The axis that is least parallel to the normal, so that the cross product is well
-    # conditioned.
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    first /= np.linalg.norm(first)
-    chart = PlaneChart(ray / (m @ ray), first, np.cross(normal, first), m, camera_matrix)
+    chart = build_chart(ray / (m @ ray), m, camera_matrix)
     # The search reaches a quarter of the size: the first ellipse may be that wrong.
     size = float(np.sqrt(ellipse[2] * ellipse[3]))
-    profiles = _find_profile_edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
+    profiles = find_profile_edges(gray, ellipse, max(NARROW_PX, 0.25 * size), chart)
     if profiles is None:
         return None
-    found, fit = _vote_for_circle(*profiles, radius_m, tolerance), None
+    found, fit = _vote_for_circle(profiles.edges, profiles.pixel_m, radius_m, tolerance), None
     # Twice: profiles across the better circle find the rim more exactly.
     for _ in range(2):
         if found is None:
             return None
         seen = chart.seen(found)
         profiles = (
-            _find_profile_edges(gray, seen, NARROW_PX, chart) if np.isfinite(seen).all() else None
+            find_profile_edges(gray, seen, NARROW_PX, chart) if np.isfinite(seen).all() else None
         )
         if profiles is None:
             return None
-        fit = _fit_circle(found, *profiles, center_px, shape_px)
+        fit = _fit_circle(found, profiles.edges, profiles.pixel_m, center_px, shape_px)
         found = None if fit is None else fit.circle
         # Half as much more than the final limit, which the caller checks.
         if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
@@ -178,15 +183,29 @@ def fit_rim_circle(
     )
 
 
-def _find_profile_edges(
-    gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: PlaneChart
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Find the steepest places of profiles across an ellipse, on the plane.
+@dataclass(frozen=True)
+class ProfileEdges:
+    """The steepest places of profiles across an ellipse, on a plane.
 
-    Returns:
-        Places, m, `(P, PEAKS, 2)`, NaN where there are fewer; and the length of a pixel on the
-        plane along each profile, `(P,)`.
+    Attributes:
+        edges: Places, m, `(P, PEAKS, 2)`, NaN where there are fewer.
+        strength: Their steepness, grey levels a sample, `(P, PEAKS)`.
+        pixel_m: Length of a pixel on the plane along each profile, `(P,)`.
+        pixels: The places in the picture, `(P, PEAKS, 2)`.
+        outward: Direction of each profile in the picture, `(P, 2)`.
     """
+
+    edges: np.ndarray
+    strength: np.ndarray
+    pixel_m: np.ndarray
+    pixels: np.ndarray
+    outward: np.ndarray
+
+
+def find_profile_edges(
+    gray: np.ndarray, ellipse: np.ndarray, reach_px: float, chart: PlaneChart
+) -> ProfileEdges | None:
+    """Find the steepest places of profiles across an ellipse; `None` beside the picture."""
     # At most 144 profiles limit the time; their edges are correlated beyond that number.
     number = int(np.clip(2 * conic.compute_perimeter(ellipse[2], ellipse[3]), 48, 144))
     points, outward, _ = (
@@ -233,14 +252,15 @@ def _find_profile_edges(
         -0.5, 0.5
     )
     way = offset[at] + STEP_PX * shift
-    edges = chart.flat(points[:, None] + way[..., None] * outward[:, None])
+    pixels = points[:, None] + way[..., None] * outward[:, None]
+    edges = chart.flat(pixels)
     # NaN marks the missing edges, which comparisons leave out.
     edges[~good] = np.nan
     # Pixels on the plane are longer where the face is seen obliquely.
     pixel_m = np.linalg.norm(
         chart.flat(points + 0.5 * outward) - chart.flat(points - 0.5 * outward), axis=1
     )
-    return edges, pixel_m
+    return ProfileEdges(edges, strength[rows, chosen], pixel_m, pixels, outward)
 
 
 def _vote_for_circle(

@@ -70,6 +70,9 @@ def draw_block(
         for place, size in zip(places[num_holes:], radii[num_holes:], strict=False)
     )
     chips = tuple(chip for hole in holes[:num_holes] for chip in _draw_chips(kind, hole, generator))
+    chips += tuple(
+        dent for hole in holes[:num_holes] for dent in _draw_dents(kind, hole, generator)
+    )
     rotation = build_frame(normal, turn_rad)
     first = np.array([*places[0], half[2]]) if places else np.array([0.0, 0.0, half[2]])
     pose = SolidPose(rotation, target - rotation @ first)
@@ -160,14 +163,32 @@ def draw_bars(
 
 
 def _draw_chips(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
-    """Return pieces broken off a rim: balls that cut bowls of width `chip_m` near it."""
+    """Return pieces broken off a rim: balls that cut bowls of radius `chip_m` into it."""
     found = []
     for _ in range(int(generator.integers(kind.chips[0], kind.chips[1] + 1))):
         angle, wide = generator.uniform(-np.pi, np.pi), float(generator.uniform(*kind.chip_m))
-        out = hole.radius_m * np.array([np.cos(angle), np.sin(angle)])
-        height = wide * float(generator.uniform(0.2, 1.5))
-        found.append(Chip(hole.center_m + np.array([*out, height]), float(np.hypot(wide, height))))
+        found.append(_draw_bowl(hole, angle, hole.radius_m, wide, generator))
     return found
+
+
+def _draw_dents(kind: BlockRanges, hole: DrilledHole, generator: np.random.Generator) -> list[Chip]:
+    """Return bowls of radius `dent_m` that a chisel left in the face beside a rim."""
+    found = []
+    for _ in range(int(generator.integers(kind.dents[0], kind.dents[1] + 1))):
+        angle, wide = generator.uniform(-np.pi, np.pi), float(generator.uniform(*kind.dent_m))
+        # Beyond the rim, up to a hole's diameter away: a chisel that misses lands near.
+        away = hole.radius_m + wide + generator.uniform(0.0, 2.0 * hole.radius_m)
+        found.append(_draw_bowl(hole, angle, away, wide, generator))
+    return found
+
+
+def _draw_bowl(
+    hole: DrilledHole, angle: float, away: float, wide: float, generator: np.random.Generator
+) -> Chip:
+    """Return a ball that cuts a bowl of radius `wide` into the face, `away` from a hole's axis."""
+    height = wide * float(generator.uniform(0.2, 1.5))
+    place = hole.center_m + np.array([away * np.cos(angle), away * np.sin(angle), height])
+    return Chip(place, float(np.hypot(wide, height)))
 
 
 def draw_block_materials(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,9 @@ from brokk_rl.spec import spec
 from perception.label.camera_pose import Charuco
 from perception.render.drilled_block import DrilledBlock
 from perception.render.printed_board import PrintedPlate, build_plate
-from perception.render.scene_ranges import Range, Scene, SceneRanges, draw_uniform
+from perception.render.scene_ranges import Range, SceneRanges, draw_uniform, view_from
 from perception.render.scene_sampler import compose_scene, compute_hidden_share
-from perception.render.scene_sequence import StagedScene, build_pose, move_light, move_solids
+from perception.render.scene_sequence import StagedScene, build_pose
 from perception.render.stereo_camera import StereoRig
 
 CAMERAS, PLACING, MEASURED = "cameras.yaml", "placing.yaml", "measured.yaml"
@@ -98,9 +99,10 @@ class FootageScenes:
         generator = self._session.generator(f"scene/{number}")
         first_from_camera = self._draw_place(generator)
         motion = np.linalg.inv(first_from_camera)
-        scene = self._scene
-        solids = move_solids((*scene.solids, self._plate), motion)
-        block = solids[scene.solids.index(self._block)]
+        staged = replace(self._scene, solids=(*self._scene.solids, self._plate))
+        scene = view_from(staged, motion)
+        block = scene.block
+        assert block is not None
         to_face = block.pose.center_m - motion[:3, 3]
         conditions = scene.conditions | {
             "distance_m": float(np.linalg.norm(motion[:3, :3] @ self._aim + motion[:3, 3])),
@@ -109,14 +111,12 @@ class FootageScenes:
             ),
             "arm": 0.0,
         }
-        moved = Scene(
-            solids=solids,
-            block=block,
-            light=move_light(scene.light, motion),
-            exposure=scene.exposure,
-            sky=scene.sky,
-            hidden=tuple(compute_hidden_share(solids, block, hole) for hole in block.holes),
-            hidden_discs=tuple(compute_hidden_share(solids, block, disc) for disc in block.discs),
+        moved = replace(
+            scene,
+            hidden=tuple(compute_hidden_share(scene.solids, block, hole) for hole in block.holes),
+            hidden_discs=tuple(
+                compute_hidden_share(scene.solids, block, disc) for disc in block.discs
+            ),
             conditions=conditions,
         )
         return StagedScene(moved, self._rig.base_from_camera @ first_from_camera, generator)

@@ -8,7 +8,7 @@ rays where edges of solids, rims or shadows cross it.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -32,23 +32,21 @@ class Pinhole:
         height: Pixels.
         focal_px: Focal length.
         origin_m: Centre of projection.
+        axis_px: Pixel of the optical axis; `None`: the picture's middle. A part of a picture has it
+            elsewhere.
     """
 
     width: int
     height: int
     focal_px: float
     origin_m: np.ndarray
+    axis_px: tuple[float, float] | None = field(default=None, kw_only=True)
 
     @property
     def matrix(self) -> np.ndarray:
-        """Camera matrix, `(3, 3)`: axis through the picture's middle, pixel centres at integers."""
-        return np.array(
-            [
-                [self.focal_px, 0, (self.width - 1) / 2],
-                [0, self.focal_px, (self.height - 1) / 2],
-                [0, 0, 1.0],
-            ]
-        )
+        """Camera matrix, `(3, 3)`; pixel centres lie at integers."""
+        x, y = self.axis_px or ((self.width - 1) / 2, (self.height - 1) / 2)
+        return np.array([[self.focal_px, 0, x], [0, self.focal_px, y], [0, 0, 1.0]])
 
     def project(self, point_m: np.ndarray) -> np.ndarray:
         """Return the pixels, `(…, 2)`, of points, `(…, 3)`, in front of the camera."""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from perception.render.drilled_block import DrilledBlock
 from perception.render.ray_tracer import Light
-from perception.render.solids import Solid
+from perception.render.solids import Solid, SolidPose
 from perception.render.stereo_camera import CameraExposure
 
 Range = tuple[float, float]
@@ -57,7 +58,9 @@ class BlockRanges:
         bar_probability: That a reinforcing bar crosses a hole.
         edge_m: Concrete left between a hole and the edge of the face.
         chips: Pieces broken off each rim.
-        chip_m: Size of each, along the face.
+        chip_m: Radius of each, along the face.
+        dents: Bowls struck into the face beside each rim.
+        dent_m: Radius of each, along the face.
         decoys: Flat dark discs on the face.
         decoy_radius_m: Of the discs.
         decoy_brightness: Of the discs.
@@ -83,6 +86,8 @@ class BlockRanges:
     edge_m: Range
     chips: Count
     chip_m: Range
+    dents: Count
+    dent_m: Range
     decoys: Count
     decoy_radius_m: Range
     decoy_brightness: Range
@@ -200,6 +205,28 @@ class Scene:
     hidden: tuple[float, ...]
     hidden_discs: tuple[float, ...]
     conditions: dict[str, float]
+
+
+def view_from(scene: Scene, camera_from_reference: np.ndarray) -> Scene:
+    """Return the scene in the coordinates of another left camera; light and exposure stay.
+
+    `hidden` and `conditions` stay those of the first camera.
+
+    Args:
+        scene: The scene.
+        camera_from_reference: Motion from the coordinates of `scene` to the new ones, `(4, 4)`.
+    """
+    turn, shift_m = camera_from_reference[:3, :3], camera_from_reference[:3, 3]
+
+    def move(solid: Any) -> Any:
+        pose = SolidPose(turn @ solid.pose.rotation, turn @ solid.pose.center_m + shift_m)
+        return replace(solid, pose=pose)
+
+    block = None if scene.block is None else move(scene.block)
+    solids = tuple(block if solid is scene.block else move(solid) for solid in scene.solids)
+    shade = tuple(move(solid) for solid in scene.light.shade)
+    light = replace(scene.light, to_sun=turn @ scene.light.to_sun, shade=shade)
+    return replace(scene, solids=solids, block=block, light=light)
 
 
 @spec

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import cv2
 import numpy as np
@@ -130,19 +132,85 @@ class StereoRig:
     @property
     def base_from_camera(self) -> np.ndarray:
         """Pose of the left camera in the base frame, `(4, 4)`: x right, y down, z forward."""
-        cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        down, ahead = math.sin(self.pitch_rad), math.cos(self.pitch_rad)
-        forward = np.array([cos * ahead, sin * ahead, -down])
-        right = np.array([sin, -cos, 0.0])
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
-        pose[:3, 3] = self.position_in_base_m
-        return pose
+        return build_camera_pose(self.position_in_base_m, self.yaw_rad, self.pitch_rad)
 
     @property
     def down_in_camera(self) -> np.ndarray:
         """Direction of gravity, `(3,)`, camera coordinates."""
         return -self.base_from_camera[2, :3]
+
+
+@spec
+class PlacedRig(StereoRig):
+    """A rig in another place, of which a part of the picture is read out.
+
+    Attributes:
+        pose: Pose of the left camera in the base frame, `(4, 4)`; counts instead of position, yaw
+            and pitch.
+        axis_px: Pixel of the optical axis in the part that is read out.
+    """
+
+    pose: Any
+    axis_px: tuple[float, float]
+
+    def check(self) -> None:
+        StereoRig.check(self)
+        # Its radial shift is that of a whole picture, which a part does not know.
+        if not self.error.is_none:
+            raise ConfigError(
+                "rig.error: a part of the picture is rendered for rig/error=none only"
+            )
+
+    @property
+    def left(self) -> Pinhole:
+        """The camera in whose coordinates everything is told."""
+        return Pinhole(self.width, self.height, self.focal_px, np.zeros(3), axis_px=self.axis_px)
+
+    @property
+    def right(self) -> Pinhole:
+        """Its partner."""
+        place_m = np.array([self.baseline_m, 0.0, 0.0])
+        return Pinhole(self.width, self.height, self.focal_px, place_m, axis_px=self.axis_px)
+
+    @property
+    def base_from_camera(self) -> np.ndarray:
+        """Pose of the left camera in the base frame, `(4, 4)`."""
+        return self.pose
+
+
+def place_rig(
+    rig: StereoRig, pose: np.ndarray, corner_px: tuple[int, int], size_px: tuple[int, int]
+) -> PlacedRig:
+    """Return `rig` at `pose`, `(4, 4)`, which reads out a part of its picture.
+
+    Args:
+        rig: The rig.
+        pose: Pose of the left camera in the base frame.
+        corner_px: First column and row of the part.
+        size_px: Columns and rows of the part.
+    """
+    values = {entry.name: getattr(rig, entry.name) for entry in fields(rig)}
+    axis_px = (rig.left.matrix[0, 2] - corner_px[0], rig.left.matrix[1, 2] - corner_px[1])
+    values |= {"width": size_px[0], "height": size_px[1], "pose": pose, "axis_px": axis_px}
+    return PlacedRig(**values)
+
+
+def build_camera_pose(position_m: Sequence[float], yaw_rad: float, pitch_rad: float) -> np.ndarray:
+    """Return the pose of a level camera, `(4, 4)`: x right, y down, z forward.
+
+    Args:
+        position_m: Centre of projection in a frame with x forward, y left and z up.
+        yaw_rad: Turn of the view about the vertical, from x towards y.
+        pitch_rad: How far it looks down.
+    """
+    cos, sin = math.cos(yaw_rad), math.sin(yaw_rad)
+    down, ahead = math.sin(pitch_rad), math.cos(pitch_rad)
+    forward = np.array([cos * ahead, sin * ahead, -down])
+    right = np.array([sin, -cos, 0.0])
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward], 1)
+    pose[:3, 3] = position_m
+    return pose
 
 
 def measure_disparity_error(rig: StereoRig) -> tuple[float, float, float]:

@@ -16,11 +16,19 @@ from perception.render.drilled_block import FRONT, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer, RenderedFrame
 from perception.render.materials import Material
 from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
-from perception.render.scene_ranges import SceneRanges
+from perception.render.scene_ranges import Scene, SceneRanges, view_from
 from perception.render.scene_sampler import add_surroundings
 from perception.render.solids import Cylinder, Solid, SolidPose
 from perception.render.stereo_camera import StereoRig
 from perception.stereo import Stereo
+
+
+def make_frame(shot: RenderedFrame, rig: StereoRig, t_s: float) -> Frame:
+    """Return what a camera tells of a rendered frame: pictures, depth and its own pose."""
+    return Frame(
+        color=shot.color, depth_m=shot.depth_m, camera_matrix=rig.left.matrix, base_from_camera=rig.base_from_camera,
+        t_s=t_s, right=shot.right, baseline_m=rig.baseline_m, disparity_std_px=rig.disparity_std_px,
+    )  # fmt: skip
 
 
 @spec
@@ -81,14 +89,6 @@ class SimulatedSource:
 
     def __init__(self, settings: SimulatedCamera) -> None:
         self._settings = settings
-        self._studio = FrameRenderer(
-            rig=settings.rig,
-            scene=settings.surroundings,
-            stereo=settings.stereo,
-            surfaces=NO_PHOTOGRAPHS,
-            depth="matched",
-            pair=True,
-        )
         self._scene: tuple[float, ...] = settings.task_scene
         self._chain = np.zeros((0, 3))
         self._count = -1
@@ -131,14 +131,31 @@ class SimulatedSource:
         number, rig = self._count, self._settings.rig
         self._count += 1
         shot = self.shot(np.random.default_rng((self._settings.seed, number)))
-        return Frame(
-            color=shot.color, depth_m=shot.depth_m, camera_matrix=rig.left.matrix, base_from_camera=rig.base_from_camera,
-            t_s=number / self._settings.rate_hz, right=shot.right, baseline_m=rig.baseline_m,
-            disparity_std_px=rig.disparity_std_px,
-        )  # fmt: skip
+        return make_frame(shot, rig, number / self._settings.rate_hz)
 
-    def shot(self, noise: np.random.Generator) -> RenderedFrame:
-        """Return the current frame, with its truth."""
+    def shot(self, noise: np.random.Generator, rig: StereoRig | None = None) -> RenderedFrame:
+        """Return the current frame, with its truth.
+
+        Args:
+            noise: Noise of the pictures.
+            rig: A rig elsewhere that takes it; `None`: the source's own.
+        """
+        scene, settings = self.compose(), self._settings
+        if rig is not None:
+            own = settings.rig.base_from_camera
+            scene = view_from(scene, np.linalg.inv(rig.base_from_camera) @ own)
+        studio = FrameRenderer(
+            rig=rig or settings.rig,
+            scene=settings.surroundings,
+            stereo=settings.stereo,
+            surfaces=NO_PHOTOGRAPHS,
+            depth="matched",
+            pair=True,
+        )
+        return studio.shot(scene, noise)
+
+    def compose(self) -> Scene:
+        """Return the present scene in the coordinates of the source's own camera."""
         settings, kind = self._settings, self._settings.surroundings
         chance = np.random.default_rng(settings.seed)  # the same stains and light for every frame
         x, y, z, yaw, scale, radius_m = self._scene
@@ -162,7 +179,7 @@ class SimulatedSource:
             pose, half, draw_block_materials(kind.block, half, (hole,), (), chance), (hole,)
         )
         down_m = float((from_base[:3, 3]) @ settings.rig.down_in_camera)
-        scene = add_surroundings(
+        return add_surroundings(
             kind,
             settings.rig,
             block,
@@ -172,7 +189,6 @@ class SimulatedSource:
             chance,
             max(down_m, 0.3),
         )
-        return self._studio.shot(scene, noise)
 
     def _arm(self, from_base: np.ndarray) -> list[Solid]:
         """Return the links as cylinders from point to point, in camera coordinates."""

@@ -20,6 +20,7 @@ SMALLEST_VARIANCE_M2 = 1e-8
 class VarianceFusion:
     """Average the detections of each hole by their variance, with a limited memory.
 
+    An unseen hole ages: its covariance grows until it is seen again.
     The error of the camera's pose is the same in all frames (`HolePose.shared_m2`): it weighs
     nothing, and averaging does not reduce it.
 
@@ -29,6 +30,8 @@ class VarianceFusion:
         confirm: Detections from which a hole is confirmed.
         stale_s: Age from which a hole is stale.
         forget_s: Age from which a hole is forgotten.
+        drift_m_sqrt_s: Standard deviation of each coordinate one second after a detection, by which
+            the base may have moved against the hole; it grows with the square root of the time.
     """
 
     near_m: float
@@ -36,6 +39,7 @@ class VarianceFusion:
     confirm: int
     stale_s: float
     forget_s: float
+    drift_m_sqrt_s: float
 
     def check(self) -> None:
         if not 0 < self.stale_s <= self.forget_s or min(self.memory, self.confirm) < 1:
@@ -43,8 +47,11 @@ class VarianceFusion:
                 "tracker: expected 0 < stale_s <= forget_s, memory and confirm of 1 or more, got "
                 f"{self.stale_s}, {self.forget_s}, {self.memory} and {self.confirm}"
             )
-        if self.near_m <= 0:
-            raise ConfigError(f"tracker: expected near_m above 0, got {self.near_m}")
+        if self.near_m <= 0 or self.drift_m_sqrt_s < 0:
+            raise ConfigError(
+                "tracker: expected near_m above 0 and drift_m_sqrt_s of 0 or more, got "
+                f"{self.near_m} and {self.drift_m_sqrt_s}"
+            )
 
     def build(self) -> FusionTracker:
         """Return a tracker that has seen nothing yet."""
@@ -100,7 +107,7 @@ class FusionTracker:
             self._num_names += 1
             self._tracks[self._num_names] = _Track(hole, weight, own_cov_m2, 1, t_s)
             return
-        old = self._tracks[name]
+        old = self._age(self._tracks[name], t_s)
         # The cap lets a base that was moved be noticed within a few detections.
         before = min(old.weight, self.settings.memory * weight)
         total = before + weight
@@ -111,6 +118,13 @@ class FusionTracker:
         # Axis and radius are the newest: they are not averaged.
         pose = replace(hole, center_m=center_m)
         self._tracks[name] = _Track(pose, total, own_cov_m2, old.num_frames + 1, t_s)
+
+    def _age(self, track: _Track, t_s: float) -> _Track:
+        """Return a track as it is known at `t_s`: a random walk since its last detection."""
+        variance_m2 = self.settings.drift_m_sqrt_s**2 * max(0.0, t_s - track.seen_s)
+        weight = 1.0 / (1.0 / track.weight + variance_m2)
+        own_cov_m2 = track.own_cov_m2 + variance_m2 * np.eye(3)
+        return replace(track, weight=weight, own_cov_m2=own_cov_m2)
 
     def _find_nearest(self, hole: HolePose) -> int | None:
         """Return the name of the track at the place of a detection, `None` for none."""
@@ -123,6 +137,7 @@ class FusionTracker:
         return name if name is not None and distances_m[name] <= self.settings.near_m else None
 
     def _describe(self, name: int, track: _Track, t_s: float) -> TrackedHole:
+        track = self._age(track, t_s)
         shared_m2 = track.pose.shared_m2
         cov_m2 = track.own_cov_m2 if shared_m2 is None else track.own_cov_m2 + shared_m2
         return TrackedHole(

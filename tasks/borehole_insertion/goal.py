@@ -11,7 +11,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim import scene
 from tasks.borehole_insertion import BoreholeInsertion
 from tasks.classical import ClassicalController
-from tasks.process import ToolPoseOptions, ToolPoseProcess
+from tasks.options import ToolPoseOptions
+from tasks.process import ToolPoseProcess
 from tasks.starts import CandidateTargets, DrawTally, Uniform, draw_starts
 
 DOWN_RAD = math.pi / 2

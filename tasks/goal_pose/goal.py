@@ -9,7 +9,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim import scene
 from tasks.classical import ClassicalController
 from tasks.goal_pose import GoalPose
-from tasks.process import ToolPoseOptions, ToolPoseProcess
+from tasks.options import ToolPoseOptions
+from tasks.process import ToolPoseProcess
 from tasks.starts import CandidateTargets, DrawTally, Uniform, draw_starts
 
 BLOCK_AWAY_M = -20.0

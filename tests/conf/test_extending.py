@@ -24,7 +24,11 @@ from brokk_rl.modes.new import NewPackage, PackageRequest
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/extending.md").read_text()
 SHOWN = dict(re.findall(r"^`mine/(\S+)`:\n\n```\w+\n(.*?)^```", PAGE, re.M | re.S))
-TRAINING = next(line for line in PAGE.splitlines() if line.startswith("brokk mode=train "))
+TRAINING = next(line for line in PAGE.splitlines() if line.startswith("brokk experiment="))
+SHORT = (
+    "rl.num_envs=8", "rl.num_starts=64", "rl.budget.max_seconds=3", "evaluation.episodes=16",
+)  # fmt: skip
+"""Changes of the page's training for a test: some seconds instead of a minute."""
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +56,7 @@ def site(
 
 def test_the_page_shows_the_files_of_a_new_package(project: Path) -> None:
     groups = {path.split("/")[1] for path in SHOWN if path.startswith("conf/")}
-    assert groups == {"actuator", "effect", "perception", "machine", "task"}
+    assert groups == {"actuator", "effect", "perception", "machine", "task", "experiment"}
     for name, text in SHOWN.items():
         assert (project / "mine" / name).read_text() == text
 
@@ -67,7 +71,7 @@ def test_a_new_package_passes_its_own_tests(project: Path, site: Path) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stdout
-    assert "6 passed" in done.stdout
+    assert "7 passed" in done.stdout
 
 
 def test_no_name_of_the_template_is_left(tmp_path: Path) -> None:
@@ -100,16 +104,25 @@ def test_a_folder_that_exists_is_left_alone(brokk: Callable[..., Any], tmp_path:
 def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machine) -> None:
     check_actuator(option("actuator", "rubber"), machine)
     check_task(option("task", "hold"), machine)
+    check_task(option("task", "trace"), machine)
 
 
 def test_its_options_are_listed(site: Path, brokk: Callable[..., Any]) -> None:
     out = brokk("mode=list").out
-    for text in ("rubber", "sag", "darkest", "two_links", "hold", "A planar arm of two links."):
+    for text in ("rubber", "sink", "darkest", "two_links", "hold", "A planar arm of two links."):
         assert text in out
 
 
 def test_all_of_it_trains_together(site: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
-    done = brokk(*shlex.split(TRAINING)[1:])
+    done = brokk(*shlex.split(TRAINING)[1:], *SHORT)
     assert done.code == 0, done.err
     evaluation = json.loads((tmp_path / "runs/mine/evaluation.json").read_text())
     assert evaluation["episodes"] == 16 and "success_strict" in evaluation
+    endings = evaluation["terminations"]
+    assert list(endings) == ["joint_limit", "strayed", "fault", "time_limit"]
+    assert sum(endings.values()) == 16
+    contract = json.loads((tmp_path / "runs/mine/policy.json").read_text())
+    assert contract["task"]["name"] == "trace" and contract["observation"]["size"] == 22
+    example = [sys.executable, str(ROOT / "examples/run_policy.py"), "runs/mine"]
+    out = subprocess.run(example, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert float(out.split()[-1]) < 1e-4

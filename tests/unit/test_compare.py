@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from brokk_rl.comparison import (
@@ -19,6 +20,14 @@ from brokk_rl.comparison import (
 )
 from brokk_rl.errors import ConfigError
 from brokk_rl.intervals import compute_student_interval, compute_wilson_interval
+from brokk_rl.seed_statistics import (
+    Method,
+    choose_baseline,
+    compute_differences,
+    compute_interquartile_mean,
+    format_latex,
+    summarise_methods,
+)
 
 
 def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any) -> None:
@@ -203,3 +212,75 @@ def test_a_row_says_only_what_most_others_do_not_share() -> None:
     assert describe_differences(
         [{"variation": {"task.memory": 13}}, {"variation": {"task.memory": 1}}]
     ) == ["memory 13", "memory 1"]
+
+
+def test_the_interquartile_mean_drops_the_outer_quarters() -> None:
+    # of 0.0, 0.1, …, 0.7 the two lowest and the two highest go: (0.2 + 0.3 + 0.4 + 0.5) / 4
+    strata = [np.array([0.0, 0.7, 0.2, 0.5]), np.array([0.6, 0.1, 0.4, 0.3])]
+    assert compute_interquartile_mean(strata, np.random.default_rng(0))[0] == pytest.approx(0.35)
+    assert compute_interquartile_mean([np.array([0.4])], np.random.default_rng(0)) == (0.4, None)
+
+
+def test_runs_are_drawn_again_within_their_stratum() -> None:
+    # each stratum has equal scores: no resample differs, unless strata are mixed
+    strata = [np.array([0.2, 0.2, 0.2]), np.array([0.8, 0.8, 0.8])]
+    mean, interval = compute_interquartile_mean(strata, np.random.default_rng(0))
+    assert mean == pytest.approx(0.5) and interval == pytest.approx((0.5, 0.5))
+
+
+@pytest.mark.parametrize(
+    ("strata", "mean", "interval"),
+    [
+        ([[0.2, 0.4, 0.95, 0.6], [0.9, 0.7, 0.8, 0.99]], 0.75, (0.55, 0.925)),
+        ([[0.2, 0.4, 0.95, 0.6, 0.7]], 1.7 / 3, (0.8 / 3, 2.6 / 3)),
+    ],
+)
+def test_interquartile_means_are_those_of_rliable(
+    strata: list[list[float]], mean: float, interval: tuple[float, float]
+) -> None:
+    # rliable 1.2.0: get_interval_estimates with aggregate_iqm, 50,000 resamples, numpy's seed 0
+    found, bounds = compute_interquartile_mean(
+        [np.array(scores) for scores in strata], np.random.default_rng(1)
+    )
+    assert found == pytest.approx(mean, abs=1e-9)
+    assert bounds == pytest.approx(interval, abs=0.006)
+
+
+def test_differences_are_those_of_the_same_seed_and_condition() -> None:
+    base = Method("trained", {"actuator": "lag"}, {"ideal": {0: 0.5, 1: 0.9}, "mlp": {0: 0.3}})
+    other = Method(
+        "trained", {"actuator": "mlp"}, {"ideal": {1: 1.0, 0: 0.7, 2: 0.0}, "mlp": {0: 0.7}}
+    )
+    assert compute_differences(other, base) == pytest.approx({0: 0.3, 1: 0.1})
+    summary = summarise_methods([base, other], base, np.random.default_rng(0))
+    assert summary[0]["difference"] is None
+    # mean 0.2, standard error 0.1, t(0.975, 1) = 12.706
+    assert summary[1]["difference"]["ci95"] == pytest.approx((0.2 - 1.2706, 0.2 + 1.2706), abs=1e-4)
+    assert choose_baseline([base, other], {"actuator": "mlp"}) is other
+    with pytest.raises(ConfigError, match=r"0 rows have them.*'actuator': 'lag'"):
+        choose_baseline([base, other], {"actuator": "lagg"})
+
+
+def test_the_latex_table_holds_names_that_tex_would_misread() -> None:
+    methods = [
+        Method("trained", {"actuator": name}, {"": {0: 0.5, 1: 0.7}})
+        for name in ("load_sensing", "50%")
+    ]
+    text = format_latex(summarise_methods(methods, methods[0], np.random.default_rng(0)))
+    assert r"load\_sensing & 2 & 0.600" in text and r"50\% & 2" in text
+    assert text.startswith(r"\begin{tabular}") and r"\bottomrule" in text
+    rows = [line for line in text.splitlines() if line.endswith(r"\\")]
+    assert {row.count("&") - row.count(r"\&") for row in rows} == {5}
+
+
+def test_the_command_writes_the_tables_over_seeds(
+    sweep: Path, brokk: Callable[..., Any], tmp_path: Path
+) -> None:
+    words = ("mode=compare", f"compare.runs={sweep}", "session.out=compared")
+    done = brokk(*words, "compare.baseline={actuator: mlp}")
+    assert done.code == 0 and "interquartile mean" in done.out and "-0.600" in done.out
+    methods = json.loads((tmp_path / "compared/comparison.json").read_text())["methods"]
+    assert methods[0]["difference"]["by_seed"] == pytest.approx({"0": -0.7, "1": -0.5})
+    assert (tmp_path / "compared/seeds.png").read_bytes()[:4] == b"\x89PNG"
+    assert r"\toprule" in (tmp_path / "compared/comparison.tex").read_text()
+    assert brokk(*words, "compare.baseline={actuator: x}").code == 2

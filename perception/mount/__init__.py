@@ -1,0 +1,1 @@
+"""Mounts that carry a camera, and the choice of their next view."""

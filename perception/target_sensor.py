@@ -1,0 +1,351 @@
+"""Perception in the loop of a policy: a rendered camera on its mount, the finder and the tracker.
+
+Each environment has a camera of its own. At the camera's rate its view is rendered, with the block
+and the arm as they stand, and searched. What was found reaches the tracker after a delay. Then the
+next view is chosen. While the camera moves, its pictures are not used. The scene is rendered in a
+part of the picture around the expected hole: a person has pointed at the hole, as on the page.
+
+Axes: `N` environments, `J` joints.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.contracts.target import MotionPlan, TargetReading
+from brokk_rl.contracts.vision import BoreholeFinder, FinderSpec, HolePose, TrackedHole, TrackerSpec
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.machine import Machine
+from brokk_rl.parallel import map_parallel, use_workers
+from brokk_rl.spec import spec
+from perception.calibrate import transforms
+from perception.mount.mounts import CameraMount, CameraMountSpec
+from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
+from perception.mount.occlusion import ArmShape
+from perception.render.stereo_camera import StereoRig, place_rig
+from perception.sources.simulator import SimulatedCamera, make_frame
+
+LEAST_HINT_M = 1e-3
+"""Least error of a pointed place as the choice of a view takes it: nobody points better."""
+
+
+@spec
+class PerceivedTarget:
+    """Find the borehole in rendered pictures of a camera on a mount, in the loop of a policy.
+
+    Attributes:
+        camera: Rig, light and stereo; its scene is that of each episode.
+        finder: Finds boreholes.
+        tracker: Fuses their detections from all views.
+        mount: Carries the camera.
+        next_view: Chooses where it looks.
+        arm: Thickness of the arm in the pictures.
+        rate_hz: Frames a second.
+        delay_s: From the picture to the estimate.
+        window_px: Columns and rows of the picture that are rendered and searched.
+        hint_m: Error of the place at which a person has pointed, 1 sigma in each direction.
+        steady_rad_s: Fastest turn of the camera at which its pictures are sharp.
+        num_processes: Processes that render.
+    """
+
+    camera: SimulatedCamera
+    finder: FinderSpec
+    tracker: TrackerSpec
+    mount: CameraMountSpec
+    next_view: ExpectedCovariance
+    arm: ArmShape
+    rate_hz: float
+    delay_s: float
+    window_px: tuple[int, int]
+    hint_m: float
+    steady_rad_s: float
+    num_processes: int
+
+    def check(self) -> None:
+        if self.rate_hz <= 0 or min(self.delay_s, self.hint_m) < 0 or self.steady_rad_s <= 0:
+            raise ConfigError(
+                "target: expected rate_hz and steady_rad_s above 0, delay_s and hint_m of 0 or more"
+            )
+        if min(self.window_px) < 64 or self.num_processes < 1:
+            raise ConfigError(
+                "target: expected window_px of 64 or more and num_processes of 1 or more, got "
+                f"{self.window_px} and {self.num_processes}"
+            )
+
+    def sense(self, machine: Machine, num_envs: int, seed: int) -> PerceivedTargets:
+        """Return the cameras of `num_envs` environments."""
+        return PerceivedTargets(self, machine, num_envs, seed)
+
+
+@dataclass(frozen=True)
+class _Exposure:
+    """One picture to be taken: all that a process needs for it."""
+
+    task_scene: tuple[float, ...]
+    chain_m: np.ndarray
+    true_pose: np.ndarray
+    believed_pose: np.ndarray
+    corner_px: tuple[int, int]
+    t_s: float
+    seed: tuple[int, ...]
+
+
+class WatchedHole:
+    """The camera of one environment: its mount, its tracker and what is known.
+
+    Attributes:
+        position: Position of the mount, `(A,)`.
+        arrives_s: Time from which its pictures are used.
+        num_missed: Last pictures from this position in which nothing was found.
+        choice: The last choice of a view, `None` before the first.
+        hole: The tracked hole, `None` before the first detection.
+        history: What happened at each frame, JSON data.
+    """
+
+    def __init__(
+        self,
+        settings: PerceivedTarget,
+        mount: CameraMount,
+        task_scene: np.ndarray,
+        generator: np.random.Generator,
+    ) -> None:
+        self._settings, self._mount, self._generator = settings, mount, generator
+        self.task_scene = tuple(float(value) for value in task_scene)
+        self.true_m = np.array(self.task_scene[:3])
+        self._hint_m = self.true_m + settings.hint_m * generator.standard_normal(3)
+        self._tracker = settings.tracker.build()
+        self._shared = mount.error.draw(generator, "shared")
+        self._view = mount.error.draw(generator, "view")
+        self._waiting: deque[tuple[float, Sequence[HolePose] | None, float]] = deque()
+        self.position, self.arrives_s = mount.start.copy(), 0.0
+        self.num_missed = 0
+        self.choice: ViewChoice | None = None
+        self.hole: TrackedHole | None = None
+        self.history: list[dict[str, Any]] = []
+
+    @property
+    def center_m(self) -> np.ndarray:
+        """Where the hole is believed, `(3,)`: as tracked, else where the person pointed."""
+        return self._hint_m if self.hole is None else self.hole.pose.center_m
+
+    def believe(self) -> HoleBelief:
+        """Return what is known, for the choice of a view."""
+        if self.hole is not None:
+            return HoleBelief.take(self.hole)
+        std_m = max(self._settings.hint_m, LEAST_HINT_M)
+        return HoleBelief.expect(self._hint_m, self.task_scene[5], std_m)
+
+    def move(self, choice: ViewChoice, t_s: float) -> None:
+        """Send the mount to a chosen view."""
+        self.choice = choice
+        if choice.view.is_moving:
+            self.position, self.arrives_s = choice.position, t_s + choice.view.travel_s
+            self._view = self._mount.error.draw(self._generator, "view")
+            self.num_missed = 0
+
+    def expose(
+        self,
+        q: np.ndarray,
+        measured_q: np.ndarray,
+        chain_m: np.ndarray,
+        t_s: float,
+        seed: tuple[int, ...],
+    ) -> _Exposure | None:
+        """Return the picture to take, `None` where the hole is out of the picture."""
+        rig, window = self._settings.camera.rig, self._settings.window_px
+        believed = self._mount.locate(self.position, measured_q)
+        true = self._mount.locate(self.position, q)
+        true = transforms.apply_motion(transforms.apply_motion(true, self._shared), self._view)
+        away_m = np.linalg.inv(believed) @ np.append(self.center_m, 1.0)
+        if away_m[2] < self._settings.camera.stereo.nearest_m:
+            return None
+        pixel = rig.left.project(away_m[:3])
+        size = np.array([rig.width, rig.height])
+        if (pixel < 0).any() or (pixel > size - 1).any():
+            return None
+        corner = np.clip(np.round(pixel - np.array(window) / 2), 0, size - window).astype(int)
+        return _Exposure(
+            self.task_scene, chain_m, true, believed, (int(corner[0]), int(corner[1])), t_s, seed
+        )
+
+    def wait_for(self, holes: Sequence[HolePose] | None, t_s: float) -> None:
+        """Take the holes of a picture at `t_s`, known after the delay; `None`: no sharp picture."""
+        self._waiting.append((t_s + self._settings.delay_s, holes, t_s))
+
+    def learn(self, now_s: float) -> None:
+        """Hand to the tracker what has become known by now."""
+        while self._waiting and self._waiting[0][0] <= now_s + 1e-9:
+            _, holes, t_s = self._waiting.popleft()
+            if holes is not None and t_s >= self.arrives_s - 1e-9:
+                self.num_missed = 0 if holes else self.num_missed + 1
+            tracked = self._tracker.update(holes or (), t_s)
+            near = []
+            for hole in tracked:
+                if np.linalg.norm(hole.pose.center_m - self._hint_m) < 4 * self._settings.hint_m:
+                    near.append(hole)
+            # The person's choice: of several holes the surest that was seen most often.
+            self.hole = max(near, key=lambda hole: hole.num_frames, default=self.hole)
+            self.history.append(self._describe(holes or (), t_s))
+
+    def _describe(self, holes: Sequence[HolePose], t_s: float) -> dict[str, Any]:
+        known = self.hole
+        error_m = None if known is None else known.pose.center_m - self.true_m
+        reason = None if self.choice is None else self.choice.view.explain()
+        return {
+            "reason": reason,
+            "t_s": round(t_s, 3),
+            "seen": len(holes) > 0,
+            "view": self._mount.describe(self.position),
+            "error_m": None if error_m is None else error_m.round(6).tolist(),
+            "std_m": None if known is None else round(known.std_m, 6),
+        }
+
+
+class PerceivedTargets:
+    """See `PerceivedTarget` and `brokk_rl.contracts.target.TargetSensor`."""
+
+    def __init__(
+        self, settings: PerceivedTarget, machine: Machine, num_envs: int, seed: int
+    ) -> None:
+        self._settings, self._machine, self._seed = settings, machine, seed
+        self._mount = settings.mount.build(machine)
+        rig = settings.camera.rig
+        self._planner = settings.next_view.build(machine, self._mount, rig, settings.arm)
+        self._finder = settings.finder.build()
+        self._attended = np.ones(num_envs, bool)
+        self._steps = np.zeros(num_envs, int)
+        self._before: np.ndarray | None = None
+        self._episodes = np.zeros(num_envs, int)
+        self.watched: list[WatchedHole] = []
+        self.ended: list[WatchedHole] = []
+        """Episodes that have ended, in this order."""
+        self._every = max(1, round(1.0 / (settings.rate_hz * machine.period_s)))
+
+    def reset(self, mask: np.ndarray, start: dict[str, np.ndarray]) -> None:
+        """Begin new episodes; see `TargetSensor.reset`."""
+        for number in np.flatnonzero(mask):
+            stream = (self._seed, int(number), int(self._episodes[number]))
+            generator = np.random.default_rng(stream)
+            eye = WatchedHole(self._settings, self._mount, start["scene"][number], generator)
+            if len(self.watched) <= number:
+                self.watched.append(eye)
+            else:
+                if self._attended[number]:
+                    self.ended.append(self.watched[number])
+                self.watched[number] = eye
+            self._steps[number] = 0
+            self._episodes[number] += 1
+
+    def forget(self) -> None:
+        """Forget all episodes; see `TargetSensor.forget`."""
+        self.watched, self.ended = [], []
+        self._episodes[:], self._attended[:] = 0, True
+
+    def attend(self, mask: np.ndarray) -> None:
+        """Sense in some environments alone; see `TargetSensor.attend`."""
+        self._attended = mask.copy()
+
+    def read(self, q: np.ndarray, measured_q: np.ndarray, plan: MotionPlan) -> TargetReading:
+        """Return the estimates; see `TargetSensor.read`."""
+        due = np.flatnonzero(self._attended & (self._steps % self._every == 0))
+        if len(due):
+            self._look(due, q, measured_q)
+            self._choose_views(due, plan)
+        self._before = q.copy()
+        now_s = self._steps * self._machine.period_s
+        for number in np.flatnonzero(self._attended):
+            self.watched[number].learn(float(now_s[number]))
+        self._steps[self._attended] += 1
+        target_m = np.stack([eye.center_m for eye in self.watched])
+        is_known = np.array([eye.hole is not None for eye in self.watched])
+        return TargetReading(target_m, is_known & self._attended)
+
+    def summarize(self) -> dict[str, Any]:
+        """Return figures of the episodes; see `TargetSensor.summarize`."""
+        frames = [frame for eye in self.ended for frame in eye.history]
+        known = [frame for frame in frames if frame["error_m"] is not None]
+        last = [eye.history[-1] for eye in self.ended if eye.history and eye.hole is not None]
+        errors_m = [float(np.linalg.norm(frame["error_m"])) for frame in last]
+        return {
+            "frames": len(frames),
+            "seen_share": float(np.mean([frame["seen"] for frame in frames])) if frames else None,
+            "known_share": len(known) / len(frames) if frames else None,
+            "never_seen": sum(eye.hole is None for eye in self.ended),
+            "last_error_m": {
+                "median": float(np.median(errors_m)) if errors_m else None,
+                "p95": float(np.quantile(errors_m, 0.95)) if errors_m else None,
+            },
+        }
+
+    def _look(self, due: np.ndarray, q: np.ndarray, measured_q: np.ndarray) -> None:
+        """Take and search the pictures that are due."""
+        asked: list[tuple[int, _Exposure]] = []
+        for number in due:
+            eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
+            seed = (self._seed, int(number), int(self._steps[number]))
+            chain_m = self._settings.arm.trace(self._machine, q[number])
+            if t_s < eye.arrives_s - 1e-9 or not self._is_steady(eye, int(number), q):
+                eye.wait_for(None, t_s)
+                continue
+            exposure = eye.expose(q[number], measured_q[number], chain_m, t_s, seed)
+            if exposure is None:
+                eye.wait_for((), t_s)
+            else:
+                asked.append((int(number), exposure))
+        with use_workers(self._settings.num_processes):
+            found = map_parallel(
+                lambda item: _search(self._settings, self._mount, self._finder, item[1]), asked
+            )
+        for (number, exposure), holes in zip(asked, found, strict=True):
+            self.watched[number].wait_for(holes, exposure.t_s)
+
+    def _is_steady(self, eye: WatchedHole, number: int, q: np.ndarray) -> bool:
+        """Return whether the arm does not swing the camera faster than a picture allows."""
+        if self._before is None or self._steps[number] == 0:
+            return True
+        poses = self._mount.locate(eye.position, np.stack([self._before[number], q[number]]))
+        if poses.ndim == 2:
+            return True
+        cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1.0) / 2.0
+        turn_rad = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        return turn_rad <= self._settings.steady_rad_s * self._machine.period_s
+
+    def _choose_views(self, due: np.ndarray, plan: MotionPlan) -> None:
+        s = self._settings.next_view
+        target_m = np.stack([eye.center_m for eye in self.watched])
+        if len(self._mount.views) < 2:
+            return
+        step_s = s.horizon_s / (s.num_times - 1)
+        planned = plan(target_m, s.num_times, step_s)
+        for number in due:
+            eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
+            if t_s >= eye.arrives_s - 1e-9:  # one motion at a time
+                choice = self._planner.choose(
+                    eye.believe(), eye.position, planned[number], eye.num_missed
+                )
+                eye.move(choice, t_s)
+
+
+def _search(
+    settings: PerceivedTarget, mount: CameraMount, finder: BoreholeFinder, exposure: _Exposure
+) -> list[HolePose]:
+    """Render a picture, and return the holes that are found in it, in the base frame."""
+    rig: StereoRig = settings.camera.rig
+    true = place_rig(rig, exposure.true_pose, exposure.corner_px, settings.window_px)
+    source = settings.camera.build()
+    source.show(exposure.task_scene, exposure.chain_m)
+    shot = source.shot(np.random.default_rng(exposure.seed), true)
+    frame = replace(
+        make_frame(shot, true, exposure.t_s),
+        base_from_camera=exposure.believed_pose,
+        camera_cov=mount.error.covariance,
+    )
+    try:
+        return list(finder.find(frame).in_base_frame(frame).holes)
+    except FrameError:  # the arm fills the picture: no depth
+        return []

@@ -1,0 +1,224 @@
+"""Every `brokk …` command of the pages composes as typed, with values that its specs accept."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import hydra
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from packages import forget_package, install_package
+
+from brokk_rl import cli, extensions, registry
+from brokk_rl.modes.new import NewPackage, PackageRequest
+
+ROOT = Path(__file__).parents[2]
+NEWCOMERS = (ROOT / "README.md", *ROOT.glob("docs/tutorials/*.md"))
+"""Pages whose commands are checked in every run of the tests; those of the others are slow."""
+OTHERS = (
+    ROOT / "CONTRIBUTING.md",
+    ROOT / "benchmarks/README.md",
+    *ROOT.glob("docs/*.md"),
+    *ROOT.glob("docs/tutorials/*.ipynb"),
+)
+BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.M | re.S)
+INLINE = re.compile(r"`((?:\.venv/bin/)?brokk [^`]+)`")
+NOT_COMPOSED = {
+    "session.seed=<random, 1000 or more>": "a rule for a number instead of one",
+    "session.seed=<below 1000>": "a rule for a number instead of one",
+    "effect.<name>.<number>=<size>": "a pattern for any number of any effect",
+    "-sc install=": "completion of a shell composes nothing",
+    "mode=<mode>": "any mode",
+    "mode=X": "any mode",
+    "group=option": "any group",
+    "hydra/launcher=": "Hydra warns of the launcher's schema; brokk silences that",
+    "mine.terms:": "a function that the reader writes",
+    "search=": "its sweeper comes with the extra `optuna`",
+}
+"""Parts of commands that stand for something that does not compose, and the reason."""
+WITHOUT_VALUES = {
+    "mode=identify fit=coupled …": "the values before the dots stand in the line above it",
+    "mode=diagnose …": "the values before the dots stand in the block above it",
+    '"$': "a variable of the shell holds a value that must be given",
+}
+"""Parts of commands that leave out such values: groups and fields are checked alone."""
+
+
+def find_commands(page: Path) -> Iterator[tuple[str, bool]]:
+    """Yields each command of a page, and whether it stands in a block, whole and to be typed."""
+    text = page.read_text()
+    if page.suffix == ".ipynb":
+        cells = ["".join(cell["source"]) for cell in json.loads(text)["cells"]]
+        for cell in cells:
+            for command in re.findall(r"^!(brokk .*)", cell.replace("\\\n", " "), re.M):
+                yield re.split(r" 2>", command)[0], True
+        text = "\n".join(cells)
+    for block in BLOCK.findall(text):
+        for line in block.replace("\\\n", " ").splitlines():
+            found = re.search(r"(?:^|[ /])(brokk(?: .*)?)$", re.sub(r"(^|\s)#.*", "", line).strip())
+            if found:
+                yield found[1], True
+    for command in INLINE.findall(BLOCK.sub("", text)):
+        yield command.removeprefix(".venv/bin/"), False
+
+
+def read_arguments(command: str) -> list[str]:
+    """Returns the arguments with a value in the place of each placeholder."""
+    text = re.split(r" [|;&]", command)[0].replace("…", "")
+    text = re.sub(r"<([\w, ]+)[|.][^>]*>", r"\1", text)  # <mlp|ideal>, <1..5>
+    text = re.sub(r"<([^>]+)>", lambda found: re.sub(r"\W", "_", found[1]), text)
+    text = re.sub(r"\"\$\w+\"|\$\{(\w+)[^}]*\}|\$(\w+)", r"\1\2", text)
+    found = []
+    for word in shlex.split(text)[1:]:
+        found.append(word[1:-1] if word.startswith("[") else word)  # [session.seed=1]: if you like
+    return found
+
+
+def list_jobs(arguments: list[str]) -> list[list[Override]]:
+    """Returns the overrides of a command; of a sweep those of the first and the last job."""
+    words = [word for word in arguments if not word.startswith("-")]
+    write_option_files(words)
+    extensions.register_options(words)
+    parser = OverridesParser.create()
+    first, last = [], []
+    for override in parser.parse_overrides(words):
+        if not override.is_sweep_override():
+            first.append(override)
+            last.append(override)
+            continue
+        values = list(override.sweep_string_iterator())
+        name = str(override.input_line).partition("=")[0]
+        first += parser.parse_overrides([f"{name}={values[0]}"])
+        last += parser.parse_overrides([f"{name}={values[-1]}"])
+    same = [one.input_line for one in first] == [one.input_line for one in last]
+    return [first] if same else [first, last]
+
+
+@dataclass
+class Bundle:
+    """Commands with the same options that set no value differently: they compose together.
+
+    Attributes:
+        options: Their options of groups.
+        whole: All values that must be given are given.
+        values: The values of all of them, by key.
+        jobs: The overrides of each of them, by command.
+    """
+
+    options: frozenset[str]
+    whole: bool
+    values: dict[str, str]
+    jobs: dict[str, list[str]]
+
+    def take(self, command: str, job: list[Override], groups: set[str], whole: bool) -> bool:
+        """Add a command and return true, if it fits."""
+        options, values = split_overrides(job, groups)
+        if (options, whole) != (self.options, self.whole):
+            return False
+        if any(self.values.get(key, value) != value for key, value in values.items()):
+            return False
+        self.values |= values
+        self.jobs[command] = [str(one.input_line) for one in job]
+        return True
+
+    def find_faults(self) -> Iterator[str]:
+        """Yields the commands that do not compose, with the message."""
+        if explain_fault([*self.options, *self.values.values()], self.whole):
+            for command, job in self.jobs.items():
+                if fault := explain_fault(job, self.whole):
+                    yield f"{command}\n    {fault}"
+
+
+def split_overrides(job: list[Override], groups: set[str]) -> tuple[frozenset[str], dict[str, str]]:
+    """Returns the options of groups, and the values by key; each has folders of its own."""
+    options, values = set(), {}
+    for override in job:
+        line, key = str(override.input_line), str(override.key_or_group)
+        if key in groups:
+            options.add(line)
+        else:
+            values[key] = "session.out=folder" if key == "session.out" else line
+    return frozenset(options), values
+
+
+def explain_fault(overrides: list[str], whole: bool) -> str | None:
+    """Returns why a command does not compose, `None` if it does."""
+    try:
+        cfg = hydra.compose("config", overrides=overrides)
+        if whole:
+            cli.check_values(cfg)
+    except Exception as error:
+        return cli.explain(error) or repr(error)
+    return None
+
+
+def find_faults(pages: Sequence[Path]) -> list[str]:
+    """Returns the commands of these pages that do not compose, with the message."""
+    bundles: list[Bundle] = []
+    groups = {option.group for option in registry.list_options()}
+    commands = dict.fromkeys(found for page in pages for found in find_commands(page))
+    for command, in_block in commands:
+        if any(part in command for part in NOT_COMPOSED):
+            continue
+        whole = in_block and not any(part in command for part in WITHOUT_VALUES)
+        for job in list_jobs(read_arguments(command)):
+            if not any(bundle.take(command, job, groups, whole) for bundle in bundles):
+                options, _ = split_overrides(job, groups)
+                bundles.append(Bundle(options, whole, {}, {}))
+                assert bundles[-1].take(command, job, groups, whole)
+    return [fault for bundle in bundles for fault in bundle.find_faults()]
+
+
+def write_option_files(overrides: list[str]) -> None:
+    """Puts a shipped option in the place of each file that a command names by `group=@<file>`."""
+    for override in overrides:
+        group, _, value = override.partition("=")
+        for name in re.findall(r"@([\w./]+\.yaml)", value):
+            options = [one for one in registry.list_options() if one.group == group.split("@")[0]]
+            same = [one for one in options if one.name == Path(name).stem]
+            path = Path(name)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text((same or options)[0].path.read_text())
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """An empty working directory beside the package `mine` of `mode=new`, installed."""
+    site, projects = (tmp_path_factory.mktemp(name) for name in ("site", "projects"))
+    forget_package("mine")
+    NewPackage(new=PackageRequest(name="mine", folder=str(projects))).run()
+    package = projects / "mine/mine"
+    with pytest.MonkeyPatch.context() as patch:
+        files = {str(path.relative_to(package)): path.read_text() for path in package.rglob("*.*")}
+        files["conf/machine/arm.yaml"] = files[
+            "conf/machine/two_links.yaml"
+        ]  # made in the tutorial
+        install_package(site, "mine", files, patch)
+        extensions.register_options([])
+        patch.chdir(tmp_path_factory.mktemp("desk"))
+        with hydra.initialize_config_module("conf", version_base="1.3"):
+            yield
+
+
+def test_commands_for_newcomers_compose(desk: None) -> None:
+    assert not find_faults(NEWCOMERS)
+
+
+@pytest.mark.slow
+def test_commands_of_the_other_pages_compose(desk: None) -> None:
+    assert not find_faults(OTHERS)
+
+
+def test_a_fault_of_one_command_is_named(tmp_path: Path, desk: None) -> None:
+    page = tmp_path / "page.md"
+    page.write_text(
+        "```\nbrokk mode=list\nbrokk mode=list list.group=task\nbrokk mode=list list.gruop=task\n```\n"
+    )
+    (fault,) = find_faults([page])
+    assert fault.startswith("brokk mode=list list.gruop=task\n")

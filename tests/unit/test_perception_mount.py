@@ -1,0 +1,188 @@
+"""A mount puts the camera where its axes say; the next view is the one that would tell the most."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from composed import every, option
+
+from brokk_rl.contracts.vision import HolePose
+from brokk_rl.errors import ConfigError
+from brokk_rl.kinematics import compute_link_pose, compute_tool_kinematics
+from brokk_rl.machine import Machine
+from perception.mount.next_view import HoleBelief
+from perception.mount.occlusion import Capsules, compute_visible_share, sample_circle
+from perception.render.scene_ranges import view_from
+from perception.render.stereo_camera import place_rig
+
+RIG = option("rig", "zed_2i_1080p")
+ARM = option("target", "perceived").arm
+UP = np.array([0.0, 0.0, 1.0])
+HOLE_M = np.array([2.6, 0.0, 0.75])
+
+
+def believe(std_m: float = 0.01) -> HoleBelief:
+    return HoleBelief.expect(HOLE_M, 0.05, std_m)
+
+
+def plan(machine: Machine, name: str, **fields: Any) -> tuple[Any, Any]:
+    mount = option("perception/mount", name, **fields).build(machine)
+    chooser = option("perception/next_view", "expected_covariance")
+    return mount, chooser.build(machine, mount, RIG, ARM)
+
+
+@every("perception/mount")
+def test_a_mount_is_at_its_start_at_once_and_later_elsewhere(name: str, machine: Machine) -> None:
+    mount = option("perception/mount", name).build(machine)
+    views, q = mount.views, machine.home
+    travel_s = mount.compute_travel_s(mount.start, np.concatenate([mount.start[None], views]))
+    assert travel_s[0] == 0.0
+    is_elsewhere = (np.abs(views - mount.start) > 0).any(-1)
+    assert ((travel_s[1:] > 0) == is_elsewhere).all()
+    poses = mount.locate(views[:, None], np.stack([q, q])[None])
+    poses = np.broadcast_to(poses, (len(views), 2, 4, 4))
+    turn = poses[..., :3, :3]
+    np.testing.assert_allclose(
+        turn @ np.swapaxes(turn, -1, -2), np.broadcast_to(np.eye(3), turn.shape), atol=1e-9
+    )
+    one = mount.locate(views[-1], q)
+    np.testing.assert_allclose(one, poses[-1, 0], atol=1e-12)
+    assert mount.describe(mount.start)
+
+
+def test_the_frame_of_a_link_is_that_of_the_tool_s_chain(machine: Machine) -> None:
+    q = np.array([0.3, -0.7, 0.5, 0.9, 0.4])
+    arm = compute_tool_kinematics(machine, q)
+    last = compute_link_pose(machine, q, machine.joint_names[-1])
+    np.testing.assert_allclose(last[:3, :3] @ machine.tip_m + last[:3, 3], arm.tip_in_base_m)
+    third = compute_link_pose(machine, q, machine.joint_names[2])
+    np.testing.assert_allclose(third[:3, 3], arm.joints_in_base_m[2])
+    with pytest.raises(ConfigError, match="q9"):
+        compute_link_pose(machine, q, "q9")
+
+
+def test_lift_and_pan_move_the_camera_as_worked_out_by_hand(machine: Machine) -> None:
+    mount = option("perception/mount", "mast").build(machine)
+    q = np.zeros(5)
+    q[0] = np.pi / 2
+    pose = mount.locate(np.array([1.5, np.pi / 2]), q)
+    # foot (0.05, 0.33) turned by 90 degrees with the tower, 0.62 m and the lift above the ground
+    np.testing.assert_allclose(pose[:3, 3], [-0.33, 0.05, 0.62 + 1.5], atol=1e-9)
+    # tower and pan together turn it to face backwards, 0.6 rad down
+    np.testing.assert_allclose(pose[:3, 2], [-np.cos(0.6), 0.0, -np.sin(0.6)], atol=1e-9)
+
+
+def test_a_rod_hides_exactly_the_part_of_the_rim_behind_it() -> None:
+    camera, rim = np.array([0.0, 0.0, 2.0]), sample_circle(np.zeros(3), UP, 0.1)
+    # half way up, a rod over the half x < 0: it looks twice as large
+    rod = Capsules(np.array([[-0.06, -1.0, 1.0]]), np.array([[-0.06, 1.0, 1.0]]), np.array([0.05]))
+    behind = np.abs(rim[:, 0] / 2 + 0.06) < 0.05
+    share = compute_visible_share(camera, rim, rod)
+    assert 0.3 < behind.mean() < 0.7
+    assert share == pytest.approx(1.0 - behind.mean(), abs=1 / len(rim))
+    aside = np.array([3.0, 0.0, 2.0])
+    assert compute_visible_share(np.stack([camera, aside]), rim, rod)[1] == 1.0
+
+
+def test_the_next_view_sees_a_hole_that_the_arm_will_hide(machine: Machine) -> None:
+    mount, planner = plan(machine, "hand_placed", move_s=1.0)
+    # the arm comes to rest between the first place and the hole
+    q = np.array([0.0, -0.6, 1.2, 0.8, 0.3])
+    between = (mount.locate(mount.start, q)[:3, 3] + 3 * HOLE_M) / 4
+    planner._arm = _Wall(between)
+    view = planner.choose(believe(), mount.start, np.stack([q] * 7)).view
+    assert view.is_moving and view.name in ("right", "beyond")
+    assert view.seen_before_s == 0.0 and view.seen_s > 3.0
+    assert view.std_m < view.std_before_m
+    assert "Camera moves" in view.explain() and view.name in view.explain()
+
+
+class _Wall:
+    """A ball before the first place, in the place of an arm."""
+
+    def __init__(self, center_m: np.ndarray) -> None:
+        self._center_m = center_m
+
+    def cover(self, machine: Machine, q: np.ndarray) -> Capsules:
+        ends = np.broadcast_to(self._center_m, (len(q), 1, 3))
+        return Capsules(ends, ends + 1e-3, np.array([0.1]))
+
+
+def test_a_camera_that_sees_the_hole_as_well_as_any_stays(machine: Machine) -> None:
+    mount, planner = plan(machine, "hand_placed")
+    q = np.stack([machine.home] * 7)
+    view = planner.choose(believe(), mount.start, q).view
+    assert not view.is_moving and view.travel_s == 0.0
+    assert "stays" in view.explain()
+
+
+def test_what_is_not_seen_ages_in_the_tracker_and_is_corrected_by_the_next_view() -> None:
+    fusion = replace(option("perception/tracker", "fusion"), drift_m_sqrt_s=0.001)
+    cov = 0.001**2 * np.eye(3)
+    pose = HolePose(HOLE_M, UP, 0.05, cov, np.zeros((3, 3)), "base", 0.9, 0.0)
+    tracker = fusion.build()
+    tracker.update([pose], 0.0)
+    (hole,) = tracker.update([], 8.0)
+    # a random walk: 1 mm² of its own, 1 mm² more in each second
+    assert hole.std_m == pytest.approx(0.003)
+    np.testing.assert_allclose(hole.pose.cov_m2, 9e-6 * np.eye(3))
+    moved = replace(pose, center_m=HOLE_M + np.array([0.01, 0.0, 0.0]))
+    (hole,) = tracker.update([moved], 8.0)
+    # weights 1 to 9
+    assert hole.pose.center_m[0] == pytest.approx(HOLE_M[0] + 0.009)
+    assert hole.std_m == pytest.approx(np.sqrt(0.9) * 0.001)
+
+
+def test_a_part_of_a_picture_from_elsewhere_shows_the_same_points() -> None:
+    pose = RIG.base_from_camera.copy()
+    pose[:3, 3] += [0.1, -0.4, 0.3]
+    part = place_rig(RIG, pose, (700, 300), (448, 336))
+    point = np.linalg.inv(pose) @ np.append(HOLE_M, 1.0)
+    whole = RIG.left.project(point[:3])
+    np.testing.assert_allclose(part.left.project(point[:3]), whole - [700, 300])
+    assert (part.width, part.height) == (448, 336)
+    np.testing.assert_array_equal(part.base_from_camera, pose)
+
+
+def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:
+    source = option("perception/source", "simulator").build()
+    scene = source.compose()
+    motion = np.linalg.inv(RIG.base_from_camera)
+    seen = view_from(scene, motion @ RIG.base_from_camera)
+    assert seen.block is not None and scene.block is not None
+    np.testing.assert_allclose(seen.block.pose.center_m, scene.block.pose.center_m, atol=1e-12)
+    # in the base frame the block's top is level, and the sun is where it was
+    level = view_from(scene, RIG.base_from_camera)
+    assert level.block is not None
+    np.testing.assert_allclose(level.block.pose.rotation[:, 2], UP, atol=1e-9)
+    np.testing.assert_allclose(
+        level.light.to_sun, RIG.base_from_camera[:3, :3] @ scene.light.to_sun
+    )
+    assert any(solid is level.block for solid in level.solids)
+
+
+def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself(
+    machine: Machine,
+) -> None:
+    mount, planner = plan(machine, "hand_placed", move_s=1.0)
+    q = np.stack([machine.home] * 7)
+    before = planner.choose(believe(), mount.start, q, num_missed=0)
+    after = planner.choose(believe(), mount.start, q, num_missed=8)
+    assert not before.view.is_moving
+    assert after.view.is_moving and after.position[0] != mount.start[0]
+
+
+def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) -> None:
+    mount, planner = plan(machine, "mast")
+    for q1 in (-1.2, 0.0, 1.2):
+        q = machine.home.copy()
+        q[0] = q1
+        chosen = planner.choose(believe(), mount.start, np.stack([q] * 7))
+        ahead = mount.locate(chosen.position, q)[:3, 2]
+        camera_m = mount.locate(chosen.position, q)[:3, 3]
+        away = HOLE_M - camera_m
+        bearing = np.arctan2(away[1], away[0]) - np.arctan2(ahead[1], ahead[0])
+        assert abs(np.angle(np.exp(1j * bearing))) < 0.5
