@@ -122,11 +122,6 @@ class ObservedTerm:
         for name in ("noise", "bias"):
             require_number(f"{name} of the {where}", getattr(self, name), least=0)
 
-    def __call__(self, state: TermState) -> torch.Tensor:
-        """Return the newest sample without error, `(N, K)`."""
-        value = resolve_name(self.function)(state)
-        return value[:, None] if value.dim() == 1 else value
-
 
 @spec
 class HeldCriterion:
@@ -146,10 +141,6 @@ class HeldCriterion:
         require_function("success criterion", self.function)
         require_number("task.success.share", self.share, above=0, most=1)
         require_number("task.success.after_s", self.after_s, least=0)
-
-    def __call__(self, state: TermState) -> torch.Tensor:
-        """Return where the criterion holds in this step, `(N,)` bool."""
-        return resolve_name(self.function)(state)
 
 
 @spec
