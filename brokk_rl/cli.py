@@ -46,17 +46,8 @@ log = logging.getLogger(__name__)
 
 
 CHECKED_FIRST = (
-    "session",
-    "machine",
-    "sim",
-    "task",
-    "rl",
-    "evaluation",
-    "tracking",
-    "excitation",
-    "collect",
-    "identify",
-    "play",
+    "session machine sim task rl evaluation tracking excitation collect identify play bench subject "
+    "diagnosis compare convert log inspect observe perceive render label twin study"
 )
 """Nodes whose specs are checked before the mode is imported, and torch with it: their modules do
 without."""
@@ -181,7 +172,7 @@ def check_values(cfg: DictConfig) -> None:
     Raises:
         ConfigError: A value is bad, or one that must be given is not.
     """
-    for name in CHECKED_FIRST:
+    for name in CHECKED_FIRST.split():
         node = OmegaConf.select(cfg, name, throw_on_missing=False)
         if not isinstance(node, DictConfig):
             continue

@@ -8,7 +8,6 @@ measured is read from the table, so that a stopped sweep goes on.
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -19,10 +18,10 @@ from typing import Any
 
 from rich.table import Table
 
-from brokk_rl.bounds import require_number
 from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
 from brokk_rl.plot import BLUE, ORANGE, make_figure, remove_frame
+from brokk_rl.rl.benchmark_sizes import KEYS, SuccessSweep
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger
 from brokk_rl.rl.runner import TrainingRunner
@@ -30,7 +29,6 @@ from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
 from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
@@ -41,43 +39,6 @@ WINDOW = 1024
 lucky iteration does not count."""
 TABLE = "success_sweep.jsonl"
 """One line for each training that was measured."""
-KEYS = ("num_envs", "epochs", "mini_batches", "seed")
-
-
-@spec
-class SuccessSweep:
-    """Sizes of a training over which the time to success is measured.
-
-    Attributes:
-        num_envs: Numbers of environments, of each process.
-        epochs: Passes over a rollout (`num_learning_epochs`).
-        mini_batches: Mini-batches of a pass (`num_mini_batches`).
-        seeds: Seeds of each point.
-        max_seconds: Longest training; one that passes the highest level ends earlier.
-    """
-
-    num_envs: tuple[int, ...]
-    epochs: tuple[int, ...]
-    mini_batches: tuple[int, ...]
-    seeds: tuple[int, ...]
-    max_seconds: float
-
-    def check(self) -> None:
-        for name in ("num_envs", "epochs", "mini_batches"):
-            values = getattr(self, name)
-            if not values or min(values) < 1:
-                raise ConfigError(
-                    f"bench.success.{name}: expected one or more positive numbers, "
-                    f"got {list(values)}"
-                )
-        if not self.seeds:
-            raise ConfigError("bench.success.seeds: expected one or more seeds, got none")
-        require_number("bench.success.max_seconds", self.max_seconds, above=0)
-
-    def list_points(self) -> list[dict[str, int]]:
-        """Return all trainings; those with as many environments follow each other."""
-        values = itertools.product(self.num_envs, self.epochs, self.mini_batches, self.seeds)
-        return [dict(zip(KEYS, point, strict=True)) for point in values]
 
 
 def find_passing(

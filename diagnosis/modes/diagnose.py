@@ -22,46 +22,13 @@ from brokk_rl.spec import spec
 from diagnosis import answer, baseline, case, effect_library, pipeline, report, report_checks
 from diagnosis.answer import Answer, Outcome
 from diagnosis.baseline import Baseline
-from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
-from diagnosis.detection import Penalties, ProgressCallback
+from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import EffectType
 from diagnosis.pipeline import DiagnosisPipeline
+from diagnosis.request import DiagnosisSubject
 
 log = logging.getLogger(__name__)
-
-
-@spec
-class DiagnosisSubject:
-    """Recordings to diagnose.
-
-    Attributes:
-        case: Folder with `reference/` and `field/`; or `null`.
-        field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead
-            of a case.
-        unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
-            fitted: how far the effects carry.
-        effects: Names of the effects to choose among; `null`: all that are registered.
-        workers: Processes that share the work; 1 where the system has no safe fork.
-        prices: Penalties of effects.
-        certainty: Calibration of the probabilities.
-    """
-
-    case: str | None
-    field: str | tuple[str, ...] | None
-    unseen: str | tuple[str, ...] | None
-    effects: tuple[str, ...] | None
-    workers: int
-    prices: Penalties
-    certainty: ProbabilityModel
-
-    def check(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"diagnosis.workers: expected 1 or more, got {self.workers}")
-        if (self.case is None) == (self.field is None):
-            raise ConfigError(
-                "diagnosis: give either case=<folder with reference/ and field/>, or field=<glob> and actuator=<simulator>"
-            )
 
 
 @spec

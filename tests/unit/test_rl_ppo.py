@@ -97,6 +97,22 @@ def test_it_learns_the_same_as_rsl_rls_own(changes: dict) -> None:
     torch.testing.assert_close(ours.actor.obs_normalizer.mean, theirs.actor.obs_normalizer.mean)
 
 
+@pytest.mark.slow  # the compiler takes half a minute
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+def test_compiled_parts_learn_the_same_as_rsl_rls_own() -> None:
+    ours, theirs = _algorithm(DevicePPO), _algorithm(PPO)
+    ours._rollout = CapturedRollout(ours, fuse=True)
+    ours.fuse = True
+    for seed in range(3):
+        last = _roll_out(ours, seed)
+        theirs.storage = copy.deepcopy(ours.storage)
+        assert _learn(ours, seed, last) == pytest.approx(
+            _learn(theirs, seed, last), rel=1e-3, abs=1e-5
+        )
+    for mine, other in zip(ours.actor.parameters(), theirs.actor.parameters(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)
+
+
 def _teacher() -> MLPModel:
     torch.manual_seed(7)
     seen = TensorDict({"policy": torch.zeros(1, 7)}, batch_size=[1])

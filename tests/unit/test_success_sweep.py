@@ -12,15 +12,9 @@ import training as runs
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.rl.benchmark_sizes import SuccessSweep
 from brokk_rl.rl.distributed import TrainingGroup
-from brokk_rl.rl.success_sweep import (
-    TABLE,
-    SuccessSweep,
-    find_passing,
-    report_sweep,
-    run_sweep,
-    summarise,
-)
+from brokk_rl.rl.success_sweep import TABLE, find_passing, report_sweep, run_sweep, summarise
 from brokk_rl.session import Session
 
 SWEEP = SuccessSweep(
