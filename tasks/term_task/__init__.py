@@ -16,6 +16,7 @@ from brokk_rl.bounds import require_number
 from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.sim.objects import SceneObject
 from brokk_rl.spec import spec
 from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.step_state import StepState
@@ -168,6 +169,7 @@ class TermTask:
 
     Attributes:
         episode_s: Time limit.
+        scene: Objects that stand beside the machine by name; `null` leaves one out.
         start: Where the arm begins.
         command: What the task asks for, drawn for each episode, by name.
         observation: Parts of the policy's vector by name, in this order; `null` leaves one out.
@@ -180,6 +182,7 @@ class TermTask:
     """
 
     episode_s: float
+    scene: dict[str, SceneObject | None]
     start: StartsNearHome
     command: dict[str, UniformCommand]
     observation: dict[str, ObservedTerm | None]
