@@ -19,7 +19,7 @@ from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.objects import DrilledObject, PipeObject, SceneObject, SlabObject, list_objects
 from brokk_rl.sim.scene import make_nominal_scenes
 
-UPRIGHT = {"yaw_rad": 0.0, "tilt_rad": 0.0}
+UPRIGHT: dict[str, Any] = {"yaw_rad": 0.0, "tilt_rad": 0.0}
 
 
 def drilled(**changes: Any) -> DrilledObject:
@@ -118,10 +118,11 @@ def test_the_tool_feels_a_wall_that_it_is_driven_against(name: str, machine: Mac
 def test_a_simulator_without_objects_says_so() -> None:
     slab = SlabObject(place_m=(2.0, 0.0, 1.0), size_m=(1.0, 0.1, 0.1), **UPRIGHT)
     task: Any = SimpleNamespace(scene={"wall": slab, "off": None})
+    without: Any = Kinematic()
     assert list_objects(task, option("sim", "native")) == (slab,)
-    assert list_objects(option("task", "goal_pose"), Kinematic()) == ()
+    assert list_objects(option("task", "goal_pose"), without) == ()
     with pytest.raises(ConfigError, match=r"task\.scene: sim=kinematic cannot build objects"):
-        list_objects(task, Kinematic())
+        list_objects(task, without)
 
 
 @pytest.mark.parametrize(
