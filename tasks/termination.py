@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 from brokk_rl.bounds import require_number, require_range
 from brokk_rl.contracts.task import FAULT
@@ -33,8 +33,10 @@ would have followed, as `time_out` does in other libraries."""
 class Termination(Protocol):
     """A termination term."""
 
-    outcome: Any
-    """An `Outcome`."""
+    @property
+    def outcome(self) -> str:
+        """An `Outcome`; most terms have it as a class attribute."""
+        ...
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the episode ends, `(N,)` bool; no host synchronisation."""
@@ -45,7 +47,7 @@ class Termination(Protocol):
 class Succeeded:
     """The task's strict criterion holds."""
 
-    outcome: ClassVar[Outcome] = "success"
+    outcome = "success"
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the criterion holds; see `Termination`."""
@@ -62,7 +64,7 @@ class JointLimit:
 
     margin: float
 
-    outcome: ClassVar[Outcome] = "failure"
+    outcome = "failure"
 
     def check(self) -> None:
         require_number("margin of the termination JointLimit", self.margin)
@@ -77,7 +79,7 @@ class JointLimit:
 class StartInContact:
     """The arm touches something in the first step: the start was not valid."""
 
-    outcome: ClassVar[Outcome] = "void"
+    outcome = "void"
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the first step has a contact; see `Termination`."""
@@ -94,7 +96,7 @@ class ContactForce:
 
     largest_n: float
 
-    outcome: ClassVar[Outcome] = "failure"
+    outcome = "failure"
 
     def check(self) -> None:
         require_number("largest_n of the termination ContactForce", self.largest_n, above=0)
@@ -118,7 +120,7 @@ class TipLeft:
     y_m: tuple[float, float]
     z_m: tuple[float, float]
 
-    outcome: ClassVar[Outcome] = "failure"
+    outcome = "failure"
 
     def check(self) -> None:
         for name in ("x_m", "y_m", "z_m"):
@@ -137,7 +139,7 @@ class TipLeft:
 class TimeLimit:
     """The time of the episode, `task.episode_s`, is over."""
 
-    outcome: ClassVar[Outcome] = "time"
+    outcome = "time"
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the time is over; see `Termination`."""

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from brokk_rl import extensions
-from brokk_rl.observation import measure_ranges, restore_encoder
+from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
 from brokk_rl.rl.policy import TrainedPolicy
 from brokk_rl.rl.vec_env import ControlLoopConfig
 
@@ -47,9 +47,9 @@ def measure(folder: Path) -> dict[str, object]:
                 vectors.append(groups["policy"].numpy().copy())
             groups = loop.step(actor.act(dict(groups.items())))[0]
     stacked = np.concatenate(vectors)
-    ranges = measure_ranges(
-        restore_encoder(machine, contract["observation"]), stacked, machine.joint_names
-    )
+    encoder = restore_encoder(machine, contract["observation"])
+    assert isinstance(encoder, ObservationEncoder), "a policy of a tool-pose task"
+    ranges = measure_ranges(encoder, stacked, machine.joint_names)
     return {"count": len(stacked), "ranges": ranges}
 
 

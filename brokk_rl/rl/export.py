@@ -92,11 +92,15 @@ def export_onnx(
     }
     if contract["observation"]:
         encoder = restore_encoder(machine, contract["observation"])
-        recorded["inputs"] = _decode_inputs(encoder, vectors)
-        ranges = measure_ranges(encoder, observations.numpy(), machine.joint_names)
-        contract = contract | {
-            "training_observations": {"count": len(observations), "ranges": ranges}
+        recorded["inputs"] = {
+            name: np.asarray(value, float).tolist()
+            for name, value in encoder.decode_inputs(vectors).items()
         }
+        if isinstance(encoder, ObservationEncoder):
+            ranges = measure_ranges(encoder, observations.numpy(), machine.joint_names)
+            contract = contract | {
+                "training_observations": {"count": len(observations), "ranges": ranges}
+            }
     write_json(folder / GOLDEN, recorded)
     parity = {
         "observations": len(off),
@@ -128,17 +132,6 @@ def _explain_difference(
         f"of {len(difference)} observations (largest {difference.max():.3g}); nothing was written. "
         f"{cause}."
     )
-
-
-def _decode_inputs(encoder: ObservationEncoder, vectors: np.ndarray) -> dict[str, Any]:
-    """Return target, history, pitch and proposals of observation vectors in their units."""
-    target_m, q, u = encoder.decode(vectors)
-    inputs = {"target_in_base_m": target_m, "q": q, "u": u}
-    if encoder.has_pitch:
-        inputs["pitch_rad"] = encoder.decode_pitch(vectors)
-    if encoder.has_proposals:
-        inputs["proposals"] = encoder.decode_proposals(vectors)
-    return {name: np.asarray(value, float).tolist() for name, value in inputs.items()}
 
 
 def _write_onnx(module: torch.nn.Module, example: torch.Tensor, path: Path) -> None:

@@ -34,6 +34,7 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
+from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.fault_recorder import FaultRecorder
 from brokk_rl.task_description import TaskDescription, describe_task
@@ -93,6 +94,7 @@ class ControlLoopConfig:
         model = self.actuator.build(self.machine, num, device)
         for effect in self.effects.values():
             model = effect.wrap(model, self.machine, num, device)
+        model = accept_speeds(model, self.machine, num, device)
         follower = self.follower.build(self.machine, num, device)
         process = self.task.build(self.machine, num, device)
         # with all threads, four processes on a computer of 64 cores had no starts after three

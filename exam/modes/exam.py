@@ -26,8 +26,7 @@ from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import effect_library
-from diagnosis.calibration import ProbabilityModel
-from diagnosis.detection import Penalties
+from diagnosis.request import Penalties, ProbabilityModel
 from exam import dataset, oracle, registration, report, run_cases
 from exam.answer_scoring import RUN_FILE, AnswerScoring
 from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family

@@ -100,3 +100,11 @@ def test_help_is_short_and_says_how_to_begin(brokk: Callable[..., Any]) -> None:
     for part in ("brokk mode=list", "brokk mode=doctor", "-m", "session.out"):
         assert part in done.out
     assert len(done.out.splitlines()) < 25
+
+
+def test_windows_is_refused_with_the_way_that_works(
+    brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.platform", "win32")
+    done = brokk("mode=list")
+    assert done.code == 2 and "WSL 2" in done.err
