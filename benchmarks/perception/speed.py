@@ -68,8 +68,8 @@ def main() -> None:
         shortest.append(min(looks, key=lambda look: look[-2]))
     table = {stage: {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95))}
              for stage, ms in zip(STAGES, np.array(shortest).T, strict=True)}  # fmt: skip
-    told = {"option": given.option, "frames": len(shortest), "threads": given.threads, "shrink": given.shrink, "processor": processor(),
-            "opencv": cv2.__version__, "load": round(os.getloadavg()[0], 1), "ms": table}  # fmt: skip
+    told = {"option": given.option, "frames": len(shortest), "threads": given.threads, "shrink": given.shrink,
+            "processor": processor(), "opencv": cv2.__version__, "load": round(os.getloadavg()[0], 1), "ms": table}  # fmt: skip
     given.out.write_text(json.dumps(told, indent=1) + "\n")
     Console().print(told)
 
