@@ -42,6 +42,7 @@ def main() -> None:
     parser.add_argument("networks", nargs="*", default=["segmenter.onnx"])
     parser.add_argument("--train", action="store_true", help="write pictures to learn from")
     parser.add_argument("--panoramas", type=Path, help="their folder; default: that of viser")
+    parser.add_argument("--gate", help="also judge the first network behind this gate")
     parser.add_argument("--pictures", type=Path, help="folder of other pictures to judge by")
     given = parser.parse_args()
     panoramas = given.panoramas or find_panoramas()
@@ -51,7 +52,9 @@ def main() -> None:
     pictures = read_judged(panoramas) if given.pictures is None else read_folder(given.pictures)
     rows = {}
     for network in given.networks:
-        rows[Path(network).name] = judge(network, pictures)
+        rows[Path(network).name] = judge(network, None, pictures)
+    if given.gate is not None:
+        rows["ships"] = judge(given.networks[0], given.gate, pictures)
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     ).stdout.strip()
@@ -97,9 +100,9 @@ def read_judged(panoramas: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def judge(network: str, pictures: dict[str, np.ndarray]) -> dict[str, object]:
+def judge(network: str, gate: str | None, pictures: dict[str, np.ndarray]) -> dict[str, object]:
     """Return on how many pictures a network names a block, and the part of each that it takes."""
-    segmenter = Onnx(weights=network, margin=0.15, threads=1).build()
+    segmenter = Onnx(weights=network, margin=0.15, gate=gate, threads=1).build()
     parts = {}
     for name, picture in track(pictures.items(), network, transient=True):
         height, width = picture.shape[:2]

@@ -50,11 +50,14 @@ class Onnx:
         weights: An ONNX file of `mode=train_perception`: a path, or the name of one that ships with
             the package.
         margin: Room around the block in the second run, as a part of its box; `null`: one run.
+        gate: Another such file, which learned from many pictures without a block: a piece of block
+            that it does not see is dropped; `null` for none.
         threads: CPU threads.
     """
 
     weights: str
     margin: float | None
+    gate: str | None
     threads: int
 
     def check(self) -> None:
@@ -68,6 +71,15 @@ class Onnx:
         Raises:
             CheckpointError: there is no such network, or it is none of ours.
         """
+        gate = None if self.gate is None else self._open_network(self.gate, None)
+        return self._open_network(self.weights, gate)
+
+    def _open_network(self, weights: str, gate: NetworkSegmenter | None) -> NetworkSegmenter:
+        """Return one network.
+
+        Raises:
+            CheckpointError: see `build`.
+        """
         import onnxruntime
         from onnxruntime.capi.onnxruntime_pybind11_state import (
             Fail,
@@ -76,7 +88,7 @@ class Onnx:
             NoSuchFile,
         )
 
-        path = find_weights(self.weights)
+        path = find_weights(weights)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads
         try:
@@ -97,7 +109,7 @@ class Onnx:
         def infer(picture: np.ndarray) -> np.ndarray:
             return session.run(None, {"picture": picture[None]})[0][0]  # type: ignore[index]
 
-        return NetworkSegmenter(infer, size_px, self.margin)
+        return NetworkSegmenter(infer, size_px, self.margin, gate)
 
 
 @spec
@@ -143,13 +155,28 @@ class NetworkSegmenter:
         infer: The network.
         size_px: Width and height of its input.
         margin: Room around the block in the second run; `None` for one run.
+        gate: Drops pieces of block that it does not see; `None` for none.
     """
 
-    def __init__(self, infer: Infer, size_px: tuple[int, int], margin: float | None) -> None:
-        self._infer, self._size_px, self._margin = infer, size_px, margin
+    def __init__(
+        self,
+        infer: Infer,
+        size_px: tuple[int, int],
+        margin: float | None,
+        gate: NetworkSegmenter | None = None,
+    ) -> None:
+        self._infer, self._size_px, self._margin, self._gate = infer, size_px, margin, gate
 
     def segment(self, frame: Frame) -> Masks:
         """Return both masks."""
+        masks = self._segment_alone(frame)
+        if self._gate is None or not (masks.block > THRESHOLD).any():
+            return masks
+        seen = self._gate.segment(frame).block > THRESHOLD
+        return _drop_pieces(masks, lambda pieces, count: np.isin(range(count), pieces[seen]))
+
+    def _segment_alone(self, frame: Frame) -> Masks:
+        """Return both masks, without the gate."""
         window = cover_picture(frame.color.shape, self._size_px)
         block, holes = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
         self._write_masks(frame, window, block, holes)
@@ -185,16 +212,30 @@ class NetworkSegmenter:
 
 
 def _drop_specks(block: np.ndarray, holes: np.ndarray) -> Masks:
-    """Return masks without pieces of block that are too small; no block has no holes."""
-    pieces, numbers, stats, _ = cv2.connectedComponentsWithStats(
-        (block > THRESHOLD).astype(np.uint8)
+    """Return masks without pieces of block that are too small."""
+    least = LEAST_BLOCK * block.size
+    return _drop_pieces(
+        Masks(block, holes),
+        lambda pieces, count: np.bincount(pieces.ravel(), minlength=count) >= least,
     )
-    kept = stats[:, cv2.CC_STAT_AREA] >= LEAST_BLOCK * block.size
-    kept[0] = True  # beside all pieces
-    block = np.where(kept[np.asarray(numbers, int)], block, np.float32(0.0))
-    if not kept[1:pieces].any():
-        holes = np.zeros_like(holes)
-    return Masks(block, holes)
+
+
+def _drop_pieces(masks: Masks, choose: Callable[[np.ndarray, int], np.ndarray]) -> Masks:
+    """Return masks with some pieces of block; where none is left there are no holes.
+
+    Args:
+        masks: Both masks.
+        choose: From the number of each pixel's piece, `(h, w)`, 0 beside all, and their count, to
+            which pieces are kept, `(count,)` bool.
+    """
+    count, numbers = cv2.connectedComponents((masks.block > THRESHOLD).astype(np.uint8))
+    pieces = np.asarray(numbers, int)
+    kept = choose(pieces, count)
+    kept[0] = True
+    block = np.where(kept[pieces], masks.block, np.float32(0.0))
+    if masks.hole_mask is None or kept[1:].any():
+        return Masks(block, masks.hole_mask)
+    return Masks(block, np.zeros_like(masks.hole_mask))
 
 
 def as_input(picture: np.ndarray) -> np.ndarray:

@@ -184,3 +184,25 @@ def test_a_photograph_keeps_brightness_and_colour(tmp_path: Path) -> None:
     np.testing.assert_allclose(far[0], far[1], rtol=0.01)
     with pytest.raises(ConfigError, match="found none"):
         PhotographedSurfaces(folder=str(tmp_path / "no"), share=1.0, block_share=0.0, size_m=(1, 2))
+
+
+def test_a_gate_drops_the_blocks_that_it_does_not_see() -> None:
+    def build(*places: int) -> NetworkSegmenter:
+        def infer(picture: np.ndarray) -> np.ndarray:
+            found = np.zeros((2, 32, 64), np.float32)
+            for left in places:
+                found[:, 8:20, left : left + 12] = 0.9
+            return found
+
+        return NetworkSegmenter(infer, (64, 32), None, gates.pop() if gates else None)
+
+    frame = Frame(
+        np.zeros((32, 64, 3), np.uint8), np.zeros((32, 64), np.float32), np.eye(3), None, 0.0
+    )
+    gates: list[NetworkSegmenter] = []
+    gates.append(build(42))
+    masks = build(4, 40).segment(frame)
+    assert not (masks.block[:, :32] > 0.5).any() and (masks.block[:, 40:52] > 0.5).any()
+    gates.append(build())
+    masks = build(4, 40).segment(frame)
+    assert not (masks.block > 0.5).any() and not np.asarray(masks.hole_mask).any()
