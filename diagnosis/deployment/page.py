@@ -49,6 +49,8 @@ REMEDIES = {
     UNLISTED: "Log the observation vector too (obs_0, obs_1, …): then the doctor says which number departs first.",
 }
 """Next step by kind of mistake."""
+SEEN_REMEDY = "Look where the numbers are made that depart first; the picture shows them."
+"""Next step for a mistake without a name in an observation that was logged."""
 NUM_BANDS = 24
 """Numbers of the vector that the picture shows at most."""
 LARGEST_RATIO = 1e4
@@ -75,7 +77,11 @@ def write_page(answer: DoctorAnswer, folder: Path) -> None:
 
 def describe_remedies(findings: Sequence[Finding]) -> list[str]:
     """Return what to change, one text for each kind of mistake."""
-    return list(dict.fromkeys(REMEDIES[finding.kind] for finding in findings))
+    texts = []
+    for finding in findings:
+        is_seen = finding.kind == UNLISTED and finding.stage == "observation"
+        texts.append(SEEN_REMEDY if is_seen else REMEDIES[finding.kind])
+    return list(dict.fromkeys(texts))
 
 
 def _name_run(run: RunExamination) -> str:
@@ -89,16 +95,11 @@ def _add_code(page: Report, run: RunExamination) -> None:
         rows = []
         for one in run.findings:
             same = ", ".join(f"{kind} of {field}" for kind, field in one.alike)
-            rows.append(
-                [
-                    Cell(one.text, f"the log shows as well: {same}" if same else ""),
-                    one.kind,
-                    one.field,
-                    f"{one.begin_s:.2f} to {one.end_s:.2f} s",
-                    f"{one.explained:.1%}",
-                ]
-            )
-        page.add_table(["mistake", "kind", "field", "shows", "rows explained"], rows)
+            share = f"{one.explained:.1%}" if one.is_named and one.explained else None
+            shows = f"{one.begin_s:.2f} to {one.end_s:.2f} s"
+            text = Cell(one.text, f"the log shows as well: {same}" if same else "")
+            rows.append([one.kind, one.field, shows, share, text])
+        page.add_table(["kind", "field", "shows", "rows explained", "mistake"], rows)
         page.add_list(describe_remedies(run.findings))
     for stage in run.stages:
         departs = stage.departs
