@@ -121,7 +121,7 @@ class WatchedHole:
         self._tracker = settings.tracker.build()
         self._shared = mount.error.draw(generator, "shared")
         self._view = mount.error.draw(generator, "view")
-        self._waiting: deque[tuple[float, Sequence[HolePose], float]] = deque()
+        self._waiting: deque[tuple[float, Sequence[HolePose] | None, float]] = deque()
         self.position, self.arrives_s = mount.start.copy(), 0.0
         self.num_missed = 0
         self.choice: ViewChoice | None = None
@@ -173,24 +173,24 @@ class WatchedHole:
             self.task_scene, chain_m, true, believed, (int(corner[0]), int(corner[1])), t_s, seed
         )
 
-    def wait_for(self, holes: Sequence[HolePose], t_s: float) -> None:
-        """Take the holes of a picture at `t_s`; they become known after the delay."""
+    def wait_for(self, holes: Sequence[HolePose] | None, t_s: float) -> None:
+        """Take the holes of a picture at `t_s`, known after the delay; `None`: no sharp picture."""
         self._waiting.append((t_s + self._settings.delay_s, holes, t_s))
 
     def learn(self, now_s: float) -> None:
         """Hand to the tracker what has become known by now."""
         while self._waiting and self._waiting[0][0] <= now_s + 1e-9:
             _, holes, t_s = self._waiting.popleft()
-            if t_s >= self.arrives_s - 1e-9:
+            if holes is not None and t_s >= self.arrives_s - 1e-9:
                 self.num_missed = 0 if holes else self.num_missed + 1
-            tracked = self._tracker.update(holes, t_s)
+            tracked = self._tracker.update(holes or (), t_s)
             near = []
             for hole in tracked:
                 if np.linalg.norm(hole.pose.center_m - self._hint_m) < 4 * self._settings.hint_m:
                     near.append(hole)
             # The person's choice: of several holes the surest that was seen most often.
             self.hole = max(near, key=lambda hole: hole.num_frames, default=self.hole)
-            self.history.append(self._describe(holes, t_s))
+            self.history.append(self._describe(holes or (), t_s))
 
     def _describe(self, holes: Sequence[HolePose], t_s: float) -> dict[str, Any]:
         known = self.hole
@@ -217,7 +217,7 @@ class PerceivedTargets:
         rig = settings.camera.rig
         self._planner = settings.next_view.build(machine, self._mount, rig, settings.arm)
         self._finder = settings.finder.build()
-        self._attended = np.ones(num_envs, bool)
+        self._attended = np.zeros(num_envs, bool)
         self._steps = np.zeros(num_envs, int)
         self._before: np.ndarray | None = None
         self._episodes = np.zeros(num_envs, int)
@@ -241,8 +241,8 @@ class PerceivedTargets:
             self._steps[number] = 0
             self._episodes[number] += 1
 
-    def forget(self) -> None:
-        """Forget all episodes; see `TargetSensor.forget`."""
+    def begin(self) -> None:
+        """Forget all episodes, and look everywhere; see `TargetSensor.begin`."""
         self.watched, self.ended = [], []
         self._episodes[:], self._attended[:] = 0, True
 
@@ -289,11 +289,12 @@ class PerceivedTargets:
             eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             seed = (self._seed, int(number), int(self._steps[number]))
             chain_m = self._settings.arm.trace(self._machine, q[number])
-            exposure = None
-            if t_s >= eye.arrives_s - 1e-9 and self._is_steady(eye, int(number), q):
-                exposure = eye.expose(q[number], measured_q[number], chain_m, t_s, seed)
+            if t_s < eye.arrives_s - 1e-9 or not self._is_steady(eye, int(number), q):
+                eye.wait_for(None, t_s)
+                continue
+            exposure = eye.expose(q[number], measured_q[number], chain_m, t_s, seed)
             if exposure is None:
-                eye.wait_for([], t_s)
+                eye.wait_for((), t_s)
             else:
                 asked.append((int(number), exposure))
         with use_workers(self._settings.num_processes):

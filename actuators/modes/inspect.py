@@ -16,6 +16,7 @@ from rich.table import Table
 from actuators.identify import dead_time
 from actuators.recordings import inspection_picture, preview_report
 from brokk_rl import record
+from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.preview import EffectPreview, PreviewResult
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.inspection import KINDS, Inspection, InspectionThresholds, inspect_recording
@@ -159,8 +160,9 @@ class Inspect:
         recording, breaches = record.examine_recording(path, self.machine)
         if recording is None or recording.num_samples < 2:
             return InspectedFile(path, None, breaches, None)
+        (viewed,) = view_recordings([recording], self.machine)
         return InspectedFile(
-            path, recording, breaches, inspect_recording(recording, self.machine, self.thresholds)
+            path, recording, breaches, inspect_recording(viewed, self.machine, self.thresholds)
         )
 
     def _preview(self, recordings: Sequence[Recording]) -> PreviewResult | None:

@@ -335,7 +335,8 @@ class ColumnMap:
         for j, name in enumerate(machine.joint_names):
             command = self._read_command(signals, self.joints[name].command, machine, j)
             for piece in pieces:
-                piece.u[:, j] = command.hold(piece.ticks_s, machine.period_s)
+                read = command.average if machine.interface == "torque" else command.hold
+                piece.u[:, j] = read(piece.ticks_s, machine.period_s)
             position = _scale(signals, self.joints[name].position)
             for piece in pieces:
                 piece.q[:, j] = position.interpolate(piece.ticks_s)

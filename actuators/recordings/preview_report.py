@@ -43,7 +43,14 @@ def run_preview(
     generator: np.random.Generator,
     are_measured: bool,
 ) -> PreviewResult | None:
-    """Return the preview of some motions, with a bar of progress; `None` where none is long enough."""
+    """Return the preview of some motions, with a bar of progress.
+
+    `None` where none is long enough, or where joints are not commanded by speed: the expected error of
+    the preview is that of a valve.
+    """
+    if machine.interface != "speed":
+        log.info("no preview: its expected error is known for joints commanded by speed only")
+        return None
     try:
         with ItemProgress("preview", SHARE) as progress:
             return preview.assess(

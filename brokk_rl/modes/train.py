@@ -20,6 +20,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
+from brokk_rl.rl.learning_curve import find_passing
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves
 from brokk_rl.rl.policy import (
     ClassicalPolicy,
@@ -32,7 +33,7 @@ from brokk_rl.rl.policy import (
 )
 from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
-from brokk_rl.rl.success_sweep import LEVELS, find_passing
+from brokk_rl.rl.success_sweep import LEVELS
 from brokk_rl.rl.tracking import NoTracking, Tracker, Tracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session, read_record

@@ -23,6 +23,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.plot import BLUE, ORANGE, make_figure, remove_frame
 from brokk_rl.rl.benchmark_sizes import KEYS, SuccessSweep
 from brokk_rl.rl.distributed import TrainingGroup
+from brokk_rl.rl.learning_curve import WINDOW, find_passing
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
@@ -34,38 +35,8 @@ log = logging.getLogger(__name__)
 
 LEVELS = (0.95, 0.99)
 """Strict success whose time is measured."""
-WINDOW = 1024
-"""Newest finished episodes over which success is averaged: as many as an evaluation has, so that a
-lucky iteration does not count."""
 TABLE = "success_sweep.jsonl"
 """One line for each training that was measured."""
-
-
-def find_passing(
-    rows: Sequence[Mapping[str, Any]], level: float, window: int = WINDOW
-) -> Mapping[str, Any] | None:
-    """Return the first row of `progress.csv` at which the newest episodes succeed so often.
-
-    Args:
-        rows: One an iteration, with `episodes` and `episode/success_strict`.
-        level: Share of strict successes.
-        window: Least number of newest episodes that are averaged; whole iterations.
-
-    Returns:
-        The row, or `None` where the level was never reached.
-    """
-    first, episodes, successes = 0, 0.0, 0.0
-    for row in rows:
-        episodes += float(row["episodes"])
-        successes += float(row["episodes"]) * float(row["episode/success_strict"])
-        while episodes - float(rows[first]["episodes"]) >= window:
-            gone = float(rows[first]["episodes"])
-            episodes -= gone
-            successes -= gone * float(rows[first]["episode/success_strict"])
-            first += 1
-        if episodes >= window and successes >= level * episodes:
-            return row
-    return None
 
 
 def run_sweep(
@@ -118,7 +89,8 @@ def _train(
     runner_config["algorithm"]["num_learning_epochs"] = point["epochs"]
     runner_config["algorithm"]["num_mini_batches"] = point["mini_batches"]
     budget = TrainingBudget(max_env_steps=None, max_seconds=sweep.max_seconds)
-    training = replace(training, runner=runner_config, budget=budget)
+    # one that stops learning trains on: the time to a level is asked for
+    training = replace(training, runner=runner_config, budget=budget, plateau=None)
     replace(session, seed=point["seed"]).seed_all()
     loop.begin()
     loop.statistics()  # forget the episodes of the point before

@@ -15,6 +15,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import track_items
 from brokk_rl.record import Recording
+from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -61,6 +62,7 @@ class SimulatedTrials:
         model = self.actuator.build(machine, num, device)
         for effect in self.effect.values():
             model = effect.wrap(model, machine, num, device)
+        model = accept_speeds(model, machine, num, device)
         levers = OperatorLevers(operators, trials.guided)
         task = self.task.build(machine, num, device)
         starts = {}

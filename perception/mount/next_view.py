@@ -26,6 +26,8 @@ UP = np.array([0.0, 0.0, 1.0])
 """Axis of a hole that was never seen: the task drills from above."""
 SMALLEST_VARIANCE_M2 = 1e-10
 """Smallest variance of a belief, (0.01 mm)²: no camera measures better."""
+AS_GOOD = 1.05
+"""Factor on the smallest expected standard deviation up to which a view is as good. Chosen by hand."""
 BELIEF_AFTER_MISS = 0.5
 """Factor on the frames expected from a view after each frame that showed nothing. Chosen by hand."""
 
@@ -160,7 +162,11 @@ class ViewPlanner:
         seen[(positions == present).all(-1)] *= BELIEF_AFTER_MISS**num_missed
         variance_m2 = self._predict_variance(hole, poses, s.rate_hz * s.horizon_s * seen)
         std_m = np.sqrt(variance_m2)
-        best = int(np.argmin(std_m))
+        # Of views that are as good, the one that has the hole in the middle.
+        away_m = hole.center_m - poses[:, -1, :3, 3]
+        ahead = (poses[:, -1, :3, 2] * away_m).sum(1) / np.linalg.norm(away_m, axis=1)
+        is_good = std_m <= AS_GOOD * std_m.min()
+        best = int(np.argmax(np.where(is_good, ahead, -np.inf)))
         if std_m[best] > (1.0 - s.improvement) * std_m[0]:
             best = 0
         view = CameraView(

@@ -61,7 +61,7 @@ class MovingSource:
         self._q: np.ndarray | None = None
         self._choice: ViewChoice | None = None
         self._seen_s, self._num_missed, self._t_s = -np.inf, 0, 0.0
-        self._count = -1
+        self._count, self._is_taken = -1, False
 
     @property
     def num_frames(self) -> None:
@@ -84,8 +84,9 @@ class MovingSource:
         if t_s < self._arrives_s:  # one motion at a time
             return None if self._choice is None else self._choice.view
         seen_s = -np.inf if hole is None else hole.seen_s
-        self._num_missed = 0 if seen_s > self._seen_s else self._num_missed + 1
-        self._seen_s = seen_s
+        if self._is_taken:
+            self._num_missed = 0 if seen_s > self._seen_s else self._num_missed + 1
+        self._seen_s, self._is_taken = seen_s, False
         scene = s.camera.task_scene
         belief = HoleBelief.expect(np.array(scene[:3]), scene[5], s.hint_m)
         if hole is not None:
@@ -112,7 +113,7 @@ class MovingSource:
         if self._t_s < self._arrives_s:
             raise FrameError("moving camera: on its way, its pictures are not used")
         s, number = self._settings, self._count
-        self._count += 1
+        self._count, self._is_taken = number + 1, True
         rig = s.camera.rig
         placed = place_rig(
             rig, self._mount.locate(self._position, self._q), (0, 0), (rig.width, rig.height)

@@ -26,9 +26,10 @@ from brokk_rl.sim.scene import make_nominal_scenes
 
 
 def find_machine(spec: object, machine: Machine) -> Machine:
-    """Returns the default machine, or for a spec of position commands an arm of servos."""
+    """Returns the default machine, or one that is commanded as the spec asks for."""
     interfaces = getattr(spec, "interfaces", {"speed"})
-    return machine if machine.interface in interfaces else option("machine", "so101")
+    known = (machine, option("machine", "so101"), option("machine", "emps"))
+    return next(one for one in known if one.interface in interfaces)
 
 
 @every("actuator")

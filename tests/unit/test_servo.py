@@ -12,10 +12,12 @@ from composed import option
 from scipy.integrate import solve_ivp
 
 from actuators.excite.player import NominalLink
+from brokk_rl.checks.actuator import check_actuator_model
 from brokk_rl.commands import SpeedProgram, find_rest, read_targets, scale_targets, view_speeds
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
+from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.signals import Command
 from diagnosis.effect_library import load_effects
 from diagnosis.error_covariance import LevelCovariance, fit_level_noise
@@ -168,3 +170,28 @@ def test_errors_of_a_held_position_do_not_add_up() -> None:
     found = fit_level_noise(error, np.zeros_like(error), 20)
     assert found.stray == pytest.approx(0.01, rel=0.2)
     assert found.memory == pytest.approx(4.0, rel=0.5)
+
+
+def test_a_policy_commands_speeds_and_the_servo_gets_targets(
+    arm: Machine, machine: Machine
+) -> None:
+    ideal = replace(option("actuator", "servo"), top_speed=50.0)
+    model = accept_speeds(ideal.build(arm, 4, CPU), arm, 4, CPU)
+    check_actuator_model(model, arm, CPU)
+    model = accept_speeds(ideal.build(arm, 1, CPU), arm, 1, CPU)
+    speeds = np.random.default_rng(3).uniform(-0.3, 0.3, (30, arm.num_joints))
+    start = torch.as_tensor(arm.home, dtype=torch.float32)
+    history = History(
+        q=start.repeat(1, arm.num_history, 1), u=torch.zeros(1, arm.num_history, arm.num_joints)
+    )
+    for speed in speeds:
+        history.push_u(torch.as_tensor(speed[None], dtype=torch.float32))
+        history.push_q(model.step(history))
+    way = speeds.sum(0) * arm.max_speed * arm.period_s
+    np.testing.assert_allclose(history.q[0, -1].numpy(), arm.home + way, atol=1e-5)
+    # a machine that is commanded by speed keeps its model, one by torque is refused
+    known = option("actuator", "ideal").build(machine, 1, CPU)
+    assert accept_speeds(known, machine, 1, CPU) is known
+    drive = option("machine", "emps")
+    with pytest.raises(ConfigError, match="commanded by torque"):
+        accept_speeds(option("actuator", "force").build(drive, 1, CPU), drive, 1, CPU)
