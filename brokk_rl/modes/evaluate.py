@@ -24,6 +24,7 @@ from brokk_rl.rl.settings import Evaluation
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.events import Event
+from brokk_rl.sim.objects import list_objects
 from brokk_rl.sim.video import render_video
 from brokk_rl.spec import name_spec, spec
 from brokk_rl.task_description import describe_task
@@ -167,7 +168,8 @@ def evaluate_policies(
         recorded = evaluated[first].episodes
         shown = next((episode for episode in recorded if episode.success), recorded[0])
         log.info("drawing a video of one episode")
-        path = render_video(config.machine, shown, session.folder / "insertion.mp4")
+        objects = list_objects(config.task, config.sim)
+        path = render_video(config.machine, shown, session.folder / "insertion.mp4", objects)
         log.info("video of one episode: %s", path)
     return results
 

@@ -26,6 +26,7 @@ import torch
 from brokk_rl.errors import StorageError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.posed_scene import SHOWN_GROUPS, PosedScene
 from brokk_rl.sim.probe import find_renderer
 from brokk_rl.sim.scene import FAR_M, HALF_LENGTH_M, HALF_WIDTH_M, HOLE_DEPTH_M
@@ -99,6 +100,7 @@ class RenderJob:
         scene: The scene, `(S,)`.
         target_m: Target of the tip, `(3,)` or `None`.
         path: The mp4 to write.
+        objects: Objects beside the block.
     """
 
     machine: Machine
@@ -108,6 +110,7 @@ class RenderJob:
     scene: np.ndarray
     target_m: np.ndarray | None
     path: Path
+    objects: tuple[SceneObject, ...] = ()
 
     @property
     def has_block(self) -> bool:
@@ -120,7 +123,9 @@ class RenderJob:
         return None if self.has_block else self.target_m
 
 
-def render_video(machine: Machine, episode: SimulatedEpisode, path: Path) -> Path:
+def render_video(
+    machine: Machine, episode: SimulatedEpisode, path: Path, objects: tuple[SceneObject, ...] = ()
+) -> Path:
     """Write an mp4 to `path` and stills beside it.
 
     `<stem>_0.png` shows the start, the last still the end. The renderer runs in a process of its
@@ -142,6 +147,7 @@ def render_video(machine: Machine, episode: SimulatedEpisode, path: Path) -> Pat
             scene=np.asarray(episode.scene),
             target_m=None if episode.target_m is None else np.asarray(episode.target_m),
             path=draft,
+            objects=objects,
         )
         if not _render_in_subprocess(job):
             write_video(draft, draw_schematic(job, SIZE), len(job.q), machine.period_s)
@@ -257,10 +263,11 @@ class SceneRenderer:
 
     Args:
         machine: The machine.
+        objects: Objects beside the block.
     """
 
-    def __init__(self, machine: Machine) -> None:
-        self._posed = PosedScene(machine)
+    def __init__(self, machine: Machine, objects: tuple[SceneObject, ...] = ()) -> None:
+        self._posed = PosedScene(machine, objects)
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = [group in SHOWN_GROUPS for group in range(6)]
@@ -319,7 +326,7 @@ def draw_rendered(job: RenderJob) -> DrawFrames:
     close = "close" if job.mark_m is None else _look_at(job.mark_m)
 
     def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
-        with SceneRenderer(job.machine) as renderer:
+        with SceneRenderer(job.machine, job.objects) as renderer:
             for step in steps:
                 renderer.set_pose(job.q[step], job.scene)
                 views = (

@@ -63,6 +63,7 @@ def term(function: str, **changes: Any) -> ObservedTerm:
 def make(**changes: Any) -> Turn:
     fields: dict[str, Any] = {
         "episode_s": 0.5,
+        "scene": {},
         "start": StartsNearHome(spread=0.2, margin=0.05),
         "command": {"speed": UniformCommand(lowest=(0.1,), highest=(0.2,))},
         "observation": {
