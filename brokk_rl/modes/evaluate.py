@@ -143,7 +143,8 @@ def evaluate_policies(
             loops[key] = loop, loop.state_dict()
         loop, fresh = loops[key]
         is_rival = evaluated and isinstance(policy, ClassicalPolicy)
-        if is_rival and not supports_classical_control(loop.task):
+        process: object = loop.task
+        if is_rival and not supports_classical_control(process):
             log.info(
                 "the task (%s) has no classical controller to compare with", descriptions[name].name
             )
