@@ -17,10 +17,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import torch
-from rich.progress import track
 from torch.nn import functional
 
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.progress import track_items
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.segment.network import SMALLEST_PIECE, THRESHOLD
@@ -236,7 +236,7 @@ def read_views(
     try:
         with ThreadPoolExecutor(min(THREADS, os.cpu_count() or 1)) as pool:
             work = pool.map(fill, range(len(stems)))
-            conditions = list(track(work, "reading frames", total=len(stems), transient=True))
+            conditions = list(track_items(work, "reading frames", len(stems)))
     finally:
         cv2.setNumThreads(threads)
     return TrainingViews(
