@@ -36,9 +36,8 @@ class TargetBacklash(EffectSpec):
     placed = True
     interfaces = frozenset({"position"})
     numbers: ClassVar = {
-        # Friction of hobby servos holds targets of 1 to 5 degrees, 1 to 12 % of the travel in the
-        # logs of an SO-101: more than the play of pins.
-        "gap_rad": EffectNumber("rad", none=0.0, typical=0.1, bounds=(0.0, 0.8), scale="travel")
+        # Friction of hobby servos holds targets of 1 to 5 degrees: more than the play of pins.
+        "gap_rad": EffectNumber("rad", none=0.0, typical=0.04, bounds=(0.0, 0.6), scale="travel")
     }
 
     def begin(self, now: StepInputs) -> Memory:
@@ -117,10 +116,10 @@ class Sag(EffectSpec):
     numbers: ClassVar = {
         # The weight of a stretched-out arm is about half of the yield force.
         "load_rad": EffectNumber(
-            "rad", none=0.0, typical=0.16, bounds=(0.0, 1.0), scale="travel", masses=True
+            "rad", none=0.0, typical=0.08, bounds=(0.0, 1.0), scale="travel", masses=True
         ),
         "sag_rad": EffectNumber(
-            "rad", none=0.0, typical=0.08, bounds=(-0.5, 0.5), scale="travel", masses=False
+            "rad", none=0.0, typical=0.04, bounds=(-0.5, 0.5), scale="travel", masses=False
         ),
         # A stiffness that lets the joint sag by 1.5 % of the travel in a turn by half of it.
         "sag_slope": EffectNumber("1", none=0.0, typical=0.03, bounds=(-0.5, 0.5), masses=False),
