@@ -10,7 +10,7 @@ This module needs no torch, so that a bad value is refused before torch is loade
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
@@ -227,6 +227,11 @@ class EpisodeTerms:
 
     def __init__(self, terms: Mapping[str, Termination | None]) -> None:
         self.terms = {name: term for name, term in terms.items() if term is not None}
+        # found once: a compiled step cannot import
+        self._functions: dict[str, Callable[[Any], torch.Tensor]] = {}
+        for name, term in self.terms.items():
+            is_named = isinstance(term, TerminationTerm)
+            self._functions[name] = resolve_name(term.function) if is_named else term
         events = tuple(name for name, term in self.terms.items() if term.outcome != "time")
         self.reasons = (*events, FAULT, *(name for name in self.terms if name not in events))
 
@@ -239,14 +244,14 @@ class EpisodeTerms:
         """
         held = {FAULT: faults}
         unsound = faults
-        for name, term in self._having("void"):
-            held[name] = term(state)
+        for name, _ in self._having("void"):
+            held[name] = self._functions[name](state)
             unsound = unsound | held[name]
         state.success = state.success & ~unsound
         terminated, timed_out = unsound, unsound & False
         failed = timed_out
         for name, term in self._having("success", "failure", "time"):
-            held[name] = term(state)
+            held[name] = self._functions[name](state)
             if term.outcome == "time":
                 timed_out = timed_out | held[name]
                 continue

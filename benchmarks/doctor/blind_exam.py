@@ -21,6 +21,7 @@ import sys
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,7 @@ OTHERS = {"goal_pose_early": ROOT / "benchmarks/doctor/policies/goal_pose_early"
 """A checkpoint of before, without an exam of its own."""
 OTHER = {"residual": "direct", "direct": "residual", "goal_pose": "goal_pose_early"}
 """Network that was copied by mistake."""
+NUM_WORKERS = 2
 NUM_CLEAN = 20
 NUM_STEPS = 300
 """Control periods of a log, 15 s."""
@@ -362,7 +364,7 @@ def make(folder: Path, seed: int, per_policy: int | None) -> None:
     (folder / "logs").mkdir(parents=True)
     paths, labels = [folder / "logs" / f"{number:03d}.parquet" for number in order], []
     chosen = {policy: [case for case in cases if case["policy"] == policy] for policy in POLICIES}
-    with ProcessPoolExecutor(2) as pool:
+    with ProcessPoolExecutor(NUM_WORKERS) as pool:
         seeds = [seed + 100 * number for number in range(len(chosen))]
         made_logs = dict(
             zip(chosen, pool.map(make_logs, chosen, chosen.values(), seeds), strict=True)
@@ -380,14 +382,24 @@ def make(folder: Path, seed: int, per_policy: int | None) -> None:
     (folder / "policies.json").write_text(json.dumps(dict(sorted(given.items()))))
 
 
-def answer_one(folder: Path, name: str, policy_name: str) -> dict[str, Any]:
-    """Returns the doctor's answer to one log."""
+@cache
+def load_given() -> tuple[Any, dict[str, Any], Any, Any]:
+    """Returns machine, policies by name, actuator and effects of the training."""
     from diagnosis.deployment.contract import load_policy
-    from diagnosis.deployment.doctor import examine_deployment
 
     machine = extensions.load_option("machine", "brokk170")
-    policies = {key: load_policy(str(place), machine) for key, (place, _) in POLICIES.items()}
-    policies |= {key: load_policy(str(place), machine) for key, place in OTHERS.items()}
+    places = {key: place for key, (place, _) in POLICIES.items()} | OTHERS
+    policies = {key: load_policy(str(place), machine) for key, place in places.items()}
+    actuator = extensions.load_option("actuator", "mlp")
+    return machine, policies, actuator, extensions.load_option("effect", "library")
+
+
+def answer_one(folder: Path, name: str, policy_name: str) -> dict[str, Any]:
+    """Returns the doctor's answer to one log."""
+    from diagnosis.deployment.doctor import examine_deployment
+
+    machine, known, actuator, library = load_given()
+    policies = dict(known)
     recording = read_recording(folder / "logs" / f"{name}.parquet", machine)
     begun = time.perf_counter()
     found = examine_deployment(
@@ -397,8 +409,8 @@ def answer_one(folder: Path, name: str, policy_name: str) -> dict[str, Any]:
         others=policies,
         target_m=None,
         is_sent=True,
-        actuator=extensions.load_option("actuator", "mlp"),
-        effects={"library": extensions.load_option("effect", "library")},
+        actuator=actuator,
+        effects={"library": library},
         seed=0,
     )
     return found.to_json() | {"seconds": time.perf_counter() - begun}
@@ -407,7 +419,7 @@ def answer_one(folder: Path, name: str, policy_name: str) -> dict[str, Any]:
 def answer(folder: Path) -> None:
     """Answers all logs; the labels are not read."""
     given = json.loads((folder / "policies.json").read_text())
-    with ProcessPoolExecutor(2) as pool:
+    with ProcessPoolExecutor(NUM_WORKERS) as pool:
         found = list(pool.map(answer_one, [folder] * len(given), given, given.values()))
     (folder / "answers.json").write_text(json.dumps(dict(zip(given, found, strict=True)), indent=1))
 

@@ -400,7 +400,7 @@ def draw_effect(number: int, rng: np.random.Generator, joint: str) -> tuple[str,
     if number == 0:
         return "flow_gain", {"joints": [joint], "gain": float(rng.uniform(0.35, 0.65))}
     if number == 1:
-        return "dead_time", {"joints": "all", "dead_time_s": float(rng.uniform(0.25, 0.6))}
+        return "dead_time", {"joints": "all", "dead_time_s": float(rng.uniform(0.25, 0.45))}
     return "dead_band", {
         "joints": [joint],
         "extend": float(rng.uniform(0.25, 0.5)),

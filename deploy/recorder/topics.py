@@ -81,6 +81,7 @@ TOPICS: dict[str, tuple[TopicField, ...]] = {
         TopicField("button_right", "flag", "whether the right button is to be held"),
         TopicField("target_in_base_m", "number", "centre of the target's rim, base frame, m", many=True),
         TopicField("infer_s", "number", "time that the network took, s"),
+        TopicField("observation", "number", "vector that the network got; empty without advice", many=True),
     ),
     "guard": (
         TopicField("state", "text", f"state of the guard; {_list_names(GuardState)}"),

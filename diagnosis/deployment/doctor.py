@@ -105,7 +105,10 @@ def examine_deployment(
     runs = []
     for recording in recordings:
         runs.append(examine_run(policy, recording, machine, others, target_m, is_sent, generator))
-    motion = check_motion(recordings, machine, actuator, effects, seed)
+    if any(run.findings for run in runs):
+        motion = MotionEvidence((), 0.0, "the code is to be mended first")
+    else:
+        motion = check_motion(recordings, machine, actuator, effects, seed)
     verdict, reason = decide_verdict(runs, motion)
     return DoctorAnswer(verdict, reason, tuple(runs), motion)
 

@@ -130,9 +130,10 @@ def examine_run(
     log = read_run_log(recording, contract, target_m)
     is_sent = is_sent and not log.is_measured
     lacking, notes = _list_lacking(log, is_sent), list[str]()
-    findings = [*_check_golden(policy), *_check_rate(policy, log)]
+    findings = [*_check_golden(policy), *_check_rate(policy, log), *_check_size(policy, log)]
     stages = []
-    for stage in _list_stages(policy, log, others, is_sent, generator):
+    is_other = any(finding.kind == "network" for finding in findings)
+    for stage in () if is_other else _list_stages(policy, log, others, is_sent, generator):
         result = judge_stage(stage)
         stages.append(result)
         if result.departs:
@@ -172,7 +173,7 @@ def decide_verdict(
     if motion.blamed and not outside:
         joints = ", ".join(motion.blamed)
         return "actuator", (
-            f"{code}Under the recorded commands {joints} moved otherwise than each machine that the "
+            f"{code}Under the recorded commands {joints} moved otherwise than nearly all machines that the "
             "training draws."
         )
     if outside:
@@ -404,6 +405,16 @@ def _check_golden(policy: LoadedPolicy) -> list[Finding]:
         return []
     text = f"the bundle is mixed: its network departs from {GOLDEN} by {difference:.2g}"
     return [Finding("network", "bundle", "network", text, {}, 0.0, 0.0, 1.0)]
+
+
+def _check_size(policy: LoadedPolicy, log: RunLog) -> list[Finding]:
+    """Compare the length of the logged vector with that of the contract."""
+    size, found = policy.contract.size, log.num_observed
+    if found in (0, size):
+        return []
+    text = f"the network got {found} numbers, the contract has {size}: another policy ran"
+    begin_s, end_s = float(log.t_s[0]), float(log.t_s[-1])
+    return [Finding("network", "observation", "observation", text, {}, begin_s, end_s, 1.0)]
 
 
 def _check_rate(policy: LoadedPolicy, log: RunLog) -> list[Finding]:

@@ -21,22 +21,32 @@ Predict = Callable[[Sequence[Change], np.ndarray], np.ndarray]
 """Returns what a stage gives, `(R, D)`, with changes, at rows."""
 LEAST_ROWS = 3
 """Departing rows below which nothing is found: a mask's edge decides a row by the last bit."""
-LEAST_SHARE = 0.01
-"""Share of departing rows below which nothing is found; the export allows half of it."""
-EXPLAINED = 0.97
+LEAST_SHARE = 0.02
+"""Share of departing rows below which nothing is found. The export allows a quarter of it; by hand."""
+LEAST_START_SHARE = 0.3
+"""Share of the rows at the beginning from which a departure there counts by itself. By hand."""
+EXPLAINED = 0.95
 """Share of rows that a named mistake explains. Chosen by hand; with exact logs it explains all."""
 EXPLAINED_DEPARTED = 0.9
 """Share of the departing rows among them. Chosen by hand."""
 ALIKE = 0.01
 """Difference of the explained share within which mistakes cannot be told apart."""
-CLIP = 0.25
-"""Difference, of full command or in standard deviations, beyond which a row counts no more: what
-is wholly wrong must not outweigh what is nearly right. Chosen by hand."""
-SEARCH_ROWS = 160
-"""Departing rows by which mistakes are compared first; a quarter as many of the others."""
-NUM_REFINED = 24
+LOSS_SCALE = 0.01
+"""Difference, of full command or in standard deviations, from which the loss of a row grows with its
+logarithm: what is wholly wrong must not outweigh what is nearly right. Chosen by hand."""
+UNKNOWN = 1.0
+"""Difference that stands for one that is not known."""
+LEAST_GAIN = 0.5
+"""Share of the loss that a named mistake removes at least: what explains a few rows at the edge of a
+mask by a number that is nearly neutral is none. Chosen by hand."""
+SCREEN_ROWS, SEARCH_ROWS = 40, 96
+"""Departing rows by which mistakes are screened on their grids, and by which the best of them are
+refined; a quarter as many of the others. Chosen by hand."""
+NUM_SCREENED = 40
+"""Mistakes that are refined. Chosen by hand."""
+NUM_REFINED = 12
 """Mistakes, the best of the first comparison, that are replayed on all rows. Chosen by hand."""
-NUM_FIRST, PAIR_GAIN = 4, 0.3
+NUM_FIRST, PAIR_GAIN = 2, 0.3
 """Of pairs: mistakes that are tried as the first of two, and the share of the difference that such a
 mistake removes at least. Chosen by hand."""
 TOLERANCE_REFINED = 1e-5
@@ -82,7 +92,7 @@ class FittedDistortion:
         end: Last one.
         explained: Share of the rows that is explained, with the replay as it is outside.
         explained_departed: The same of the rows that depart without it.
-        gain: Share of the clipped difference that it removes.
+        gain: Share of the loss that it removes.
     """
 
     distortion: Distortion
@@ -96,7 +106,8 @@ class FittedDistortion:
     @property
     def fits(self) -> bool:
         """True if it explains nearly every row."""
-        return self.explained >= EXPLAINED and self.explained_departed >= EXPLAINED_DEPARTED
+        explains = self.explained >= EXPLAINED and self.explained_departed >= EXPLAINED_DEPARTED
+        return explains and self.gain >= LEAST_GAIN
 
 
 @dataclass(frozen=True)
@@ -132,7 +143,7 @@ class StageResult:
     @property
     def departs(self) -> bool:
         """True if more rows depart than rounding explains."""
-        return is_departure(len(self.departed), self.num_rows)
+        return self.only_start or is_departure(len(self.departed), self.num_rows)
 
     def rank_labels(self) -> list[tuple[str, float]]:
         """Return the compared numbers by their share of departing rows, largest first."""
@@ -158,11 +169,13 @@ def judge_stage(stage: ReplayStage) -> StageResult:
     departed = rows[(np.abs(residual[rows]) > stage.floor[rows]).any(1)]
     later = departed[departed >= stage.num_start]
     settled = rows[rows >= stage.num_start + MAX_DELAY]
-    only_start = bool(len(departed)) and not is_departure(len(later), len(rows))
+    num_early = len(departed) - len(later)
+    is_start = num_early >= max(LEAST_ROWS, LEAST_START_SHARE * stage.num_start)
+    only_start = is_start and not is_departure(len(later), len(rows))
     named: tuple[FittedDistortion, ...] = ()
     alike: tuple[FittedDistortion, ...] = ()
     ranking: tuple[FittedDistortion, ...] = ()
-    if is_departure(len(departed), len(rows)):
+    if only_start or is_departure(len(departed), len(rows)):
         judged = rows if only_start or len(settled) < LEAST_ROWS else settled
         search = _FaultSearch(stage, residual, judged)
         ranking = search.rank(())
@@ -189,19 +202,28 @@ class _FaultSearch:
         self._stage, self._rows = stage, rows
         self._ok = (np.abs(residual[rows]) <= stage.floor[rows]).all(1)
         self._loss = _measure_loss(residual[rows])
-        self._sample = self._choose_sample()
+        self._screen = self._choose_sample(SCREEN_ROWS)
+        self._sample = self._choose_sample(SEARCH_ROWS)
 
-    def _choose_sample(self) -> np.ndarray:
-        """Return places in the judged rows by which mistakes are compared first."""
+    def _choose_sample(self, num: int) -> np.ndarray:
+        """Return so many departing places in the judged rows, and a quarter as many others."""
         departed, others = np.flatnonzero(~self._ok), np.flatnonzero(self._ok)
-        parts = [_select_evenly(departed, SEARCH_ROWS), _select_evenly(others, SEARCH_ROWS // 4)]
+        parts = [_select_evenly(departed, num), _select_evenly(others, num // 4)]
         return np.sort(np.concatenate(parts))
 
     def rank(self, given: tuple[Change, ...]) -> tuple[FittedDistortion, ...]:
         """Return all mistakes, beside those of `given`, best first."""
-        first = []
+        screened = []
         for distortion in self._stage.distortions:
-            value, gain = self._fit_value(distortion, given)
+            gains = [
+                self._measure(distortion, value, given, self._screen)[1]
+                for value in distortion.values
+            ]
+            screened.append((max(gains), int(np.argmax(gains)), distortion))
+        screened.sort(key=lambda one: -one[0])
+        first = []
+        for _, best, distortion in screened[:NUM_SCREENED]:
+            value, gain = self._refine_value(distortion, best, given)
             first.append((gain, distortion, value))
         first.sort(key=lambda one: -one[0])
         found = [self._judge(one, value, given) for _, one, value in first[:NUM_REFINED]]
@@ -226,24 +248,24 @@ class _FaultSearch:
                     return (first, second), ()
         return (), ()
 
-    def _fit_value(self, distortion: Distortion, given: tuple[Change, ...]) -> tuple[float, float]:
-        """Return the number of a distortion and its gain on the sample."""
+    def _refine_value(
+        self, distortion: Distortion, best: int, given: tuple[Change, ...]
+    ) -> tuple[float, float]:
+        """Return the number of a distortion, near value `best` of its grid, and its gain."""
 
         def measure_gain(value: float) -> float:
             return self._measure(distortion, value, given, self._sample)[1]
 
-        gains = [measure_gain(value) for value in distortion.values]
-        best = int(np.argmax(gains))
-        value, gain = distortion.values[best], gains[best]
+        values = distortion.values
+        value, gain = values[best], measure_gain(values[best])
         if distortion.is_continuous:
-            ends = (
-                distortion.values[max(0, best - 1)],
-                distortion.values[min(len(gains) - 1, best + 1)],
-            )
+            low, high = values[max(0, best - 1)], values[min(len(values) - 1, best + 1)]
             found = minimize_scalar(
-                lambda x: -measure_gain(float(x)), bounds=ends, method="bounded",
-                options={"xatol": TOLERANCE_REFINED * max(abs(ends[0]), abs(ends[1]))},
-            )  # fmt: skip
+                lambda x: -measure_gain(float(x)),
+                bounds=(low, high),
+                method="bounded",
+                options={"xatol": TOLERANCE_REFINED * max(abs(low), abs(high))},
+            )
             if -found.fun > gain:
                 value, gain = float(found.x), -float(found.fun)
         return value, gain
@@ -288,8 +310,8 @@ def _rank_fit(one: FittedDistortion) -> tuple[float, int, float]:
 
 
 def _measure_loss(residual: np.ndarray) -> np.ndarray:
-    """Return the mean clipped difference of each row, `(R,)`; what is not known counts in full."""
-    return np.nan_to_num(np.abs(residual), nan=CLIP).clip(max=CLIP).mean(1)
+    """Return the mean loss of each row, `(R,)`: the logarithm of its differences."""
+    return np.log1p(np.nan_to_num(np.abs(residual), nan=UNKNOWN) / LOSS_SCALE).mean(1)
 
 
 def _find_segment(gained: np.ndarray) -> tuple[tuple[int, int], float]:

@@ -11,8 +11,27 @@ from diagnosis.deployment.distortions import Distortion, make_fixed
 from diagnosis.deployment.replay import Change
 from diagnosis.deployment.transforms import rotate_frame, shift_column
 
-ANGLES_RAD = tuple(np.deg2rad((-170, -130, -90, -45, -20, -8, 8, 20, 45, 90, 130, 170)))
+ANGLES_RAD = tuple(np.deg2rad([*range(-165, 0, 15), -4, 4, *range(15, 181, 15)]))
 """Angles at which a search for a turned frame begins."""
+SHIFTS_M = (
+    -1.5,
+    -1.0,
+    -0.7,
+    -0.5,
+    -0.3,
+    -0.2,
+    -0.1,
+    -0.05,
+    0.05,
+    0.1,
+    0.2,
+    0.3,
+    0.5,
+    0.7,
+    1.0,
+    1.5,
+)
+"""Shifts at which a search for another origin begins, m."""
 
 
 def list_frame_distortions(policy: LoadedPolicy) -> list[Distortion]:
@@ -62,7 +81,7 @@ def list_frame_distortions(policy: LoadedPolicy) -> list[Distortion]:
                 f"{name}.{letter}",
                 f"{name} is in a frame shifted by {{value}} m along {letter}",
                 lambda value, axis=axis: Change(signals={name: shift_column(axis, value)}),
-                (-1.0, -0.5, -0.2, -0.05, 0.05, 0.2, 0.5, 1.0),
+                SHIFTS_M,
                 True,
                 "shift_m",
             )

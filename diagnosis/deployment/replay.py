@@ -20,7 +20,7 @@ from diagnosis.deployment.contract import LoadedPolicy, ObservationTerm, PolicyN
 from diagnosis.deployment.run_log import RunLog
 
 Transform = Callable[[np.ndarray], np.ndarray]
-NUM_DRAWS = 6
+NUM_DRAWS = 24
 """Draws of the log's rounding by which its effect on the command is measured. Chosen by hand."""
 SPREAD_FACTOR = 3.0
 """Multiple of the largest deviation among the draws that still counts as rounding; by hand."""
@@ -145,14 +145,16 @@ class PolicyReplay:
         """Return a change by what the log lost: its rounding, and the jitter of its clock."""
         units = np.array([self.log.units[name] for name in term.columns])
         share = self._generator.uniform(-0.5, 0.5, self.log.signals[term.name].shape)
-        jitter = self._generator.uniform(0.0, 1.0, len(share)) if self.log.is_measured else None
+        jitter = self._generator.uniform(-1.0, 1.0, share.shape) if self.log.is_measured else None
 
         def transform(values: np.ndarray) -> np.ndarray:
             moved = values + share * units
             if jitter is not None:
                 # A captured row lies up to a period beside the moment at which the policy looked.
-                motion = np.diff(values, axis=0, append=values[-1:])
-                moved = moved + jitter[:, None] * np.nan_to_num(motion)
+                motion = np.nan_to_num(np.diff(values, axis=0))
+                ahead = np.concatenate([motion, motion[-1:]])
+                behind = np.concatenate([motion[:1], motion])
+                moved = moved + np.where(jitter > 0.0, jitter * ahead, jitter * behind)
             return moved
 
         return transform

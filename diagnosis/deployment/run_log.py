@@ -25,8 +25,8 @@ CAPTURED = "capture:"
 REST_SHARE = 0.002
 """Share of a joint's travel within which it counts as resting over the dead time at the start;
 chosen by hand, 5 mrad on brokk170."""
-MAX_STEPS = 64
-"""Distinct steps between values by which a rounded column is recognised. Chosen by hand."""
+MAX_STEPS, STEP_TOLERANCE = 8, 0.05
+"""Multiples of a step by which a rounded column is recognised, and how exact they are, of a step."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class RunLog:
         commanded: Command that the policy gave, `(T, J)`; `None` where it was not logged.
         in_force: Command in force, `(T, J)`.
         observed: Observation vector as the network got it, `(T, O)`; `None` where not logged.
+        num_observed: Numbers of the logged vector; 0 where it was not logged.
         is_measured: The command in force is a measured valve feedback, not what was sent.
     """
 
@@ -49,6 +50,7 @@ class RunLog:
     commanded: np.ndarray | None
     in_force: np.ndarray | None
     observed: np.ndarray | None
+    num_observed: int
     is_measured: bool
     units: Mapping[str, float] = field(default_factory=dict)
 
@@ -97,13 +99,17 @@ def read_run_log(
     in_force = _stack(columns, contract.commands)
     names = [OBSERVATION_COLUMN.format(number) for number in range(contract.size)]
     source = recording.metadata.get("source", "")
+    num_observed = 0
+    while OBSERVATION_COLUMN.format(num_observed) in columns:
+        num_observed += 1
     return RunLog(
         recording=recording,
         signals=signals,
         missing=tuple(missing),
         commanded=advice,
         in_force=in_force,
-        observed=_stack(columns, names),
+        observed=_stack(columns, names) if num_observed == contract.size else None,
+        num_observed=num_observed,
         is_measured=source.startswith(CAPTURED),
         units={name: measure_resolution(values) for name, values in columns.items()},
     )
@@ -146,10 +152,10 @@ def measure_resolution(values: np.ndarray) -> float:
     steps = steps[steps > 4 * exact]
     if len(steps) < 2:
         return exact
+    # Float32 has relative steps: only the small multiples of a step are compared.
     step = float(steps.min())
-    ratio = steps[:MAX_STEPS] / step
-    # Float32 has relative steps: within a thousandth of a step a multiple counts as one.
-    is_rounded = np.abs(ratio - np.round(ratio)).max() < 1e-2 and step > 100 * exact
+    ratio = steps[steps < MAX_STEPS * step] / step
+    is_rounded = np.abs(ratio - np.round(ratio)).max() < STEP_TOLERANCE and step > 100 * exact
     return step if is_rounded else exact
 
 

@@ -37,7 +37,7 @@ BESIDE_PX, BESIDE = 0.0, 0.3
 """Range of that comparison beyond an edge: from so many px to a part of the radius."""
 SECTORS, ALIKE_PX2 = 12, 20.0
 """Sectors around the rim, each compared alone; pixels that share their error, by the blur."""
-STRIP = 0.15
+STRIP = 0.25
 """Standard deviation of the depth of an edge by that beside it, relative."""
 STEEP = 0.5
 """Least part of the radius along the displacement from which an edge tells its depth."""

@@ -16,6 +16,7 @@ from brokk_rl.bounds import require_number
 from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.sim.objects import SceneObject
 from brokk_rl.spec import spec
 from tasks.reward import RewardCurriculum, RewardTerm
 from tasks.step_state import StepState
@@ -122,11 +123,6 @@ class ObservedTerm:
         for name in ("noise", "bias"):
             require_number(f"{name} of the {where}", getattr(self, name), least=0)
 
-    def __call__(self, state: TermState) -> torch.Tensor:
-        """Return the newest sample without error, `(N, K)`."""
-        value = resolve_name(self.function)(state)
-        return value[:, None] if value.dim() == 1 else value
-
 
 @spec
 class HeldCriterion:
@@ -146,10 +142,6 @@ class HeldCriterion:
         require_function("success criterion", self.function)
         require_number("task.success.share", self.share, above=0, most=1)
         require_number("task.success.after_s", self.after_s, least=0)
-
-    def __call__(self, state: TermState) -> torch.Tensor:
-        """Return where the criterion holds in this step, `(N,)` bool."""
-        return resolve_name(self.function)(state)
 
 
 @spec
@@ -177,6 +169,7 @@ class TermTask:
 
     Attributes:
         episode_s: Time limit.
+        scene: Objects that stand beside the machine by name; `null` leaves one out.
         start: Where the arm begins.
         command: What the task asks for, drawn for each episode, by name.
         observation: Parts of the policy's vector by name, in this order; `null` leaves one out.
@@ -189,6 +182,7 @@ class TermTask:
     """
 
     episode_s: float
+    scene: dict[str, SceneObject | None]
     start: StartsNearHome
     command: dict[str, UniformCommand]
     observation: dict[str, ObservedTerm | None]

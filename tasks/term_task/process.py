@@ -7,6 +7,7 @@ the whole control step can be captured in one CUDA graph.
 from __future__ import annotations
 
 import dataclasses
+from pkgutil import resolve_name
 from typing import Any
 
 import torch
@@ -68,6 +69,13 @@ class TermProcess:
         names = (*figures, *(f"{REWARD}{name}" for name in task.reward))
         self.episode = {name: torch.zeros(num_envs, device=device) for name in names}
         self._terms = {group: select_terms(getattr(task, field)) for group, field in GROUPS.items()}
+        # found once: a compiled step cannot import
+        self._is_good = resolve_name(task.success.function)
+        self._functions = {
+            term.function: resolve_name(term.function)
+            for terms in self._terms.values()
+            for term in terms.values()
+        }
         self._encoders = self._build_encoders(num_envs, device)
 
     def _build_encoders(self, num_envs: int, device: torch.device) -> dict[str, PartsEncoder]:
@@ -78,7 +86,7 @@ class TermProcess:
         for group, terms in self._terms.items():
             parts = []
             for name, term in terms.items():
-                width = term(state).shape[1]
+                width = self._call(term, state).shape[1]
                 parts.append(
                     ObservationPart(
                         name=name, samples=term.samples, width=width, mean=term.mean, std=term.std
@@ -145,7 +153,7 @@ class TermProcess:
         # forces of a diverged world may be NaN, and one NaN would poison the sums over all worlds
         force_n = torch.where(world.faults, 0.0, world.contact_force_n)
         seen = self._make_state(history, force_n)
-        holds = self.task.success(seen) & ~world.faults
+        holds = self._is_good(seen) & ~world.faults
         state["held"] += holds & (state["age"] > self._after_steps)
         seen.success = state["held"] >= self._needed_steps
         endings = self._endings.judge(seen, world.faults)
@@ -199,12 +207,17 @@ class TermProcess:
 
     def _measure(self, group: str, name: str, term: ObservedTerm, seen: TermState) -> torch.Tensor:
         """Return the newest sample of a term with its errors, `(N, K)`."""
-        value = term(seen)
+        value = self._call(term, seen)
         if term.noise:
             value = value + _draw_error(term.noise, value)
         if term.bias:
             value = value + self.state[f"bias.{group}.{name}"]
         return value
+
+    def _call(self, term: ObservedTerm, seen: TermState) -> torch.Tensor:
+        """Return the newest sample of a term without error, `(N, K)`."""
+        value = self._functions[term.function](seen)
+        return value[:, None] if value.dim() == 1 else value
 
     def _make_state(self, history: History, force_n: torch.Tensor) -> TermState:
         state, period_s = self.state, self._machine.period_s

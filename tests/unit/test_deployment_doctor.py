@@ -20,6 +20,7 @@ from diagnosis.deployment import page
 from diagnosis.deployment.contract import LoadedPolicy, load_policy
 from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
 from diagnosis.deployment.run_log import measure_resolution
+from diagnosis.modes import why
 
 NUM_ROWS, SAMPLES = 120, 4
 TERMS = (("target", 3), ("q", 5 * SAMPLES), ("u", 5 * SAMPLES))
@@ -233,6 +234,27 @@ def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy, machine: Machin
     assert measure_resolution(rounded[:, 0].astype(float)) == pytest.approx(1e-3, rel=1e-2)
     found = ask(policy, replace(recording, q=rounded.astype(np.float32)), machine)
     assert found.verdict == "nothing"
+
+
+def test_a_vector_of_another_length_is_another_policy(
+    policy: LoadedPolicy, machine: Machine
+) -> None:
+    recording = run_loop(policy, machine, detail="observation")
+    longer = dict(recording.extra) | {"obs_43": np.zeros(NUM_ROWS, np.float32)}
+    (finding,) = ask(policy, replace(recording, extra=longer), machine).findings
+    assert (finding.kind, finding.field) == ("network", "observation")
+
+
+def test_the_page_of_the_whole_question_holds_verdict_and_next_step(
+    policy: LoadedPolicy, machine: Machine, tmp_path: Path
+) -> None:
+    found = ask(policy, run_loop(policy, machine, see_q=turn_joint), machine)
+    (tmp_path / "doctor").mkdir()
+    found.write(tmp_path / "doctor")
+    why.write_why_page(tmp_path, {"doctor": "Is the code to blame?"})
+    text = (tmp_path / why.WHY_PAGE).read_text()
+    assert "q.q3 has the wrong sign" in text
+    assert page.REMEDIES["sign"] in text
 
 
 def test_page_and_answer_hold_the_verdict(
