@@ -2,7 +2,13 @@
 PYTHON ?= $(shell command -v python3.11 || echo python3)
 BIN := .venv/bin
 UV := $(shell command -v uv 2>/dev/null || echo $(BIN)/uv)
-SYNC := UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode
+SYNC = UV_PROJECT_ENVIRONMENT=.venv $(UV) sync --locked --inexact --compile-bytecode $(if $(EXTRA),--no-dev --extra $(EXTRA))
+# Torch and its CUDA libraries take 5 GB of 8. Without an NVIDIA GPU the same version for the CPU takes their place.
+TORCH ?= $(if $(filter Darwin,$(shell uname -s)),lock,$(shell nvidia-smi -L >/dev/null 2>&1 && echo lock || echo cpu))
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
+TORCH_VERSION ?= $(shell sed -n '/^name = "torch"$$/{n;s/.*"\(.*\)"/\1/p;}' uv.lock)
+GET_TORCH = $(UV) pip install --quiet --python $(BIN)/python --no-deps --default-index $(TORCH_INDEX) torch==$(TORCH_VERSION)
+NO_CUDA = $(shell sed -nE 's/^name = "(torch|triton|nvidia-.*|cuda-.*)"$$/--no-install-package \1/p' uv.lock)
 
 .PHONY: help play train test test-all mutants figures docs check setup clean
 
@@ -35,12 +41,18 @@ check: setup            ## format, lint, types
 	$(BIN)/ruff check .
 	$(BIN)/pyright
 
-setup: .venv/.synced    ## the environment of uv.lock in .venv
+setup: .venv/.synced    ## the environment of uv.lock in .venv; EXTRA=train leaves out the tools of developers
 
 .venv/.synced: uv.lock pyproject.toml
 	test -x $(BIN)/python || $(PYTHON) -m venv .venv
 	command -v $(UV) >/dev/null || $(BIN)/python -m pip install --quiet uv
-	$(SYNC) || UV_SYSTEM_CERTS=1 $(SYNC)  # behind a proxy only the system has the certificates
+	@if [ $(TORCH) = cpu ] && echo "torch for the CPU, 5 GB less (for an NVIDIA GPU: make setup TORCH=lock)" && \
+	    { $(GET_TORCH) || UV_SYSTEM_CERTS=1 $(GET_TORCH); }; then \
+	    flags="$(NO_CUDA)"; \
+	elif [ $(TORCH) = cpu ]; then \
+	    echo "$(TORCH_INDEX) gives no torch $(TORCH_VERSION): it comes with CUDA, 5 GB more (make setup TORCH_INDEX=<mirror>)"; \
+	fi; \
+	$(SYNC) $$flags || UV_SYSTEM_CERTS=1 $(SYNC) $$flags  # behind a proxy only the system has the certificates
 	touch $@
 
 clean:                  ## remove what can be made again; runs and recordings stay

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import errno
 import logging
 import math
@@ -46,17 +47,8 @@ log = logging.getLogger(__name__)
 
 
 CHECKED_FIRST = (
-    "session",
-    "machine",
-    "sim",
-    "task",
-    "rl",
-    "evaluation",
-    "tracking",
-    "excitation",
-    "collect",
-    "identify",
-    "play",
+    "session machine sim task rl evaluation tracking excitation collect identify play bench subject "
+    "diagnosis compare convert log inspect observe perceive render label twin study"
 )
 """Nodes whose specs are checked before the mode is imported, and torch with it: their modules do
 without."""
@@ -78,6 +70,9 @@ def main() -> int:
     if "--version" in sys.argv[1:]:
         sys.stdout.write(f"brokk {brokk_rl.__version__}\n")
         return 0
+    if sys.platform == "win32":
+        sys.stderr.write("error: brokk_rl needs Linux or macOS; on Windows install it in WSL 2\n")
+        return 2
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
     # The launcher options keep the names that submitit gave them; Hydra warns of that three times.
@@ -178,13 +173,14 @@ def check_values(cfg: DictConfig) -> None:
     Raises:
         ConfigError: A value is bad, or one that must be given is not.
     """
-    for name in CHECKED_FIRST:
+    if missing := OmegaConf.missing_keys(cfg) - {"session.out"}:
+        raise ConfigError(_explain_missing_value(min(missing)))
+    cfg = copy.deepcopy(cfg)  # a node that takes in another one resolves that one in its place
+    for name in CHECKED_FIRST.split():
         node = OmegaConf.select(cfg, name, throw_on_missing=False)
         if not isinstance(node, DictConfig):
             continue
         given = {"out": "."} if name == "session" else {}  # the command chooses the folder itself
-        if missing := OmegaConf.missing_keys(node) - {"session.out"}:
-            raise ConfigError(_explain_missing_value(min(missing)))
         instantiate(node, **given, _convert_="all")
 
 

@@ -71,13 +71,13 @@ def load_option(group: str, name: str, **fields: object) -> Any:
 
     Args:
         group: Config group.
-        name: Name of the option, of this package or of an installed extension.
+        name: Name of the option, of this package or of an installed extension; or `@<path>` of a file.
         fields: Values that replace those of its file.
     """
-    register_options([])
+    register_options([f"{group}={name}"])
     changes = [f"subject.{field}={value}" for field, value in fields.items()]
     with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject={name}", *changes])
+        cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject='{name}'", *changes])
     return instantiate(cfg.subject, _convert_="all")
 
 

@@ -8,7 +8,6 @@ one computer thus share the GPUs.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import tempfile
@@ -60,6 +59,8 @@ def take_place() -> Iterator[str | None]:
 
 def _wait_for_place(names: list[str]) -> tuple[IO[str], str]:
     """Return the open, locked file of the first free place, and its GPU."""
+    import fcntl  # Windows has none; the command says so before it comes here
+
     folder = Path(tempfile.gettempdir()) / f"brokk_places_{os.getuid()}"
     folder.mkdir(mode=0o700, exist_ok=True)
     said = False

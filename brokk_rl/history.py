@@ -39,13 +39,18 @@ class History:
         self.q.copy_(self.q.roll(-1, 1))
         self.q[:, -1] = q
 
-    def reset(self, mask: Any, q: Any) -> None:
+    def reset(self, mask: Any, q: Any, u: Any = None) -> None:
         """Put environments at rest, without commands, over the whole history.
 
         Args:
             mask: Environments, shape `(N,)` bool.
             q: Positions, shape `(N, J)`.
+            u: Commands under which they rest, shape `(N, J)`; `None` for 0. Joints that are
+                commanded by position rest at a target.
         """
         rows = mask[:, None, None]
         self.q.copy_(q[:, None, :].where(rows, self.q))
-        self.u.masked_fill_(rows, 0.0)
+        if u is None:
+            self.u.masked_fill_(rows, 0.0)
+        else:
+            self.u.copy_(u[:, None, :].where(rows, self.u))

@@ -18,6 +18,13 @@ from brokk_rl.spec import spec
 JointPart = Literal["slew", "arm_1", "arm_2", "arm_3", "boom", "stick", "bucket", "tool"]
 """Parts of demolition machines and excavators; the operator's page has a word and an icon for each."""
 
+CommandInterface = Literal["valve", "velocity", "position", "torque"]
+"""Quantity that a command of a joint sets. A command of 1 is for `valve` and `velocity` the joint's
+`max_speed`, for `position` a target at the upper end of its travel (-1: the lower end), for `torque`
+its `max_force`. `valve` is a speed that the load may change, `velocity` one that a drive regulates."""
+SPEED_INTERFACES: tuple[CommandInterface, ...] = ("valve", "velocity")
+"""Interfaces whose command is a speed: at 0 the joint rests."""
+
 
 @spec
 class Dimension:
@@ -74,6 +81,8 @@ class Joint:
         max_speed: Speed at full command (rad/s or m/s), the slower of both directions.
         body: The link behind it; `null` where it is not known: such a machine can be recorded and
             identified, but not simulated.
+        command: Quantity that its command sets; see `CommandInterface`.
+        max_force: Force (N) or torque (Nm) at full command; a joint commanded by torque needs it.
     """
 
     name: str
@@ -84,6 +93,8 @@ class Joint:
     home: float
     max_speed: Dimension
     body: Body | None
+    command: CommandInterface = "valve"  # as files from before this field mean
+    max_force: Dimension | None = None  # files from before this field lack it
 
     @property
     def unit(self) -> str:
@@ -94,6 +105,10 @@ class Joint:
         if not self.lower.value <= self.home <= self.upper.value:
             raise ConfigError(
                 f"joint {self.name}: home {self.home} lies outside [{self.lower.value}, {self.upper.value}]"
+            )
+        if self.command == "torque" and (self.max_force is None or self.max_force.value <= 0):
+            raise ConfigError(
+                f"joint {self.name}: command: torque needs max_force, the force or torque at full command, above 0"
             )
 
 
@@ -116,7 +131,7 @@ class Lever:
 
 @spec
 class Machine:
-    """A hydraulic machine with any number of joints.
+    """A machine with any number of joints.
 
     Attributes:
         name: Config name, written into recordings and checkpoints.
@@ -152,6 +167,12 @@ class Machine:
                 raise ConfigError(
                     f"machine {self.name}: '{other}' is none of its joints ({', '.join(names)})"
                 )
+        if len({_name_family(joint.command) for joint in self.joints}) > 1:
+            listed = ", ".join(f"{joint.name}: {joint.command}" for joint in self.joints)
+            raise ConfigError(
+                f"machine {self.name}: joints are commanded by different quantities ({listed}); expected speeds "
+                "(valve, velocity) only, or positions only, or torques only: record and diagnose the parts as machines of their own"
+            )
         if self.dead_time_s > (self.num_history - 1) * self.period_s + 1e-9:
             raise ConfigError(
                 f"machine {self.name}: {self.num_history} samples of {self.period_s} s do not span the dead time of "
@@ -192,6 +213,19 @@ class Machine:
     def is_exclusive(self) -> np.ndarray:
         """True for joints that never move together with others, shape `(J,)`."""
         return np.array([name in self.exclusive for name in self.joint_names])
+
+    @property
+    def interface(self) -> Literal["speed", "position", "torque"]:
+        """Quantity that commands set: `speed` for `valve` and `velocity`."""
+        return _name_family(self.joints[0].command)
+
+    @property
+    def max_force(self) -> np.ndarray:
+        """Force or torque at full command, shape `(J,)`, N or Nm; NaN where the file has none."""
+        found = []
+        for joint in self.joints:
+            found.append(np.nan if joint.max_force is None else joint.max_force.value)
+        return np.array(found)
 
     @property
     def has_bodies(self) -> bool:
@@ -240,7 +274,7 @@ class Machine:
             )
         groups = {
             "name": self.name,
-            "joints": [[joint.name, joint.kind] for joint in self.joints],
+            "joints": [_list_traits(joint) for joint in self.joints],
             "limits": [self.lower.tolist(), self.upper.tolist()],
             "geometry": [geometry, None if self.tool_m is None else self.tip_m.tolist()],
             "control": [self.period_s, self.num_history, list(self.exclusive)],
@@ -267,6 +301,20 @@ class Machine:
                 f"{what} was made for another machine: {', '.join(differing)} differ from machine '{self.name}'. "
                 "Choose the machine it was made for (machine=…) or make it again for this one."
             )
+
+
+def _name_family(command: CommandInterface) -> Literal["speed", "position", "torque"]:
+    return "speed" if command in SPEED_INTERFACES else command
+
+
+def _list_traits(joint: Joint) -> list[object]:
+    """Return name, kind and interface of a joint; the files of valves have no interface yet."""
+    traits: list[object] = [joint.name, joint.kind]
+    if joint.command != "valve":
+        traits.append(joint.command)
+    if joint.max_force is not None:
+        traits.append(joint.max_force.value)
+    return traits
 
 
 def mask_exclusive_joints(is_exclusive: Any, positioning: Any) -> Any:

@@ -35,7 +35,11 @@ def describe_mode(choices: Mapping[str, Any], node: Mapping[str, Any], width: in
     ]
     taken, groups = {"_target_"}, {key: [choices[key]] for key in reversed(list(choices))}
     # Hydra records no options that were chosen as a list; each is an entry of the node.
-    lists = {key: list(node[key]) for key in node if key in options and key not in groups}
+    # A mode's own values have a class, and may bear the name of a group: `bench`.
+    lists = {}
+    for key in node:
+        if key in options and key not in groups and "_target_" not in (node[key] or ()):
+            lists[key] = list(node[key])
     for key, chosen in (groups | lists).items():
         group, _, package = key.partition("@")
         taken.add(re.split("[./]", package or group)[0])

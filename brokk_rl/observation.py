@@ -10,7 +10,8 @@ configuration: a policy carries no hidden statistics.
 
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,16 @@ class ObservationEncoder:
         target_m = self._concat(parts, 1)
         return self.encode(target_m, q * joint_signs, u * joint_signs, pitch_rad, proposed)
 
+    def decode_inputs(self, vector: Any) -> dict[str, Any]:
+        """Return target, history, pitch and proposals of vectors in their units, by name."""
+        target_m, q, u = self.decode(vector)
+        inputs = {"target_in_base_m": target_m, "q": q, "u": u}
+        if self.has_pitch:
+            inputs["pitch_rad"] = self.decode_pitch(vector)
+        if self.has_proposals:
+            inputs["proposals"] = self.decode_proposals(vector)
+        return inputs
+
     def describe(self) -> dict[str, Any]:
         """Return order and scale of the vector as plain JSON data, for the contract of a policy."""
         lower, upper = self._machine.lower, self._machine.upper
@@ -165,16 +176,111 @@ class ObservationEncoder:
         } | pitch
 
 
-def restore_encoder(machine: Machine, observation: Mapping[str, Any]) -> ObservationEncoder:
+@dataclass(frozen=True)
+class ObservationPart:
+    """A part of the vector of a task made of terms.
+
+    Attributes:
+        name: Name of its term.
+        samples: Newest samples in the vector, oldest first.
+        width: Numbers of a sample.
+        mean: Subtracted.
+        std: By which the difference is divided.
+    """
+
+    name: str
+    samples: int
+    width: int
+    mean: float
+    std: float
+
+
+class PartsEncoder:
+    """Turns the samples of named parts into one vector, and back; numpy and torch.
+
+    Args:
+        parts: In the order of the vector.
+        concat: `numpy.concatenate` or `torch.cat`, called as `concat(parts, 1)`.
+    """
+
+    def __init__(
+        self,
+        parts: Sequence[ObservationPart],
+        concat: Callable[[tuple[Any, ...], int], Any] = np.concatenate,
+    ) -> None:
+        self.parts, self._concat = tuple(parts), concat
+        self.size = sum(part.samples * part.width for part in self.parts)
+
+    def encode(self, samples: Mapping[str, Any]) -> Any:
+        """Return the vector, `(N, size)`, of the samples by name, each `(N, samples, width)`."""
+        scaled = []
+        for part in self.parts:
+            value = (samples[part.name] - part.mean) / part.std
+            scaled.append(value.reshape(-1, part.samples * part.width))
+        return self._concat(tuple(scaled), 1)
+
+    def decode_inputs(self, vector: Any) -> dict[str, Any]:
+        """Invert `encode`."""
+        inputs, begin = {}, 0
+        for part in self.parts:
+            end = begin + part.samples * part.width
+            value = vector[:, begin:end].reshape(-1, part.samples, part.width)
+            inputs[part.name], begin = value * part.std + part.mean, end
+        return inputs
+
+    def describe(self) -> dict[str, Any]:
+        """Return the parts as plain JSON data, for the contract of a policy."""
+        order = [f"{part.name} ({part.samples} x {part.width})" for part in self.parts]
+        parts = [asdict(part) for part in self.parts]
+        return {"size": self.size, "order": order, "parts": parts}
+
+
+TARGET_DISTANCE = "target.distance"
+"""Name of the horizontal distance of the target in a range table."""
+RangeTable = dict[str, tuple[float, float]]
+"""Lowest and highest value by name: `target.x`, `target.distance`, `pitch`, `q.<joint>`."""
+
+
+def measure_ranges(
+    encoder: "ObservationEncoder", vectors: np.ndarray, joints: tuple[str, ...]
+) -> RangeTable:
+    """Return the range of targets and positions, in rad and m, over observation vectors.
+
+    Args:
+        encoder: The encoder of the vectors, with numpy arrays.
+        vectors: Observation vectors, `(B, size)`.
+        joints: Names of the joints, `J`.
+    """
+    target_m, q, _ = encoder.decode(vectors)
+    values = {f"target.{letter}": target_m[:, axis] for axis, letter in enumerate("xyz")}
+    values[TARGET_DISTANCE] = np.hypot(target_m[:, 0], target_m[:, 1])
+    if encoder.has_pitch:
+        values["pitch"] = encoder.decode_pitch(vectors)
+    for column, joint in enumerate(joints):
+        values[f"q.{joint}"] = q[:, :, column]
+    return {name: (float(one.min()), float(one.max())) for name, one in values.items()}
+
+
+def restore_encoder(
+    machine: Machine, observation: Mapping[str, Any]
+) -> ObservationEncoder | PartsEncoder:
     """Return the numpy encoder that `observation` of a policy's contract describes.
 
     Args:
         machine: The machine of the policy.
-        observation: `ObservationEncoder.describe`, as it stands in `policy.json`.
+        observation: `describe` of the encoder, as it stands in `policy.json`.
 
     Raises:
         KeyError: A part of the description is missing.
     """
+    if "parts" in observation:
+        names = ObservationPart.__dataclass_fields__
+        return PartsEncoder(
+            [
+                ObservationPart(**{name: part[name] for name in names})
+                for part in observation["parts"]
+            ]
+        )
     pitch = observation.get("pitch")
     scaling = TargetScaling(
         target_mean_m=observation["target"]["mean_m"],

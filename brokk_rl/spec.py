@@ -54,6 +54,9 @@ def restore_spec(kind: type[T], values: Mapping[str, Any]) -> T:
 def restore_value(hint: Any, value: Any) -> Any:
     """Return a plain value as the annotation `hint` has it; see `restore_spec`."""
     if isinstance(value, Mapping):
+        if typing.get_origin(hint) is dict:
+            inner = typing.get_args(hint)[1]
+            return {name: restore_value(inner, item) for name, item in value.items()}
         for kind in (hint, *typing.get_args(hint)):
             if isinstance(kind, type) and is_dataclass(kind):
                 return restore_spec(kind, value)

@@ -15,7 +15,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, TypeVar, get_type_hints
@@ -100,9 +100,7 @@ def describe_task(task: object) -> TaskDescription:
         value: Any = task
         for part in path.split("."):
             value = getattr(value, part)
-        if is_dataclass(value) and not isinstance(value, type):
-            value = asdict(value)
-        behaviour[path] = json.loads(json.dumps(value))
+        behaviour[path] = json.loads(json.dumps(value, default=asdict))
     return TaskDescription(name=name_task(type(task)), behaviour=behaviour)
 
 

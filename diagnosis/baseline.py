@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from brokk_rl import open_loop
+from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
@@ -30,18 +31,15 @@ from brokk_rl.scales import choose_horizon_s, scale_time
 from diagnosis import residual_model
 from diagnosis.case import GapCase, estimate_running_s, split_recordings
 from diagnosis.effect_library import EffectSimulator, EffectType, EffectValues
-from diagnosis.free_runs import WindowedRuns
-from diagnosis.refine import drop_windows
-from diagnosis.residuals import (
+from diagnosis.error_covariance import (
     ErrorCovariance,
-    ParameterRay,
-    Residuals,
-    build_rays,
     compute_loss,
-    fit_noise,
-    join_windows,
+    fit_joint_noise,
     weigh_residuals,
 )
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.refine import drop_windows
+from diagnosis.residuals import ParameterRay, Residuals, build_rays
 from diagnosis.responses import (
     MIN_RESPONSE,
     Response,
@@ -147,8 +145,8 @@ class SimulatorComparison:
     """A simulator held against recordings.
 
     Attributes:
-        recordings: The recordings.
-        evidence: Its errors there.
+        recordings: The recordings, their commands as speeds.
+        residuals: Its errors there.
         source: Number of the recording of each window.
         row: Row of the first simulated position of each window.
     """
@@ -215,7 +213,8 @@ def compare_simulator(
     windows = open_loop.join_windows(cuts)
     valid_mask = np.ones((len(windows.q), machine.num_joints), dtype=bool)
     simulator = EffectSimulator(actuator, machine, windows, np.array(running), seed)
-    recordings, residuals = [one for one, _ in begun], Residuals(simulator, None, valid_mask)
+    recordings = view_recordings([one for one, _ in begun], machine)
+    residuals = Residuals(simulator, None, valid_mask)
     return SimulatorComparison(recordings, residuals, np.array(source), np.array(row))
 
 
@@ -357,9 +356,10 @@ def fit_covariances(
     pairs = [(one.residuals.error, one.residuals.increments) for one in left_out]
 
     def fit(j: int) -> ErrorCovariance:
-        error = [join_windows(one[..., j]) for one, _ in pairs]
-        moved = [join_windows(one[..., j]) for _, one in pairs]
-        return fit_noise(np.concatenate(error), np.concatenate(moved))
+        errors, motions = zip(
+            *((error[..., j], moved[..., j]) for error, moved in pairs), strict=True
+        )
+        return fit_joint_noise(errors, motions, machine)
 
     return map_parallel(fit, range(machine.num_joints))
 

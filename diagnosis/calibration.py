@@ -12,22 +12,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.spec import spec
 from diagnosis.detection import DetectionResult
 from diagnosis.residual_model import CLUES, CURVE, FORMS, LATER, STARTS, TIME
 
-OUTSIDE_SIGNS = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
-EFFECT_SIGNS = ("constant", "margin", "adds", "size", "names", "outside")
-GAP_SIGNS = (*OUTSIDE_SIGNS, "error", "worst", "gain")
-CHOICE_SIGNS = {
-    "effects": ("gain", "reference", "joints", "size", "shared"),
-    "none": GAP_SIGNS,
-    "unknown": GAP_SIGNS,
-    "stakes": ("effects", "none", "unknown"),
-}
-"""Signs of the hypotheses of each verdict, and the verdicts that have a stake; see `hypotheses`."""
-STAGES = ("timing", "actuation", "sensing", "kinematics", "perception")
 REFERENCE_FACTOR = 1.5
 """Times that a clue must earn what it earns on the reference before it counts."""
 LITTLE_NATS = 10.0
@@ -40,49 +27,6 @@ CLUE_NATS = 100.0
 OWN_CLUE_NATS = {STARTS: 50.0, CURVE: 1000.0, TIME: 1000.0, LATER: 1000.0}
 """The same of single clues: real forms differ most in starts and stops, little in their curve, and
 not with the running time."""
-
-
-@spec
-class ProbabilityModel:
-    """Weights of signs, and how far forms of effects differ.
-
-    Attributes:
-        outside: Of the signs that the cause lies outside the library; their weighted sum is the
-            logarithm of the odds.
-        right: Of the signs that an effect is rightly named.
-        form: Relative model-form error of the size of an effect, 1 sigma, by stage.
-        choice: Of the signs of hypotheses, by verdict, and the `stakes`: factors on the probability of
-            each verdict when one is told.
-    """
-
-    outside: dict[str, float]
-    right: dict[str, float]
-    form: dict[str, float]
-    choice: dict[str, dict[str, float]]
-
-    def check(self) -> None:
-        known = {
-            "outside": OUTSIDE_SIGNS,
-            "right": EFFECT_SIGNS,
-            "form": STAGES,
-            "choice": tuple(CHOICE_SIGNS),
-        }
-        given = {name: getattr(self, name) for name in known}
-        for verdict, signs in CHOICE_SIGNS.items():
-            known[f"choice.{verdict}"] = signs
-            given[f"choice.{verdict}"] = self.choice.get(verdict, {})
-        for name, signs in known.items():
-            for sign in given[name]:
-                if sign not in signs:
-                    raise ConfigError(
-                        f"certainty.{name}: '{sign}' is no sign; {list_choices(sign, signs)}"
-                    )
-            if missing := [sign for sign in signs if sign not in given[name]]:
-                raise ConfigError(
-                    f"certainty.{name}: expected a number for {', '.join(missing)} too"
-                )
-        if min(self.form.values()) < 0:
-            raise ConfigError("certainty: expected form of 0 or more")
 
 
 def compute_probability(weights: Mapping[str, float], signs: Mapping[str, float]) -> float:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from brokk_rl import open_loop, record
+from brokk_rl.commands import view_recordings
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -48,6 +49,10 @@ class GapCase:
     def doubts(self) -> list[str]:
         """Return reasons why these recordings cannot tell anything, in words for people; none where they can."""
         found = []
+        if self.machine.interface == "torque":
+            found.append(
+                "no effect of the library is one of joints commanded by torque; fit=force measures mass and friction"
+            )
         total_s = sum(recording.duration_s for recording in self.field)
         horizon_s = choose_horizon_s(self.machine)
         least_s = MIN_TOTAL_RUNS * horizon_s
@@ -63,7 +68,8 @@ class GapCase:
             found.append(
                 "there is one recording only, and no reference: nothing to judge by that it was not fitted to"
             )
-        u = np.concatenate([recording.u for recording in self.field])
+        field = view_recordings(self.field, self.machine)
+        u = np.concatenate([recording.u for recording in field])
         if not (np.abs(u) > COMMANDED).any():
             found.append("no joint is ever commanded in the field recordings")
         elif all(np.ptp(recording.u, axis=0).max() < COMMANDED for recording in self.field):
@@ -72,7 +78,8 @@ class GapCase:
 
     def resting(self) -> np.ndarray:
         """Return which joints are never commanded in the field recordings, `(J,)` bool."""
-        commanded = np.abs(np.concatenate([recording.u for recording in self.field])) > COMMANDED
+        field = view_recordings(self.field, self.machine)
+        commanded = np.abs(np.concatenate([recording.u for recording in field])) > COMMANDED
         return np.logical_not(np.any(commanded, axis=0))
 
 

@@ -17,10 +17,10 @@ import numpy as np
 from brokk_rl.machine import Machine
 from diagnosis import calibration
 from diagnosis.answer import Estimate, Selected
-from diagnosis.calibration import ProbabilityModel
-from diagnosis.detection import DetectionResult, Penalties, choose_by_penalties
+from diagnosis.detection import DetectionResult, choose_by_penalties
 from diagnosis.effect_library import DetectedEffect, EffectType, list_shared_effects
 from diagnosis.refine import drop_effects
+from diagnosis.request import Penalties, ProbabilityModel
 from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import fit_faults
 from diagnosis.search import EffectSet, Subset, SubsetScore, SubsetTable, list_promising_subsets

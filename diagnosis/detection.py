@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from brokk_rl.parallel import map_parallel
-from brokk_rl.spec import spec
 from diagnosis import (
     effect_library,
     geometry,
@@ -27,6 +26,7 @@ from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
 from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.refine import FittedSet, fit_set
+from diagnosis.request import Penalties
 from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import (
     REFERENCE_GRID,
@@ -64,26 +64,6 @@ MAX_REFITS = 2
 """Rounds in which all effects are simulated beside a fitted set."""
 ProgressCallback = Callable[[str, float], None]
 """Receives the name of the step and the share of the whole that is done."""
-
-
-@spec
-class Penalties:
-    """Penalties of effects, nats of log likelihood on recordings outside the fit.
-
-    Attributes:
-        joint: For each joint that has it, unless one cause is behind it on all joints.
-        reference: Factor on its gain on reference recordings.
-        name: For the effect as such.
-        partial: For each joint that lacks an effect with one cause for all joints.
-        share: Least part of the gain of its joint's set: an effect that adds less only corrects the
-            form of another.
-    """
-
-    joint: float
-    reference: float
-    name: float
-    partial: float
-    share: float
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,10 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[E
             raise ConfigError(
                 f"effect={option.name}: {path} cannot be imported ({error}); reinstall {option.package}"
             ) from error
-        if hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
+        if not hasattr(target, "numbers"):  # an option may hold several effects: it is none itself
+            continue
+        target = getattr(target, "find_variant", lambda _, own=target: own)(machine)
+        if target is not None:
             found[option.name] = EffectType(option.name, target, machine)
     for name in names or ():
         if name not in found:
@@ -371,7 +374,7 @@ class EffectSimulator:
         with torch.inference_mode():
             model.reset(torch.ones(count, dtype=torch.bool))
             plan = getattr(model, "plan_run", None)
-            run = (plan(u, size) if plan else None) or _SteppedRun(model, u, size)
+            run = (plan(u, size, q) if plan else None) or _SteppedRun(model, u, size)
             for k in range(size, len(q)):
                 position = run.step(k, q)
                 if k >= before:
@@ -447,9 +450,9 @@ class _DrivenModel:
         """Return the positions one control period later."""
         return self._model.step(history)
 
-    def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun:
+    def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> PlannedRun:
         """Return a run; an effect on commands makes other commands of `u`."""
-        return self._model.plan_run(u, first, self._drive if u is self._u else None)
+        return self._model.plan_run(u, first, q, drive=self._drive if u is self._u else None)
 
 
 class _SteppedRun:

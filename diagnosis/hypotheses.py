@@ -17,10 +17,11 @@ import numpy as np
 
 from diagnosis import calibration, decision
 from diagnosis.answer import Ranked, Selected, Verdict
-from diagnosis.calibration import LITTLE_NATS, MUCH_NATS, ProbabilityModel
-from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.calibration import LITTLE_NATS, MUCH_NATS
+from diagnosis.detection import DetectionResult
 from diagnosis.gap import GapClosure
 from diagnosis.refine import compute_gain, fit_set
+from diagnosis.request import Penalties, ProbabilityModel
 from diagnosis.search import MIN_SIZE, EffectSet, Subset
 
 # Chosen by hand; not searched.

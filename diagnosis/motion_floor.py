@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from diagnosis.bootstrap import draw_weights
+from diagnosis.error_covariance import ErrorCovariance
 from diagnosis.residual_model import MAX_STRAY
-from diagnosis.residuals import ErrorCovariance, Residuals
+from diagnosis.residuals import Residuals
 
 
 def expect_squares(noise: Sequence[ErrorCovariance], increments: np.ndarray) -> np.ndarray:

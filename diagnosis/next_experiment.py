@@ -19,7 +19,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from diagnosis.answer import NextExperiment
 from diagnosis.effect_library import EffectSimulator, EffectType, EffectValues
-from diagnosis.residuals import MAX_BLOCK_INCREMENTS, ErrorCovariance, to_increments
+from diagnosis.error_covariance import ErrorCovariance
+from diagnosis.residuals import MAX_BLOCK_INCREMENTS, to_increments
 
 EXPERIMENT_S = 30.0
 MIN_DISTANCE = 8.0

@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from brokk_rl.parallel import map_parallel
+from diagnosis.error_covariance import compute_loss
 from diagnosis.refine import (
     FittedSet,
     drop_windows,
@@ -25,14 +26,7 @@ from diagnosis.refine import (
     search_sizes,
     simulate_sizes,
 )
-from diagnosis.residuals import (
-    SIZE_GRID,
-    ParameterRay,
-    Residuals,
-    build_rays,
-    compute_loss,
-    to_increments,
-)
+from diagnosis.residuals import SIZE_GRID, ParameterRay, Residuals, build_rays, to_increments
 from diagnosis.responses import MIN_RESPONSE, Response
 from diagnosis.search import EffectSet, PenaltyFunction, SubsetTable
 

@@ -29,15 +29,15 @@ from diagnosis import (
 from diagnosis.answer import Answer, NextExperiment, Outcome, Ranked, Selected, Where
 from diagnosis.attribution import MIN_RESTORED, EffectAttribution, EffectPart
 from diagnosis.baseline import Baseline
-from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
 from diagnosis.closure import Estimate, Gate, serialize_estimate
-from diagnosis.detection import DetectionResult, Penalties, ProgressCallback
+from diagnosis.detection import DetectionResult, ProgressCallback
 from diagnosis.effect_library import DetectedEffect, EffectSimulator, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
 from diagnosis.hypotheses import MAX_SAME, Choice, Hypothesis
 from diagnosis.refine import FittedSet
+from diagnosis.request import Penalties, ProbabilityModel
 from diagnosis.residual_model import CLUES
 from diagnosis.rivals import Rival
 from diagnosis.speed_curves import SpeedCurves

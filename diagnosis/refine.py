@@ -12,7 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from diagnosis.effect_library import EffectSimulator, EffectType
-from diagnosis.residuals import ParameterRay, Residuals, compute_loss, weigh_residuals
+from diagnosis.error_covariance import compute_loss, weigh_residuals
+from diagnosis.residuals import ParameterRay, Residuals
 from diagnosis.responses import SIZE_PRIOR, fit_joint_faults
 from diagnosis.search import MIN_SIZE, EffectSet, PenaltyFunction, Subset
 

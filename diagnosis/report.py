@@ -198,7 +198,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
     answer, more = outcome.answer, outcome.answer.more
     text, tone = write_headline(answer)
     page = Report(f"Missing effects in the simulator of {machine.name}", text, tone)
-    if curves := more.get("curves"):
+    if machine.interface == "speed" and (curves := more.get("curves")):
         page.add_picture(
             plots.draw_speed_curves(curves, machine),
             "Speed over command, positive and negative side. Black: the machine; red: the simulator "

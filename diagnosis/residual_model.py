@@ -18,14 +18,9 @@ import numpy as np
 from scipy.signal import lfilter
 
 from brokk_rl.parallel import map_parallel
+from diagnosis.error_covariance import compute_loss, weigh_residuals
 from diagnosis.refine import FittedSet
-from diagnosis.residuals import (
-    INCREMENT_SAMPLES,
-    Residuals,
-    compute_loss,
-    to_increments,
-    weigh_residuals,
-)
+from diagnosis.residuals import INCREMENT_SAMPLES, Residuals, to_increments
 from diagnosis.responses import fit_sizes
 
 # Chosen by hand; not searched.

@@ -17,22 +17,14 @@ from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-from scipy.optimize import minimize
 
 from diagnosis.effect_library import EffectSimulator, EffectType
+from diagnosis.error_covariance import ErrorCovariance
 
 INCREMENT_SAMPLES = 5
 """Samples in an increment: a quarter of a second at 20 Hz."""
-T_FREEDOM = 5.0
-"""Degrees of freedom of the t distribution that whitened errors are taken to have."""
 MAX_BLOCK_INCREMENTS = 80
 """Increments in a block."""
-NO_BORDER = 1e300
-"""Last element of a bordered covariance: so large that the matrix stays positive definite."""
-COVARIANCE_WINDOWS = 3
-"""Windows in a row on which the noise is fitted."""
-MIN_TYPICAL_ERROR = 0.1
-"""Smallest typical error, over the root of the mean square."""
 
 
 def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
@@ -41,121 +33,6 @@ def to_increments(paths: np.ndarray, start: np.ndarray) -> np.ndarray:
     ends = paths[..., INCREMENT_SAMPLES - 1 : count * INCREMENT_SAMPLES : INCREMENT_SAMPLES, :]
     first = np.broadcast_to(start[:, None], (*ends.shape[:-2], 1, ends.shape[-1]))
     return np.diff(ends, axis=-2, prepend=first)
-
-
-def compute_loss(z: np.ndarray, axis: int | None = None) -> np.ndarray:
-    """Return the negative log likelihood of whitened errors, up to a constant, summed."""
-    return 0.5 * (T_FREEDOM + 1.0) * np.log1p(np.square(z) / T_FREEDOM).sum(axis)
-
-
-def weigh_residuals(z: np.ndarray) -> np.ndarray:
-    """Return the weights that turn squares of `z` into `loss` (iteratively reweighted least squares)."""
-    return (T_FREEDOM + 1.0) / (T_FREEDOM + np.square(z))
-
-
-@dataclass(frozen=True)
-class ErrorCovariance:
-    """Covariance of the increments of one joint's error, as a function of the simulated motion.
-
-    Attributes:
-        sensor: Standard deviation of each increment, rad or m.
-        change: The same over the change of speed between neighbouring increments.
-        wander: Relative standard deviation of the speed.
-        memory: Increments over which a wandering speed forgets.
-        reading: Standard deviation of each position as it is read, rad or m; it enters two
-            increments in a row with opposite signs.
-    """
-
-    sensor: float
-    change: float
-    wander: float
-    memory: float
-    reading: float = 0.0
-
-    def covariance(self, increments: np.ndarray) -> np.ndarray:
-        """Return the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `increments` `(B, S)`."""
-        lag = _count_between(increments.shape[1])
-        read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
-        kept = self.remember(increments.shape[1])
-        return (
-            self.wander**2 * increments[:, :, None] * increments[:, None, :] * kept
-            + self.vary(increments)[:, :, None] * np.eye(increments.shape[1])
-            + read
-        )
-
-    def remember(self, size: int) -> np.ndarray:
-        """Return the correlation of a wandering speed between `size` increments in a row, `(S, S)`."""
-        return np.exp(-_count_between(size) / self.memory)
-
-    def vary(self, increments: np.ndarray) -> np.ndarray:
-        """Return the variance of each increment that it shares with no other, `(B, S)`."""
-        turn = np.abs(np.diff(increments, axis=1, prepend=increments[:, :1])) + np.abs(
-            np.diff(increments, axis=1, append=increments[:, -1:])
-        )
-        return self.sensor**2 + (self.change * turn) ** 2
-
-    def strayed(self, increments: np.ndarray) -> np.ndarray:
-        """Return the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
-        return np.diagonal(self.covariance(increments).cumsum(1).cumsum(2), axis1=1, axis2=2)
-
-    def whitener(self, increments: np.ndarray) -> np.ndarray:
-        """Return the inverse Cholesky factors of the covariance, `(B, S, S)`."""
-        return np.linalg.inv(np.linalg.cholesky(self.covariance(increments)))
-
-
-def _count_between(size: int) -> np.ndarray:
-    """Return how many increments lie between two of `size` in a row, `(S, S)`."""
-    return np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
-
-
-def join_windows(values: np.ndarray) -> np.ndarray:
-    """Return increments `(W, I)` with `COVARIANCE_WINDOWS` in a row, `(W / N, N I)`."""
-    together = min(COVARIANCE_WINDOWS, len(values))
-    return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
-
-
-def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
-    """Return the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
-    # a joint that stands still most of the time, read by a coarse sensor, has a median error of 0
-    typical = (
-        max(1.4826 * np.median(np.abs(error)), MIN_TYPICAL_ERROR * np.sqrt(np.mean(error**2)))
-        + 1e-9
-    )
-    size = np.sqrt(np.mean(increments**2)) + 1e-9
-    error = np.clip(
-        error, -12.0 * typical - 0.3 * np.abs(increments), 12.0 * typical + 0.3 * np.abs(increments)
-    )
-
-    steps = increments.shape[1]
-    # The Cholesky factor of the covariance bordered by the error has the whitened error in its last row.
-    bordered = np.zeros((len(error), steps + 1, steps + 1))
-    bordered[:, -1, :-1] = error
-    products = increments[:, :, None] * increments[:, None, :]
-    diagonal = np.arange(steps)
-
-    def minus_log(x: np.ndarray) -> float:
-        noise = ErrorCovariance(*np.exp(x))
-        bordered[:, :-1, :-1] = noise.wander**2 * noise.remember(steps) * products
-        bordered[:, diagonal, diagonal] += noise.vary(increments) + 1e-18
-        bordered[:, -1, -1] = NO_BORDER
-        factor = np.linalg.cholesky(bordered)
-        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)[:, :-1]).sum()
-        z = factor[:, -1, :-1]
-        return float(compute_loss(z) + log_size + 0.02 * np.square(x[3] - np.log(10.0)) * 10)
-
-    start = np.log([typical, 0.05, max(0.01, 0.5 * np.sqrt(np.mean(error**2)) / size), 10.0])
-    low, high = (
-        np.log([typical / 10, 1e-4, 1e-4, 1.0]),
-        np.log([10 * typical + 1e-6, 1.0, 0.5, 200.0]),
-    )
-    found = minimize(
-        minus_log,
-        start,
-        method="L-BFGS-B",
-        bounds=list(zip(low, high, strict=True)),
-        options={"maxiter": 40},
-    )
-    return ErrorCovariance(*np.exp(found.x))
 
 
 SIZE_GRID = (0.12, 0.3, 0.6, 1.0, 1.6, 2.5, 4.0)

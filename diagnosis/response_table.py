@@ -16,7 +16,8 @@ import numpy as np
 from brokk_rl.contracts.preview import PreviewCallback
 from diagnosis.decision import SAME_NATS, SAME_SHARE
 from diagnosis.effect_library import EffectType
-from diagnosis.residuals import T_FREEDOM, Residuals, build_rays
+from diagnosis.error_covariance import T_FREEDOM
+from diagnosis.residuals import Residuals, build_rays
 from diagnosis.responses import SIZE_PRIOR
 
 TRIED_SIZES = np.geomspace(0.02, 4.0, 240)

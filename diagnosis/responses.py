@@ -17,15 +17,8 @@ import numpy as np
 
 from brokk_rl.parallel import map_parallel
 from diagnosis.effect_library import EffectType, list_shared_effects
-from diagnosis.residuals import (
-    SIZE_GRID,
-    T_FREEDOM,
-    ParameterRay,
-    Residuals,
-    build_rays,
-    compute_loss,
-    weigh_residuals,
-)
+from diagnosis.error_covariance import T_FREEDOM, compute_loss, weigh_residuals
+from diagnosis.residuals import SIZE_GRID, ParameterRay, Residuals, build_rays
 
 # Chosen by hand; not searched.
 BETWEEN = (0.25, 0.5, 0.75)

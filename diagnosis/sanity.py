@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from brokk_rl.commands import view_recordings
 from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
@@ -291,6 +292,7 @@ def examine_recordings(
     recordings: Sequence[Recording], machine: Machine, thresholds: InspectionThresholds
 ) -> list[RecordingRemark]:
     """Return all remarks about recordings of `machine`, the most severe first."""
+    recordings = view_recordings(recordings, machine)
     inspected = [
         (recording, inspect_recording(recording, machine, thresholds).findings)
         for recording in recordings

@@ -110,6 +110,8 @@ def measure_curves(
     Raises:
         RecordingError: no recording is long enough.
     """
+    if machine.interface != "speed":  # a target or a torque sets no speed: there is no such curve
+        return SpeedCurves(np.array(fit.knots), {})
     measured = _place_steps(field, field.residuals.simulator.cut.measured)
     motions = [measured, _place_steps(field, field.residuals.base)]
     further = [_place_steps(one, one.residuals.base) for one in others]

@@ -28,10 +28,11 @@ from brokk_rl.scales import choose_horizon_s
 from brokk_rl.spec import name_spec, spec
 from diagnosis import effect_library
 from diagnosis.case import estimate_running_s
-from diagnosis.detection import Penalties
 from diagnosis.effect_library import EffectSimulator, EffectType
+from diagnosis.error_covariance import ErrorCovariance
 from diagnosis.late_frames import find_smallest_lateness
-from diagnosis.residuals import INCREMENT_SAMPLES, ErrorCovariance, Residuals
+from diagnosis.request import Penalties
+from diagnosis.residuals import INCREMENT_SAMPLES, Residuals
 from diagnosis.response_table import (
     ResponseTable,
     compare_pair,

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from brokk_rl.commands import view_speeds
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from diagnosis import gates
@@ -140,7 +141,9 @@ def _build_reach(
 
 def collect_rivals(base: Baseline) -> dict[str, Rival]:
     """Return the rivals on the windows of the field; a flexible model that is at hand replaces the boosting."""
-    found = measure_rivals(base.field.residuals.simulator.cut)
+    simulator = base.field.residuals.simulator
+    cut = simulator.cut
+    found = measure_rivals(replace(cut, u=view_speeds(cut.u, simulator.machine)))
     if base.is_flexible and base.left_out:
         squares = [measure_squares(one.residuals) for one in base.left_out]
         found["flexible"] = Rival(np.concatenate(squares))

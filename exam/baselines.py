@@ -18,7 +18,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from diagnosis import responses
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict, Where
-from diagnosis.residuals import compute_loss
+from diagnosis.error_covariance import compute_loss
 from exam import oracle
 from exam.oracle import JointErrors
 

@@ -24,9 +24,9 @@ from brokk_rl.machine import Machine
 from diagnosis import answer, decision, hypotheses
 from diagnosis import calibration as certainty
 from diagnosis.answer import Answer, Selected, Where
-from diagnosis.calibration import ProbabilityModel
-from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.detection import DetectionResult
 from diagnosis.effect_library import EffectType
+from diagnosis.request import Penalties, ProbabilityModel
 from exam import dataset, score
 from exam.score import QUIET_KINDS, CaseScore, ParameterScore
 

@@ -49,6 +49,13 @@ class ExportedPolicy:
         }
         return np.concatenate([np.ravel(parts[name.split()[0]]) for name in scale["order"]])
 
+    def observe_parts(self, **samples):
+        """Return the observation vector of a task made of terms, of its parts (samples, width)."""
+        scaled = []
+        for part in self.contract["observation"]["parts"]:
+            scaled.append(np.ravel((samples[part["name"]] - part["mean"]) / part["std"]))
+        return np.concatenate(scaled)
+
     def command(self, observation):
         """Return the command, (J,), in the order of `joints`: a share of the full valve opening."""
         batch = observation[None].astype(np.float32)
@@ -101,7 +108,10 @@ def compare_with_golden_answers(folder):
     inputs, found = golden["inputs"], []
     for i in range(len(golden["command"])):
         one = {name: np.array(values[i]) for name, values in inputs.items()}
-        found.append(policy.command(policy.observe(one.pop("target_in_base_m"), **one)))
+        has_parts = "parts" in policy.contract["observation"]
+        observe = policy.observe_parts if has_parts else policy.observe
+        target = [] if has_parts else [one.pop("target_in_base_m")]
+        found.append(policy.command(observe(*target, **one)))
     return np.abs(np.array(found) - golden["command"]).max()
 
 

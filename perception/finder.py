@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -39,6 +39,8 @@ inside each other the larger one wins, a weak larger one does not."""
 SAME_REGION = 0.6
 """Distance, as a part of the smaller major semi-axis, below which a proposal shows the region of an
 ellipse. Chosen by hand: the middle of a region with a broken rim is off by up to 0.35."""
+MOST_CANDIDATES = 16
+"""Candidates of a stage that are judged, the best first: each takes about 10 ms."""
 SHAPE_REASONS = ("part of a circle on the face with a rim", "radius, m", "axis ratio on the face")
 """Reasons that refuse an ellipse and not its region: it may have followed the wrong edges."""
 
@@ -92,6 +94,14 @@ EXPLANATIONS = {
         "it is evenly dark, and as deep as the face",
         "A flat dark disc looks like this.",
     ),
+    "major semi-axis where it lies, px": (
+        "a hole in the face around it does not look as large or as small",
+        "Check perception.radius_m if the holes have another size.",
+    ),
+    "candidates of a frame before it": (
+        "there are too many better candidates in the frame",
+        "Grain or clutter that looks like rims.",
+    ),
     "distance to a larger rim, m": (
         "it lies within a larger rim",
         "The far rim or the floor of a hole.",
@@ -119,6 +129,8 @@ class StagedPerception:
         segmenter: Marks the block.
         ellipse: Finds ellipses on it.
         proposer: Proposes further places, by other signs than edges; `null` for none.
+        regions_first: Judge the proposer's places first, and search ellipses only in frames where
+            none of them is a hole: faster, but a frame with several holes may show fewer of them.
         pose: Turns ellipses into holes.
         radius_m: Radius of the holes; limits the size of the ellipses.
         size_slack: Allowed relative error of that size.
@@ -134,6 +146,7 @@ class StagedPerception:
     segmenter: SegmenterSpec
     ellipse: EllipseDetectorSpec
     proposer: HoleProposerSpec | None
+    regions_first: bool
     pose: PoseEstimatorSpec
     radius_m: float
     size_slack: float
@@ -156,6 +169,21 @@ class StagedPerception:
     def build(self) -> StagedFinder:
         """Return a finder."""
         return StagedFinder(self)
+
+
+@dataclass(frozen=True)
+class _Judged:
+    """Candidates of a frame that were judged.
+
+    Attributes:
+        found: Holes, with the candidates they come from.
+        rejected: Refused candidates.
+        decided: Candidates that were judged by their appearance.
+    """
+
+    found: list[tuple[Ellipse, HolePose]]
+    rejected: list[Rejection]
+    decided: list[Ellipse]
 
 
 class StagedFinder:
@@ -191,25 +219,32 @@ class StagedFinder:
             reason = "part of the picture that is block"
             rejection = Rejection("segment", reason, share, s.smallest_block)
             return FrameDetections([], [rejection], [], masks, ms)
-        with _time_stage(ms, "ellipse"):
-            ellipses = self._detect_ellipses(frame, on_block)
-        proposals: list[Ellipse] = []
-        if self._proposer is not None:
-            with _time_stage(ms, "regions"):
-                proposals = self._proposer.propose(frame, masks)
-        with _time_stage(ms, "pose"):
-            found, rejected = self._judge(frame, masks, ellipses, proposals)
-            found, doubles = self._remove_inner_rims(found)
-        if not ellipses and not proposals:
+        judged = _Judged([], [], [])
+        # Regions take a third of the time of arcs: searched first, they may make arcs needless.
+        stages = ("regions", "ellipse") if s.regions_first else ("ellipse", "regions")
+        for stage in stages:
+            if s.regions_first and judged.found:
+                break
+            with _time_stage(ms, stage):
+                if stage == "ellipse":
+                    candidates, wrong_size = self._detect_ellipses(frame, on_block)
+                    judged.rejected.extend(wrong_size)
+                else:
+                    candidates = self._proposer.propose(frame, masks) if self._proposer else []
+            with _time_stage(ms, "pose"):
+                self._judge(frame, masks, candidates, judged)
+        found, doubles = self._remove_inner_rims(judged.found)
+        rejected = judged.rejected
+        if not found and not rejected:
             rejected = [Rejection("ellipse", "ellipses of a possible size on the block", 0.0, 1.0)]
         # Doubles are holes too; they are told apart from rejected candidates only by their
         # reason.
         rejected += doubles
-        judged = [ellipse for ellipse, _ in found]
-        judged += [one.ellipse for one in rejected if one.ellipse is not None]
+        shown = [ellipse for ellipse, _ in found]
+        shown += [one.ellipse for one in rejected if one.ellipse is not None]
         # The stages so far; what follows is negligible.
         ms["total"] = sum(ms.values())
-        detections = FrameDetections([pose for _, pose in found], rejected, judged, masks, ms)
+        detections = FrameDetections([pose for _, pose in found], rejected, shown, masks, ms)
         return detections.in_base_frame(frame)
 
     def find_ellipses(self, frame: Frame) -> list[Ellipse]:
@@ -221,28 +256,33 @@ class StagedFinder:
         return explain_rejection(rejection)
 
     def _judge(
-        self, frame: Frame, masks: Masks, ellipses: Sequence[Ellipse], proposals: Sequence[Ellipse]
-    ) -> tuple[list[tuple[Ellipse, HolePose]], list[Rejection]]:
-        """Return the holes among ellipses and proposals, and why the others are none."""
-        found: list[tuple[Ellipse, HolePose]] = []
-        rejected: list[Rejection] = []
-        decided: list[Ellipse] = []
+        self, frame: Frame, masks: Masks, candidates: Sequence[Ellipse], judged: _Judged
+    ) -> None:
+        """Add the holes among some candidates, and why the others are none."""
+        # The appearance of a place is judged in one stage; its shape may be wrong, and another right.
+        decided = list(judged.decided)
         # Every candidate is judged alone: holes do not compete until all are known.
-        for candidate in (*ellipses, *proposals):
-            # A proposal is of use only where no ellipse was judged by its appearance.
-            if candidate in proposals and _is_near_any(candidate, decided):
+        for number, candidate in enumerate(candidates):
+            if _is_near_any(candidate, decided):
+                continue
+            if number >= MOST_CANDIDATES:
+                reason = "candidates of a frame before it"
+                judged.rejected.append(
+                    Rejection("ellipse", reason, float(number), MOST_CANDIDATES, candidate)
+                )
                 continue
             pose = self._pose.estimate(frame, masks, candidate)
             if isinstance(pose, Rejection):
-                rejected.append(pose)
+                judged.rejected.append(pose)
             else:
-                found.append((candidate, pose))
+                judged.found.append((candidate, pose))
             if not isinstance(pose, Rejection) or pose.reason not in SHAPE_REASONS:
-                decided.append(candidate)
-        return found, rejected
+                judged.decided.append(candidate)
 
-    def _detect_ellipses(self, frame: Frame, on_block: np.ndarray) -> list[Ellipse]:
-        """Return the ellipses of a possible size on the block, each rim once."""
+    def _detect_ellipses(
+        self, frame: Frame, on_block: np.ndarray
+    ) -> tuple[list[Ellipse], list[Rejection]]:
+        """Return the ellipses of a possible size on the block, each rim once, and the others."""
         s = self.settings
         gray = convert_to_gray(frame)
         levels = search.plan_search_levels(
@@ -250,10 +290,16 @@ class StagedFinder:
         )
         if s.roi == "box":
             levels = search.merge_levels_to_box(on_block, levels)
-        ellipses = []
+        ellipses, wrong_size = [], []
         for level in levels:
-            ellipses += level.detect(self._detector, gray)
-        return _remove_duplicates(ellipses)
+            for ellipse in level.detect(self._detector, gray):
+                limit_px = level.find_missed_limit(ellipse)
+                if limit_px is None:
+                    ellipses.append(ellipse)
+                else:
+                    reason = "major semi-axis where it lies, px"
+                    wrong_size.append(Rejection("ellipse", reason, ellipse.a, limit_px, ellipse))
+        return _remove_duplicates(ellipses), wrong_size
 
     def _remove_inner_rims(
         self, found: Sequence[tuple[Ellipse, HolePose]]
@@ -355,7 +401,7 @@ def _is_same_ellipse(one: Ellipse, other: Ellipse, size: float) -> bool:
 
 @contextmanager
 def _time_stage(ms: dict[str, float], stage: str) -> Iterator[None]:
-    """Measure the duration of a stage, ms."""
+    """Add the duration of a stage, ms."""
     start = time.perf_counter()
     yield
-    ms[stage] = 1000.0 * (time.perf_counter() - start)
+    ms[stage] = ms.get(stage, 0.0) + 1000.0 * (time.perf_counter() - start)

@@ -46,9 +46,11 @@ AROUND = 2.0
 """Radii around a pixel within which its gradient is compared with the usual one."""
 INSIDE, RING = 0.75, (1.25, 1.75)
 """Radii of the inside of a region, and of the ring of face around it."""
+DARKER_PART = 33.0
+"""Percentile of a ring with which the inside is compared: half of it may lie in the sun."""
 APART = 1.0
 """Least distance of two proposals, in radii."""
-ROUND, ON_FACE = 24, 0.5
+ROUND, ON_FACE = 24, 0.8
 """Places around a region at each of six radii where depth is read; least part of the outer ones
 that lies on the face: the arm may cover the rest."""
 
@@ -66,7 +68,6 @@ class FaceRegions:
         darker: Least contrast of inside and ring, over the brightness of the ring.
         hole_mask: Least mean of the segmenter's hole mask inside.
         void: Least part of the inside without depth or behind the face, less that of the ring.
-        most: Most proposals of a frame, the best ones.
     """
 
     radius_m: float
@@ -77,13 +78,12 @@ class FaceRegions:
     darker: float
     hole_mask: float
     void: float
-    most: int
 
     def check(self) -> None:
-        if self.radius_m <= 0 or self.radius_px < 4 or self.most < 1:
+        if self.radius_m <= 0 or self.radius_px < 4:
             raise ConfigError(
-                "perception.proposer: expected radius_m > 0, radius_px >= 4 and most >= 1, got "
-                f"{self.radius_m}, {self.radius_px} and {self.most}"
+                "perception.proposer: expected radius_m > 0 and radius_px >= 4, got "
+                f"{self.radius_m} and {self.radius_px}"
             )
 
     def build(self) -> FaceRegionProposer:
@@ -109,7 +109,7 @@ class FaceRegionProposer:
         for one in sorted(found, key=lambda one: -one.score):
             if all(np.hypot(one.x - k.x, one.y - k.y) > APART * k.b for k in kept):
                 kept.append(one)
-        return kept[: s.most]
+        return kept
 
     def _propose_on(
         self, face: FacePicture, frame: Frame, gray: np.ndarray, masks: Masks
@@ -123,13 +123,11 @@ class FaceRegionProposer:
         rows, columns = np.nonzero((border == highest) & (border >= s.weak_border))
         if not len(rows):
             return
-        block = masks.block > 0.5
-        for row, column in zip(rows.tolist(), columns.tolist(), strict=True):
-            on, void = face.measure_depth(frame, block, row, column, s.noise_per_m)
+        on, void = face.measure_depth(frame, masks.block > 0.5, rows, columns, s.noise_per_m)
+        for number in np.flatnonzero(on >= ON_FACE).tolist():
+            row, column = int(rows[number]), int(columns[number])
             share = min(float(border[row, column]), 1.0)
-            if on < ON_FACE:
-                continue
-            if share < s.border and void < s.void:
+            if share < s.border and void[number] < s.void:
                 bright, dark = average_parts(drawn, row, column, face.radius_px)
                 is_dark = bright - dark >= s.darker * max(bright, 1.0)
                 if not is_dark and self._measure_mouth(face, masks, row, column) < s.hole_mask:
@@ -218,18 +216,23 @@ class FacePicture:
         ).astype(np.float32)
 
     def measure_depth(
-        self, frame: Frame, mask: np.ndarray, row: int, column: int, noise_per_m: float
-    ) -> tuple[float, float]:
-        """Return the part of a ring around a pixel that lies on the face, and the void inside.
+        self,
+        frame: Frame,
+        mask: np.ndarray,
+        rows: np.ndarray,
+        columns: np.ndarray,
+        noise_per_m: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the part of a ring around pixels `(R,)` that lies on the face, and the void inside.
 
-        The void is the part without depth, or with depth behind the face.
+        The void is the part without depth, or with depth behind the face, less that of the ring.
         """
         angle = np.linspace(0.0, 2 * np.pi, ROUND, endpoint=False)
         radii = self.radius_px * np.array([[0.25], [0.5], [0.75], [1.3], [1.6], [1.9]])
-        x = (column + radii * np.cos(angle)).ravel()
-        y = (row + radii * np.sin(angle)).ravel()
-        u, v, w = self.into_frame @ np.stack([x, y, np.ones_like(x)])
-        u, v = np.rint(u / w).astype(int), np.rint(v / w).astype(int)
+        x = columns[:, None] + (radii * np.cos(angle)).ravel()
+        y = rows[:, None] + (radii * np.sin(angle)).ravel()
+        seen = np.stack([x, y, np.ones_like(x)], -1) @ self.into_frame.T
+        u, v = np.moveaxis(np.rint(seen[..., :2] / seen[..., 2:]).astype(int), -1, 0)
         height, width = mask.shape
         shown = (u >= 0) & (u < width) & (v >= 0) & (v < height)
         u, v = u.clip(0, width - 1), v.clip(0, height - 1)
@@ -238,8 +241,8 @@ class FacePicture:
         off = 1.0 / frame.depth_m[v, u] - here
         on = shown & mask[v, u] & (np.abs(off) < 2 * NOISES * noise_per_m)
         void = shown & ~(off > -NOISES * noise_per_m)
-        half = len(x) // 2
-        return float(on[half:].mean()), float(void[:half].mean() - void[half:].mean())
+        half = x.shape[1] // 2
+        return on[:, half:].mean(1), void[:, :half].mean(1) - void[:, half:].mean(1)
 
 
 def find_faces(
@@ -330,11 +333,13 @@ def vote_for_centres(drawn: np.ndarray, radius_px: float) -> np.ndarray:
 def average_parts(
     picture: np.ndarray, row: int, column: int, radius_px: float
 ) -> tuple[float, float]:
-    """Return the mean of a picture in the ring around a place, and inside it."""
+    """Return the lower third of a picture in the ring around a place, and its mean inside."""
     reach = int(RING[1] * radius_px) + 1
     top, left = max(0, row - reach), max(0, column - reach)
     part = picture[top : row + reach + 1, left : column + reach + 1]
     y, x = np.ogrid[top : top + part.shape[0], left : left + part.shape[1]]
     radii = np.hypot(y - row, x - column) / radius_px
     ring, inside = part[(radii > RING[0]) & (radii < RING[1])], part[radii < INSIDE]
-    return float(ring.mean()) if ring.size else 0.0, float(inside.mean()) if inside.size else 0.0
+    return float(np.percentile(ring, DARKER_PART)) if ring.size else 0.0, float(
+        inside.mean()
+    ) if inside.size else 0.0

@@ -64,14 +64,13 @@ class SearchLevel:
     depth_m: np.ndarray | None = None
     nearest_m: np.ndarray | None = None
 
-    def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        """Return the ellipses of a possible size at their place, in px of the picture `(h, w)`."""
-        return [one for one in self._detect_all(detector, gray) if self._fits(one)]
+    def find_missed_limit(self, one: Ellipse) -> float | None:
+        """Return the limit that the size of an ellipse misses where it lies, px; `None` for none.
 
-    def _fits(self, one: Ellipse) -> bool:
-        """Return whether a hole in the face around an ellipse can look as large; true for unknown depth."""
+        Where the depth of the face is unknown, any size is possible.
+        """
         if self.sizes_px is None:
-            return True
+            return None
         # An ellipse may lie on the border of two depths; one of them must allow its size.
         reach = AROUND * one.a
         rows = slice(max(0, int((one.y - reach) / STEP)), int((one.y + reach) / STEP) + 1)
@@ -79,12 +78,15 @@ class SearchLevel:
         near = self.sizes_px[rows, columns]
         # No depth near the ellipse: nothing speaks against its size.
         near = near[np.isfinite(near)]
-        return not near.size or near.min() / (1.0 + self.slack) <= one.a <= near.max() * (
-            1.0 + self.slack
-        )
+        if not near.size:
+            return None
+        lowest, highest = near.min() / (1.0 + self.slack), near.max() * (1.0 + self.slack)
+        if one.a < lowest:
+            return float(lowest)
+        return float(highest) if one.a > highest else None
 
-    def _detect_all(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
-        """Return the ellipses of the region, whatever their size at their place."""
+    def detect(self, detector: EllipseDetector, gray: np.ndarray) -> list[Ellipse]:
+        """Return the ellipses of the region in px of the picture `(h, w)`, whatever their size there."""
         # Only the bounding box is searched: the cost of the detector is proportional to its area.
         x, y, wide, high = cv2.boundingRect(self.region)
         left, top = x * STEP, y * STEP

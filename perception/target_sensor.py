@@ -19,7 +19,7 @@ import numpy as np
 
 from brokk_rl.contracts.target import MotionPlan, TargetReading
 from brokk_rl.contracts.vision import BoreholeFinder, FinderSpec, HolePose, TrackedHole, TrackerSpec
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.spec import spec
@@ -30,8 +30,8 @@ from perception.mount.occlusion import ArmShape
 from perception.render.stereo_camera import StereoRig, place_rig
 from perception.sources.simulator import SimulatedCamera, make_frame
 
-UP = np.array([0.0, 0.0, 1.0])
-"""Axis of a hole that was never seen: the task drills from above."""
+LEAST_HINT_M = 1e-3
+"""Least error of a pointed place as the choice of a view takes it: nobody points better."""
 
 
 @spec
@@ -101,6 +101,7 @@ class WatchedHole:
     Attributes:
         position: Position of the mount, `(A,)`.
         arrives_s: Time from which its pictures are used.
+        num_missed: Last pictures from this position in which nothing was found.
         choice: The last choice of a view, `None` before the first.
         hole: The tracked hole, `None` before the first detection.
         history: What happened at each frame, JSON data.
@@ -120,8 +121,9 @@ class WatchedHole:
         self._tracker = settings.tracker.build()
         self._shared = mount.error.draw(generator, "shared")
         self._view = mount.error.draw(generator, "view")
-        self._waiting: deque[tuple[float, Sequence[HolePose], float]] = deque()
+        self._waiting: deque[tuple[float, Sequence[HolePose] | None, float]] = deque()
         self.position, self.arrives_s = mount.start.copy(), 0.0
+        self.num_missed = 0
         self.choice: ViewChoice | None = None
         self.hole: TrackedHole | None = None
         self.history: list[dict[str, Any]] = []
@@ -133,22 +135,18 @@ class WatchedHole:
 
     def believe(self) -> HoleBelief:
         """Return what is known, for the choice of a view."""
-        drift_m2_s = getattr(self._settings.tracker, "drift_m_sqrt_s", 0.0) ** 2
-        radius_m = self.task_scene[5]
-        if self.hole is None:
-            cov_m2 = max(self._settings.hint_m, 1e-3) ** 2 * np.eye(3)
-            return HoleBelief(self._hint_m, UP, radius_m, cov_m2, drift_m2_s)
-        pose = self.hole.pose
-        shared_m2 = np.zeros((3, 3)) if pose.shared_m2 is None else pose.shared_m2
-        own_m2 = pose.cov_m2 - shared_m2 + 1e-10 * np.eye(3)
-        return HoleBelief(pose.center_m, pose.axis, radius_m, own_m2, drift_m2_s)
+        if self.hole is not None:
+            return HoleBelief.take(self.hole)
+        std_m = max(self._settings.hint_m, LEAST_HINT_M)
+        return HoleBelief.expect(self._hint_m, self.task_scene[5], std_m)
 
     def move(self, choice: ViewChoice, t_s: float) -> None:
         """Send the mount to a chosen view."""
         self.choice = choice
-        if choice.is_new:
-            self.position, self.arrives_s = choice.position, t_s + choice.travel_s
+        if choice.view.is_moving:
+            self.position, self.arrives_s = choice.position, t_s + choice.view.travel_s
             self._view = self._mount.error.draw(self._generator, "view")
+            self.num_missed = 0
 
     def expose(
         self,
@@ -175,27 +173,31 @@ class WatchedHole:
             self.task_scene, chain_m, true, believed, (int(corner[0]), int(corner[1])), t_s, seed
         )
 
-    def wait_for(self, holes: Sequence[HolePose], t_s: float) -> None:
-        """Take the holes of a picture at `t_s`; they become known after the delay."""
+    def wait_for(self, holes: Sequence[HolePose] | None, t_s: float) -> None:
+        """Take the holes of a picture at `t_s`, known after the delay; `None`: no sharp picture."""
         self._waiting.append((t_s + self._settings.delay_s, holes, t_s))
 
     def learn(self, now_s: float) -> None:
         """Hand to the tracker what has become known by now."""
         while self._waiting and self._waiting[0][0] <= now_s + 1e-9:
             _, holes, t_s = self._waiting.popleft()
-            tracked = self._tracker.update(holes, t_s)
+            if holes is not None and t_s >= self.arrives_s - 1e-9:
+                self.num_missed = 0 if holes else self.num_missed + 1
+            tracked = self._tracker.update(holes or (), t_s)
             near = []
             for hole in tracked:
                 if np.linalg.norm(hole.pose.center_m - self._hint_m) < 4 * self._settings.hint_m:
                     near.append(hole)
             # The person's choice: of several holes the surest that was seen most often.
             self.hole = max(near, key=lambda hole: hole.num_frames, default=self.hole)
-            self.history.append(self._describe(holes, t_s))
+            self.history.append(self._describe(holes or (), t_s))
 
     def _describe(self, holes: Sequence[HolePose], t_s: float) -> dict[str, Any]:
         known = self.hole
         error_m = None if known is None else known.pose.center_m - self.true_m
+        reason = None if self.choice is None else self.choice.view.explain()
         return {
+            "reason": reason,
             "t_s": round(t_s, 3),
             "seen": len(holes) > 0,
             "view": self._mount.describe(self.position),
@@ -215,7 +217,7 @@ class PerceivedTargets:
         rig = settings.camera.rig
         self._planner = settings.next_view.build(machine, self._mount, rig, settings.arm)
         self._finder = settings.finder.build()
-        self._attended = np.ones(num_envs, bool)
+        self._attended = np.zeros(num_envs, bool)
         self._steps = np.zeros(num_envs, int)
         self._before: np.ndarray | None = None
         self._episodes = np.zeros(num_envs, int)
@@ -239,8 +241,8 @@ class PerceivedTargets:
             self._steps[number] = 0
             self._episodes[number] += 1
 
-    def forget(self) -> None:
-        """Forget all episodes; see `TargetSensor.forget`."""
+    def begin(self) -> None:
+        """Forget all episodes, and look everywhere; see `TargetSensor.begin`."""
         self.watched, self.ended = [], []
         self._episodes[:], self._attended[:] = 0, True
 
@@ -287,11 +289,12 @@ class PerceivedTargets:
             eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             seed = (self._seed, int(number), int(self._steps[number]))
             chain_m = self._settings.arm.trace(self._machine, q[number])
-            exposure = None
-            if t_s >= eye.arrives_s - 1e-9 and self._is_steady(eye, int(number), q):
-                exposure = eye.expose(q[number], measured_q[number], chain_m, t_s, seed)
+            if t_s < eye.arrives_s - 1e-9 or not self._is_steady(eye, int(number), q):
+                eye.wait_for(None, t_s)
+                continue
+            exposure = eye.expose(q[number], measured_q[number], chain_m, t_s, seed)
             if exposure is None:
-                eye.wait_for([], t_s)
+                eye.wait_for((), t_s)
             else:
                 asked.append((int(number), exposure))
         with use_workers(self._settings.num_processes):
@@ -322,7 +325,10 @@ class PerceivedTargets:
         for number in due:
             eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             if t_s >= eye.arrives_s - 1e-9:  # one motion at a time
-                eye.move(self._planner.choose(eye.believe(), eye.position, planned[number]), t_s)
+                choice = self._planner.choose(
+                    eye.believe(), eye.position, planned[number], eye.num_missed
+                )
+                eye.move(choice, t_s)
 
 
 def _search(
@@ -339,4 +345,7 @@ def _search(
         base_from_camera=exposure.believed_pose,
         camera_cov=mount.error.covariance,
     )
-    return list(finder.find(frame).in_base_frame(frame).holes)
+    try:
+        return list(finder.find(frame).in_base_frame(frame).holes)
+    except FrameError:  # the arm fills the picture: no depth
+        return []

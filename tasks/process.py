@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Callable
 from dataclasses import asdict
-from pkgutil import resolve_name
 from typing import Any, Protocol
 
 import torch
@@ -26,6 +24,7 @@ from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.classical import ClassicalController
 from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
 from tasks.options import ToolPoseOptions
+from tasks.reward import RewardSum
 from tasks.starts import DrawTally, move_starts_near
 from tasks.step_state import ToolState
 from tasks.termination import EpisodeTerms
@@ -113,15 +112,12 @@ class ToolPoseProcess:
         self._lower, self._upper = to_constant(machine.lower), to_constant(machine.upper)
         self._endings = EpisodeTerms(options.termination)
         self.reasons = self._endings.reasons
-        self._terms: dict[str, tuple[Callable[[ToolState], torch.Tensor], float]] = {
-            name: (resolve_name(term.function), term.weight)
-            for name, term in options.reward.items()
-        }
+        self._rewards = RewardSum(options.reward, options.curriculum)
         self.state = {
             name: torch.zeros((num_envs, *shape), device=device)
             for name, shape in self._list_state_shapes().items()
         }
-        figures = (*FIGURES, *(f"{REWARD}{name}" for name in self._terms))
+        figures = (*FIGURES, *(f"{REWARD}{name}" for name in options.reward))
         self.episode = {name: torch.zeros(num_envs, device=device) for name in figures}
 
     def _list_state_shapes(self) -> dict[str, tuple[int, ...]]:
@@ -253,7 +249,8 @@ class ToolPoseProcess:
         force_n = torch.where(world.faults, 0.0, world.contact_force_n)
         tool = self._make_tool_state(q, pose, verdict, force_n)
         endings = self._endings.judge(tool, world.faults)
-        reward = self._sum_reward(tool, endings.is_sound)
+        succeeded = state.get("succeeded", state["steps"])  # read with a curriculum only
+        reward = self._rewards(tool, endings.is_sound, succeeded, self.episode)
         self._count(tool, history.u, reward)
         state["closeness"].copy_(verdict["closeness"])
         state["contact_force_n"].copy_(force_n)
@@ -263,16 +260,6 @@ class ToolPoseProcess:
             timed_out=endings.timed_out,
             reason=endings.reason,
         )
-
-    def _sum_reward(self, tool: ToolState, is_sound: torch.Tensor) -> torch.Tensor:
-        """Return the weighted sum of all terms where `is_sound`, `(N,)`, else 0; adds up each term."""
-        curriculum, reward = self.options.curriculum, torch.zeros_like(tool.reach_m)
-        scale = curriculum.scale(self.state["succeeded"]) if curriculum else {}
-        for name, (term, weight) in self._terms.items():
-            part = scale.get(name, 1.0) * weight * term(tool)
-            reward = reward + part
-            self.episode[f"{REWARD}{name}"] += torch.where(is_sound, part, 0.0)
-        return torch.where(is_sound, reward, 0.0)
 
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None

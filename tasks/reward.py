@@ -7,11 +7,12 @@ names functions of its own there as `package.module:function`. The six terms of 
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from brokk_rl.bounds import require_number
+from brokk_rl.contracts.task import REWARD
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 from tasks.step_state import StepState, ToolState
@@ -85,6 +86,47 @@ class RewardCurriculum:
         low, high = self.success
         share = ((succeeded.mean() - low) / (high - low)).clamp(0.0, 1.0)
         return {name: part + (1.0 - part) * share for name, part in self.begin.items()}
+
+
+class RewardSum:
+    """Weighted sum of a task's terms.
+
+    Args:
+        terms: By name.
+        curriculum: Terms whose weights grow with success; `None` for constant weights.
+    """
+
+    def __init__(
+        self, terms: Mapping[str, RewardTerm], curriculum: RewardCurriculum | None
+    ) -> None:
+        self._functions: dict[str, Callable[[Any], torch.Tensor]] = {}
+        for name, term in terms.items():
+            self._functions[name] = resolve_name(term.function)
+        self._weights = {name: term.weight for name, term in terms.items()}
+        self._curriculum = curriculum
+
+    def __call__(
+        self,
+        state: StepState,
+        is_sound: torch.Tensor,
+        succeeded: torch.Tensor,
+        episode: dict[str, torch.Tensor],
+    ) -> torch.Tensor:
+        """Return the sum where `is_sound`, `(N,)`, else 0; adds up each term in `episode`.
+
+        Args:
+            state: After the step.
+            is_sound: Whether the step counts, `(N,)` bool.
+            succeeded: Whether the last episode of each environment succeeded, `(N,)`, 0 or 1.
+            episode: Figures of the running episodes, written in place.
+        """
+        reward = state.contact_force_n.new_zeros(state.contact_force_n.shape)
+        scale = self._curriculum.scale(succeeded) if self._curriculum else {}
+        for name, function in self._functions.items():
+            part = scale.get(name, 1.0) * self._weights[name] * function(state)
+            reward = reward + part
+            episode[f"{REWARD}{name}"] += part.where(is_sound, 0.0)
+        return reward.where(is_sound, 0.0)
 
 
 # the paper's equation 1

@@ -10,10 +10,10 @@ This module needs no torch, so that a bad value is refused before torch is loade
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pkgutil import resolve_name
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, Literal, Protocol, get_args
 
 from brokk_rl.bounds import require_number, require_range
 from brokk_rl.contracts.task import FAULT
@@ -33,8 +33,10 @@ would have followed, as `time_out` does in other libraries."""
 class Termination(Protocol):
     """A termination term."""
 
-    outcome: Any
-    """An `Outcome`."""
+    @property
+    def outcome(self) -> str:
+        """An `Outcome`; most terms have it as a class attribute."""
+        ...
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the episode ends, `(N,)` bool; no host synchronisation."""
@@ -45,7 +47,7 @@ class Termination(Protocol):
 class Succeeded:
     """The task's strict criterion holds."""
 
-    outcome: ClassVar[Outcome] = "success"
+    outcome = "success"
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the criterion holds; see `Termination`."""
@@ -62,7 +64,7 @@ class JointLimit:
 
     margin: float
 
-    outcome: ClassVar[Outcome] = "failure"
+    outcome = "failure"
 
     def check(self) -> None:
         require_number("margin of the termination JointLimit", self.margin)
@@ -77,7 +79,7 @@ class JointLimit:
 class StartInContact:
     """The arm touches something in the first step: the start was not valid."""
 
-    outcome: ClassVar[Outcome] = "void"
+    outcome = "void"
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the first step has a contact; see `Termination`."""
@@ -94,7 +96,7 @@ class ContactForce:
 
     largest_n: float
 
-    outcome: ClassVar[Outcome] = "failure"
+    outcome = "failure"
 
     def check(self) -> None:
         require_number("largest_n of the termination ContactForce", self.largest_n, above=0)
@@ -118,7 +120,7 @@ class TipLeft:
     y_m: tuple[float, float]
     z_m: tuple[float, float]
 
-    outcome: ClassVar[Outcome] = "failure"
+    outcome = "failure"
 
     def check(self) -> None:
         for name in ("x_m", "y_m", "z_m"):
@@ -137,7 +139,7 @@ class TipLeft:
 class TimeLimit:
     """The time of the episode, `task.episode_s`, is over."""
 
-    outcome: ClassVar[Outcome] = "time"
+    outcome = "time"
 
     def __call__(self, state: StepState) -> torch.Tensor:
         """Return where the time is over; see `Termination`."""
@@ -225,6 +227,11 @@ class EpisodeTerms:
 
     def __init__(self, terms: Mapping[str, Termination | None]) -> None:
         self.terms = {name: term for name, term in terms.items() if term is not None}
+        # found once: a compiled step cannot import
+        self._functions: dict[str, Callable[[Any], torch.Tensor]] = {}
+        for name, term in self.terms.items():
+            is_named = isinstance(term, TerminationTerm)
+            self._functions[name] = resolve_name(term.function) if is_named else term
         events = tuple(name for name, term in self.terms.items() if term.outcome != "time")
         self.reasons = (*events, FAULT, *(name for name in self.terms if name not in events))
 
@@ -237,14 +244,14 @@ class EpisodeTerms:
         """
         held = {FAULT: faults}
         unsound = faults
-        for name, term in self._having("void"):
-            held[name] = term(state)
+        for name, _ in self._having("void"):
+            held[name] = self._functions[name](state)
             unsound = unsound | held[name]
         state.success = state.success & ~unsound
         terminated, timed_out = unsound, unsound & False
         failed = timed_out
         for name, term in self._having("success", "failure", "time"):
-            held[name] = term(state)
+            held[name] = self._functions[name](state)
             if term.outcome == "time":
                 timed_out = timed_out | held[name]
                 continue

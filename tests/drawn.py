@@ -53,3 +53,18 @@ def drawn(
         Masks(np.ones(inverse.shape, np.float32), None),
         Ellipse(*map(float, row), rms_px=0.05, coverage=1.0, score=0.9),
     )
+
+
+def both_views(
+    m: np.ndarray, pull_px: float, generator: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Returns a plane's grain, of variance one before it is smoothed, as both cameras see it, `(480, 640)` each."""
+    grain = cv2.GaussianBlur(generator.normal(0, 1, (480, 900)).astype(np.float32), (0, 0), 1.2)
+    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    # the right camera sees at column x what the left one has at u = x + pull (m . ray(u)), solved
+    # for u
+    x = u - pull_px * (m[0] * (u - K[0, 2]) / K[0, 0] + m[1] * (v - K[1, 2]) / K[1, 1] + m[2])
+    back = (u - x[:, :1]) / (1 - pull_px * m[0] / K[0, 0])
+    return grain[:, 200:840], cv2.remap(
+        grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC
+    )

@@ -9,8 +9,8 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis.error_covariance import ErrorCovariance
 from diagnosis.gap import GapClosure
-from diagnosis.residuals import ErrorCovariance
 
 PERIOD_S = 0.05
 DELAY = 11

@@ -58,12 +58,16 @@ def small(
 
 
 def make(
-    machine: Machine, folder: Path, training: TrainingConfig, loop: ControlLoop | None = None
+    machine: Machine,
+    folder: Path,
+    training: TrainingConfig,
+    loop: ControlLoop | None = None,
+    device: torch.device = CPU,
 ) -> tuple[TrainingRunner, TrainingLogger]:
     """Returns a runner on a control loop of its own; every run of a test starts from the same seed."""
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
-    loop = loop or plant(machine).build(CPU, training.num_envs, training.num_starts, 0)
+    loop = loop or plant(machine).build(device, training.num_envs, training.num_starts, 0)
     book = TrainingLogger(
         folder,
         NoTracking().open(folder, {}),
@@ -72,7 +76,7 @@ def make(
         training.max_fault_rate,
         training.budget.share_spent,
     )
-    return TrainingRunner(loop, training, folder, CPU, book), book
+    return TrainingRunner(loop, training, folder, device, book), book
 
 
 def train(

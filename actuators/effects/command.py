@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.effect import EffectSpec, Memory, StepInputs
+from actuators.effects.effect import ANY_INTERFACE, EffectSpec, Memory, StepInputs
 from actuators.effects.ranges import EffectNumber, Joints, Value
 from actuators.effects.timing import append_command
 from actuators.models.transport import open_valve
@@ -53,6 +53,7 @@ class Saturation(EffectSpec):
     level: Value
     side = "command"
     pointwise = True
+    interfaces = frozenset({"speed", "torque"})
     numbers: ClassVar = {"level": EffectNumber("1", none=1.0, typical=0.75, bounds=(0.05, 1.0))}
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
@@ -74,6 +75,7 @@ class RateLimit(EffectSpec):
     stroke_s: Value
     side = "command"
     recent = 2
+    interfaces = ANY_INTERFACE  # of a target: a lower top speed
     numbers: ClassVar = {
         "stroke_s": EffectNumber("s", none=0.0, typical=0.4, bounds=(0.0, 5.0), scale="time")
     }

@@ -18,12 +18,15 @@ from actuators.effects.planned_run import ChainRun
 from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
 from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
 from brokk_rl.contracts.actuator import ActuatorModel, PlannedRun
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
 Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
 MOTION: tuple[Side, ...] = ("speed", "joints")
 """Sides that change the increment which the inner model returns."""
+ANY_INTERFACE = frozenset({"speed", "position", "torque"})
+"""Machines of all interfaces, see `Machine.interface`."""
 SALT_STEP = 2_654_435_761
 """Knuth's multiplicative hash constant (2^32 / golden ratio): spreads the salts of effects."""
 
@@ -45,13 +48,17 @@ class EffectSpec:
         pointwise: Whether each command that it returns depends on the same command only, so that
             all commands of a run can be given to it at once.
         recent: Number of newest commands that it looks at, where it changes the newest only and
-            asks for no positions; `None`: any. See `EffectChain.plan_run`.
+            asks for no positions but in `begin`; `None`: any. See `EffectChain.plan_run`.
+        placed: Whether its `begin` asks for the positions of the joints.
         weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
             on a few of them.
         alike: Whether a shared effect has about the same size on all joints.
         running: Name of the number that is the time since the machine was started. That number is
             known and not fitted.
+        interfaces: Quantities commanded of the machines that it is on; see `Machine.interface`.
+        variants: Classes with the same fields that are this effect on machines of other interfaces.
+        label: Its name where it is not that of the class: the name of the effect it is a variant of.
     """
 
     side: ClassVar[Side]
@@ -64,15 +71,26 @@ class EffectSpec:
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
+    placed: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
     alike: ClassVar[bool] = True
     running: ClassVar[str | None] = None
+    interfaces: ClassVar[frozenset[str]] = frozenset({"speed"})
+    variants: ClassVar[Mapping[str, "type[EffectSpec]"]] = MappingProxyType({})
+    label: ClassVar[str] = ""
+
+    @classmethod
+    def find_variant(cls, machine: Machine) -> "type[EffectSpec] | None":
+        """Return the class that is this effect on the machine; `None`: the machine cannot have it."""
+        if machine.interface in cls.interfaces:
+            return cls
+        return cls.variants.get(machine.interface)
 
     @classmethod
     def name(cls) -> str:
         """Return the name of the effect, as in `effect=[name]`."""
-        return re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+        return cls.label or re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
 
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
@@ -83,6 +101,12 @@ class EffectSpec:
             ConfigError: A number is out of bounds, or a joint is unknown.
         """
         name = self.name()
+        variant = self.find_variant(machine)
+        if variant is None:
+            raise ConfigError(
+                f"effect={name}: joints of machine '{machine.name}' are commanded by {machine.interface}, where it does not "
+                f"occur; it is for joints commanded by {', '.join(sorted({*self.interfaces, *self.variants}))}"
+            )
         return EffectChain(
             {"": self},
             model,
@@ -176,7 +200,8 @@ class EffectChain:
         num_recent: int | None = None,
     ) -> None:
         self.inner: Any = inner
-        self.effects, self._num_recent = dict(effects), num_recent
+        self._num_recent = num_recent
+        self.effects = effects = _list_variants(effects, machine)
         given: dict[str, Value] = {}
         numbers: dict[str, EffectNumber] = {}
         joints: dict[str, Joints] = {}
@@ -247,9 +272,11 @@ class EffectChain:
         self._fresh.fill_(False)
         return q
 
-    def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun | None:
+    def plan_run(
+        self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
+    ) -> PlannedRun | None:
         """See `brokk_rl.contracts.actuator.PlannedModel`."""
-        return ChainRun.plan(self, u, first)
+        return ChainRun.plan(self, u, first, q)
 
     @property
     def is_plannable(self) -> bool:
@@ -422,6 +449,20 @@ class EffectChain:
 def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
     """Return `mask`, `(N,)`, in a shape that broadcasts over the rows of `like`."""
     return mask.reshape(-1, *[1] * (like.dim() - 1))
+
+
+def _list_variants(effects: Mapping[str, EffectSpec], machine: Machine) -> dict[str, EffectSpec]:
+    """Return the effects as they are on this machine, without those that it cannot have."""
+    found = {}
+    for name, effect in effects.items():
+        variant = effect.find_variant(machine)
+        if variant is None:
+            continue
+        if variant is not type(effect):
+            values = {field.name: getattr(effect, field.name) for field in fields(effect)}  # pyright: ignore[reportArgumentType]
+            effect = variant(**values)
+        found[name] = effect
+    return found
 
 
 def _join(name: str, key: str) -> str:

@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.effect import EffectSpec, MachineTensors
+from actuators.effects.effect import ANY_INTERFACE, EffectSpec, MachineTensors
 from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.spec import spec
 
@@ -32,6 +32,7 @@ class LinkLength(EffectSpec):
     joints: Joints
     extra_m: Value
     side = "kinematics"
+    interfaces = ANY_INTERFACE
     stage = "kinematics"
     numbers: ClassVar = {
         "extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3), scale="reach")
@@ -67,6 +68,7 @@ class BaseTilt(EffectSpec):
     roll_rad: Value
     pitch_rad: Value
     side = "kinematics"
+    interfaces = ANY_INTERFACE
     stage = "kinematics"
     numbers: ClassVar = {"roll_rad": _describe_angle(0.03), "pitch_rad": _describe_angle(0.03)}
 
@@ -110,6 +112,7 @@ class Extrinsics(EffectSpec):
     pitch_rad: Value
     yaw_rad: Value
     side = "kinematics"
+    interfaces = ANY_INTERFACE
     stage = "perception"
     numbers: ClassVar = {name: _describe_shift(0.02) for name in ("x_m", "y_m", "z_m")} | {
         name: _describe_angle(0.01) for name in ("roll_rad", "pitch_rad", "yaw_rad")

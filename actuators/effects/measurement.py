@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.effect import EffectSpec
+from actuators.effects.effect import ANY_INTERFACE, EffectSpec
 from actuators.effects.ranges import CHANCE, EffectNumber, Joints, Value
 from actuators.models import random_draws
 from brokk_rl.spec import spec
@@ -24,6 +24,7 @@ class Quantisation(EffectSpec):
     side = "measurement"
     stage = "sensing"
     smooth = False
+    interfaces = ANY_INTERFACE
     numbers: ClassVar = {
         "step_rad": EffectNumber("rad", none=0.0, typical=0.003, bounds=(0.0, 0.1), scale="travel")
     }
@@ -50,6 +51,7 @@ class SensorNoise(EffectSpec):
     side = "measurement"
     stage = "sensing"
     stochastic = True
+    interfaces = ANY_INTERFACE
     numbers: ClassVar = {
         "sigma_rad": EffectNumber("rad", none=0.0, typical=0.002, bounds=(0.0, 0.1), scale="travel")
     }
@@ -75,6 +77,7 @@ class EncoderBias(EffectSpec):
     bias_rad: Value
     side = "measurement"
     stage = "sensing"
+    interfaces = frozenset({"speed", "torque"})  # a servo has its encoder within its loop
     numbers: ClassVar = {
         "bias_rad": EffectNumber("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3), scale="travel")
     }
@@ -103,6 +106,7 @@ class EncoderScale(EffectSpec):
     scale: Value
     side = "measurement"
     stage = "sensing"
+    interfaces = frozenset({"speed", "torque"})  # a servo has its encoder within its loop
     numbers: ClassVar = {"scale": EffectNumber("1", none=1.0, typical=1.015, bounds=(0.7, 1.4))}
 
     def measured(

@@ -6,6 +6,7 @@ what depends on positions. Axes: `T` commands of the run, `N` environments, `J` 
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
@@ -64,15 +65,19 @@ class ChainRun:
         self._memory: dict[str, Memory] = {}
 
     @classmethod
-    def plan(cls, chain: PlannableChain, u: torch.Tensor, first: int) -> PlannedRun | None:
+    def plan(
+        cls, chain: PlannableChain, u: torch.Tensor, first: int, q: torch.Tensor | None
+    ) -> PlannedRun | None:
         """Return the run; `None` where an effect or the model inside has to be stepped."""
         plan_inner = getattr(chain.inner, "plan_run", None)
         if plan_inner is None or not chain.is_plannable:
             return None
+        if q is None and any(effect.placed for effect in chain.commands.values()):
+            return None
         seen = u
         for name, effect in chain.commands.items():
-            seen = _change_commands(chain, name, effect, seen, first)
-        inner = plan_inner(seen, first)
+            seen = _change_commands(chain, name, effect, seen, first, q)
+        inner = plan_inner(seen, first, q)
         if inner is None or not chain.motions:
             return inner
         return cls(chain, inner, u, first)
@@ -98,9 +103,14 @@ class ChainRun:
 
 
 def _change_commands(
-    chain: PlannableChain, name: str, effect: Any, u: torch.Tensor, first: int
+    chain: PlannableChain,
+    name: str,
+    effect: Any,
+    u: torch.Tensor,
+    first: int,
+    q: torch.Tensor | None,
 ) -> torch.Tensor:
-    """Return the commands of a run `(T, N, J)` after one effect."""
+    """Return the commands of a run `(T, N, J)` after one effect; `q`: the positions before it."""
     values, still, rows = chain.get_values(name), torch.zeros_like(u[0]), u.transpose(0, 1)
     if effect.delays:  # in a step no command is known before it is given
         earliest_s = -chain.inner.delay_s
@@ -116,7 +126,8 @@ def _change_commands(
         counter = chain.salt_counter(name, chain.advance_draws())
         now = StepInputs(values, memory, History(q=seen, u=seen), chain.plant, still, counter)
         if k == first:
-            memory = effect.begin(now)
+            placed = seen if q is None else q[:first].transpose(0, 1)
+            memory = effect.begin(replace(now, history=History(q=placed, u=seen)))
             now = StepInputs(values, memory, now.history, chain.plant, still, counter)
         result, memory = effect.commands(now)
         changed[k - 1] = result[:, -1]

@@ -1,12 +1,14 @@
 """Effects on the speed that a joint reaches for a valve opening, joint by joint."""
 
 import math
+from types import MappingProxyType
 from typing import ClassVar
 
 import torch
 
 from actuators.effects.effect import EffectSpec, Memory, StepInputs
 from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.effects.targets import TargetBacklash, TargetLag
 from brokk_rl.spec import spec
 
 
@@ -66,6 +68,7 @@ class Lag(EffectSpec):
     joints: Joints
     time_constant_s: Value
     side = "speed"
+    variants = MappingProxyType({"position": TargetLag, "torque": TargetLag})
     numbers: ClassVar = {
         "time_constant_s": EffectNumber(
             "s", none=0.0, typical=0.12, bounds=(0.0, 2.0), scale="time"
@@ -98,6 +101,7 @@ class Backlash(EffectSpec):
     joints: Joints
     gap_rad: Value
     side = "speed"
+    variants = MappingProxyType({"position": TargetBacklash})
     numbers: ClassVar = {
         "gap_rad": EffectNumber("rad", none=0.0, typical=0.01, bounds=(0.0, 0.2), scale="travel")
     }

@@ -38,6 +38,8 @@ class MachineTensors:
         self.period_s = machine.period_s
         self.full_step = tensor(machine.max_speed * machine.period_s)
         self.lower, self.upper = tensor(machine.lower), tensor(machine.upper)
+        self.middle = 0.5 * (self.lower + self.upper)
+        self.half_travel = 0.5 * (self.upper - self.lower)
         self.has_masses = machine.has_bodies
         self._slides = torch.tensor([j.kind == "slide" for j in machine.joints], device=device)
         self._machine, self._device = machine, device

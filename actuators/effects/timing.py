@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.effect import EffectSpec, Memory, StepInputs
+from actuators.effects.effect import ANY_INTERFACE, EffectSpec, Memory, StepInputs
 from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.spec import spec
 
@@ -20,6 +20,7 @@ class _Delayed(EffectSpec):
     side = "command"
     stage = "timing"
     delays = True
+    interfaces = ANY_INTERFACE
 
     def begin(self, now: StepInputs) -> Memory:
         """Before the history the command equals its oldest entry."""
@@ -70,6 +71,9 @@ class ClockOffset(_Delayed):
     joints: Joints
     offset_s: Value
     shared = True
+    interfaces = frozenset(
+        {"speed", "torque"}
+    )  # a loop that holds a target shows it as a dead time
     numbers: ClassVar = {
         "offset_s": EffectNumber("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3), scale="time")
     }
@@ -94,6 +98,7 @@ class DelayJitter(EffectSpec):
     stage = "timing"
     stochastic = True
     shared = True
+    interfaces = ANY_INTERFACE
     numbers: ClassVar = {
         "jitter_s": EffectNumber("s", none=0.0, typical=0.03, bounds=(0.0, 0.5), scale="time")
     }
@@ -133,6 +138,7 @@ class FrameLoss(EffectSpec):
     stochastic = True
     smooth = False
     shared = True
+    interfaces = ANY_INTERFACE
     numbers: ClassVar = {
         "probability": EffectNumber("1", none=0.0, typical=0.02, bounds=(0.0, 0.95)),
         "persistence": EffectNumber(

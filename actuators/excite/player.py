@@ -19,6 +19,7 @@ from typing import Any, Self
 import numpy as np
 
 from actuators.excite.schedule import Approach, ExcitationPlan
+from brokk_rl.commands import SpeedProgram, find_rest, read_targets
 from brokk_rl.contracts.link import Link
 from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine, mask_exclusive_joints
@@ -361,7 +362,13 @@ def drive(
     Raises:
         LinkError: the link fell silent, or said something that makes no sense.
     """
+    if machine.interface == "torque":
+        raise ConfigError(
+            f"machine '{machine.name}' is commanded by torque: programs of speeds do not drive it; record it with its own "
+            "controller, and read its logs with mode=import"
+        )
     extra, before = getattr(link, "extra", dict), -np.inf
+    program = SpeedProgram(machine)
     shape = (num_runs, machine.num_joints)
     for _ in range(round(run_s / machine.period_s)):
         if runner.done:
@@ -374,10 +381,10 @@ def drive(
                 f"link: expected {shape} finite positions at {state.t_s:.2f} s, got {q}"
             )
         q = q.reshape(shape)
-        u = runner.command(q)
+        u, speeds = program.command(runner.command(q), q)
         phase, segment, played = runner.phase.copy(), runner.segment.copy(), runner.played
         sent = np.array(link.send(Command(u.reshape(form))).u, dtype=np.float64).reshape(shape)
-        runner.took(sent)
+        runner.took(speeds if machine.interface == "position" else sent)
         columns = {}
         for name, value in extra().items():
             columns[name] = np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64)
@@ -422,7 +429,7 @@ class NominalMachine:
 
 
 class NominalLink:
-    """Link to `N` nominal machines: dead time, full speed times command, stops.
+    """Link to `N` nominal machines: dead time, full speed times command (or its target), stops.
 
     One machine alone has no axis `N`.
     """
@@ -434,9 +441,8 @@ class NominalLink:
             (machine.num_joints,) if alone else (num_runs, machine.num_joints),
         )
         self._q = np.tile(machine.home, (num_runs, 1))
-        self._in_flight = np.zeros(
-            (round(machine.dead_time_s / machine.period_s) + 1, *self._q.shape)
-        )
+        on_their_way = round(machine.dead_time_s / machine.period_s) + 1
+        self._in_flight = np.tile(find_rest(self._q, machine), (on_their_way, 1, 1))
 
     def read(self) -> JointState:
         """Return the true positions."""
@@ -449,9 +455,10 @@ class NominalLink:
             -1.0, 1.0
         )
         self._in_flight = np.concatenate([self._in_flight[1:], u.reshape(1, *self._q.shape)])
-        self._q = (self._q + self._in_flight[0] * machine.max_speed * machine.period_s).clip(
-            machine.lower, machine.upper
-        )
+        step = self._in_flight[0] * machine.max_speed * machine.period_s
+        if machine.interface == "position":
+            step = read_targets(self._in_flight[0], machine) - self._q
+        self._q = (self._q + step).clip(machine.lower, machine.upper)
         self._t_s += machine.period_s
         return Command(u)
 

@@ -190,7 +190,13 @@ class FirstOrderLagModel:
         """Dead time, `(N, J)`."""
         return self.parameters["dead_time_s"]
 
-    def plan_run(self, u: torch.Tensor, first: int, drive: "LagDrive | None" = None) -> "LagRun":
+    def plan_run(
+        self,
+        u: torch.Tensor,
+        first: int,
+        q: torch.Tensor | None = None,
+        drive: "LagDrive | None" = None,
+    ) -> "LagRun":
         """See `brokk_rl.contracts.actuator.PlannedModel`; `drive`: that of the commands, if known."""
         return LagRun(self, self.drive(u, first) if drive is None else drive, first)
 

@@ -298,7 +298,11 @@ class ValveModel:
         return self.parameters["dead_time_s"]
 
     def plan_run(
-        self, u: torch.Tensor, first: int, drive: "ValveDrive | None" = None
+        self,
+        u: torch.Tensor,
+        first: int,
+        q: torch.Tensor | None = None,
+        drive: "ValveDrive | None" = None,
     ) -> "ValveRun":
         """See `brokk_rl.contracts.actuator.PlannedModel`; `drive`: that of the commands, if known."""
         kept = _compute_decay(self._period_s, self.parameters["speed_s"])

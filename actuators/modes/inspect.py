@@ -11,17 +11,18 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 from actuators.identify import dead_time
 from actuators.recordings import inspection_picture, preview_report
 from brokk_rl import record
+from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.preview import EffectPreview, PreviewResult
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.inspection import KINDS, Inspection, InspectionThresholds, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure
+from brokk_rl.progress import track_items
 from brokk_rl.record import Breach, Recording
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json
@@ -111,7 +112,7 @@ class Inspect:
             self._inspect_machine()
             return
         paths = record.find_files(self.inspect.recordings, "recording")
-        inspected = [self._look(path) for path in track(paths, "inspecting", transient=True)]
+        inspected = [self._look(path) for path in track_items(paths, "inspecting")]
         folder = self.session.folder
         result = {
             "schema": 1,
@@ -159,8 +160,9 @@ class Inspect:
         recording, breaches = record.examine_recording(path, self.machine)
         if recording is None or recording.num_samples < 2:
             return InspectedFile(path, None, breaches, None)
+        (viewed,) = view_recordings([recording], self.machine)
         return InspectedFile(
-            path, recording, breaches, inspect_recording(recording, self.machine, self.thresholds)
+            path, recording, breaches, inspect_recording(viewed, self.machine, self.thresholds)
         )
 
     def _preview(self, recordings: Sequence[Recording]) -> PreviewResult | None:

@@ -144,27 +144,34 @@ class CommandColumn:
 
 @spec
 class TargetColumn:
-    """A column of target positions whose speed is the command, for a servo that follows targets.
+    """A column of target positions, for a servo that follows targets.
+
+    On a machine whose joints are commanded by position the target is the command; -1 and 1 are the
+    ends of the joint's travel. On one that is commanded by speed it is the speed of the target.
 
     Attributes:
         column: Its name in the log, or arithmetic over columns.
         scale: Unit of the recording for one of the log; negative turns the sign.
         full_speed: Speed of the target at full command, rad/s or m/s; that of the machine's
-            `max_speed`, for a model that integrates commands to give the target.
+            `max_speed`, for a model that integrates commands to give the target. `null` for a
+            machine that is commanded by position.
+        offset: Added after scaling, in the unit of the recording.
     """
 
     column: str
     scale: float
-    full_speed: float
+    full_speed: float | None
+    offset: float = 0.0  # maps from before this field have none
 
     def check(self) -> None:
-        if self.full_speed <= 0 or self.scale == 0:
+        if (self.full_speed is not None and self.full_speed <= 0) or self.scale == 0:
             raise ConfigError(
                 f"column '{self.column}': expected full_speed > 0 and a scale other than 0"
             )
 
     def command(self, values: np.ndarray, t_s: np.ndarray) -> np.ndarray:
-        """Return the command in force from each sample to the next, 0 at the last; same shape."""
+        """Return the speed in force from each sample to the next, 0 at the last; same shape."""
+        assert self.full_speed is not None, "checked against the machine"
         speed = np.diff(self.scale * values) / np.diff(t_s)
         return np.append(speed, 0.0) / self.full_speed
 
@@ -174,7 +181,7 @@ class JointColumns:
     """The columns of one joint.
 
     Attributes:
-        command: Its command: a column of commands, or the speed of a column of targets.
+        command: Its command: a column of commands, or of targets.
         position: Its position, to rad or m.
     """
 
@@ -237,6 +244,7 @@ class ColumnMap:
                 f"import: the map names the joints {', '.join(self.joints)}, machine '{machine.name}' has "
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
+        self._check_interface(machine)
         places = index_columns(opened.list_tables())
         sources = {text: resolve_column(text, places, opened.path) for text in self._list_texts()}
         wanted = self._list_wanted(sources, places, opened.path)
@@ -253,6 +261,19 @@ class ColumnMap:
                 f"{num_rows} rows; is import.time.scale right?"
             )
         return found
+
+    def _check_interface(self, machine: Machine) -> None:
+        """Raise a `ConfigError` where targets are read as another quantity than the machine's command."""
+        for name, joint in self.joints.items():
+            if not isinstance(joint.command, TargetColumn):
+                continue
+            is_position = joint.command.full_speed is None
+            if is_position != (machine.interface == "position"):
+                mend = "a number" if is_position else "null"
+                raise ConfigError(
+                    f"import: machine '{machine.name}' is commanded by {machine.interface}; give joints.{name}.command.full_speed "
+                    f"as {mend} in the column map"
+                )
 
     def find_time(self, table: str, where: object) -> Column | AlignedTime:
         """Return the time of a table.
@@ -312,9 +333,10 @@ class ColumnMap:
             )
         pieces = [Piece(begin_s, end_s, machine) for begin_s, end_s in spans_s]
         for j, name in enumerate(machine.joint_names):
-            command = self._read_command(signals, self.joints[name].command)
+            command = self._read_command(signals, self.joints[name].command, machine, j)
             for piece in pieces:
-                piece.u[:, j] = command.hold(piece.ticks_s, machine.period_s)
+                read = command.average if machine.interface == "torque" else command.hold
+                piece.u[:, j] = read(piece.ticks_s, machine.period_s)
             position = _scale(signals, self.joints[name].position)
             for piece in pieces:
                 piece.q[:, j] = position.interpolate(piece.ticks_s)
@@ -325,9 +347,19 @@ class ColumnMap:
         clock_s = clocks[signals.find_table(self.joints[machine.joint_names[0]].position.column)]
         return [piece.make_recording(signals.run, clock_s) for piece in pieces]
 
-    def _read_command(self, signals: RunSignals, column: CommandColumn | TargetColumn) -> Signal:
+    def _read_command(
+        self,
+        signals: RunSignals,
+        column: CommandColumn | TargetColumn,
+        machine: Machine,
+        joint: int,
+    ) -> Signal:
         signal = signals.read(column.column)
-        if isinstance(column, TargetColumn):
+        if isinstance(column, TargetColumn) and column.full_speed is None:
+            q = column.scale * signal.values + column.offset
+            low, high = machine.lower[joint], machine.upper[joint]
+            u = (2.0 * q - low - high) / (high - low)
+        elif isinstance(column, TargetColumn):
             u = column.command(signal.values, signal.t_s)
             # a gap between pieces is no motion of the target
             u[:-1][np.diff(signal.t_s) > self.longest_gap_s] = 0.0
@@ -344,7 +376,7 @@ class ColumnMap:
                 )
             raise RecordingError(
                 f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
-                "neutral or full_speed of the column map, or the log"
+                "neutral or full_speed of the column map, the limits of a joint that is commanded by position, or the log"
             )
         return Signal(signal.table, signal.t_s, u.clip(-1.0, 1.0), signal.text)
 

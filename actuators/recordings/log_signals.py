@@ -41,6 +41,17 @@ class Signal:
         newest = np.searchsorted(self.t_s, ticks_s + TICK_TOLERANCE * period_s, "right") - 1
         return self.values[newest.clip(0)]
 
+    def average(self, ticks_s: np.ndarray, period_s: float) -> np.ndarray:
+        """Return the mean over the period that begins at each tick, of values held between samples.
+
+        A force acts by its mean over a period; samples between two ticks would else be lost.
+        """
+        held_s = np.diff(self.t_s, append=self.t_s[-1] + period_s)
+        impulse = np.concatenate([[0.0], np.cumsum(self.values * held_s)])
+        edges_s = np.append(self.t_s, self.t_s[-1] + period_s)
+        begin, end = (np.interp(ticks_s + later_s, edges_s, impulse) for later_s in (0.0, period_s))
+        return (end - begin) / period_s
+
     def interpolate(self, ticks_s: np.ndarray) -> np.ndarray:
         """Return the value at each tick, linear between samples."""
         return np.interp(ticks_s, self.t_s, self.values)

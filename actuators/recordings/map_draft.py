@@ -65,6 +65,11 @@ class Draft:
     dbc: str | None
     remarks: Sequence[str]
 
+    @property
+    def has_targets(self) -> bool:
+        """True if all joints are commanded by position; a machine is commanded by one quantity."""
+        return all(joint.kind == "target" for joint in self.joints)
+
     def list_guesses(self) -> list[Guess]:
         """Return all guesses, those of the clocks first."""
         found = [time.guess for time in self.times.values()]
@@ -124,7 +129,7 @@ def format_map(draft: Draft) -> str:
         lines[-2:] = [f"time: {_format_time(draft.times[''])}"]
     lines.append("joints:")
     for joint in draft.joints:
-        lines += _format_joint(joint, draft.survey.joints[joint.name])
+        lines += _format_joint(joint, draft.survey.joints[joint.name], draft.has_targets)
     period_s = draft.survey.period_s
     lines += [
         "optional: {}",
@@ -156,7 +161,7 @@ def _format_time(time: TimeGuess) -> str:
     return f"{text}   # {_explain(time.guess)}"
 
 
-def _format_joint(joint: JointGuess, survey: JointSurvey) -> list[str]:
+def _format_joint(joint: JointGuess, survey: JointSurvey, has_targets: bool) -> list[str]:
     columns, kind, unit = (joint.guesses[key] for key in ("columns", "kind", "unit"))
     is_unsure = columns.sureness == "unsure"
     command = MISSING if is_unsure else joint.command
@@ -169,6 +174,11 @@ def _format_joint(joint: JointGuess, survey: JointSurvey) -> list[str]:
     ]
     if kind.sureness == "unsure":
         lines.append(f"    command: {QUOTED_MISSING}")
+    elif has_targets:
+        lines.append(
+            f"    command: {{_target_: {MAP}.TargetColumn, column: {_quote(command)}, scale: {scale}, full_speed: null}}"
+            f"   # {joint.unit} for one of the log; a target is the command itself"
+        )
     elif joint.kind == "target":
         speed = (
             QUOTED_MISSING if scale == QUOTED_MISSING else f"{measure_full_speed(joint, survey):g}"
@@ -241,6 +251,8 @@ def format_machine(draft: Draft) -> str:
             f"    max_speed: {_format_dimension(speed, f'fastest target or motion in its logs, {unit}')}",
             "    body: null",
         ]
+        if draft.has_targets:
+            lines.append("    command: position   # full commands are the ends of the travel")
     return "\n".join(lines) + "\n"
 
 

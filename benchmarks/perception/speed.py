@@ -1,6 +1,6 @@
-"""How long a 1080p frame takes from picture and depth to holes, on some threads, without the network.
+"""How long a 1080p frame takes from both pictures to holes, on some threads, without the network.
 
-    taskset -c 0,1 python benchmarks/perception/speed.py <out.json> --count 6 --threads 2
+    taskset -c 0,1 python benchmarks/perception/speed.py <out.json> --count 6 --threads 2 --shrink 2
 
 Renders scenes of several conditions at 1 to 4 m, looks at each several times and takes the
 shortest: what else runs on the machine makes the others longer. Writes the milliseconds of each
@@ -15,6 +15,7 @@ import json
 import os
 import platform
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +28,10 @@ from rich.progress import track
 
 from brokk_rl.signals import Frame
 from perception.render.scene_sampler import compose_scene
+from perception.stereo import Stereo
 
 CONDITIONS, DISTANCES_M, TIMES = ("clean", "haze", "hidden"), (1.0, 2.0, 3.0, 4.0), 7
-STAGES = ("segment", "ellipse", "pose", "total", "processor_time")
+STAGES = ("stereo", "pair", "segment", "regions", "ellipse", "pose", "total", "processor_time")
 
 
 def main() -> None:
@@ -42,11 +44,13 @@ def main() -> None:
         "--count", type=int, default=6, help="scenes of each condition and distance"
     )
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--shrink", type=int, default=1, help="of the pictures that are matched")
     given = parser.parse_args()
     cv2.setNumThreads(given.threads)
     finder = configured(
         "perception", "mode=perceive", "perceive.input=.", f"perception={given.option}"
     ).build()
+    stereo = replace(configured("stereo", "mode=render"), shrink=given.shrink)
     shortest = []
     kinds = [(condition, distance_m) for condition in CONDITIONS for distance_m in DISTANCES_M]
     for number, (condition, distance_m) in enumerate(track(kinds * given.count, transient=True)):
@@ -54,7 +58,9 @@ def main() -> None:
         looks = []
         for _ in range(TIMES):
             start, busy = time.perf_counter(), time.process_time()
-            ms = finder.find(frame).ms
+            depth_m = match(stereo, frame)
+            ms = {"stereo": 1000.0 * (time.perf_counter() - start)}
+            ms |= finder.find(replace(frame, depth_m=depth_m)).ms
             total, spent = time.perf_counter() - start, time.process_time() - busy
             looks.append(
                 [ms.get(stage, 0.0) for stage in STAGES[:-2]] + [1000.0 * total, 1000.0 * spent]
@@ -62,10 +68,17 @@ def main() -> None:
         shortest.append(min(looks, key=lambda look: look[-2]))
     table = {stage: {"median": float(np.median(ms)), "p95": float(np.percentile(ms, 95))}
              for stage, ms in zip(STAGES, np.array(shortest).T, strict=True)}  # fmt: skip
-    told = {"option": given.option, "frames": len(shortest), "threads": given.threads, "processor": processor(),
-            "opencv": cv2.__version__, "load": round(os.getloadavg()[0], 1), "ms": table}  # fmt: skip
+    told = {"option": given.option, "frames": len(shortest), "threads": given.threads, "shrink": given.shrink,
+            "processor": processor(), "opencv": cv2.__version__, "load": round(os.getloadavg()[0], 1), "ms": table}  # fmt: skip
     given.out.write_text(json.dumps(told, indent=1) + "\n")
     Console().print(told)
+
+
+def match(stereo: Stereo, frame: Frame) -> np.ndarray:
+    """Returns the depth of a frame by its two pictures."""
+    assert frame.right is not None and frame.baseline_m is not None
+    focal_px = float(frame.camera_matrix[0, 0])
+    return stereo.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
 
 
 def rendered(condition: str, distance_m: float, number: int) -> Frame:

@@ -176,7 +176,7 @@ def _check_deployment(
 ) -> None:
     description = process.describe()
     json.dumps(description)
-    sizes = []
+    sizes = [sum(part["samples"] * part["width"] for part in description.get("parts", ()))]
     for proposals in (False, True):
         sizes += [observation.compute_size(machine, pitch, proposals) for pitch in (False, True)]
     size = description["size"]

@@ -71,7 +71,9 @@ class PlannedModel(ActuatorModel, Protocol):
         """Time until a command begins to act, `(N, J)`, s."""
         ...
 
-    def plan_run(self, u: torch.Tensor, first: int) -> PlannedRun | None:
+    def plan_run(
+        self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
+    ) -> PlannedRun | None:
         """Return the run that begins after a `reset` of all environments; `None`: `step` through it.
 
         The positions are those of `step`. The state stays as it was.
@@ -79,6 +81,8 @@ class PlannedModel(ActuatorModel, Protocol):
         Args:
             u: Commands of the run, `(T, N, J)`; position `k` follows command `k - 1`.
             first: Number of the first position that is asked for: the length of the history.
+            q: Positions up to there, `(first, N, J)` or more, for effects that begin where a joint is;
+                `None`: a model with such an effect has to be stepped.
         """
         ...
 

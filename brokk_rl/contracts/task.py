@@ -163,9 +163,9 @@ class DeployableTask(Protocol):
         """Return `size`, order, scale and filters of the `policy` group, as plain JSON data.
 
         It becomes `observation` in `policy.json`; the machine's computer builds the same vector
-        with `brokk_rl.observation`. Two entries stand elsewhere in that file: `stop`, when an
-        episode ends, and `masked`, `False` where commands may move exclusive and other joints at
-        once.
+        with `brokk_rl.observation`. A task made of terms lists its `parts`. Two entries stand
+        elsewhere in that file: `stop`, when an episode ends, and `masked`, `False` where commands
+        may move exclusive and other joints at once.
         """
         ...
 

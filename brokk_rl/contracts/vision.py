@@ -217,6 +217,47 @@ class TrackedHole:
     stale: bool
 
 
+@dataclass(frozen=True)
+class CameraView:
+    """Where a camera on a mount looks, and why.
+
+    Attributes:
+        name: Position of the mount in words.
+        is_moving: It is on its way there.
+        travel_s: Time until it stands there; 0 where it stays.
+        seen_s: Part of the coming `horizon_s` for which the hole will be seen from there.
+        seen_before_s: The same had it stayed where it was.
+        horizon_s: Time ahead that is looked at.
+        std_m: Expected standard deviation of one coordinate of the hole after that time.
+        std_before_m: The same had it stayed.
+    """
+
+    name: str
+    is_moving: bool
+    travel_s: float
+    seen_s: float
+    seen_before_s: float
+    horizon_s: float
+    std_m: float
+    std_before_m: float
+
+    def explain(self) -> str:
+        """Return where the camera looks and why, in a sentence or two."""
+        if self.is_moving:
+            return (
+                f"Camera moves ({self.name}, {self.travel_s:.1f} s): from here the hole would be "
+                f"seen for {self.seen_before_s:.1f} of the next {self.horizon_s:.0f} s, from there "
+                f"for {self.seen_s:.1f} s. Expected {1000 * self.std_m:.1f} mm instead of "
+                f"{1000 * self.std_before_m:.1f} mm."
+            )
+        if self.seen_s > 0:
+            return (
+                f"Camera stays ({self.name}): the hole will be seen for {self.seen_s:.1f} of the "
+                f"next {self.horizon_s:.0f} s."
+            )
+        return f"Camera stays ({self.name}): no view would see the hole."
+
+
 class BoreholeFinder(Protocol):
     """Finds boreholes in frames, as `mode=perceive` and the camera process call it."""
 
@@ -293,6 +334,24 @@ class FrameSource(Protocol):
     def __enter__(self) -> FrameSource: ...
 
     def __exit__(self, *exc: Any) -> None: ...
+
+
+@runtime_checkable
+class AimedSource(Protocol):
+    """Optional ability of a source: its camera is moved to where it sees the hole."""
+
+    def aim(self, q: np.ndarray | None, hole: TrackedHole | None, t_s: float) -> CameraView | None:
+        """Choose where to look, and go there; called before each `read_latest`.
+
+        Args:
+            q: Joint positions of the machine, `(J,)`; `None` for unknown.
+            hole: The chosen hole as tracked; `None` before it was seen.
+            t_s: Time of the call.
+
+        Returns:
+            The view and the reason; `None` before the positions are known.
+        """
+        ...
 
 
 class FrameSourceSpec(Protocol):

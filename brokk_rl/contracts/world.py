@@ -124,7 +124,8 @@ class Simulator(Protocol):
     """A spec in `conf/sim`: builds a world.
 
     `build` may take one more argument, `varied: tuple[Property, ...]`; it then returns a
-    `VariedWorld`, and events can be used with it.
+    `VariedWorld`, and events can be used with it. With an argument `objects` it builds objects
+    beside the block (`brokk_rl.sim.objects`).
     """
 
     def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:

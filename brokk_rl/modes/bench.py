@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from rich.table import Table
@@ -19,12 +19,13 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.rl.benchmark_sizes import BenchmarkSizes
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.execution import capture_graph
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingConfig
-from brokk_rl.rl.success_sweep import LEVELS, SuccessSweep, report_sweep, run_sweep, summarise
+from brokk_rl.rl.success_sweep import LEVELS, report_sweep, run_sweep, summarise
 from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session, read_versions, write_json
@@ -42,38 +43,6 @@ RATES: tuple[str, ...] = (
 )
 """In the order of what each has to do: MuJoCo's own batch (CPU only), with drive and contacts, the
 control step, training."""
-
-
-@spec
-class BenchmarkSizes:
-    """Measurements: numbers of environments, durations, and a run to compare with.
-
-    Attributes:
-        num_envs: Numbers of environments, one row each; of each process where `torchrun` starts
-            several.
-        seconds: Least time of each measurement.
-        iterations: Training iterations timed, after one to warm up.
-        against: `benchmark.json` of one process with the same numbers of environments, to compare
-            several processes with; `null` for no comparison.
-        measure: `rates` of physics, control step and training, or seconds of training until
-            `success`.
-        success: Sizes of the trainings whose time to success is measured.
-    """
-
-    num_envs: tuple[int, ...]
-    seconds: float
-    iterations: int
-    against: str | None
-    measure: Literal["rates", "success"]
-    success: SuccessSweep
-
-    def check(self) -> None:
-        if not self.num_envs or min(self.num_envs) < 1:
-            raise ConfigError(
-                f"bench.num_envs: expected one or more positive numbers, got {list(self.num_envs)}"
-            )
-        if self.measure not in ("rates", "success"):
-            raise ConfigError(f"bench.measure: expected rates or success, got '{self.measure}'")
 
 
 @spec

@@ -14,12 +14,13 @@ from rich.console import Console
 
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.contracts.task import Task, can_count_starts
-from brokk_rl.errors import BrokkError, ConfigError
+from brokk_rl.errors import BrokkError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, ORANGE, make_figure, remove_frame
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json, write_text
+from brokk_rl.sim.check_subject import CheckSubject
 from brokk_rl.sim.machine_check import MachineCheck, check_machine
 from brokk_rl.sim.model_import import import_model
 from brokk_rl.spec import name_spec, spec
@@ -31,37 +32,6 @@ CLASSES = {
     frozenset({"axis", "origin_m", "mass_kg", "com_m", "yield_force", "stiffness"}): "Body",
 }
 """Class of a table of a machine's file by its keys; the others are the machine and its joints."""
-
-
-@spec
-class CheckSubject:
-    """Subject and size of a check.
-
-    Attributes:
-        model: URDF or MJCF of a new machine; `None` checks `machine=…`.
-        name: Name of the new machine; `None`: that of its file.
-        num_poses: Random poses from which the reach is read.
-        num_starts: Starts of the task that are drawn.
-    """
-
-    model: str | None
-    name: str | None
-    num_poses: int
-    num_starts: int
-
-    def check(self) -> None:
-        if self.num_poses < 1 or self.num_starts < 1:
-            raise ConfigError(
-                f"subject: expected num_poses and num_starts of 1 or more, got {self.num_poses} and {self.num_starts}"
-            )
-        if self.model is not None and not Path(self.model).is_file():
-            raise ConfigError(
-                f"subject.model={self.model}: there is no such file (seen from {Path.cwd()})"
-            )
-        if self.name is not None and not re.fullmatch(r"\w+", self.name):
-            raise ConfigError(
-                f"subject.name: expected letters, digits and _, got '{self.name}'; it names files and recordings"
-            )
 
 
 @spec

@@ -49,7 +49,7 @@ class PackageRequest:
 
 @spec
 class NewPackage:
-    """Write a package with machine, task, actuator, effect, finder and their tests."""
+    """Write a package with machine, tasks, actuator, effect, finder and their tests."""
 
     new: PackageRequest
 
@@ -75,10 +75,10 @@ class NewPackage:
                 f"cannot write {folder}: {error.strerror}; choose new.folder=<folder>"
             ) from error
         Console(highlight=False).print(
-            f"{folder} holds a machine, a task, an actuator, an effect, a finder and their tests.\n"
+            f"{folder} holds a machine, two tasks, an actuator, an effect, a finder and their tests.\n"
             f"  pip install -e {folder}\n"
             f"  python -m pytest {folder / 'tests'}\n"
-            "  brokk mode=check machine=two_links task=hold actuator=rubber",
+            "  brokk mode=check machine=two_links task=trace actuator=rubber",
             soft_wrap=True,
         )
 

@@ -19,7 +19,7 @@ from rsl_rl.models import MLPModel
 from brokk_rl.contracts.task import DeployableTask
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, restore_encoder
+from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
 from brokk_rl.rl.policy import CONTRACT, GOLDEN, ONNX, TOLERANCE, PlainActor
 from brokk_rl.session import write_json
 
@@ -92,7 +92,15 @@ def export_onnx(
     }
     if contract["observation"]:
         encoder = restore_encoder(machine, contract["observation"])
-        recorded["inputs"] = _decode_inputs(encoder, vectors)
+        recorded["inputs"] = {
+            name: np.asarray(value, float).tolist()
+            for name, value in encoder.decode_inputs(vectors).items()
+        }
+        if isinstance(encoder, ObservationEncoder):
+            ranges = measure_ranges(encoder, observations.numpy(), machine.joint_names)
+            contract = contract | {
+                "training_observations": {"count": len(observations), "ranges": ranges}
+            }
     write_json(folder / GOLDEN, recorded)
     parity = {
         "observations": len(off),
@@ -124,17 +132,6 @@ def _explain_difference(
         f"of {len(difference)} observations (largest {difference.max():.3g}); nothing was written. "
         f"{cause}."
     )
-
-
-def _decode_inputs(encoder: ObservationEncoder, vectors: np.ndarray) -> dict[str, Any]:
-    """Return target, history, pitch and proposals of observation vectors in their units."""
-    target_m, q, u = encoder.decode(vectors)
-    inputs = {"target_in_base_m": target_m, "q": q, "u": u}
-    if encoder.has_pitch:
-        inputs["pitch_rad"] = encoder.decode_pitch(vectors)
-    if encoder.has_proposals:
-        inputs["proposals"] = encoder.decode_proposals(vectors)
-    return {name: np.asarray(value, float).tolist() for name, value in inputs.items()}
 
 
 def _write_onnx(module: torch.nn.Module, example: torch.Tensor, path: Path) -> None:

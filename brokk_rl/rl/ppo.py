@@ -2,8 +2,11 @@
 
 rsl-rl reads the divergence and three losses back to the host after each mini-batch. A mini-batch
 launches a few hundred small kernels, a control step about seventy. On a GPU that takes longer than
-the arithmetic. Here the learning rate and the losses stay on the device. Acting, storing and a
-mini-batch are one replay of a CUDA graph each.
+the arithmetic. Here the learning rate and the losses stay on the device. Acting, storing, returns
+and a pass over all mini-batches are one replay of a CUDA graph each.
+
+The stored steps are put in the order of the mini-batches once an update, with the inputs of both
+networks normalised, mirrored and padded. rsl-rl does that in every mini-batch of every pass.
 
 Where several processes train together a mini-batch is two graphs. Between them one sum over all
 processes takes a single buffer: every gradient and the divergence.
@@ -12,7 +15,7 @@ processes takes a single buffer: every gradient and the divergence.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import chain
+from functools import partial
 from typing import Any
 
 import torch
@@ -23,106 +26,17 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
 
-from brokk_rl.rl.execution import capture_graph, limit_to_one_thread
+from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
+from brokk_rl.rl.rollout import CapturedRollout, pad_columns, run_network
 from brokk_rl.symmetry import Mirror
-
-
-class CapturedRollout:
-    """Acting and storing as `rsl_rl.algorithms.PPO` does them, into the algorithm's own storage.
-
-    Each is one replay of a CUDA graph.
-
-    For feed-forward networks with a Gaussian policy; all tensors keep their addresses. On a CPU the
-    same runs without graphs.
-
-    Args:
-        algorithm: Gives networks, storage and discount.
-    """
-
-    def __init__(self, algorithm: PPO) -> None:
-        self._algorithm, storage = algorithm, algorithm.storage
-        self._observations = {
-            name: torch.zeros_like(value[0])  # type: ignore[arg-type]
-            for name, value in storage.observations.items()
-        }
-        self._reward, self._done, self._timed_out = (
-            torch.zeros_like(storage.rewards[0]) for _ in range(3)
-        )
-        self._slot = torch.zeros(1, dtype=torch.int64, device=storage.rewards.device)
-        self._actions = torch.zeros_like(storage.actions[0])
-        self._values, self._log_prob = (
-            torch.zeros_like(storage.values[0]),
-            torch.zeros_like(storage.actions_log_prob[0]),
-        )
-        self._parameters = tuple(torch.zeros_like(self._actions) for _ in range(2))
-        if storage.distribution_params is None:
-            storage.distribution_params = tuple(torch.zeros_like(storage.actions) for _ in range(2))
-        self._act, self._store = self._run(self._decide), self._run(self._keep)
-
-    def act(self, observations: Mapping[str, torch.Tensor]) -> torch.Tensor:
-        """Return drawn actions, `(N, A)`; the tensor is overwritten by the next call."""
-        for name, value in self._observations.items():
-            value.copy_(observations[name])
-        self._act()
-        return self._actions
-
-    def store(self, reward: torch.Tensor, done: torch.Tensor, timed_out: torch.Tensor) -> None:
-        """Store the step that followed the last `act`; each `(N,)`.
-
-        Raises:
-            OverflowError: The storage is full.
-        """
-        storage = self._algorithm.storage
-        if storage.step >= storage.num_transitions_per_env:
-            raise OverflowError("the storage is full: update before going on")
-        for target, value in (
-            (self._reward, reward),
-            (self._done, done),
-            (self._timed_out, timed_out),
-        ):
-            target[:, 0].copy_(value)
-        self._slot.fill_(storage.step)
-        self._store()
-        storage.step += 1
-
-    def _run(self, step: Callable[[], None]) -> Callable[[], None]:
-        device = self._slot.device
-        return capture_graph(step, device).replay if device.type == "cuda" else step
-
-    @torch.no_grad()
-    def _decide(self) -> None:
-        actor, seen = self._algorithm.actor, self._observations
-        actor.distribution.update(actor.mlp(actor.get_latent(seen)))  # type: ignore[union-attr, arg-type]
-        mean, std = actor.output_mean, actor.output_std
-        # as `Normal.sample`, which asks the host whether the spread is positive and cannot be
-        # captured
-        self._actions.copy_(mean + std * torch.randn_like(mean))
-        self._log_prob[:, 0].copy_(actor.get_output_log_prob(self._actions))
-        self._values.copy_(self._algorithm.critic(seen))  # type: ignore[arg-type]
-        for kept, value in zip(self._parameters, actor.output_distribution_params, strict=True):
-            kept.copy_(value)
-
-    @torch.no_grad()
-    def _keep(self) -> None:
-        storage = self._algorithm.storage
-        reward = (
-            self._reward + self._algorithm.gamma * self._values * self._timed_out
-        )  # the end of time is not the end
-        rows = [
-            (storage.actions, self._actions),
-            (storage.rewards, reward),
-            (storage.dones, self._done.to(storage.dones.dtype)),
-        ]
-        rows += [(storage.values, self._values), (storage.actions_log_prob, self._log_prob)]
-        rows += [(storage.observations[name], value) for name, value in self._observations.items()]
-        rows += zip(storage.distribution_params or (), self._parameters, strict=True)
-        for stored, value in rows:
-            stored.index_copy_(0, self._slot, value[None])
-
 
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds and step of the adaptive learning rate, as in rsl-rl."""
 FIGURES = ("value", "surrogate", "entropy")
+PARAMETER = "parameter_"
+"""Beginning of the names under which samples hold the parameters of the old distribution."""
+CLIP_MARGIN = 1e-6
+"""Added to a norm that is divided by, as `torch.nn.utils.clip_grad_norm_` does."""
 
 
 class DevicePPO(PPO):
@@ -134,14 +48,16 @@ class DevicePPO(PPO):
     teacher's, in the states that the student itself meets (Ross et al. 2011; Schmitt et al. 2018).
     """
 
+    fuse: bool = False
+    """Whether `torch.compile` fuses acting and the loss; set it before the first step."""
     _rollout: CapturedRollout | None = None
-    _mini_batch: Sequence[Callable[[], None]] | None = None
-    """What one step of the optimiser consists of."""
+    _epoch: Sequence[Callable[[], None]] | None = None
+    """What one pass over all mini-batches consists of."""
+    _samples: dict[str, torch.Tensor] | None = None
+    """Stored steps in the order of the mini-batches; see `shuffle`."""
     _gathered: torch.Tensor
     """Gradients of all parameters, of which `grad` of each is a view, and at the end the
     divergence."""
-    _rows: torch.Tensor
-    _advantages: torch.Tensor
     _rate: torch.Tensor
     _wanted: torch.Tensor
     """`desired_kl`, which may change from update to update."""
@@ -173,7 +89,10 @@ class DevicePPO(PPO):
         if not (self._on_device and isinstance(self.actor.distribution, GaussianDistribution)):
             with limit_to_one_thread(self.device):
                 return super().act(obs)
-        self._rollout = self._rollout or CapturedRollout(self)
+        if self._rollout is None:
+            # tensors of rsl-rl's inference mode could not be used outside of it
+            with torch.inference_mode(False), report_compile_errors():
+                self._rollout = CapturedRollout(self, self.fuse)
         return self._rollout.act(obs)
 
     def process_env_step(
@@ -190,32 +109,34 @@ class DevicePPO(PPO):
         else:
             self._rollout.store(rewards, dones, extras.get("time_outs", torch.zeros_like(rewards)))
 
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Compute returns and advantages; see `rsl_rl.algorithms.PPO.compute_returns`."""
+        if self._rollout is None:
+            super().compute_returns(obs)
+        else:
+            self._rollout.compute_returns(obs)
+
     def update(self) -> dict[str, float]:
         """Learn from the stored steps; return mean losses (`rsl_rl.algorithms.PPO.update`)."""
         return self.update_on_device() if self._on_device else super().update()
 
     def update_on_device(self) -> dict[str, float]:
         """Learn as `update` does, with one read-back; the same numbers up to rounding."""
-        storage = self.storage
-        used = self._batch_size() * self.num_mini_batches
-        order = torch.randperm(used, device=self.device)
-        fresh = self._mini_batch is None
-        if fresh:
+        order = torch.randperm(self._batch_size() * self.num_mini_batches, device=self.device)
+        self.shuffle(order)
+        if self._epoch is None:
             self._prepare()
-        self._advantages.copy_(storage.advantages)
-        if fresh:
-            self._rows.copy_(order[: len(self._rows)])
-            self._mini_batch = self._parts()
+            self._wanted.fill_(self.desired_kl or 0.0)
+            with report_compile_errors():
+                self._epoch = self._parts()
         self._sums.zero_()
         self._wanted.fill_(self.desired_kl or 0.0)
         for _ in range(self.num_learning_epochs):
-            for rows in order.split(len(self._rows)):
-                self._rows.copy_(rows)
-                for part in self._mini_batch or ():
-                    part()
+            for part in self._epoch:
+                part()
         for model in (self.actor, self.critic):
             self._normalise(model)
-        storage.clear()
+        self.storage.clear()
         *sums, self.learning_rate = torch.cat((self._sums, self._rate[None])).tolist()
         updates = self.num_learning_epochs * self.num_mini_batches
         return {name: value / updates for name, value in zip(FIGURES, sums, strict=True)}
@@ -232,7 +153,7 @@ class DevicePPO(PPO):
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load a state; the next update captures new graphs for the optimiser's new tensors."""
-        self._mini_batch = None
+        self._epoch = None
         return super().load(loaded_dict, load_cfg, strict)
 
     @property
@@ -252,16 +173,20 @@ class DevicePPO(PPO):
 
         The optimiser reads its rate from one of them.
         """
-        self._rows = torch.zeros(self._batch_size(), dtype=torch.int64, device=self.device)
-        self._advantages = torch.zeros_like(self.storage.values)
+        self._loss = self._measure_loss
+        if self.fuse and isinstance(self.actor.distribution, GaussianDistribution):
+            self._loss = torch.compile(self._measure_loss, fullgraph=True, dynamic=False)
         self._rate = torch.tensor(self.learning_rate, device=self.device)
         self._wanted = torch.zeros((), device=self.device)
         self._sums = torch.zeros(len(FIGURES), device=self.device)
-        parameters = list(chain(self.actor.parameters(), self.critic.parameters()))
-        self._gathered = torch.zeros(sum(p.numel() for p in parameters) + 1, device=self.device)
-        for parameter, part in zip(
-            parameters, self._gathered[:-1].split([p.numel() for p in parameters]), strict=True
-        ):
+        trained = [
+            [p for p in m.parameters() if p.requires_grad] for m in (self.actor, self.critic)
+        ]
+        self._sizes = [sum(p.numel() for p in part) for part in trained]
+        self._trained = [*trained[0], *trained[1]]
+        self._gathered = torch.zeros(sum(self._sizes) + 1, device=self.device)
+        parts = self._gathered[:-1].split([p.numel() for p in self._trained])
+        for parameter, part in zip(self._trained, parts, strict=True):
             parameter.grad = part.view_as(parameter)
         on_gpu = torch.device(self.device).type == "cuda"
         for group in self.optimizer.param_groups:
@@ -276,30 +201,35 @@ class DevicePPO(PPO):
         The calls before the capture leave no trace.
         """
         device = torch.device(self.device)
+        starts = range(0, self._batch_size() * self.num_mini_batches, self._batch_size())
         if device.type != "cuda":
-            return (
-                (self._differentiate, self._sum_up, self._descend)
-                if self.is_multi_gpu
-                else (self._differentiate_and_descend,)
-            )
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        kept = [(p, p.detach().clone()) for p in parameters] + [(self._rate, self._rate.clone())]
+            parts: list[Callable[[], None]] = []
+            for first in starts:
+                parts += [partial(self._differentiate, first)]
+                parts += [self._sum_up, self._descend] if self.is_multi_gpu else [self._descend]
+            return parts
+        kept = [(p, p.detach().clone()) for p in self._trained] + [(self._rate, self._rate.clone())]
         moments = [
             (value, value.clone())
             for state in self.optimizer.state.values()
             for value in state.values()
         ]
-        if (
-            self.is_multi_gpu
-        ):  # the sum stays outside: it is the one part whose length others decide
-            graphs = []
-            for part in (self._differentiate, self._descend):
-                graphs.append(capture_graph(part, device, gradients=True))
-            captured = (graphs[0].replay, self._sum_up, graphs[1].replay)
+        captured: list[Callable[[], None]] = []
+        if self.is_multi_gpu:
+            # the sum stays outside: it is the one part whose length others decide
+            for first in starts:
+                part = partial(self._differentiate, first)
+                captured += [capture_graph(part, device, gradients=True).replay, self._sum_up]
+                captured += [lambda: descend.replay()]
+            descend = capture_graph(self._descend, device, gradients=True)
         else:
-            captured = (
-                capture_graph(self._differentiate_and_descend, device, gradients=True).replay,
-            )
+
+            def learn() -> None:
+                for first in starts:
+                    self._differentiate(first)
+                    self._descend()
+
+            captured += [capture_graph(learn, device, gradients=True).replay]
         with torch.no_grad():
             for value, before in kept + moments:
                 value.copy_(before)
@@ -324,87 +254,113 @@ class DevicePPO(PPO):
             if value is not None and module._buffers[name] is not value:
                 module._buffers[name] = value.copy_(module._buffers[name])  # type: ignore[arg-type]
 
-    def _differentiate_and_descend(self) -> None:
-        self._differentiate()
-        self._descend()
+    @torch.no_grad()
+    def shuffle(self, order: torch.Tensor) -> None:
+        """Put the stored steps in `order`, the inputs of the networks ready for use.
 
-    def _differentiate(self) -> None:
-        """Differentiate the loss of the stored steps `_rows`.
+        Normalisers and teacher do not change while a rollout is learned. Inputs, actions and the
+        teacher's wishes have a leading axis: the steps, and with a mirror their images.
+        """
+        storage = self.storage
+        observations = {}
+        for name, value in storage.observations.items():
+            observations[name] = value.flatten(0, 1)[order]
+        sides, actions = [observations], storage.actions.flatten(0, 1)[order][None]
+        if self._mirror is not None:
+            mirrored = {}
+            for name, value in observations.items():
+                mirrored[name] = self._mirror.apply(name, value)
+            sides.append(mirrored)
+            actions = torch.cat((actions, actions * self._mirror.action))
+        samples = {"actions": actions}
+        if (teacher := self._teacher) is not None:
+            wanted = [teacher.mlp(teacher.get_latent(side)) for side in sides]  # type: ignore[arg-type]
+            samples["wanted"] = torch.stack(wanted).clamp(-1.0, 1.0)
+        stored = {name: getattr(storage, name) for name in ("values", "returns", "advantages")}
+        stored["log_prob"] = storage.actions_log_prob
+        for index, value in enumerate(storage.distribution_params or ()):
+            stored[f"{PARAMETER}{index}"] = value
+        for name, value in stored.items():
+            samples[name] = value.flatten(0, 1)[order][None]
+        models = {"actor": self.actor, "critic": self.critic}
+        if self._samples is None:
+            kind = torch.bfloat16 if self.use_mixed_precision else torch.float32
+            shapes = {
+                name: (len(sides), len(order), model.obs_dim) for name, model in models.items()
+            }
+            inputs = {name: order.new_zeros(shape, dtype=kind) for name, shape in shapes.items()}
+            self._samples = samples | {name: pad_columns(value) for name, value in inputs.items()}
+        for name, value in samples.items():
+            self._samples[name].copy_(value)
+        for name, model in models.items():
+            for side, values in zip(self._samples[name], sides, strict=True):
+                side[:, : model.obs_dim].copy_(model.get_latent(values))  # type: ignore[operator, arg-type]
+
+    def _differentiate(self, first: int) -> None:
+        """Differentiate the loss of the mini-batch that begins at row `first` of the samples."""
+        rows = slice(first, first + self._batch_size())
+        batch = {
+            name: value[:, rows].flatten(0, 1) for name, value in (self._samples or {}).items()
+        }
+        loss, figures = self._loss(batch)
+        gradients = torch.autograd.grad(loss, self._trained, materialize_grads=True)
+        torch.cat([*(g.flatten() for g in gradients), figures[-1:]], out=self._gathered)
+        self._sums.add_(figures[:-1])
+
+    def _measure_loss(self, batch: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the loss of a mini-batch, and `FIGURES` with the divergence at the end.
 
         Schulman et al. 2017, equations 7 and 9, with the weights of rsl-rl.
         """
-        storage, rows = self.storage, self._rows
-        observations = {}
-        for name, value in storage.observations.items():
-            observations[name] = value.flatten(0, 1)[rows]
-        old_values, returns, advantages, old_log_prob, actions = (
-            value.flatten(0, 1)[rows]
-            for value in (
-                storage.values,
-                storage.returns,
-                self._advantages,
-                storage.actions_log_prob,
-                storage.actions,
-            )
+        actor, own = self.actor, len(batch["values"])
+        sides = len(batch["actor"]) // own
+        old_values, returns, advantages, old_log_prob = (
+            batch[name] for name in ("values", "returns", "advantages", "log_prob")
         )
-        parameters = []
-        for value in storage.distribution_params or ():
-            parameters.append(value.flatten(0, 1)[rows])
-        old_parameters = tuple(parameters)
         if self.normalize_advantage_per_mini_batch:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        own, mirror = len(rows), self._mirror
-        if mirror is not None:
-            for name, value in observations.items():
-                observations[name] = torch.cat((value, mirror.apply(name, value)))
-            actions = torch.cat((actions, actions * mirror.action))
-            old_values, returns, advantages, old_log_prob = (
-                torch.cat((value, value))
-                for value in (old_values, returns, advantages, old_log_prob)
-            )
-        kind = torch.device(self.device).type
-        with torch.autocast(
-            device_type=kind, dtype=torch.bfloat16, enabled=self.use_mixed_precision
-        ):
-            # not by calling the actor: that would draw actions, and torch's check of their spread
-            # asks the host
-            self.actor.distribution.update(self.actor.mlp(self.actor.get_latent(observations)))  # type: ignore
-            log_prob, entropy = (
-                self.actor.get_output_log_prob(actions),
-                self.actor.output_entropy[:own].mean(),
-            )
-            values = self.critic(observations)  # type: ignore[arg-type]
-            if self._is_adaptive:
-                with torch.no_grad():
-                    new_parameters = tuple(
-                        value[:own] for value in self.actor.output_distribution_params
-                    )
-                    divergence = self.actor.get_kl_divergence(old_parameters, new_parameters).mean()
-            ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
-            gain = advantages.squeeze(1)
-            clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-            surrogate_loss = torch.max(-gain * ratio, -gain * clipped).mean()
-            value_loss = (values - returns).square()
-            if self.use_clipped_value_loss:
-                near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
-                value_loss = torch.max(value_loss, (near - returns).square())
-            value_loss = value_loss.mean()
-            loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
-        if self._teacher is not None:
-            loss = loss + self._imitation * self._measure_distance(self._teacher, observations)
-        self._gathered.zero_()
-        loss.backward()
-        if self._is_adaptive:
-            self._gathered[-1] = divergence
-        self._sums.add_(torch.stack((value_loss, surrogate_loss, entropy)).detach())
-
-    def _measure_distance(
-        self, teacher: MLPModel, observations: dict[str, torch.Tensor]
-    ) -> torch.Tensor:
-        """Return the mean squared distance of the mean action from the teacher's command."""
+        old_values, returns, advantages, old_log_prob = (
+            value.repeat(sides, 1) if sides > 1 else value
+            for value in (old_values, returns, advantages, old_log_prob)
+        )
+        # not by calling the actor: that would draw actions, and torch's check of their spread asks
+        # the host
+        mixed = self.use_mixed_precision
+        actor.distribution.update(run_network(actor.mlp, batch["actor"], mixed))  # type: ignore
+        log_prob = actor.get_output_log_prob(batch["actions"])
+        entropy = actor.output_entropy[:own].mean()
+        values = run_network(self.critic.mlp, batch["critic"], mixed)
+        ratio = torch.exp(log_prob - old_log_prob.squeeze(1))
+        gain = advantages.squeeze(1)
+        clipped = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate_loss = torch.max(-gain * ratio, -gain * clipped).mean()
+        value_loss = (values - returns).square()
+        if self.use_clipped_value_loss:
+            near = old_values + (values - old_values).clamp(-self.clip_param, self.clip_param)
+            value_loss = torch.max(value_loss, (near - returns).square())
+        value_loss = value_loss.mean()
+        loss = surrogate_loss + self.value_loss_coef * value_loss - self.entropy_coef * entropy
         with torch.no_grad():
-            wanted = teacher.mlp(teacher.get_latent(observations))  # type: ignore[arg-type]
-        return (self.actor.output_mean - wanted.clamp(-1.0, 1.0)).square().mean()
+            new = tuple(value[:own] for value in actor.output_distribution_params)
+            old = tuple(batch[f"{PARAMETER}{index}"] for index in range(len(new)))
+            divergence = self._measure_divergence(old, new)
+        if self._teacher is not None:
+            distance = (actor.output_mean - batch["wanted"]).square().mean()
+            loss = loss + self._imitation * distance
+        return loss, torch.stack((value_loss, surrogate_loss, entropy, divergence)).detach()
+
+    def _measure_divergence(
+        self, old: tuple[torch.Tensor, ...], new: tuple[torch.Tensor, ...]
+    ) -> torch.Tensor:
+        """Return the mean divergence of two distributions, given by their parameters.
+
+        Of Gaussians in closed form: torch finds it by a search that torch 2.11 cannot compile.
+        """
+        if not isinstance(self.actor.distribution, GaussianDistribution):
+            return self.actor.get_kl_divergence(old, new).mean()
+        (old_mean, old_std), (new_mean, new_std) = old, new
+        spread, shift = (old_std / new_std).square(), ((old_mean - new_mean) / new_std).square()
+        return (0.5 * (spread + shift - 1.0 - spread.log())).sum(-1).mean()
 
     def _sum_up(self) -> None:
         """Add up gradients and divergence of all processes; the host does not wait for it."""
@@ -416,8 +372,8 @@ class DevicePPO(PPO):
             self._gathered.div_(self.gpu_world_size)
         if self._is_adaptive:
             self._adapt_rate(self._gathered[-1])
-        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        for part in self._gathered[:-1].split(self._sizes):  # of the actor, of the critic
+            part.mul_((self.max_grad_norm / (part.norm() + CLIP_MARGIN)).clamp(max=1.0))
         self.optimizer.step()
 
     @property

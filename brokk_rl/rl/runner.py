@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
+import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ from brokk_rl.contracts.task import MirroredTask
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.exploration import CappedGaussian
+from brokk_rl.rl.learning_curve import find_plateau
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.policy import TrainedPolicy, scale_output
 from brokk_rl.rl.ppo import DevicePPO
@@ -74,6 +76,8 @@ class TrainingRunner(OnPolicyRunner):
         log.debug(printed.getvalue())
         self.training, self.folder = training, folder
         self.logger = logger  # type: ignore[assignment]
+        if isinstance(self.alg, DevicePPO):
+            self.alg.fuse = training.fuse
         if training.symmetry and isinstance(self.alg, DevicePPO):
             if not isinstance(env.task, MirroredTask):
                 raise ConfigError(
@@ -81,6 +85,8 @@ class TrainingRunner(OnPolicyRunner):
                     "rl.symmetry=false"
                 )
             self.alg.use_mirror(env.task.mirror())
+        self._levelled_at: int | None = None
+        """Control steps after which success no longer grew; found anew after a resume."""
         scale_output(self.alg.actor, training.output_gain)
         if training.teacher and isinstance(self.alg, DevicePPO):
             self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)
@@ -95,9 +101,7 @@ class TrainingRunner(OnPolicyRunner):
         first = self.current_learning_iteration == 0
         while num := self.group.broadcast_first(self._count_iterations(steps)):
             if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
-                share = self.group.broadcast_first(
-                    self.training.budget.share_spent(self._book.env_steps, self._book.seconds)
-                )
+                share = self.group.broadcast_first(self._measure_share())
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
                 self._follow_schedules(share)
             with contextlib.redirect_stdout(io.StringIO()):
@@ -123,6 +127,20 @@ class TrainingRunner(OnPolicyRunner):
         if teacher and isinstance(self.alg, DevicePPO):
             self.alg.set_imitation(teacher.weight_at(share_spent))
 
+    def _measure_share(self) -> float:
+        """Return the spent share of the training; its end begins with a plateau."""
+        training, book = self.training, self._book
+        share = training.budget.share_spent(book.env_steps, book.seconds)
+        if training.plateau and self._levelled_at is None:
+            row = find_plateau(book.rows, training.plateau)
+            if row is not None:
+                self._levelled_at = int(float(row["env_steps"]))
+                log.info("success no longer grows after %d control steps", self._levelled_at)
+        if training.plateau is None or self._levelled_at is None:
+            return share
+        done = (book.env_steps / self._levelled_at - 1.0) / training.plateau.anneal
+        return max(share, 1.0 - training.settling * (1.0 - done))
+
     @property
     def _book(self) -> TrainingLogger:
         return self.logger  # type: ignore[return-value]
@@ -141,10 +159,13 @@ class TrainingRunner(OnPolicyRunner):
             part - self.current_learning_iteration % part
             for part in (ITERATIONS_PER_ROUND, interval)
         )
-        if budget.share_spent(book.env_steps, book.seconds) >= 1.0:
+        if self._measure_share() >= 1.0:
             return 0
-        if budget.max_env_steps:
-            num = min(num, max(1, -(-(budget.max_env_steps - book.env_steps) // steps)))
+        ends = [budget.max_env_steps] if budget.max_env_steps else []
+        if self.training.plateau and self._levelled_at is not None:
+            ends.append(math.ceil(self._levelled_at * (1.0 + self.training.plateau.anneal)))
+        for end in ends:
+            num = min(num, max(1, -(-(end - book.env_steps) // steps)))
         if budget.max_seconds:
             # the first round is short and shows how long one takes
             left = (
@@ -181,7 +202,7 @@ class TrainingRunner(OnPolicyRunner):
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = False) -> None:
         """Train for some iterations; see `rsl_rl.runners.OnPolicyRunner`."""
-        with _allow_tensor_cores(self.env.graph_active):
+        with allow_tensor_cores(self.training.tf32 and self.env.graph_active):
             super().learn(num_learning_iterations, init_at_random_ep_len)
 
     def checkpoint(self) -> None:
@@ -296,7 +317,7 @@ class TrainingRunner(OnPolicyRunner):
 
 
 @contextlib.contextmanager
-def _allow_tensor_cores(allowed: bool) -> Iterator[None]:
+def allow_tensor_cores(allowed: bool) -> Iterator[None]:
     """Let matrix products use TF32 meanwhile.
 
     Only where the control step is a captured graph, whose kernels were chosen before: ten bits of

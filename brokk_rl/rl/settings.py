@@ -75,6 +75,32 @@ class TrainingBudget:
 
 
 @spec
+class Plateau:
+    """End of a training whose success no longer grows: what follows is the end of its schedules.
+
+    Over that time `desired_kl` falls as over the last part of a budget (`settling`), and so does the
+    cap of the noise (`exploration`). Steps are counted, not seconds: a training repeats.
+
+    Attributes:
+        above: Strict success, exploration included, below which a training goes on anyway.
+        episodes: Newest finished episodes that are compared with as many before them.
+        least_gain: Gain in success between both that counts as learning.
+        anneal: Control steps of the end, as a share of those before it; none with `settling=0`.
+    """
+
+    above: float
+    episodes: int
+    least_gain: float
+    anneal: float
+
+    def check(self) -> None:
+        require_number("rl.plateau.above", self.above, least=0, most=1)
+        require_number("rl.plateau.episodes", self.episodes, least=1)
+        require_number("rl.plateau.least_gain", self.least_gain, least=0, most=1)
+        require_number("rl.plateau.anneal", self.anneal, above=0)
+
+
+@spec
 class Exploration:
     """Schedule of the cap of the exploration noise over the budget.
 
@@ -157,6 +183,7 @@ class TrainingConfig:
             of the simulator's configuration.
         num_starts: Number of valid starts from which resets draw.
         budget: When training ends.
+        plateau: When it ends earlier, because success no longer grows; `null`: never.
         save_interval: Iterations between checkpoints; a killed run loses no more. As often several
             processes prove that they agree.
         keep_checkpoints: Newest checkpoints kept.
@@ -175,10 +202,12 @@ class TrainingConfig:
             before the run stops with an error.
         fault_steps: Control steps kept of each world; those of worlds that diverge are written into
             `faults` of the run folder. 0 records nothing; `None`: 100 on a CPU, 0 on a GPU, where
-            the recorder was never run.
-        fuse: Let `torch.compile` fuse the small operations around the physics, for half a minute of
-            compiling and a C++ compiler: a fifth faster on a GPU; on a CPU, whose physics takes
-            less than half of a control step of few worlds, far more.
+            its cost has not been measured.
+        fuse: Let `torch.compile` fuse the small operations around the physics, and on a GPU those of
+            PPO, for half a minute of compiling and a C++ compiler. On a CPU, whose physics takes
+            less than half of a control step of few worlds, it gains most.
+        tf32: Multiply matrices of captured training with ten bits of mantissa (TF32) on a GPU; false:
+            all of float32. `runner.algorithm.use_mixed_precision` takes bfloat16, with seven bits.
         random_episode_lengths: Put the first episodes out of step, so that not all worlds reset at
             once.
         runner: rsl-rl's own configuration (`obs_groups`, `algorithm`, `actor`, `critic`,
@@ -188,6 +217,7 @@ class TrainingConfig:
     num_envs: int | None
     num_starts: int
     budget: TrainingBudget
+    plateau: Plateau | None
     save_interval: int
     keep_checkpoints: int
     settling: float
@@ -199,6 +229,7 @@ class TrainingConfig:
     max_fault_rate: float
     fault_steps: int | None
     fuse: bool
+    tf32: bool
     random_episode_lengths: bool
     runner: dict[str, Any]
 

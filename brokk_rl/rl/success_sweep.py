@@ -8,7 +8,6 @@ measured is read from the table, so that a stopped sweep goes on.
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
@@ -19,92 +18,25 @@ from typing import Any
 
 from rich.table import Table
 
-from brokk_rl.bounds import require_number
 from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
 from brokk_rl.plot import BLUE, ORANGE, make_figure, remove_frame
+from brokk_rl.rl.benchmark_sizes import KEYS, SuccessSweep
 from brokk_rl.rl.distributed import TrainingGroup
+from brokk_rl.rl.learning_curve import WINDOW, find_passing
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
 from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
 
 LEVELS = (0.95, 0.99)
 """Strict success whose time is measured."""
-WINDOW = 1024
-"""Newest finished episodes over which success is averaged: as many as an evaluation has, so that a
-lucky iteration does not count."""
 TABLE = "success_sweep.jsonl"
 """One line for each training that was measured."""
-KEYS = ("num_envs", "epochs", "mini_batches", "seed")
-
-
-@spec
-class SuccessSweep:
-    """Sizes of a training over which the time to success is measured.
-
-    Attributes:
-        num_envs: Numbers of environments, of each process.
-        epochs: Passes over a rollout (`num_learning_epochs`).
-        mini_batches: Mini-batches of a pass (`num_mini_batches`).
-        seeds: Seeds of each point.
-        max_seconds: Longest training; one that passes the highest level ends earlier.
-    """
-
-    num_envs: tuple[int, ...]
-    epochs: tuple[int, ...]
-    mini_batches: tuple[int, ...]
-    seeds: tuple[int, ...]
-    max_seconds: float
-
-    def check(self) -> None:
-        for name in ("num_envs", "epochs", "mini_batches"):
-            values = getattr(self, name)
-            if not values or min(values) < 1:
-                raise ConfigError(
-                    f"bench.success.{name}: expected one or more positive numbers, "
-                    f"got {list(values)}"
-                )
-        if not self.seeds:
-            raise ConfigError("bench.success.seeds: expected one or more seeds, got none")
-        require_number("bench.success.max_seconds", self.max_seconds, above=0)
-
-    def list_points(self) -> list[dict[str, int]]:
-        """Return all trainings; those with as many environments follow each other."""
-        values = itertools.product(self.num_envs, self.epochs, self.mini_batches, self.seeds)
-        return [dict(zip(KEYS, point, strict=True)) for point in values]
-
-
-def find_passing(
-    rows: Sequence[Mapping[str, Any]], level: float, window: int = WINDOW
-) -> Mapping[str, Any] | None:
-    """Return the first row of `progress.csv` at which the newest episodes succeed so often.
-
-    Args:
-        rows: One an iteration, with `episodes` and `episode/success_strict`.
-        level: Share of strict successes.
-        window: Least number of newest episodes that are averaged; whole iterations.
-
-    Returns:
-        The row, or `None` where the level was never reached.
-    """
-    first, episodes, successes = 0, 0.0, 0.0
-    for row in rows:
-        episodes += float(row["episodes"])
-        successes += float(row["episodes"]) * float(row["episode/success_strict"])
-        while episodes - float(rows[first]["episodes"]) >= window:
-            gone = float(rows[first]["episodes"])
-            episodes -= gone
-            successes -= gone * float(rows[first]["episode/success_strict"])
-            first += 1
-        if episodes >= window and successes >= level * episodes:
-            return row
-    return None
 
 
 def run_sweep(
@@ -157,7 +89,8 @@ def _train(
     runner_config["algorithm"]["num_learning_epochs"] = point["epochs"]
     runner_config["algorithm"]["num_mini_batches"] = point["mini_batches"]
     budget = TrainingBudget(max_env_steps=None, max_seconds=sweep.max_seconds)
-    training = replace(training, runner=runner_config, budget=budget)
+    # one that stops learning trains on: the time to a level is asked for
+    training = replace(training, runner=runner_config, budget=budget, plateau=None)
     replace(session, seed=point["seed"]).seed_all()
     loop.begin()
     loop.statistics()  # forget the episodes of the point before

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import track
 
 from brokk_rl.contracts.actuator import Actuator, Effect, FollowerModel
 from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
@@ -14,7 +13,9 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import track_items
 from brokk_rl.record import Recording
+from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -61,6 +62,7 @@ class SimulatedTrials:
         model = self.actuator.build(machine, num, device)
         for effect in self.effect.values():
             model = effect.wrap(model, machine, num, device)
+        model = accept_speeds(model, machine, num, device)
         levers = OperatorLevers(operators, trials.guided)
         task = self.task.build(machine, num, device)
         starts = {}
@@ -104,7 +106,7 @@ class SimulatedTrials:
             round(trials.limit_s / machine.period_s),
             np.full(len(trials.q), round(self.settle_s / machine.period_s)),
         )
-        for _ in track(range(steps), "simulated operators at work", transient=True):
+        for _ in track_items(range(steps), "simulated operators at work"):
             groups, _, done, _ = loop.step(policy.act(dict(groups.items())))  # type: ignore[arg-type]
             rows["q"].append(loop.end_q.numpy().copy())
             rows["force_n"].append(loop.end_force_n.numpy().copy())

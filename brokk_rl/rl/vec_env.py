@@ -34,8 +34,10 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
+from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.fault_recorder import FaultRecorder
+from brokk_rl.sim.objects import list_objects
 from brokk_rl.task_description import TaskDescription, describe_task
 
 Starts = dict[str, torch.Tensor]
@@ -85,14 +87,19 @@ class ControlLoopConfig:
             seed: Seed of the starts.
             starts: Starts of another control loop, in the place of drawn ones.
         """
+        objects = list_objects(self.task, self.sim)
+        more: dict[str, Any] = {"objects": objects} if objects else {}
         if self.events:
-            world: World = build_varied_world(self.sim, self.events, self.machine, device, num_envs)
+            world: World = build_varied_world(
+                self.sim, self.events, self.machine, device, num_envs, **more
+            )
         else:
-            world = self.sim.build(self.machine, device, num_envs)
+            world = self.sim.build(self.machine, device, num_envs, **more)
         num = world.num_worlds
         model = self.actuator.build(self.machine, num, device)
         for effect in self.effects.values():
             model = effect.wrap(model, self.machine, num, device)
+        model = accept_speeds(model, self.machine, num, device)
         follower = self.follower.build(self.machine, num, device)
         process = self.task.build(self.machine, num, device)
         # with all threads, four processes on a computer of 64 cores had no starts after three

@@ -59,8 +59,9 @@ def build_varied_world(
     machine: Machine,
     device: torch.device,
     num_worlds: int | None,
+    **more: Any,
 ) -> EventWorld:
-    """Return a world of `sim` under `events`.
+    """Return a world of `sim` under `events`; `more` goes to its `build`.
 
     Raises:
         ConfigError: The simulator cannot vary the machine, or two events change the same property.
@@ -75,7 +76,7 @@ def build_varied_world(
             f"event={','.join(events)}: sim={name_spec(sim)} cannot vary the machine; choose "
             "sim=native or sim=warp, or event=[]"
         )
-    world = build(machine, device, num_worlds, varied=tuple(names))
+    world = build(machine, device, num_worlds, varied=tuple(names), **more)
     return EventWorld(world, list(events.values()), machine)
 
 

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 import torch
 
+from brokk_rl.commands import find_rest
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
@@ -71,7 +72,8 @@ class SimulatedMachinesLink:
         everywhere = torch.ones(num_runs, dtype=torch.bool, device=device)
         home = torch.as_tensor(machine.home, dtype=torch.float32, device=device)
         self._history = _make_history(machine, num_runs, device)
-        self._history.reset(everywhere, home.repeat(num_runs, 1))
+        rest = torch.as_tensor(find_rest(machine.home, machine), dtype=torch.float32, device=device)
+        self._history.reset(everywhere, home.repeat(num_runs, 1), rest.repeat(num_runs, 1))
         devices = [device] if device.type == "cuda" else []
         with torch.random.fork_rng(devices):  # differences between machines are drawn here
             torch.manual_seed(session.stream("link"))

@@ -6,6 +6,7 @@ cannot disagree.
 
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -15,14 +16,17 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import find_packages, resolve_package_path
 from brokk_rl.sim.drive import add_drive
-from brokk_rl.sim.scene import add_block
+from brokk_rl.sim.objects import SceneObject
+from brokk_rl.sim.scene import add_block, add_objects
 
 ASSETS = Path(__file__).parent / "assets"
 VISUAL_GROUP = 2
 """Geoms of this group are for the eye only."""
 
 
-def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> mujoco.MjModel:
+def compile_model(
+    machine: Machine, timestep_s: float, visual: bool = False, objects: Sequence[SceneObject] = ()
+) -> mujoco.MjModel:
     """Return the model of `machine` at a work site with a block.
 
     Args:
@@ -30,6 +34,7 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
         timestep_s: Length of a substep.
         visual: Keep geoms, cameras and lights that only pictures need. The physics is the same
             without them, and faster.
+        objects: Objects beside the block.
 
     Raises:
         ConfigError: The MJCF is missing or its joints are not those of the machine.
@@ -37,6 +42,7 @@ def compile_model(machine: Machine, timestep_s: float, visual: bool = False) -> 
     spec = _read_mjcf(machine)
     _write_machine(spec, machine)
     add_block(spec, visual)
+    add_objects(spec, objects)
     _write_options(spec, timestep_s)
     if not visual:
         _remove_visuals(spec)

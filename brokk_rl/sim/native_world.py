@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 import mujoco
@@ -14,6 +14,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model, mask_contact_sensors
 from brokk_rl.sim.model_features import check_simulated
+from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
@@ -40,6 +41,7 @@ class NativeWorld:
         substeps: Physics steps per control period.
         num_threads: Threads; 0 takes all cores.
         varied: Properties of the machine that differ from world to world.
+        objects: Objects beside the block.
     """
 
     supports_graphs = False
@@ -54,9 +56,10 @@ class NativeWorld:
         substeps: int,
         num_threads: int,
         varied: tuple[Property, ...] = (),
+        objects: Sequence[SceneObject] = (),
     ) -> None:
         self.num_worlds, self.device = num_worlds, torch.device("cpu")
-        self.model = compile_model(machine, machine.period_s / substeps)
+        self.model = compile_model(machine, machine.period_s / substeps, objects=objects)
         check_simulated(self.model, machine.name, "native")
         self._batch = Batch(self.model, num_worlds, num_threads)
         self.substeps = substeps

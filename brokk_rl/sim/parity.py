@@ -7,6 +7,7 @@ MuJoCo Warp and from our kernels, and computes in double precision.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,7 @@ import torch
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.sim.native_world import NativeWorld
+from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.scene import COLUMNS, HOLE_RADIUS_BOUNDS_M, SCALE_BOUNDS, make_nominal_scenes
 
 if TYPE_CHECKING:
@@ -82,7 +84,13 @@ class ParityResult:
         )
 
 
-def measure_parity(world: World, machine: Machine, substeps: int, seed: int = 0) -> ParityResult:
+def measure_parity(
+    world: World,
+    machine: Machine,
+    substeps: int,
+    seed: int = 0,
+    objects: Sequence[SceneObject] = (),
+) -> ParityResult:
     """Return how far a simulator is from MuJoCo C; its worlds are reset and stepped.
 
     Args:
@@ -90,8 +98,9 @@ def measure_parity(world: World, machine: Machine, substeps: int, seed: int = 0)
         machine: Their machine.
         substeps: Physics steps per control period of these worlds.
         seed: For the random states and motion.
+        objects: Objects beside the block in these worlds.
     """
-    reference = NativeWorld(machine, world.num_worlds, substeps, num_threads=0)
+    reference = NativeWorld(machine, world.num_worlds, substeps, num_threads=0, objects=objects)
     generator = torch.Generator().manual_seed(seed)
     q, scene = _draw_states(machine, world.num_worlds, generator)
     everywhere = torch.ones(world.num_worlds, dtype=torch.bool)
@@ -124,13 +133,15 @@ def measure_parity(world: World, machine: Machine, substeps: int, seed: int = 0)
     )
 
 
-def check_parity(world: World, machine: Machine, substeps: int) -> ParityResult:
+def check_parity(
+    world: World, machine: Machine, substeps: int, objects: Sequence[SceneObject] = ()
+) -> ParityResult:
     """Return how far a simulator is from MuJoCo C; its worlds are reset and stepped.
 
     Raises:
         ConfigError: It is too far.
     """
-    result = measure_parity(world, machine, substeps)
+    result = measure_parity(world, machine, substeps, objects=objects)
     if not result.is_alike:
         raise ConfigError(
             f"machine {machine.name}: sim=warp does not simulate it as MuJoCo C does: "

@@ -7,11 +7,14 @@ corners. The slabs serve as block and as wall of the hole, which halves the geom
 ring of eight walls.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 import torch
+
+from brokk_rl.sim.objects import SceneObject
 
 COLUMNS = ("hole_x_m", "hole_y_m", "rim_z_m", "yaw_rad", "block_scale", "hole_radius_m")
 """Columns of a scene, `S` of them: centre of the rim in the base frame, turn of the block about the
@@ -170,6 +173,30 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
     )
     if visual:
         _add_visuals(body)
+
+
+def add_objects(spec: mujoco.MjSpec, objects: Sequence[SceneObject]) -> None:
+    """Add objects that stand still; tool and arm meet them as they are drawn."""
+    for number, placed in enumerate(objects):
+        turn, tilt = np.zeros(4), np.zeros(4)
+        mujoco.mju_axisAngle2Quat(tilt, np.array([0.0, 1.0, 0.0]), placed.tilt_rad)
+        mujoco.mju_mulQuat(turn, np.array(_turn_about_z(placed.yaw_rad)), tilt)
+        body = spec.worldbody.add_body(name=f"object_{number}", pos=placed.place_m, quat=turn)
+        for half, center, axis in placed.list_boxes():
+            angle = float(np.linalg.norm(axis))
+            quat = np.zeros(4)
+            mujoco.mju_axisAngle2Quat(quat, axis / max(angle, 1e-12), angle)
+            body.add_geom(
+                type=mujoco.mjtGeom.mjGEOM_BOX,
+                size=half,
+                pos=center,
+                quat=quat,
+                contype=0,
+                conaffinity=_TOOL | _ARM,
+                friction=_FRICTION,
+                group=1,
+                material="concrete",
+            )
 
 
 def _add_visuals(body: mujoco.MjsBody) -> None:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from brokk_rl.contracts.world import Property, World
     from brokk_rl.sim.native_world import NativeWorld
+    from brokk_rl.sim.objects import SceneObject
     from brokk_rl.sim.parity import ParityResult
     from brokk_rl.sim.warp_world import WarpWorld
 
@@ -49,10 +50,12 @@ class NativeSimulator:
         device: torch.device | str,
         num_worlds: int | None = None,
         varied: tuple[Property, ...] = (),
+        objects: tuple[SceneObject, ...] = (),
     ) -> NativeWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
 
-        `varied` names properties of the machine that differ from world to world.
+        `varied` names properties of the machine that differ from world to world, `objects` what
+        stands beside the block.
 
         Raises:
             DeviceError: `device` is not the CPU.
@@ -65,7 +68,12 @@ class NativeSimulator:
         from brokk_rl.sim.native_world import NativeWorld
 
         return NativeWorld(
-            machine, _choose(num_worlds, self.num_worlds), self.substeps, self.num_threads, varied
+            machine,
+            _choose(num_worlds, self.num_worlds),
+            self.substeps,
+            self.num_threads,
+            varied,
+            objects,
         )
 
 
@@ -124,10 +132,12 @@ class WarpSimulator:
         device: torch.device | str,
         num_worlds: int | None = None,
         varied: tuple[Property, ...] = (),
+        objects: tuple[SceneObject, ...] = (),
     ) -> WarpWorld:
         """Return the worlds; `num_worlds` overrides the number in the config.
 
-        `varied` names properties of the machine that differ from world to world.
+        `varied` names properties of the machine that differ from world to world, `objects` what
+        stands beside the block.
 
         On a CPU this is slow and meant for tests.
 
@@ -147,8 +157,9 @@ class WarpSimulator:
         if device.type == "cuda" and device.index is None:
             device = torch.device("cuda", torch.cuda.current_device())
         if self.parity_worlds:
-            _check_parity(self, machine, device)
-        return self._make_world(machine, device, _choose(num_worlds, self.num_worlds), varied)
+            _check_parity(self, machine, device, objects)
+        num = _choose(num_worlds, self.num_worlds)
+        return self._make_world(machine, device, num, varied, objects)
 
     def _make_world(
         self,
@@ -156,6 +167,7 @@ class WarpSimulator:
         device: torch.device,
         num_worlds: int,
         varied: tuple[Property, ...] = (),
+        objects: tuple[SceneObject, ...] = (),
     ) -> WarpWorld:
         from brokk_rl.sim.warp_world import WarpWorld
 
@@ -171,6 +183,7 @@ class WarpSimulator:
             tolerance=self.tolerance,
             fused=self.fused,
             varied=varied,
+            objects=objects,
         )
 
 
@@ -192,19 +205,25 @@ class AutoSimulator:
         device: torch.device | str,
         num_worlds: int | None = None,
         varied: tuple[Property, ...] = (),
+        objects: tuple[SceneObject, ...] = (),
     ) -> World:
         """Return the worlds on `device`; `num_worlds` overrides the configured number."""
         chosen = self.native if _is_cpu(device) else self.warp
-        return chosen.build(machine, device, num_worlds, varied)
+        return chosen.build(machine, device, num_worlds, varied, objects)
 
 
 @functools.lru_cache(maxsize=8)
-def _check_parity(simulator: WarpSimulator, machine: Machine, device: torch.device) -> ParityResult:
+def _check_parity(
+    simulator: WarpSimulator,
+    machine: Machine,
+    device: torch.device,
+    objects: tuple[SceneObject, ...],
+) -> ParityResult:
     """Compare a simulator with MuJoCo C on a machine, once in a process."""
     from brokk_rl.sim.parity import check_parity
 
-    world = simulator._make_world(machine, device, simulator.parity_worlds)
-    return check_parity(world, machine, simulator.substeps)
+    world = simulator._make_world(machine, device, simulator.parity_worlds, objects=objects)
+    return check_parity(world, machine, simulator.substeps, objects)
 
 
 def _is_cpu(device: torch.device | str) -> bool:

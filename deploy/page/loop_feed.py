@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from brokk_rl.contracts.vision import CameraView
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
@@ -33,6 +34,7 @@ from deploy.page.protocol import (
     ShownAdvice,
     SourceAge,
     Vector,
+    read_view,
 )
 from deploy.page.scene import locate_borehole, measure_insertion, plan_approach, to_vector
 from deploy.page.server import serve_page
@@ -42,7 +44,7 @@ from deploy.runtime.bus_process import TEXT
 from deploy.runtime.operator_state import LoopSnapshot, OperatorState, PolicyAdvice, StopRequest
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
-from deploy.runtime.shm_layout import LOG_BYTES, LoopMemory
+from deploy.runtime.shm_layout import LOG_BYTES, VIEW, LoopMemory
 from deploy.runtime.target import TargetPosition, find_nearest, locate_hole, read_holes
 
 log = logging.getLogger(__name__)
@@ -156,6 +158,7 @@ class LoopFeed:
             insertion=insertion,
             path_in_base_m=path,
             block_in_base_m=None,
+            view=self._read_view(),
         )
 
     def read_frame(self, after_s: float) -> Frame | None:
@@ -273,6 +276,13 @@ class LoopFeed:
             log_behind=any(pipe.waiting > LOG_BEHIND_BYTES for pipe in memory.logs),
             supervisor_silent=silent,
         )
+
+    def _read_view(self) -> CameraView | None:
+        record = self._memory.view.read()
+        if record is None:
+            return None
+        values = {name: record[name].item() for name in VIEW.names or ()}
+        return read_view(values | {"name": values["name"].decode()})
 
     def _read_frame_t_s(self) -> float | None:
         return self._memory.frame and self._memory.frame.peek("t_s")

@@ -7,9 +7,11 @@ greys them.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, Protocol, get_args
 
+from brokk_rl.contracts.vision import CameraView
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from deploy.guidance import LeverPositions
@@ -192,6 +194,7 @@ class PageState:
         path_in_base_m: Way of the tool from its tip; empty where nothing is planned.
         block_in_base_m: Two opposite corners of a block to draw; `None` where only the point cloud
             is known.
+        view: Where a moving camera looks, and why; `None` without one.
         replay: Place in the recording that is played; `None`: this is live.
     """
 
@@ -208,6 +211,7 @@ class PageState:
     insertion: InsertionReading | None
     path_in_base_m: tuple[Vector, ...]
     block_in_base_m: tuple[Vector, Vector] | None
+    view: CameraView | None = None
     replay: ReplayTimeline | None = None
 
     @property
@@ -263,9 +267,15 @@ class PageState:
             "insertion": self.insertion and asdict(self.insertion),
             "path_in_base_m": self.path_in_base_m,
             "block_in_base_m": self.block_in_base_m,
+            "view": self.view and asdict(self.view),
             "replay": self.replay and asdict(self.replay),
         }
         return convert_to_plain(found)
+
+
+def read_view(values: Mapping[str, Any]) -> CameraView:
+    """Return the view of a moving camera from its plain values, among others perhaps."""
+    return CameraView(**{one.name: values[one.name] for one in fields(CameraView)})
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,7 @@ from deploy.page.protocol import (
     SourceAge,
     TimelineMark,
     Vector,
+    read_view,
 )
 from deploy.page.scene import measure_insertion, plan_approach, to_vector
 from deploy.recorder.capture_reader import CaptureContents, TopicMessages, read_capture
@@ -161,6 +162,7 @@ class ReplayFeed:
         advice = self._find("advice", at_s)
         targets = self._list_targets(at_s, None if advice is None else advice[2])
         path, insertion = self._place_tool(state, targets)
+        view = self._find("view", at_s)
         replay, heard_s = self._replay, min(ages_s["positions"], ages_s["levers"])
         streams = [
             SourceAge("positions", _drop_infinite(ages_s["positions"]), replay.bus_s),
@@ -186,6 +188,7 @@ class ReplayFeed:
             insertion=insertion,
             path_in_base_m=path,
             block_in_base_m=None,
+            view=None if view is None else read_view(view[2]),
             replay=ReplayTimeline(position_s, self._duration_s, self._speed, self._marks),
         )
 

@@ -18,7 +18,7 @@ import onnxruntime
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import restore_encoder
+from brokk_rl.observation import ObservationEncoder, restore_encoder
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.task_description import TaskDescription
 
@@ -62,7 +62,14 @@ class PolicyBundle:
                 f"{folder}: the policy's task cannot be deployed, so there is no {ONNX}; see "
                 "brokk_rl.contracts.task.DeployableTask"
             )
-        self.encoder = restore_encoder(machine, observation)
+        encoder = restore_encoder(machine, observation)
+        if not isinstance(encoder, ObservationEncoder):
+            raise CheckpointError(
+                f"{folder}: the machine's loop gives target, positions and commands, but the policy "
+                f"asks for {', '.join(observation['order'])}; run it in a loop of your own, as "
+                "examples/run_policy.py does"
+            )
+        self.encoder = encoder
         expected = self.encoder.describe()
         for key, value in expected.items():
             if key != "size" and _is_different(value, observation.get(key)):

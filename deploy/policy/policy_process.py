@@ -26,6 +26,8 @@ from deploy.runtime.operator_state import (
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
 
+OBSERVATION_DECIMALS = 5
+"""Decimals of the observation in the log, for `mode=doctor_policy`; its tolerance is 1e-3."""
 ROUNDING = 1e-6
 """By which a command in float32 may exceed full and still count as full."""
 
@@ -150,6 +152,7 @@ class PolicyAdviser:
         self._history = PolicyHistory(config.machine)
         self._display = LeverDisplay(config.guidance, config.machine)
         self._number = 0
+        self._observed = np.zeros(0)
         self._exclusive = config.machine.is_exclusive
         bundle.command(np.zeros((1, bundle.encoder.size)))  # the first call is slow
 
@@ -157,7 +160,7 @@ class PolicyAdviser:
         """Run one control period; `missed` ones went by before it."""
         state, target = self._memory.state.read(), self._memory.target.read()
         status = self._sample(state, missed, now_s)
-        u, infer_s = np.zeros(self._machine.num_joints), 0.0
+        u, infer_s, self._observed = np.zeros(self._machine.num_joints), 0.0, np.zeros(0)
         target_m = np.zeros(3) if target is None else np.array(target["center_in_base_m"])
         if status is AdviceStatus.VALID:
             if target is None:
@@ -201,6 +204,7 @@ class PolicyAdviser:
         # A target of NaN would otherwise reach the network.
         if not np.isfinite(observation).all():
             return None
+        self._observed = observation[0]
         u = self._bundle.command(observation)[0].astype(float)
         moved = u != 0
         # the bundle masks its commands; an exclusive joint beside others means that it is damaged
@@ -252,5 +256,6 @@ class PolicyAdviser:
             "button_right": shown.button_right,
             "target_in_base_m": target_m.round(4).tolist(),
             "infer_s": round(infer_s, 6),
+            "observation": self._observed.round(OBSERVATION_DECIMALS).tolist(),
         }
         self._memory.policy_log.put(TEXT + json.dumps(text).encode())

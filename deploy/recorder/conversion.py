@@ -20,8 +20,12 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.spec import spec
 from deploy.recorder import capture_reader
-from deploy.recorder.capture_reader import CaptureContents
+from deploy.recorder.capture_reader import CaptureContents, TopicMessages
 
+TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
+LATE_SHARE = 0.25
+"""Part of a period by which a decision may come after its row; chosen by hand, four times the jitter
+of a loaded computer."""
 Series = tuple[np.ndarray, np.ndarray]
 """Times, s, and values."""
 
@@ -101,6 +105,7 @@ class CaptureLogReader:
         path: Path,
         machine: Machine,
     ) -> Recording:
+        begin_s = _align_with_advice(contents, begin_s, machine.period_s)
         # The small addition keeps a period that rounding would drop.
         grid_s = (
             begin_s + np.arange(int((end_s - begin_s) / machine.period_s + 1e-6)) * machine.period_s
@@ -166,16 +171,44 @@ def _build_extra_columns(
             oil_c = np.interp(grid_s, messages.series("t_s"), messages.series("OilTemperature"))
             extra["oil_c"] = oil_c.astype(np.float32)
     if advised := contents.messages.get("advice"):
-        t_s = advised.series("t_s")
-        shown = np.full((len(t_s), machine.num_joints), np.nan)
-        for row, (_, values) in enumerate(advised):
+        extra |= _read_advice(advised, grid_s, machine)
+    return extra
+
+
+def _align_with_advice(contents: CaptureContents, begin_s: float, period_s: float) -> float:
+    """Return the begin of a piece, moved by less than a period onto a decision of the policy.
+
+    Rows then hold what the policy saw when it decided.
+    """
+    advised = contents.messages.get("advice")
+    later = advised.series("t_s") if advised else np.empty(0)
+    later = later[(later >= begin_s) & (later < begin_s + period_s)]
+    return float(later[0]) if len(later) else begin_s
+
+
+def _read_advice(
+    advised: TopicMessages, grid_s: np.ndarray, machine: Machine
+) -> dict[str, np.ndarray]:
+    """Return the policy's commands, its target and its observation; NaN where there was no advice."""
+    t_s, names = advised.series("t_s"), machine.joint_names
+    widths = {"u": len(names), "target_in_base_m": len(TARGET_COLUMNS), "observation": 0}
+    rows = [values for _, values in advised]
+    widths["observation"] = max((len(one.get("observation", ())) for one in rows), default=0)
+    columns = {
+        "u": [f"advice_{name}" for name in names],
+        "target_in_base_m": list(TARGET_COLUMNS),
+        "observation": [f"obs_{number}" for number in range(widths["observation"])],
+    }
+    # The advice in force at each row is the last one before it. A decision may come a little late.
+    last = np.searchsorted(t_s, grid_s + LATE_SHARE * machine.period_s, side="right") - 1
+    extra = {}
+    for field, width in widths.items():
+        given = np.full((len(rows), width), np.nan)
+        for row, values in enumerate(rows):
             # Advice that was not valid was not shown.
-            if values["reason"] == "valid":
-                shown[row] = values["u"]
-        # The advice in force at each row is the last one before it.
-        rows = np.searchsorted(t_s, grid_s, side="right") - 1
-        for j, name in enumerate(machine.joint_names):
-            extra[f"advice_{name}"] = np.where(rows >= 0, shown[rows.clip(0), j], np.nan).astype(
-                np.float32
-            )
+            if values["reason"] == "valid" and len(values.get(field, ())) == width:
+                given[row] = values[field]
+        held = np.where((last >= 0)[:, None], given[last.clip(0)], np.nan).astype(np.float32)
+        if np.isfinite(held).any() or field == "u":
+            extra |= dict(zip(columns[field], held.T, strict=True))
     return extra

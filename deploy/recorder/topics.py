@@ -81,6 +81,7 @@ TOPICS: dict[str, tuple[TopicField, ...]] = {
         TopicField("button_right", "flag", "whether the right button is to be held"),
         TopicField("target_in_base_m", "number", "centre of the target's rim, base frame, m", many=True),
         TopicField("infer_s", "number", "time that the network took, s"),
+        TopicField("observation", "number", "vector that the network got; empty without advice", many=True),
     ),
     "guard": (
         TopicField("state", "text", f"state of the guard; {_list_names(GuardState)}"),
@@ -103,6 +104,16 @@ TOPICS: dict[str, tuple[TopicField, ...]] = {
     ),
     "bus": (TopicField("down", "text", "why the bus went down"),),
     "holes": (TopicField("holes", "text", "boreholes known now", many=True, parts=HOLE),),
+    "view": (
+        TopicField("name", "text", "position of the camera's mount"),
+        TopicField("is_moving", "flag", "whether the camera is on its way there"),
+        TopicField("travel_s", "number", "time until it stands there, s"),
+        TopicField("seen_s", "number", "time for which the hole will be seen from there, s"),
+        TopicField("seen_before_s", "number", "the same had the camera stayed, s"),
+        TopicField("horizon_s", "number", "time ahead that was looked at, s"),
+        TopicField("std_m", "number", "expected standard deviation of the hole after that time, m"),
+        TopicField("std_before_m", "number", "the same had the camera stayed, m"),
+    ),
     "wish": (
         TopicField("kind", "text", "request of the operator: start, stop, record, target, point"),
         TopicField("value", "text", "on or off, name of the target, or point of the picture"),

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.contracts.vision import (
+    AimedSource,
     BoreholeFinder,
     FinderSpec,
     FrameSource,
@@ -33,6 +34,7 @@ from deploy.runtime.bus_process import TEXT
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import MOST_HOLES, LoopMemory
+from deploy.runtime.target import NEAR_M
 
 log = logging.getLogger(__name__)
 
@@ -83,10 +85,13 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
     assert memory.frame is not None
     finder = camera.finder.build() if camera.finder else None
     tracker, complained_s = camera.tracker.build(), -math.inf
+    tracked: Sequence[TrackedHole] = ()
     with ExitStack() as stack:
         source: FrameSource = stack.enter_context(camera.source.build())
         while not stop():
             began_s = time.monotonic()
+            if isinstance(source, AimedSource):
+                point_camera(source, memory, tracked, began_s)
             try:
                 frame = source.read_latest()
             except FrameError as error:
@@ -106,6 +111,29 @@ def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:
                 text = {"topic": "holes", "t_s": now_s, "holes": _list_holes(tracked)}
                 memory.vision_log.put(TEXT + json.dumps(text).encode())
             time.sleep(max(0.0, began_s + 1.0 / camera.rate_hz - time.monotonic()))
+
+
+def point_camera(
+    source: AimedSource, memory: LoopMemory, tracked: Sequence[TrackedHole], t_s: float
+) -> None:
+    """Let a moving camera choose its view of the chosen hole, and publish it with the reason."""
+    state, target = memory.state.read(), memory.target.read()
+    hole = None
+    if target is not None:
+        center_m = np.array(target["center_in_base_m"])
+        away_m = {one.name: float(np.linalg.norm(one.pose.center_m - center_m)) for one in tracked}
+        near = [one for one in tracked if away_m[one.name] <= NEAR_M]
+        hole = min(near, key=lambda one: away_m[one.name], default=None)
+    view = source.aim(None if state is None else np.array(state.q), hole, t_s)
+    if view is None:
+        return
+    record = memory.view.new()
+    record["t_s"] = t_s
+    for name, value in vars(view).items():
+        record[name] = value.encode() if isinstance(value, str) else value
+    memory.view.write(record)
+    text = {"topic": "view", "t_s": t_s, **vars(view)}
+    memory.vision_log.put(TEXT + json.dumps(text).encode())
 
 
 def _find_holes(finder: BoreholeFinder, frame: Frame) -> Sequence[HolePose]:

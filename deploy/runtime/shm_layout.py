@@ -47,6 +47,21 @@ HOLE = np.dtype(
 HOLES = np.dtype([("t_s", float), ("count", np.uint8), ("holes", HOLE, (MOST_HOLES,))])
 """All boreholes that perception knows."""
 
+VIEW = np.dtype(
+    [
+        ("t_s", float),
+        ("name", "S64"),
+        ("is_moving", bool),
+        ("travel_s", float),
+        ("seen_s", float),
+        ("seen_before_s", float),
+        ("horizon_s", float),
+        ("std_m", float),
+        ("std_before_m", float),
+    ]
+)
+"""Where a camera on a mount looks, and why; see `brokk_rl.contracts.vision.CameraView`."""
+
 TARGET = np.dtype([("t_s", float), ("center_in_base_m", float, (3,)), ("std_m", float)])
 """The borehole to drill: when it was found, the centre of its rim, and its standard deviation."""
 
@@ -79,6 +94,7 @@ class LoopMemory:
         stop: From the page, straight to the bus process.
         frame: Newest frame of the camera; `None` without one.
         holes: Boreholes that perception knows.
+        view: Where a moving camera looks.
         bus_log: From the bus process to the log.
         policy_log: From the policy to the log.
         page_log: From the operator's page to the log.
@@ -95,6 +111,7 @@ class LoopMemory:
     stop: RecordSlot[StopRequest]
     frame: Slot | None
     holes: Slot
+    view: Slot
     bus_log: Pipe
     policy_log: Pipe
     page_log: Pipe
@@ -121,6 +138,7 @@ class LoopMemory:
             stop=RecordSlot("stop", StopRequest, num_joints),
             frame=Slot("frame", build_frame_fields(frame_px)) if frame_px else None,
             holes=Slot("holes", HOLES),
+            view=Slot("view", VIEW),
             bus_log=Pipe("bus_log", LOG_BYTES),
             policy_log=Pipe("policy_log", LOG_BYTES),
             page_log=Pipe("page_log", LOG_BYTES),

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit, CurveFit, Excitation
@@ -17,51 +16,19 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import use_workers
+from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis import answer, baseline, case, effect_library, pipeline, report, report_checks
-from diagnosis.answer import Answer
+from diagnosis.answer import Answer, Outcome
 from diagnosis.baseline import Baseline
-from diagnosis.calibration import ProbabilityModel
 from diagnosis.case import GapCase
-from diagnosis.detection import Penalties, ProgressCallback
+from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import EffectType
 from diagnosis.pipeline import DiagnosisPipeline
+from diagnosis.request import DiagnosisSubject
 
 log = logging.getLogger(__name__)
-
-
-@spec
-class DiagnosisSubject:
-    """Recordings to diagnose.
-
-    Attributes:
-        case: Folder with `reference/` and `field/`; or `null`.
-        field: Glob or globs of recordings of the machine as it is, held against `actuator`; instead
-            of a case.
-        unseen: Glob or globs of further recordings of the machine as it is, to which nothing is
-            fitted: how far the effects carry.
-        effects: Names of the effects to choose among; `null`: all that are registered.
-        workers: Processes that share the work; 1 where the system has no safe fork.
-        prices: Penalties of effects.
-        certainty: Calibration of the probabilities.
-    """
-
-    case: str | None
-    field: str | tuple[str, ...] | None
-    unseen: str | tuple[str, ...] | None
-    effects: tuple[str, ...] | None
-    workers: int
-    prices: Penalties
-    certainty: ProbabilityModel
-
-    def check(self) -> None:
-        if self.workers < 1:
-            raise ConfigError(f"diagnosis.workers: expected 1 or more, got {self.workers}")
-        if (self.case is None) == (self.field is None):
-            raise ConfigError(
-                "diagnosis: give either case=<folder with reference/ and field/>, or field=<glob> and actuator=<simulator>"
-            )
 
 
 @spec
@@ -99,16 +66,26 @@ class Diagnose:
             StorageError: something could not be written.
         """
         self.session.seed_all()
-        given = self._case()
+        outcome = self.find_causes(self._case())
+        self.write(outcome)
+        _print_answer(outcome.answer, self.session.folder)
+
+    def find_causes(self, given: GapCase) -> Outcome:
+        """Return the outcome for recordings at hand; the progress is shown.
+
+        Raises:
+            RecordingError: there is too little data to fit a simulator to.
+            ConfigError: an effect is unknown, or there is neither a reference nor an actuator.
+        """
         kinds = effect_library.load_effects(self.machine, self.diagnosis.effects)
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
-        with Progress(transient=True) as progress, use_workers(self.diagnosis.workers):
-            task, reached = progress.add_task("fitting the simulator", total=1.0), 0.0
+        with (
+            ItemProgress("fitting the simulator", SHARE) as progress,
+            use_workers(self.diagnosis.workers),
+        ):
 
             def tell(doing: str, done: float) -> None:
-                nonlocal reached
-                reached = max(reached, done)  # a step may be repeated
-                progress.update(task, description=doing, completed=reached)
+                progress.reach(done, doing)
 
             base = self._base(given, kinds, tell)
             generator = self.session.generator("diagnosis")
@@ -124,13 +101,20 @@ class Diagnose:
                 self.curve_fit,
                 generator,
             )
-            outcome = work.run(tell)
+            return work.run(tell)
+
+    def write(self, outcome: Outcome) -> None:
+        """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
+
+        Raises:
+            StorageError: something could not be written.
+        """
         folder = self.session.folder
+        kinds = effect_library.load_effects(self.machine, self.diagnosis.effects)
         outcome.save(folder)
         pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
         with use_workers(self.diagnosis.workers):
             report.write_report(outcome, folder, self.machine)
-        _print_answer(outcome.answer, folder)
 
     def _case(self) -> GapCase:
         subject = self.diagnosis
@@ -159,7 +143,10 @@ class Diagnose:
 
         if given.reference:
             return baseline.fit_baseline(given, self.fit, folder / "base", seed, device, refine)
-        assert self.actuator is not None, "there is one where there is no reference"
+        if self.actuator is None:
+            raise ConfigError(
+                "there is neither a reference nor an actuator to hold the field against"
+            )
         return baseline.accept_simulator(
             given, self.actuator, self.fit, folder / "flexible", seed, device
         )

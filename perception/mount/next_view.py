@@ -14,12 +14,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from brokk_rl.contracts.vision import CameraView, TrackedHole
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from perception.mount.mounts import CameraMount
 from perception.mount.occlusion import ArmShape, compute_visible_share, sample_circle
 from perception.render.stereo_camera import StereoRig
+
+UP = np.array([0.0, 0.0, 1.0])
+"""Axis of a hole that was never seen: the task drills from above."""
+SMALLEST_VARIANCE_M2 = 1e-10
+"""Smallest variance of a belief, (0.01 mm)²: no camera measures better."""
+AS_GOOD = 1.05
+"""Factor on the smallest expected standard deviation up to which a view is as good. Chosen by hand."""
+BELIEF_AFTER_MISS = 0.5
+"""Factor on the frames expected from a view after each frame that showed nothing. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -31,14 +41,26 @@ class HoleBelief:
         axis: Unit axis out of the hole, `(3,)`.
         radius_m: Radius.
         cov_m2: Covariance of the centre without the error of the camera's pose, `(3, 3)`.
-        drift_m2_s: Variance by which each coordinate ages in a second.
     """
 
     center_m: np.ndarray
     axis: np.ndarray
     radius_m: float
     cov_m2: np.ndarray
-    drift_m2_s: float
+
+    @classmethod
+    def expect(cls, center_m: np.ndarray, radius_m: float, std_m: float) -> HoleBelief:
+        """Return the belief about a hole drilled from above that was never seen."""
+        return cls(center_m, UP, radius_m, std_m**2 * np.eye(3))
+
+    @classmethod
+    def take(cls, hole: TrackedHole) -> HoleBelief:
+        """Return the belief about a tracked hole."""
+        pose = hole.pose
+        shared_m2 = np.zeros((3, 3)) if pose.shared_m2 is None else pose.shared_m2
+        # Frames cannot reduce the shared part, and a covariance must stay invertible without it.
+        own_m2 = pose.cov_m2 - shared_m2 + SMALLEST_VARIANCE_M2 * np.eye(3)
+        return cls(pose.center_m, pose.axis, pose.radius_m, own_m2)
 
 
 @dataclass(frozen=True)
@@ -47,43 +69,11 @@ class ViewChoice:
 
     Attributes:
         position: Position of the mount, `(A,)`.
-        is_new: It is another one than the present.
-        travel_s: Time until the camera stands there.
-        seen_here: Part of the coming seconds in which the present view would see the hole.
-        seen_there: The same of the chosen one.
-        std_m: Standard deviation of one coordinate of the centre now.
-        std_here_m: Expected one after the coming seconds from the present view.
-        std_there_m: The same from the chosen one.
-        horizon_s: The coming seconds.
-        name: The position in words.
+        view: Where it looks, and why; `is_moving` where it is another one than the present.
     """
 
     position: np.ndarray
-    is_new: bool
-    travel_s: float
-    seen_here: float
-    seen_there: float
-    std_m: float
-    std_here_m: float
-    std_there_m: float
-    horizon_s: float
-    name: str
-
-    def explain(self) -> str:
-        """Return where the camera looks and why, in a sentence or two."""
-        if not self.is_new:
-            if self.seen_here > 0:
-                return (
-                    f"Camera stays ({self.name}): the hole is in sight for "
-                    f"{self.seen_here * self.horizon_s:.1f} of the next {self.horizon_s:.0f} s."
-                )
-            return f"Camera stays ({self.name}): no view would see the hole."
-        return (
-            f"Camera moves ({self.name}, {self.travel_s:.1f} s): from here the hole would be seen "
-            f"for {self.seen_here * self.horizon_s:.1f} of the next {self.horizon_s:.0f} s, from "
-            f"there for {self.seen_there * self.horizon_s:.1f} s. Expected "
-            f"{1000 * self.std_there_m:.1f} mm instead of {1000 * self.std_here_m:.1f} mm."
-        )
+    view: CameraView
 
 
 @spec
@@ -100,6 +90,7 @@ class ExpectedCovariance:
             always.
         tilt_rad: Largest angle between the hole's axis and the line of sight.
         margin: Part of the picture along its border in which no hole is found.
+        drift_m_sqrt_s: How an unseen hole ages, as the tracker has it.
         improvement: Part by which the expected standard deviation must be smaller for the camera to
             leave its view.
     """
@@ -112,6 +103,7 @@ class ExpectedCovariance:
     visible: tuple[float, float]
     tilt_rad: float
     margin: float
+    drift_m_sqrt_s: float
     improvement: float
 
     def check(self) -> None:
@@ -145,7 +137,9 @@ class ViewPlanner:
         self.settings = settings
         self._machine, self._mount, self._rig, self._arm = machine, mount, rig, arm
 
-    def choose(self, hole: HoleBelief, present: np.ndarray, plan_q: np.ndarray) -> ViewChoice:
+    def choose(
+        self, hole: HoleBelief, present: np.ndarray, plan_q: np.ndarray, num_missed: int = 0
+    ) -> ViewChoice:
         """Return the next view.
 
         Args:
@@ -153,6 +147,8 @@ class ViewPlanner:
             present: Present position of the mount, `(A,)`.
             plan_q: Joint positions of the arm at `num_times` times from now to `horizon_s`,
                 `(T, J)`.
+            num_missed: Last frames from the present view in which nothing was found: something hides
+                the hole that the plan does not know.
         """
         s, mount = self.settings, self._mount
         positions = np.concatenate([present[None], mount.views])
@@ -162,23 +158,28 @@ class ViewPlanner:
         times_s = np.linspace(0.0, s.horizon_s, len(plan_q))
         found = self.predict_detection(hole, poses, plan_q)
         seen = (found * (times_s >= travel_s[:, None])).mean(1)
+        # The present view may be one of the mount's own, too.
+        seen[(positions == present).all(-1)] *= BELIEF_AFTER_MISS**num_missed
         variance_m2 = self._predict_variance(hole, poses, s.rate_hz * s.horizon_s * seen)
         std_m = np.sqrt(variance_m2)
-        best = int(np.argmin(std_m))
+        # Of views that are as good, the one that has the hole in the middle.
+        away_m = hole.center_m - poses[:, -1, :3, 3]
+        ahead = (poses[:, -1, :3, 2] * away_m).sum(1) / np.linalg.norm(away_m, axis=1)
+        is_good = std_m <= AS_GOOD * std_m.min()
+        best = int(np.argmax(np.where(is_good, ahead, -np.inf)))
         if std_m[best] > (1.0 - s.improvement) * std_m[0]:
             best = 0
-        return ViewChoice(
-            position=positions[best],
-            is_new=best > 0,
-            travel_s=float(travel_s[best]),
-            seen_here=float(seen[0]),
-            seen_there=float(seen[best]),
-            std_m=float(np.sqrt(np.trace(hole.cov_m2) / 3)),
-            std_here_m=float(std_m[0]),
-            std_there_m=float(std_m[best]),
-            horizon_s=s.horizon_s,
+        view = CameraView(
             name=mount.describe(positions[best]),
+            is_moving=best > 0,
+            travel_s=float(travel_s[best]),
+            seen_s=float(seen[best]) * s.horizon_s,
+            seen_before_s=float(seen[0]) * s.horizon_s,
+            horizon_s=s.horizon_s,
+            std_m=float(std_m[best]),
+            std_before_m=float(std_m[0]),
         )
+        return ViewChoice(positions[best], view)
 
     def predict_detection(
         self, hole: HoleBelief, poses: np.ndarray, plan_q: np.ndarray
@@ -215,14 +216,16 @@ class ViewPlanner:
     ) -> np.ndarray:
         """Return the expected mean variance of the centre after the frames of each view, `(V,)`."""
         s, rig = self.settings, self._rig
-        rotation = poses[:, -1, :3, :3]
-        center = np.einsum("vji,vj->vi", rotation, hole.center_m - poses[:, -1, :3, 3])
-        depth_m = np.maximum(center[:, 2], 1e-3)
-        across_m2 = (s.center_px * depth_m / rig.focal_px) ** 2
-        along_m2 = (s.disparity_px * depth_m**2 / (rig.focal_px * rig.baseline_m)) ** 2
-        noise = np.stack([across_m2, across_m2, along_m2], 1)
-        information = rotation * (num_frames[:, None] / noise)[:, None, :]
-        information = information @ np.swapaxes(rotation, 1, 2)
-        aged_m2 = hole.cov_m2 + hole.drift_m2_s * s.horizon_s * np.eye(3)
+        away_m = hole.center_m - poses[:, -1, :3, 3]
+        # The distance, not the depth: no view is better for having the hole in a corner.
+        range_m = np.linalg.norm(away_m, axis=1)
+        ray = away_m / range_m[:, None]
+        across_m = s.center_px * range_m / rig.focal_px
+        along_m = s.disparity_px * range_m**2 / (rig.focal_px * rig.baseline_m)
+        along = ray[:, :, None] * ray[:, None, :]
+        precision = along / along_m[:, None, None] ** 2
+        precision += (np.eye(3) - along) / across_m[:, None, None] ** 2
+        information = num_frames[:, None, None] * precision
+        aged_m2 = hole.cov_m2 + s.drift_m_sqrt_s**2 * s.horizon_s * np.eye(3)
         posterior = np.linalg.inv(np.linalg.inv(aged_m2) + information)
         return np.trace(posterior, axis1=1, axis2=2) / 3

@@ -94,6 +94,14 @@ class StereoPatch:
         """Return a picture like `right`, warped by a plane onto the left one; `row` as `remap` needs it."""
         return cv2.remap(picture, self.on_plane(u, v, m).astype(np.float32), row, cv2.INTER_CUBIC)
 
+    def locate(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return columns and rows of `left` for those of the picture."""
+        column, row = (
+            (some - corner + 0.5) / self.shrink - 0.5
+            for some, corner in zip((u, v), self.corner, strict=True)
+        )
+        return column, row
+
     def column(self, u: float) -> float:
         """Return the column of `left` for a column of the picture."""
         return (u - self.corner[0] + 0.5) / self.shrink - 0.5

@@ -32,8 +32,8 @@ told from a flat disc; factor on the score of such a hole, and of one in dust.""
 FORGIVEN, AT_FIRST = 0.55, 1.4
 """Least visible part of a circle whose ellipse was too small or too long; and factor on the limits
 for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
-BROKEN = 0.2
-"""Part of a rim that is missing though nothing hides it, from which pieces are broken off."""
+BROKEN_SEEN = 0.6
+"""Least part of a broken rim with edges: its pieces may lie at any depth, so texture has some too."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which occluders of its rim are searched."""
 
@@ -81,6 +81,8 @@ class PlaneConic:
             where something hides a part of the rim.
         axis_ratio: Least ratio of the semi-axes on the plane, 1 for a circle; likewise.
         coverage: Least visible part of the circle.
+        broken: Part of a rim that is missing though nothing hides it, from which its pieces count
+            as broken off; 1 for never.
         tilt_rad: Largest angle between the face's normal and the line of sight.
         inner: Inner limit of the face's support in radii of the ellipse; leaves out the bleeding of
             the rim.
@@ -108,6 +110,7 @@ class PlaneConic:
     radius_tolerance: float
     axis_ratio: float
     coverage: float
+    broken: float
     tilt_rad: float
     inner: float
     rings: tuple[float, ...]
@@ -177,7 +180,7 @@ class PlaneConicEstimator:
             shape = self._check_shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        circle = self._fit_circle(gray, frame, face, ellipse, has_good_shape=shape)
+        circle = self._fit_circle(gray, frame, face, both, ellipse, has_good_shape=shape)
         if isinstance(circle, Rejection):
             return circle
         return self._describe_hole(gray, frame, masks, face, circle, both, ellipse)
@@ -215,6 +218,7 @@ class PlaneConicEstimator:
         gray: np.ndarray,
         frame: Frame,
         face: FacePlane,
+        both: alignment.StereoPatch | None,
         ellipse: Ellipse,
         has_good_shape: bool,
     ) -> RimCircle | Rejection:
@@ -234,19 +238,22 @@ class PlaneConicEstimator:
         # What is missing of a rim is hidden, or broken off.
         seen = 0.0 if circle is None else circle.coverage
         row = as_row(ellipse) if circle is None else circle.ellipse
-        if 1.0 - seen - measure_hidden_part(face, row, frame) > BROKEN:
+        if 1.0 - seen - measure_hidden_part(face, row, frame) > s.broken:
             chart = rim.build_chart(
                 face.point(np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])),
                 face.m,
                 frame.camera_matrix,
             )
-            broken = broken_rim.fit_broken_rim(gray, chart, np.zeros(2), s.radius_m, s.center_px)
+            broken = broken_rim.fit_broken_rim(
+                gray, chart, both, np.zeros(2), s.radius_m, s.center_px
+            )
             # Its coverage counts the broken parts too.
-            if broken is not None and broken.coverage >= max(seen, FORGIVEN):
+            if broken is not None and broken.coverage >= max(seen, BROKEN_SEEN):
                 circle = broken
-        # An ellipse of wrong shape may still belong to a rim, but then most of the circle must be
-        # seen.
-        least = s.coverage if has_good_shape else max(s.coverage, FORGIVEN)
+        # An ellipse of wrong shape, or a region with little border, may still belong to a rim, but
+        # then most of the circle must be seen.
+        is_sure = has_good_shape and ellipse.coverage >= s.coverage
+        least = s.coverage if is_sure else max(s.coverage, FORGIVEN)
         if circle is None or circle.coverage < least:
             reason, seen = "part of a circle on the face with a rim", 0.0
             if circle is not None:

@@ -191,11 +191,15 @@ class ProfileEdges:
         edges: Places, m, `(P, PEAKS, 2)`, NaN where there are fewer.
         strength: Their steepness, grey levels a sample, `(P, PEAKS)`.
         pixel_m: Length of a pixel on the plane along each profile, `(P,)`.
+        pixels: The places in the picture, `(P, PEAKS, 2)`.
+        outward: Direction of each profile in the picture, `(P, 2)`.
     """
 
     edges: np.ndarray
     strength: np.ndarray
     pixel_m: np.ndarray
+    pixels: np.ndarray
+    outward: np.ndarray
 
 
 def find_profile_edges(
@@ -248,14 +252,15 @@ def find_profile_edges(
         -0.5, 0.5
     )
     way = offset[at] + STEP_PX * shift
-    edges = chart.flat(points[:, None] + way[..., None] * outward[:, None])
+    pixels = points[:, None] + way[..., None] * outward[:, None]
+    edges = chart.flat(pixels)
     # NaN marks the missing edges, which comparisons leave out.
     edges[~good] = np.nan
     # Pixels on the plane are longer where the face is seen obliquely.
     pixel_m = np.linalg.norm(
         chart.flat(points + 0.5 * outward) - chart.flat(points - 0.5 * outward), axis=1
     )
-    return ProfileEdges(edges, strength[rows, chosen], pixel_m)
+    return ProfileEdges(edges, strength[rows, chosen], pixel_m, pixels, outward)
 
 
 def _vote_for_circle(

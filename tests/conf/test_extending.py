@@ -71,7 +71,7 @@ def test_a_new_package_passes_its_own_tests(project: Path, site: Path) -> None:
         text=True,
     )
     assert done.returncode == 0, done.stdout
-    assert "6 passed" in done.stdout
+    assert "7 passed" in done.stdout
 
 
 def test_no_name_of_the_template_is_left(tmp_path: Path) -> None:
@@ -104,11 +104,12 @@ def test_a_folder_that_exists_is_left_alone(brokk: Callable[..., Any], tmp_path:
 def test_the_parts_work_with_the_shipped_machine_too(site: Path, machine: Machine) -> None:
     check_actuator(option("actuator", "rubber"), machine)
     check_task(option("task", "hold"), machine)
+    check_task(option("task", "trace"), machine)
 
 
 def test_its_options_are_listed(site: Path, brokk: Callable[..., Any]) -> None:
     out = brokk("mode=list").out
-    for text in ("rubber", "sag", "darkest", "two_links", "hold", "A planar arm of two links."):
+    for text in ("rubber", "sink", "darkest", "two_links", "hold", "A planar arm of two links."):
         assert text in out
 
 
@@ -117,3 +118,11 @@ def test_all_of_it_trains_together(site: Path, brokk: Callable[..., Any], tmp_pa
     assert done.code == 0, done.err
     evaluation = json.loads((tmp_path / "runs/mine/evaluation.json").read_text())
     assert evaluation["episodes"] == 16 and "success_strict" in evaluation
+    endings = evaluation["terminations"]
+    assert list(endings) == ["joint_limit", "strayed", "fault", "time_limit"]
+    assert sum(endings.values()) == 16
+    contract = json.loads((tmp_path / "runs/mine/policy.json").read_text())
+    assert contract["task"]["name"] == "trace" and contract["observation"]["size"] == 22
+    example = [sys.executable, str(ROOT / "examples/run_policy.py"), "runs/mine"]
+    out = subprocess.run(example, cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    assert float(out.split()[-1]) < 1e-4

@@ -65,6 +65,8 @@ COMPARE = ("mode=compare", "compare.runs=nowhere")
             ("'effect.backlash' has no 'width'",),
         ),
         (("mode=null",), ("must be a string",)),
+        (("mode=study", "study.do=report", "study.folder=x"), ("x holds no study",)),
+        (("mode=board", "board.rows=0"), ("expected 2 or more columns and rows, got",)),
         (("--config-dir", "nowhere", "mode=list"), ("nowhere",)),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
@@ -100,3 +102,11 @@ def test_help_is_short_and_says_how_to_begin(brokk: Callable[..., Any]) -> None:
     for part in ("brokk mode=list", "brokk mode=doctor", "-m", "session.out"):
         assert part in done.out
     assert len(done.out.splitlines()) < 25
+
+
+def test_windows_is_refused_with_the_way_that_works(
+    brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.platform", "win32")
+    done = brokk("mode=list")
+    assert done.code == 2 and "WSL 2" in done.err

@@ -67,6 +67,22 @@ BAD = {
     ("mode=collect", "collect.num_runs=0"): "collect.num_runs: expected 1 or more",
     ("mode=collect", "excitation.sine.share=[2.0,1.0]"): "Sine.share: expected float",
     ("mode=play", "play.port=0"): "play.port",
+    ("mode=bench", "bench.num_envs=[0]"): "bench.num_envs: expected one or more positive numbers",
+    ("mode=bench", "bench.seconds=0"): "bench.seconds: expected a finite number above 0",
+    ("mode=bench", "bench.measure=speed"): "measure: expected one of 'rates', 'success'",
+    ("mode=bench", "bench.success.seeds=[]"): "bench.success.seeds: expected one or more seeds",
+    ("mode=diagnose",): "give either case=<folder with reference/ and field/>, or field=<glob>",
+    ("mode=diagnose", "diagnosis.case=nowhere"): "diagnosis.case=nowhere: there is no such folder",
+    ("mode=diagnose", "diagnosis.field=x", "diagnosis.workers=0"): "diagnosis.workers: expected 1",
+    ("mode=diagnose", "diagnosis.field=x", "~diagnosis.certainty.form.timing"): "certainty.form",
+    ("mode=check", "subject.model=nowhere.urdf"): "subject.model=nowhere.urdf: there is no such",
+    ("mode=check", "subject.num_starts=0"): "expected num_poses and num_starts of 1 or more",
+    ("mode=export",): "checkpoint has no default and must be given",
+    ("mode=replay",): "replay.fault has no default and must be given",
+    ("mode=compare", "compare.runs=[1]"): "RunSelection.runs",
+    ("mode=convert",): "convert.input has no default and must be given",
+    ("mode=inspect", "inspect.recordings=3"): "inspect",
+    ("mode=render", "render.count=0"): "render: expected count of 1 or more",
 }
 """Words of a command, and what its message must say."""
 PROGRAM = """

@@ -17,6 +17,7 @@ MODE = 4
 FLOORS = (
     ("brokk_rl.cli", 5),
     ("brokk_rl.__main__", 5),
+    ("diagnosis.api", 5),
     ("brokk_rl.extensions", 5),
     ("brokk_rl.sweep", 5),
     ("brokk_rl.task_choice", 5),

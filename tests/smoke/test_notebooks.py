@@ -36,3 +36,14 @@ def test_a_withheld_effect_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     answer = json.loads((tmp_path / "runs/diagnosis/diagnosis.json").read_text())
     assert answer["verdict"] == "effects"
     assert "asymmetry" in (tmp_path / "runs/diagnosis/effects.yaml").read_text()
+
+
+def test_the_python_api_finds_what_the_servos_have(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run("diagnosis_in_python", tmp_path, monkeypatch)
+    answer = json.loads((tmp_path / "diagnosis/diagnosis.json").read_text())
+    found = {one["effect"]: one["joints"] for one in answer["selected"]}
+    assert answer["verdict"] == "effects"
+    assert found["sag"] == ["lift"]  # `turn` has no weight
+    assert {"backlash", "dead_time"} <= set(found)

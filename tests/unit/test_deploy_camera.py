@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.contracts.vision import FrameDetections, HolePose
+from brokk_rl.contracts.vision import CameraView, FrameDetections, HolePose
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
@@ -25,9 +25,17 @@ from deploy.recorder import capture_reader
 from deploy.recorder.capture import CaptureConfig, CaptureWriter, PictureSampler
 from deploy.runtime import perception_process
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
+from deploy.runtime.operator_state import OperatorState
 from deploy.runtime.perception_process import CameraConfig, read_frame
+from deploy.runtime.shared_memory import RecordLayout
 from deploy.runtime.shm_layout import LoopMemory
-from deploy.runtime.target import DetectedTarget, FileTarget, GivenTarget, TargetSelector
+from deploy.runtime.target import (
+    DetectedTarget,
+    FileTarget,
+    GivenTarget,
+    TargetPosition,
+    TargetSelector,
+)
 
 MACHINE = option("machine", "brokk170")
 FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 12.0)
@@ -249,6 +257,36 @@ def test_a_frame_that_cannot_be_used_costs_that_frame_and_what_was_seen_is_recor
     assert [one["topic"] for one in said] == ["holes"] * 2 and said[1]["holes"][0][
         "center_in_base_m"
     ] == [2.6, 0.0, 0.75]
+
+
+class Following(Blinking):
+    """A source whose camera follows the chosen hole."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[tuple[Any, Any]] = []
+
+    def aim(self, q: Any, hole: Any, t_s: float) -> CameraView:
+        self.asked.append((q, hole))
+        return CameraView("lift 2.00 m", self.count > 1, 1.5, 4.5, 0.5, 6.0, 0.001, 0.004)
+
+
+def test_a_camera_that_moves_is_told_arm_and_hole_and_the_page_where_it_looks(
+    exchange: LoopMemory, feed: LoopFeed
+) -> None:
+    q = np.linspace(0.1, 0.5, MACHINE.num_joints)
+    state = RecordLayout(OperatorState, MACHINE.num_joints).new()
+    exchange.state.write(replace(state, q=q))
+    TargetPosition(np.array([2.61, 0.0, 0.75]), 0.0, None).write(exchange.target)
+    source: Any = Following()
+    perception_process.run(lambda: False, camera(source), exchange)
+    (first_q, first), *_, (_, last) = source.asked
+    np.testing.assert_array_equal(first_q, q)
+    assert first is None and last.pose.center_m == pytest.approx([2.6, 0.0, 0.75])
+    view = feed.read_state().view
+    assert view == CameraView("lift 2.00 m", True, 1.5, 4.5, 0.5, 6.0, 0.001, 0.004)
+    said = [json.loads(data[1:]) for data in exchange.vision_log.take()]
+    assert said[0]["topic"] == "view" and said[0]["seen_s"] == 4.5
 
 
 def camera(source: Any) -> CameraConfig:

@@ -15,11 +15,12 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import FreeRunWindows
 from diagnosis import calibration, decision, residual_model
-from diagnosis.calibration import ProbabilityModel
-from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.detection import DetectionResult
 from diagnosis.effect_library import EffectSimulator
+from diagnosis.error_covariance import ErrorCovariance
 from diagnosis.refine import FittedSet
-from diagnosis.residuals import INCREMENT_SAMPLES, ErrorCovariance, Residuals
+from diagnosis.request import Penalties, ProbabilityModel
+from diagnosis.residuals import INCREMENT_SAMPLES, Residuals
 from diagnosis.search import EffectSet
 from exam.calibration import WeighedCase, fit_logistic, split_by_family
 

@@ -34,8 +34,8 @@ from diagnosis.answer import (
     Where,
 )
 from diagnosis.case import GapCase
-from diagnosis.detection import Penalties
 from diagnosis.pipeline import DiagnosisPipeline
+from diagnosis.request import Penalties
 
 CPU = torch.device("cpu")
 PRICES = Penalties(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06)

@@ -10,14 +10,8 @@ from actuators.models.valve import PoseFeatures
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from diagnosis import effect_library, gap, nonadditive_refit
-from diagnosis.residuals import (
-    INCREMENT_SAMPLES,
-    ErrorCovariance,
-    build_rays,
-    compute_loss,
-    fit_noise,
-    to_increments,
-)
+from diagnosis.error_covariance import ErrorCovariance, compute_loss, fit_noise
+from diagnosis.residuals import INCREMENT_SAMPLES, build_rays, to_increments
 from diagnosis.responses import Response, choose_rays, fit_faults, fit_sizes, score_responses
 from diagnosis.search import SubsetTable, bind_shared_sizes, choose_set
 

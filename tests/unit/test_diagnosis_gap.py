@@ -15,9 +15,9 @@ from brokk_rl.machine import Machine
 from diagnosis import attribution, bootstrap, motion_floor
 from diagnosis.attribution import EffectAttribution, judge_edit
 from diagnosis.closure import Estimate, Gap, read_gap, serialize_estimate
+from diagnosis.error_covariance import ErrorCovariance
 from diagnosis.gap import NO_FLOOR, NO_MOTION
 from diagnosis.motion_floor import LeftOutErrors
-from diagnosis.residuals import ErrorCovariance
 
 
 def test_what_is_closed_and_what_was_foretold_are_told_apart(machine: Machine) -> None:

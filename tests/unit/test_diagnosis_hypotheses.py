@@ -12,10 +12,10 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from diagnosis import hypotheses
-from diagnosis.calibration import OUTSIDE_SIGNS, ProbabilityModel
-from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.detection import DetectionResult
 from diagnosis.gap import GapClosure
 from diagnosis.hypotheses import Choice, Hypothesis, choose_hypothesis
+from diagnosis.request import OUTSIDE_SIGNS, Penalties, ProbabilityModel
 from diagnosis.responses import Response, fit_faults
 from diagnosis.search import EffectSet, SubsetTable
 

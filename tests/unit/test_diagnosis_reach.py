@@ -18,7 +18,8 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import baseline, bootstrap, effect_library, gap, refine
 from diagnosis.case import GapCase
-from diagnosis.residuals import ErrorCovariance, build_rays
+from diagnosis.error_covariance import ErrorCovariance
+from diagnosis.residuals import build_rays
 
 CPU = torch.device("cpu")
 LINEAR = FirstOrderLag(

@@ -15,9 +15,9 @@ from composed import option
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from diagnosis import decision, effect_library, hypotheses
-from diagnosis.calibration import GAP_SIGNS, ProbabilityModel
-from diagnosis.detection import DetectionResult, Penalties
+from diagnosis.detection import DetectionResult
 from diagnosis.hypotheses import Hypothesis
+from diagnosis.request import GAP_SIGNS, Penalties, ProbabilityModel
 from diagnosis.residuals import Residuals
 from diagnosis.responses import Response, fit_faults
 from diagnosis.search import SubsetTable

@@ -185,7 +185,7 @@ def test_a_simulator_that_shows_no_states_is_not_recorded(
     assert loop.recorder is None and "faults are not recorded" in caplog.text
 
 
-def test_a_recorder_that_was_never_run_on_a_gpu_is_asked_for_there() -> None:
+def test_on_a_gpu_the_recorder_has_to_be_asked_for() -> None:
     training = option("rl", "ppo")
     assert (training.count_fault_steps("cpu"), training.count_fault_steps("cuda")) == (100, 0)
     assert replace(training, fault_steps=7).count_fault_steps("cuda") == 7

@@ -74,10 +74,11 @@ def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
     import pyarrow.parquet as pq
 
     table = pq.read_table(path)
-    # the command is the speed of the target in parts of the full speed
-    speed = np.diff(make_targets()[:, 1]) * RATE_HZ
-    full = drafted["joints"][1]["max_speed"]["value"]
-    np.testing.assert_allclose(table["u_knee"].to_numpy()[:-1], speed / full, atol=1e-4)
+    # the command is the target itself: -1 and 1 are the ends of the travel
+    assert {joint["command"] for joint in drafted["joints"]} == {"position"}
+    low, high = (drafted["joints"][1][end]["value"] for end in ("lower", "upper"))
+    target = low + (high - low) * (table["u_knee"].to_numpy() + 1.0) / 2.0
+    np.testing.assert_allclose(target, make_targets()[:, 1], atol=1e-6)
     earlier = brokk("mode=convert", *options[:2], "convert.input=logs", "session.out=old")
     assert earlier.code == 0, earlier.err
 

@@ -42,3 +42,8 @@ def test_a_field_has_the_meaning_of_its_docstring() -> None:
     meanings = registry.read_attributes("brokk_rl.session.Session")
     assert meanings["out"] == "Run folder."
     assert list(meanings) == ["out", "seed", "device"]
+
+
+def test_values_that_bear_the_name_of_a_group_are_values(brokk: Callable[..., Any]) -> None:
+    told = brokk("mode=bench", "--help").out
+    assert "bench.num_envs=[128, 256]" in told and "bench=[" not in told

@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 from composed import option
-from drawn import AXIS, CENTER, K, drawn
+from drawn import AXIS, CENTER, K, both_views, drawn
 
-from perception.pose import broken_rim, rim
+from perception.pose import alignment, broken_rim, rim
+from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
 
 M = AXIS / (AXIS @ CENTER)
@@ -40,7 +41,7 @@ def test_the_centre_of_a_broken_rim_is_that_of_its_whole_pieces(broken: float) -
     depths_m = depths_m * (broken > 0)
     chart = rim.build_chart(CENTER, M, K)
     start_m = np.array([0.012, -0.008])
-    found = broken_rim.fit_broken_rim(draw_broken(depths_m), chart, start_m, 0.05, 0.024)
+    found = broken_rim.fit_broken_rim(draw_broken(depths_m), chart, None, start_m, 0.05, 0.024)
     assert found is not None
     assert found.coverage > 0.7
     off = found.center_m - CENTER
@@ -48,7 +49,27 @@ def test_the_centre_of_a_broken_rim_is_that_of_its_whole_pieces(broken: float) -
     # the error is what is claimed, within three deviations
     claimed = np.sqrt(np.trace(found.cov_m2))
     assert np.linalg.norm(off) < 3.0 * claimed
-    assert claimed < 4e-3
+    # without a right picture the depth of the breaks is unknown
+    assert claimed < 6e-3
+
+
+def test_the_depth_of_a_break_is_read_from_both_pictures() -> None:
+    frame, _, ellipse = drawn()
+    # all of the surroundings lie 16 mm below the face
+    below = M / (1.0 + 0.016 * np.linalg.norm(M))
+    views = both_views(below, K[0, 0] * 0.12, np.random.default_rng(5))
+    color, right = (
+        np.repeat(np.clip(120 + 60 * one, 0, 255).astype(np.uint8)[..., None], 3, 2)
+        for one in views
+    )
+    frame = replace(frame, color=color, right=right, baseline_m=0.12)
+    row = pose_row(ellipse)
+    both = alignment.crop_pair(frame, convert_to_gray(frame), M, row, 4.0)
+    chart = rim.build_chart(CENTER, M, K)
+    profiles = rim.find_profile_edges(convert_to_gray(frame), row, 10.0, chart)
+    assert both is not None and profiles is not None
+    odds = broken_rim.compare_depths(both, chart, profiles, float(np.sqrt(row[2] * row[3])))
+    assert broken_rim.DEPTHS_M[int(np.argmax(odds.sum(0)))] == pytest.approx(0.016, abs=2e-3)
 
 
 def test_a_hole_half_in_a_shadow_is_proposed_and_texture_is_not() -> None:

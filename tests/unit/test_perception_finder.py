@@ -28,7 +28,16 @@ def test_a_hole_is_found_from_picture_and_depth_alone() -> None:
     assert len(found.holes) == 1
     assert found.holes[0].center_m == pytest.approx(CENTER, abs=1e-3)
     assert float(found.holes[0].axis @ AXIS) > np.cos(np.radians(0.3))
-    assert {"segment", "ellipse", "pose", "total"} <= set(found.ms)
+    assert {"segment", "regions", "pose", "total"} <= set(found.ms)
+    assert "ellipse" not in found.ms, "a region is a hole, so no arcs are searched"
+
+
+def test_without_a_region_the_arcs_are_searched() -> None:
+    frame, masks, _ = drawn(noise=0.001)
+    spec = replace(option("perception", "plane_conic"), proposer=None)
+    segmenter = SimpleNamespace(build=lambda: SimpleNamespace(segment=lambda frame: masks))
+    found = replace(spec, segmenter=segmenter).build().find(frame)
+    assert len(found.holes) == 1 and "ellipse" in found.ms
 
 
 def test_the_base_frame_is_where_the_camera_is_said_to_be() -> None:
@@ -157,14 +166,15 @@ def test_an_ellipse_that_is_too_large_where_it_lies_is_none() -> None:
         Ellipse(x, 240.0, 25.0, 20.0, 0.0, rms_px=0.1, coverage=1.0, score=0.8)
         for x in (150.0, 500.0)
     ]
-    found = [
-        one
-        for level in search.plan_search_levels(
-            frame, np.ones(depth_m.shape, bool), 0.05, 0.35, 10.0
-        )
+    levels = search.plan_search_levels(frame, np.ones(depth_m.shape, bool), 0.05, 0.35, 10.0)
+    missed = {
+        one.x: level.find_missed_limit(one)
+        for level in levels
         for one in level.detect(Drawn(seen), np.zeros(depth_m.shape, np.uint8))
-    ]
-    assert {one.x for one in found} == {150.0}
+    }
+    assert missed[150.0] is None
+    # 16.5 px at 3.2 m, and a slack of 35 %
+    assert missed[500.0] == pytest.approx(16.5 * 1.35, rel=1e-6)
 
 
 def test_the_rim_of_a_mouth_that_something_of_unknown_depth_cuts_is_looked_at() -> None:

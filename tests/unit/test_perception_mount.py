@@ -17,6 +17,7 @@ from perception.mount.next_view import HoleBelief
 from perception.mount.occlusion import Capsules, compute_visible_share, sample_circle
 from perception.render.scene_ranges import view_from
 from perception.render.stereo_camera import place_rig
+from perception.target_sensor import WatchedHole
 
 RIG = option("rig", "zed_2i_1080p")
 ARM = option("target", "perceived").arm
@@ -25,7 +26,7 @@ HOLE_M = np.array([2.6, 0.0, 0.75])
 
 
 def believe(std_m: float = 0.01) -> HoleBelief:
-    return HoleBelief(HOLE_M, UP, 0.05, std_m**2 * np.eye(3), 0.0)
+    return HoleBelief.expect(HOLE_M, 0.05, std_m)
 
 
 def plan(machine: Machine, name: str, **fields: Any) -> tuple[Any, Any]:
@@ -93,11 +94,11 @@ def test_the_next_view_sees_a_hole_that_the_arm_will_hide(machine: Machine) -> N
     q = np.array([0.0, -0.6, 1.2, 0.8, 0.3])
     between = (mount.locate(mount.start, q)[:3, 3] + 3 * HOLE_M) / 4
     planner._arm = _Wall(between)
-    choice = planner.choose(believe(), mount.start, np.stack([q] * 7))
-    assert choice.is_new and choice.name in ("right", "beyond")
-    assert choice.seen_here == 0.0 and choice.seen_there > 0.5
-    assert choice.std_there_m < choice.std_here_m
-    assert "Camera moves" in choice.explain() and choice.name in choice.explain()
+    view = planner.choose(believe(), mount.start, np.stack([q] * 7)).view
+    assert view.is_moving and view.name in ("right", "beyond")
+    assert view.seen_before_s == 0.0 and view.seen_s > 3.0
+    assert view.std_m < view.std_before_m
+    assert "Camera moves" in view.explain() and view.name in view.explain()
 
 
 class _Wall:
@@ -114,9 +115,9 @@ class _Wall:
 def test_a_camera_that_sees_the_hole_as_well_as_any_stays(machine: Machine) -> None:
     mount, planner = plan(machine, "hand_placed")
     q = np.stack([machine.home] * 7)
-    choice = planner.choose(believe(), mount.start, q)
-    assert not choice.is_new and choice.travel_s == 0.0
-    assert "stays" in choice.explain()
+    view = planner.choose(believe(), mount.start, q).view
+    assert not view.is_moving and view.travel_s == 0.0
+    assert "stays" in view.explain()
 
 
 def test_what_is_not_seen_ages_in_the_tracker_and_is_corrected_by_the_next_view() -> None:
@@ -162,3 +163,66 @@ def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:
         level.light.to_sun, RIG.base_from_camera[:3, :3] @ scene.light.to_sun
     )
     assert any(solid is level.block for solid in level.solids)
+
+
+def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself(
+    machine: Machine,
+) -> None:
+    mount, planner = plan(machine, "hand_placed", move_s=1.0)
+    q = np.stack([machine.home] * 7)
+    before = planner.choose(believe(), mount.start, q, num_missed=0)
+    after = planner.choose(believe(), mount.start, q, num_missed=8)
+    assert not before.view.is_moving
+    assert after.view.is_moving and after.position[0] != mount.start[0]
+
+
+def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) -> None:
+    mount, planner = plan(machine, "mast")
+    for q1 in (-1.2, 0.0, 1.2):
+        q = machine.home.copy()
+        q[0] = q1
+        chosen = planner.choose(believe(), mount.start, np.stack([q] * 7))
+        ahead = mount.locate(chosen.position, q)[:3, 2]
+        camera_m = mount.locate(chosen.position, q)[:3, 3]
+        away = HOLE_M - camera_m
+        bearing = np.arctan2(away[1], away[0]) - np.arctan2(ahead[1], ahead[0])
+        assert abs(np.angle(np.exp(1j * bearing))) < 0.5
+
+
+def watch(machine: Machine) -> WatchedHole:
+    settings = replace(option("target", "perceived"), delay_s=0.35, hint_m=0.03)
+    mount = settings.mount.build(machine)
+    scene = np.array([*HOLE_M, 0.0, 1.0, 0.05])
+    return WatchedHole(settings, mount, scene, np.random.default_rng(0))
+
+
+def detect(center_m: np.ndarray) -> HolePose:
+    cov = 0.001**2 * np.eye(3)
+    return HolePose(center_m, UP, 0.05, cov, np.zeros((3, 3)), "base", 0.9, 0.0)
+
+
+def test_what_a_picture_shows_is_known_after_the_delay_and_near_the_pointed_place_alone(
+    machine: Machine,
+) -> None:
+    eye = watch(machine)
+    assert 0.0 < np.linalg.norm(eye.center_m - HOLE_M) < 0.15
+    eye.wait_for([detect(HOLE_M + np.array([0.4, 0.0, 0.0]))], 0.0)
+    eye.learn(0.4)
+    assert eye.hole is None
+    eye.wait_for([detect(HOLE_M)], 1.0)
+    eye.learn(1.3)
+    assert eye.hole is None
+    eye.learn(1.35)
+    np.testing.assert_allclose(eye.center_m, HOLE_M)
+    assert [frame["seen"] for frame in eye.history] == [True, True]
+
+
+def test_a_picture_that_was_not_taken_is_no_miss(machine: Machine) -> None:
+    eye = watch(machine)
+    for t_s, holes in ((0.0, ()), (0.5, None), (1.0, ())):
+        eye.wait_for(holes, t_s)
+    eye.learn(2.0)
+    assert eye.num_missed == 2
+    eye.wait_for([detect(HOLE_M)], 2.0)
+    eye.learn(3.0)
+    assert eye.num_missed == 0

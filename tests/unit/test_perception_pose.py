@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 from composed import option
-from drawn import AXIS, CENTER, RAYS, K, drawn
+from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 
 from brokk_rl.contracts.vision import HolePose, Rejection
 from perception.ellipse import conic
@@ -44,21 +43,6 @@ def test_a_third_of_a_rim_that_is_hidden_is_not_missed(estimator) -> None:
     assert isinstance(pose, HolePose)
     assert pose.center_m == pytest.approx(CENTER, abs=1.5e-3)
     assert float(pose.axis @ AXIS) > np.cos(np.radians(0.2))
-
-
-def both_views(
-    m: np.ndarray, pull_px: float, generator: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    """Returns a plane's grain, of variance one before it is smoothed, as both cameras see it, `(480, 640)` each."""
-    grain = cv2.GaussianBlur(generator.normal(0, 1, (480, 900)).astype(np.float32), (0, 0), 1.2)
-    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
-    # the right camera sees at column x what the left one has at u = x + pull (m . ray(u)), solved
-    # for u
-    x = u - pull_px * (m[0] * (u - K[0, 2]) / K[0, 0] + m[1] * (v - K[1, 2]) / K[1, 1] + m[2])
-    back = (u - x[:, :1]) / (1 - pull_px * m[0] / K[0, 0])
-    return grain[:, 200:840], cv2.remap(
-        grain, (back + 200).astype(np.float32), v.astype(np.float32), cv2.INTER_CUBIC
-    )
 
 
 def as_color(gray: np.ndarray) -> np.ndarray:

@@ -17,7 +17,8 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import FreeRunWindows, count_samples_before
 from diagnosis.effect_library import EffectSimulator, load_effects
-from diagnosis.residuals import ErrorCovariance, Residuals, build_rays
+from diagnosis.error_covariance import ErrorCovariance
+from diagnosis.residuals import Residuals, build_rays
 
 CPU = torch.device("cpu")
 NUM_ENVS, STEPS = 6, 50

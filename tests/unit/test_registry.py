@@ -6,14 +6,17 @@ import copy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from composed import option as load_option
 from hydra.utils import instantiate
 
 import brokk_rl
+import conf
 from brokk_rl import registry
 from brokk_rl.modes import doctor
 from brokk_rl.modes.doctor import Doctor, DoctorFinding, DoctorLimits
@@ -189,3 +192,12 @@ def test_fields_of_earlier_versions_become_the_current_ones() -> None:
         again = copy.deepcopy(config)
         registry.upgrade_fields(again)
         assert again == config and not {"limit_margin", "end_on_success"} & old.keys()
+
+
+def test_a_training_of_an_earlier_version_acts_as_it_did() -> None:
+    config = yaml.safe_load((Path(conf.__file__).parent / "rl/ppo.yaml").read_text())
+    for name in ("tf32", "plateau", "symmetry", "fault_steps"):
+        del config[name]
+    registry.upgrade_fields(config)
+    found = instantiate(config, _convert_="all")
+    assert found == replace(load_option("rl", "ppo"), fault_steps=0)

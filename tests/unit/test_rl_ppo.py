@@ -9,7 +9,8 @@ from rsl_rl.models import MLPModel
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 
-from brokk_rl.rl.ppo import CapturedRollout, DevicePPO
+from brokk_rl.rl.ppo import DevicePPO
+from brokk_rl.rl.rollout import CapturedRollout
 
 NUM_ENVS, STEPS, GROUPS = 16, 6, {"actor": ["policy"], "critic": ["policy"]}
 GAUSSIAN = {"class_name": "GaussianDistribution", "init_std": 0.3, "std_type": "log"}
@@ -94,6 +95,22 @@ def test_it_learns_the_same_as_rsl_rls_own(changes: dict) -> None:
     ):
         torch.testing.assert_close(mine, other, rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(ours.actor.obs_normalizer.mean, theirs.actor.obs_normalizer.mean)
+
+
+@pytest.mark.slow  # the compiler takes half a minute
+@pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")
+def test_compiled_parts_learn_the_same_as_rsl_rls_own() -> None:
+    ours, theirs = _algorithm(DevicePPO), _algorithm(PPO)
+    ours._rollout = CapturedRollout(ours, fuse=True)
+    ours.fuse = True
+    for seed in range(3):
+        last = _roll_out(ours, seed)
+        theirs.storage = copy.deepcopy(ours.storage)
+        assert _learn(ours, seed, last) == pytest.approx(
+            _learn(theirs, seed, last), rel=1e-3, abs=1e-5
+        )
+    for mine, other in zip(ours.actor.parameters(), theirs.actor.parameters(), strict=True):
+        torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)
 
 
 def _teacher() -> MLPModel:
@@ -214,6 +231,6 @@ def test_the_graph_learns_what_the_eager_update_learns() -> None:
         assert _learn(captured, seed, last) == pytest.approx(
             _learn(eager, seed, last), rel=1e-3, abs=1e-5
         )
-    assert captured._mini_batch is not None and captured._rollout is not None
+    assert captured._epoch is not None and captured._rollout is not None
     for mine, other in zip(captured.actor.parameters(), eager.actor.parameters(), strict=True):
         torch.testing.assert_close(mine, other, rtol=1e-3, atol=1e-5)

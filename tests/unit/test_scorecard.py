@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -140,7 +141,8 @@ def test_matlab_logs_become_recordings(tmp_path: Path) -> None:
     matlab.savemat(tmp_path / "a.mat", {**{k: v[:, None] for k, v in log.items()}, "gain": 3.0})
     machine, reader = option("machine", "emps"), option("import", "emps")
     (found,) = reader.read(tmp_path / "a.mat", machine)
-    np.testing.assert_allclose(found.u[:, 0], 0.5 * np.sin(found.t_s), atol=1e-5)
+    # the mean of the five samples of a period
+    np.testing.assert_allclose(found.u[:, 0], 0.5 * np.sin(found.t_s + 0.002), atol=1e-4)
     np.testing.assert_allclose(found.q[:, 0], 0.12 - 0.1 * np.cos(found.t_s), atol=1e-6)
 
 
@@ -160,18 +162,27 @@ def test_parquet_logs_become_recordings_and_a_missing_column_is_named(tmp_path: 
         reader.read(tmp_path / "b.parquet", machine)
 
 
-def test_the_speed_of_a_target_is_the_command(tmp_path: Path) -> None:
-    machine, reader = option("machine", "so101"), option("import", "so101_speed")
+def test_a_target_is_the_command_of_a_servo_and_its_speed_that_of_a_valve(tmp_path: Path) -> None:
+    machine, reader = option("machine", "so101"), option("import", "so101")
     t_s = np.arange(0.0, 8.0, 0.02)
     columns = {"t_state_s": t_s}
-    for joint, speed in zip(machine.joint_names, machine.max_speed, strict=True):
-        # half of full speed up to 4 s, then at rest
-        columns[f"target_{joint}_rad"] = 0.5 * speed * np.minimum(t_s, 4.0)
+    for joint, low, high in zip(machine.joint_names, machine.lower, machine.upper, strict=True):
+        columns[f"target_{joint}_rad"] = low + (high - low) * np.minimum(t_s, 4.0) / 8.0
         columns[f"q_{joint}_rad"] = columns[f"target_{joint}_rad"]
     pq.write_table(pa.table(columns), tmp_path / "a.parquet")
     (found,) = reader.read(tmp_path / "a.parquet", machine)
-    np.testing.assert_allclose(found.u[found.t_s < 3.99], 0.5, atol=1e-5)
-    np.testing.assert_allclose(found.u[found.t_s > 4.01], 0.0, atol=1e-5)
+    np.testing.assert_allclose(found.u[:, 0], np.minimum(t_s, 4.0) / 4.0 - 1.0, atol=1e-5)
+    speeds = {
+        name: replace(one, command=replace(one.command, full_speed=1.0))
+        for name, one in reader.joints.items()
+    }
+    with pytest.raises(ConfigError, match=r"commanded by position; give .* as null"):
+        replace(reader, joints=speeds).read(tmp_path / "a.parquet", machine)
+    valves = replace(machine, joints=tuple(replace(one, command="valve") for one in machine.joints))
+    (found,) = replace(reader, joints=speeds).read(tmp_path / "a.parquet", valves)
+    # a travel of 1.6 rad in 8 s, until it stops
+    np.testing.assert_allclose(found.u[found.t_s < 3.99, 0], 0.2, atol=1e-5)
+    np.testing.assert_allclose(found.u[found.t_s > 4.01, 0], 0.0, atol=1e-5)
 
 
 class Stages:
@@ -231,7 +242,7 @@ def test_a_scorecard_skips_missing_folders_and_keeps_finished_cases(
     found = json.loads((data.parent / "card" / "scorecard.json").read_text())
     assert found["cases"]["emps"]["scores"]["abstention_right"] is True
     assert found["cases"]["emps"]["errors"]["rivals"]["hold"] > 0
-    assert set(found["skipped"]) == {"mini_excavator", "so101", "so101_speed"}
+    assert set(found["skipped"]) == {"mini_excavator", "so101"}
     assert "| emps | unknown |" in (data.parent / "card" / "scorecard.md").read_text()
     assert "Known:" in (data.parent / "card" / "scorecard.html").read_text()
     # the answer stands; knowledge that has changed meanwhile counts

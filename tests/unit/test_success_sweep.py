@@ -12,15 +12,11 @@ import training as runs
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.rl.benchmark_sizes import SuccessSweep
 from brokk_rl.rl.distributed import TrainingGroup
-from brokk_rl.rl.success_sweep import (
-    TABLE,
-    SuccessSweep,
-    find_passing,
-    report_sweep,
-    run_sweep,
-    summarise,
-)
+from brokk_rl.rl.learning_curve import find_passing, find_plateau
+from brokk_rl.rl.settings import Plateau
+from brokk_rl.rl.success_sweep import TABLE, report_sweep, run_sweep, summarise
 from brokk_rl.session import Session
 
 SWEEP = SuccessSweep(
@@ -46,6 +42,43 @@ def test_a_level_is_passed_by_the_newest_episodes_and_not_by_few_of_them() -> No
     assert find_passing(rows((10, 0.0), (0, 1.0), (10, 0.0)), 0.5, window=20) is None
 
 
+PLATEAU = Plateau(above=0.5, episodes=20, least_gain=0.05, anneal=0.5)
+
+
+def test_success_that_no_longer_grows_is_a_plateau() -> None:
+    learning = rows((20, 0.0), (20, 0.3), (20, 0.6), (10, 0.8), (10, 0.9), (10, 0.9), (10, 0.8))
+    # newest 20 and those before: 0.6 and 0.3, then 0.85 and 0.6, 0.9 and 0.7, then 0.85 twice
+    found = find_plateau(learning, PLATEAU)
+    assert found is not None and found["seconds"] == 6.0
+    assert find_plateau(learning[:6], PLATEAU) is None
+    assert find_plateau(rows(*[(20, 0.4)] * 9), PLATEAU) is None  # too low to stop
+    assert find_plateau(rows((20, 0.9), (19, 0.9)), PLATEAU) is None  # too few
+    assert find_plateau([], PLATEAU) is None
+    with pytest.raises(ConfigError, match=r"rl\.plateau: the task does not report"):
+        find_plateau([{"episodes": 1.0}], PLATEAU)
+
+
+def test_a_training_ends_with_an_anneal_after_a_plateau_and_repeats(
+    machine: Machine, tmp_path: Path
+) -> None:
+    steps = 16 * runs.STEPS
+    plateau = Plateau(above=0.0, episodes=2, least_gain=1.0, anneal=0.5)
+    training = runs.small(
+        max_env_steps=900 * steps, plateau=plateau, settling=0.5, save_interval=99
+    )
+    wanted = training.runner["algorithm"]["desired_kl"]
+    ends = []
+    for name in ("one", "two"):
+        runner = runs.train(machine, tmp_path / name, training)
+        found = find_plateau(runs.progress(tmp_path / name), plateau)
+        assert found is not None
+        ends.append([float(found["env_steps"]), runner._book.env_steps])
+        # the schedule follows every ten iterations, and a tenth of the divergence is its end
+        assert wanted * 0.1 <= runner.alg.desired_kl < wanted * 0.6
+    assert ends[0] == ends[1]
+    assert ends[0][0] * 1.5 <= ends[0][1] < ends[0][0] * 1.5 + 11 * steps < 900 * steps
+
+
 def test_a_sweep_trains_each_point_once_and_goes_on(machine: Machine, tmp_path: Path) -> None:
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     training = runs.small(max_env_steps=1)
@@ -65,7 +98,7 @@ def test_a_sweep_trains_each_point_once_and_goes_on(machine: Machine, tmp_path: 
         lines = (tmp_path / TABLE).read_text().splitlines()
         (tmp_path / TABLE).write_text("\n".join(lines[:3]) + "\n")
         again = run_sweep(SWEEP, training, session, group, build)
-        assert built == [8, 16, 16] and again[:3] == found[:3] and again[3] != found[3]
+        assert built == [8, 16, 16] and again[:3] == found[:3]
         with pytest.raises(ConfigError, match=r"max_seconds: expected 0\.2"):
             run_sweep(replace(SWEEP, max_seconds=9.0), training, session, group, build)
     assert not list(tmp_path.glob("*/model_*.pt"))

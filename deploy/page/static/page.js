@@ -98,6 +98,7 @@ function draw() {
   drawStreams(shown, since_s);
   $("camera").hidden = !shown.streams.some(one => one.name === "camera");
   $("camera").classList.toggle("stale", !good("camera"));
+  drawView(shown.view, shown.streams.find(one => one.name === "camera"));
   drawTargets(shown);
   $("start").setAttribute("aria-pressed", shown.guiding);
   $("record").setAttribute("aria-pressed", shown.recording.on);
@@ -157,6 +158,17 @@ function drawStreams(shown, since_s) {
     item.dataset.stream = stream.name;
     item.classList.toggle("stale", age_s === null || age_s > stream.limit_s);
   });
+}
+
+// Where a moving camera looks, and why.
+function drawView(view, camera) {
+  const text = $("camera").querySelector("#why"), seconds = value => value.toFixed(1), mm = value => (1000 * value).toFixed(1);
+  text.hidden = !view || !camera;
+  if (!view) return;
+  const seen = say(view.seen_s > 0 ? "hole in sight for" : "no view of the hole").replace("{seen}", seconds(view.seen_s)).replace("{of}", view.horizon_s.toFixed(0));
+  const instead = view.is_moving ? `, ${say("instead of")} ${seconds(view.seen_before_s)} s · ${mm(view.std_before_m)} → ${mm(view.std_m)} mm` : "";
+  put(text, `${say(view.is_moving ? "camera moves" : "camera stays")}: ${view.name}. ${seen}${instead}`);
+  text.classList.toggle("busy", view.is_moving || view.seen_s === 0);
 }
 
 let listed = "";

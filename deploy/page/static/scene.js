@@ -2,7 +2,7 @@
 import { decompress } from "./fzstd.js";
 import { add, lookAlong, lookAt, multiply, perspective } from "./matrices.js";
 import { Painter } from "./painter.js";
-import { Shapes, block, boreholes, ground, machine, path, tip } from "./shapes.js";
+import { Shapes, block, boreholes, camera, ground, machine, path, tip } from "./shapes.js";
 import { Socket } from "./socket.js";
 
 const FOV = 0.7, NEAR = 0.1, FAR = 40, REPORT_MS = 1000;
@@ -62,6 +62,7 @@ function tick() {
     if (state.block_in_base_m) block(shapes, state.block_in_base_m);
     boreholes(shapes, state.targets);
     path(shapes, state.path_in_base_m);
+    if (state.view && painter.header?.placed && !tool) camera(shapes, painter.header);
   }
   const { width, height: tall } = setup.canvas;
   painter.draw(multiply(perspective(FOV, width / tall, NEAR, FAR), tool ? lookAt(add(tool.at, tool.ahead, -BEHIND_M), tool.at, tool.up) : orbit()), floor, shapes);

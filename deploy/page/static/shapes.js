@@ -4,6 +4,7 @@ import { add, chain, cross, frame, norm, rim, scaled, sub, unit } from "./matric
 const PAINT = [0.96, 0.65, 0.05], DARK = [0.16, 0.17, 0.18], STEEL = [0.42, 0.43, 0.45], LINE = [0.55, 0.6, 0.66];
 const CHOSEN = [0, 0.55, 0.2], OTHER = [0.05, 0.3, 0.85], PATH = [0.82, 0, 0.45], EDGE = [0.1, 0.1, 0.12];
 const THICK_M = [0.20, 0.13, 0.11, 0.095, 0.12];
+const VIEW = [0.1, 0.6, 0.75], VIEW_M = 0.7;  // how far the edges of a camera's view are drawn
 const DASH_M = 0.09, CHISEL_M = 0.034, CHISEL_PART = 0.4;
 
 export class Shapes {
@@ -71,6 +72,16 @@ export function boreholes(shapes, targets) {
     for (let i = 1; i < points.length; i++) shapes.rod(points[i - 1], points[i], wide, color);
     if (target.chosen) shapes.rod(target.center_in_base_m, add(target.center_in_base_m, target.axis_in_base, 0.3), 0.008, color);
   }
+}
+
+export function camera(shapes, { base_from_camera: m, width, height, focal_px, center_px }) {  // its body, and the edges of its view
+  const at = [m[3], m[7], m[11]], ray = (u, v) => {
+    const [x, y] = [(u - center_px[0]) / focal_px[0], (v - center_px[1]) / focal_px[1]];
+    return [0, 1, 2].map(i => m[4 * i] * x + m[4 * i + 1] * y + m[4 * i + 2]);
+  };
+  const ends = [[0, 0], [width, 0], [width, height], [0, height]].map(([u, v]) => add(at, ray(u, v), VIEW_M));
+  shapes.beam(add(at, ray(...center_px), -0.05), add(at, ray(...center_px), 0.03), [m[0], m[4], m[8]], 0.09, 0.03, DARK);
+  ends.forEach((end, i) => { shapes.rod(at, end, 0.006, VIEW); shapes.rod(end, ends[(i + 1) % 4], 0.006, VIEW); });
 }
 
 export function path(shapes, points) {

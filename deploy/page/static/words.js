@@ -36,6 +36,7 @@ const DE = {
   "history is filling": "Sammelt Messwerte", "no borehole is known": "Kein Bohrloch bekannt",
   "the borehole was found too long ago": "Bohrloch zu lange nicht gesehen", "the policy's answer makes no sense": "Vorschlag unbrauchbar",
   "no live picture": "KEIN LIVEBILD", "no picture": "kein Bild", "packets lost": "verloren", "watched elsewhere": "andere sehen zu",
+  "camera moves": "Kamera fährt", "camera stays": "Kamera bleibt", "hole in sight for": "Loch sichtbar {seen} von {of} s", "no view of the hole": "Loch verdeckt", "instead of": "statt",
 };
 const EN = {
   connected: "Connected", lost: "NO CONNECTION", dead: "Control computer silent", title: "operator's page",
@@ -59,6 +60,7 @@ const EN = {
   "the model no longer fits": "The model no longer fits", flow_gain: "flow gain", asymmetry: "asymmetry", dead_time: "dead time", creep: "creep", dead_band: "dead band",
   "refused lost": "No connection to the loop", nothing: "all is well", "emergency stop": "EMERGENCY STOP",
   "no live picture": "NO LIVE PICTURE", "no picture": "no picture", "packets lost": "lost", "watched elsewhere": "others are watching",
+  "camera moves": "Camera moves", "camera stays": "Camera stays", "hole in sight for": "Hole in sight {seen} of {of} s", "no view of the hole": "Hole hidden", "instead of": "instead of",
 };
 
 export function words(language) {

@@ -1,0 +1,208 @@
+"""Diagnosis in five functions for a Python program or a notebook, without the command line.
+
+    from diagnosis import api
+
+    field = api.load("read/recordings/*", "draft/machine.yaml")
+    outcome = api.diagnose(field, "runs/diagnosis", simulator="servo")
+    print(outcome.answer.verdict, [one.effect for one in outcome.answer.selected])
+    api.report(outcome, field, "runs/diagnosis")
+
+Options are named as on the command line (`servo`, or the path of a YAML file), or given as specs. The
+extra `diagnose` is enough: neither simulator nor training is imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from brokk_rl import extensions, open_loop, record
+from brokk_rl.contracts.actuator import Actuator, ActuatorFit
+from brokk_rl.errors import RecordingError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from brokk_rl.session import Session
+from diagnosis import report as diagnosis_report
+from diagnosis.answer import Outcome
+from diagnosis.case import GapCase
+from diagnosis.modes.diagnose import Diagnose, DiagnosisSubject
+
+EXCITATIONS = ("levels", "sine", "ramps", "holds", "reversals", "staircase")
+"""Experiments that a diagnosis may propose, as in `conf/mode/diagnose.yaml`."""
+FITS = {"speed": "valve", "position": "servo"}
+"""Fit of each command interface."""
+HELD_OUT = 4
+"""One recording in so many stops a fit."""
+
+
+@dataclass(frozen=True)
+class RecordingSet:
+    """Recordings of one machine.
+
+    Attributes:
+        recordings: The recordings.
+        machine: The machine.
+    """
+
+    recordings: tuple[Recording, ...]
+    machine: Machine
+
+
+def load(pattern: str | Sequence[str], machine: str | Path | Machine) -> RecordingSet:
+    """Return the recordings (Parquet files) that match a glob or several.
+
+    Args:
+        pattern: Glob or globs.
+        machine: Option of `machine`: a name, the path of a YAML file, or the spec.
+
+    Raises:
+        ConfigError: There is no such machine, or its file is not valid.
+        RecordingError: There are no recordings, or one cannot be used.
+    """
+    chosen: Machine = _load_option("machine", machine)
+    patterns = pattern if isinstance(pattern, str) else tuple(pattern)
+    return RecordingSet(tuple(record.read_recordings(patterns, chosen)), chosen)
+
+
+def identify(
+    recordings: RecordingSet,
+    folder: str | Path,
+    fit: str | Path | ActuatorFit | None = None,
+    seed: int = 0,
+) -> Actuator:
+    """Return an actuator fitted to recordings; its file is left in `folder`.
+
+    Args:
+        recordings: Two or more.
+        folder: Where `<name>.yaml` or the weights go.
+        fit: Option of `fit`; `None`: `valve`, or `servo` for joints commanded by position.
+        seed: Of all random numbers.
+
+    Raises:
+        RecordingError: There is too little data.
+        StorageError: The file could not be written.
+    """
+    given = recordings.recordings
+    if len(given) < 2:
+        raise RecordingError(f"identify: expected two recordings or more, got {len(given)}")
+    train = [one for number, one in enumerate(given) if number % HELD_OUT]
+    machine, cpu = recordings.machine, torch.device("cpu")
+    chosen = _choose_fit(fit, machine)
+    return chosen.fit(machine, train, given[::HELD_OUT], Path(folder), seed, cpu)
+
+
+def diagnose(
+    field: RecordingSet,
+    folder: str | Path,
+    simulator: str | Path | Actuator | None = None,
+    reference: RecordingSet | None = None,
+    unseen: RecordingSet | None = None,
+    fit: str | Path | ActuatorFit | None = None,
+    effects: Sequence[str] | None = None,
+    seed: int = 0,
+    workers: int = 1,
+) -> Outcome:
+    """Return where a simulator departs from the machine, and which effects cause it.
+
+    Args:
+        field: Recordings of the machine as it is.
+        folder: For the files of the fit.
+        simulator: Option of `actuator`; not needed with a reference.
+        reference: Recordings that the simulator was built from; it is fitted to them.
+        unseen: More of the field, to which nothing is fitted.
+        fit: Option of `fit`: the simulator with a reference, else the flexible model of the floor;
+            `None`: `valve`, or `servo` for joints commanded by position.
+        effects: Names to choose among; `None`: all that the machine may have.
+        seed: Of all random numbers.
+        workers: Processes that share the work, on Linux.
+
+    Raises:
+        RecordingError: There is too little data to fit to.
+        ConfigError: There is neither simulator nor reference, or an effect is unknown.
+    """
+    asked = _build_mode(field.machine, folder, simulator, fit, effects, seed, workers)
+    asked.session.seed_all()
+    before = () if reference is None else reference.recordings
+    later = () if unseen is None else unseen.recordings
+    return asked.find_causes(GapCase(field.machine, before, field.recordings, later))
+
+
+def simulate(actuator: str | Path | Actuator, recordings: RecordingSet) -> list[np.ndarray]:
+    """Return the positions that a model predicts for the commands of each recording, `(T, J)`.
+
+    The model sees the measured positions of its history and of one second of warm-up, which are
+    returned as they are; from then on it sees its own predictions.
+
+    Raises:
+        RecordingError: A recording is shorter than history and warm-up.
+    """
+    model: Actuator = _load_option("actuator", actuator)
+    machine, found = recordings.machine, []
+    before = open_loop.count_samples_before(machine)
+    for one in recordings.recordings:
+        horizon_s = max(1, one.num_samples - before) * machine.period_s
+        cut = open_loop.cut_windows([one], machine, horizon_s, horizon_s)
+        ahead = open_loop.roll_out(model, machine, cut, torch.device("cpu"))[0]
+        found.append(np.concatenate([cut.q[0, :before], ahead]))
+    return found
+
+
+def report(outcome: Outcome, field: RecordingSet, folder: str | Path) -> Path:
+    """Write `report.html`, `diagnosis.json` and `effects.yaml`; return the path of the report.
+
+    Raises:
+        StorageError: A file could not be written.
+    """
+    asked = _build_mode(field.machine, folder, None, None, None, 0, 1)
+    asked.session.folder.mkdir(parents=True, exist_ok=True)
+    asked.write(outcome)
+    return asked.session.folder / diagnosis_report.REPORT_FILE
+
+
+def _load_option(group: str, option: Any) -> Any:
+    """Return an option of a config group by its name or by a path that ends in `.yaml`; a spec as it is."""
+    if not isinstance(option, str | Path):
+        return option
+    name = str(option)
+    return extensions.load_option(group, f"@{name}" if name.endswith((".yaml", ".yml")) else name)
+
+
+def _choose_fit(fit: str | Path | ActuatorFit | None, machine: Machine) -> ActuatorFit:
+    if fit is None:
+        fit = FITS[machine.interface]
+    return _load_option("fit", fit)
+
+
+def _build_mode(
+    machine: Machine,
+    folder: str | Path,
+    simulator: str | Path | Actuator | None,
+    fit: str | Path | ActuatorFit | None,
+    effects: Sequence[str] | None,
+    seed: int,
+    workers: int,
+) -> Diagnose:
+    """Return the mode with the options that the command line would give it."""
+    return Diagnose(  # pyright: ignore[reportCallIssue]
+        session=Session(out=str(folder), seed=seed, device="cpu"),  # pyright: ignore[reportCallIssue]
+        machine=machine,
+        fit=_choose_fit(fit, machine),
+        actuator=_load_option("actuator", simulator),
+        curve_fit=_load_option("curve_fit", "valve"),
+        thresholds=_load_option("thresholds", "default"),
+        excitation={name: _load_option("excitation", name) for name in EXCITATIONS},
+        diagnosis=DiagnosisSubject(  # pyright: ignore[reportCallIssue]
+            case=str(folder),
+            field=None,
+            unseen=None,
+            effects=None if effects is None else tuple(effects),
+            workers=workers,
+            prices=_load_option("prices", "default"),
+            certainty=_load_option("certainty", "default"),
+        ),
+    )

@@ -1,0 +1,1 @@
+"""The deployment doctor: whether code, actuator or task makes a policy fail on the machine."""

@@ -1,0 +1,313 @@
+"""Contract of a deployed policy: which columns of a log its observation vector is made of.
+
+Two kinds of files are read. `policy.json` of this project's bundles names its terms in
+`observation.order`. For any other ONNX file a contract lists them:
+
+    {"rate_hz": 50, "joints": ["hip", "knee"],
+     "observation": {"terms": [
+       {"name": "q", "columns": ["q_hip_rad", "q_knee_rad"], "samples": 3, "newest": 0,
+        "mean": [0, 0.4], "std": 1, "clip": null, "before": "first"}]},
+     "command": {"columns": ["u_hip", "u_knee"]}}
+
+`docs/doctor.md` explains each field.
+Axes: `T` rows of a log, `H` samples of history (oldest first), `C` columns of a term, `J` joints,
+`O` numbers of the observation vector.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import onnxruntime
+
+from brokk_rl.errors import CheckpointError
+from brokk_rl.machine import Machine
+from brokk_rl.record import name_command_column, name_position_column
+from brokk_rl.registry import resolve_package_path
+
+CONTRACT, ONNX = "policy.json", "policy.onnx"
+ERRORS_ONLY = 3
+"""Severity of onnxruntime's log."""
+TARGET_COLUMNS = ("target_x_m", "target_y_m", "target_z_m")
+PITCH_COLUMN = "target_pitch_rad"
+OBSERVATION_COLUMN = "obs_{}"
+"""Column of the observation vector as the network got it, by number."""
+Filling = Literal["first", "zero"]
+
+
+def name_advice_column(joint: str) -> str:
+    """Return the column with the command that the policy gave for `joint`."""
+    return f"advice_{joint}"
+
+
+@dataclass(frozen=True)
+class ObservationTerm:
+    """A part of the observation vector: samples of some columns of the log.
+
+    Attributes:
+        name: Its name: `q`, `u`, `target`, `pitch`, `proposals`, or the author's own.
+        columns: Columns of the log, `C`.
+        samples: Samples of history, `H`.
+        newest: Row of the newest sample, counted from the row of the decision; -1 for the commands
+            in force before it.
+        mean: Subtracted, `(C,)`.
+        std: Divisor after that, `(C,)`.
+        clip: Bound of the normalised values; `None` without one.
+        before: Samples before the first row: the first one, or zero.
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    samples: int
+    newest: int
+    mean: np.ndarray
+    std: np.ndarray
+    clip: float | None
+    before: Filling
+
+    @property
+    def size(self) -> int:
+        """Numbers in the observation vector."""
+        return self.samples * len(self.columns)
+
+    def list_numbers(self) -> list[str]:
+        """Return a name for each number, oldest sample first."""
+        found = []
+        for sample in range(1 - self.samples, 1):
+            lag = f"[{sample + self.newest}]" if self.samples > 1 else ""
+            found += [f"{column}{lag}" for column in self.columns]
+        return found
+
+
+@dataclass(frozen=True)
+class PolicyContract:
+    """Contract of a policy, from either kind of file.
+
+    Attributes:
+        source: The file.
+        rate_hz: Control rate.
+        joints: Joints in the order of the command.
+        terms: Parts of the observation vector, in their order.
+        commands: Columns of the log with the command in force, in the order of the output.
+        training: Statistics of the training's observations; `None` where there are none.
+        data: All that stands in the file.
+    """
+
+    source: Path
+    rate_hz: float
+    joints: tuple[str, ...]
+    terms: tuple[ObservationTerm, ...]
+    commands: tuple[str, ...]
+    training: Mapping[str, Any] | None
+    data: Mapping[str, Any]
+
+    @property
+    def size(self) -> int:
+        """Length of the observation vector, `O`."""
+        return sum(term.size for term in self.terms)
+
+    @property
+    def num_samples(self) -> int:
+        """Rows that the longest history spans."""
+        return max(term.samples - min(0, term.newest) for term in self.terms)
+
+    @property
+    def term_slices(self) -> dict[str, slice]:
+        """Place of each term in the observation vector."""
+        found, at = {}, 0
+        for term in self.terms:
+            found[term.name] = slice(at, at + term.size)
+            at += term.size
+        return found
+
+
+class PolicyNetwork:
+    """An ONNX policy: from observation vectors to commands.
+
+    Args:
+        path: The file.
+
+    Raises:
+        CheckpointError: It cannot be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = ERRORS_ONLY
+        try:
+            self._session = onnxruntime.InferenceSession(
+                path.read_bytes(), options, providers=["CPUExecutionProvider"]
+            )
+        except FileNotFoundError:
+            raise CheckpointError(
+                f"{path} is missing; give a folder with {CONTRACT} and {ONNX}"
+            ) from None
+        except Exception as error:  # onnxruntime's errors have no base of their own
+            raise CheckpointError(
+                f"{path} is damaged or no ONNX file ({str(error).splitlines()[0]})"
+            ) from error
+        entry = self._session.get_inputs()[0]
+        self._input = entry.name
+        self._one_by_one = entry.shape[0] == 1
+        self.size = entry.shape[-1] if isinstance(entry.shape[-1], int) else None
+        """Length of the observation vector; `None` where the file leaves it open."""
+
+    def answer(self, vectors: np.ndarray) -> np.ndarray:
+        """Return commands, `(B, J)`, for observation vectors, `(B, O)`; NaN where one holds NaN."""
+        known = np.asarray(np.isfinite(vectors).all(1))
+        given = np.where(known[:, None], vectors, 0.0).astype(np.float32)
+        if self._one_by_one:
+            answers = [self._ask(row[None]) for row in given]
+            return np.where(known[:, None], np.concatenate(answers), np.nan)
+        return np.where(known[:, None], self._ask(given), np.nan)
+
+    def _ask(self, vectors: np.ndarray) -> np.ndarray:
+        return np.asarray(self._session.run(None, {self._input: vectors})[0], float)
+
+
+@dataclass(frozen=True)
+class LoadedPolicy:
+    """A policy with its contract.
+
+    Attributes:
+        contract: The contract.
+        network: The network.
+    """
+
+    contract: PolicyContract
+    network: PolicyNetwork
+
+
+def load_policy(folder: str, machine: Machine) -> LoadedPolicy:
+    """Read a policy.
+
+    Args:
+        folder: Folder with `policy.json` and `policy.onnx`, `package:path`, or an ONNX file beside
+            its contract of the same name, `<name>.json`.
+        machine: Machine of the log.
+
+    Raises:
+        CheckpointError: A file is missing, damaged, or does not fit the other.
+    """
+    place = resolve_package_path(folder)
+    is_file = place.suffix == ".onnx"
+    path = place.with_suffix(".json") if is_file else place / CONTRACT
+    contract = read_contract(path, machine)
+    network = PolicyNetwork(place if is_file else place / ONNX)
+    if network.size is not None and network.size != contract.size:
+        raise CheckpointError(
+            f"{path}: its terms have {contract.size} numbers, the network takes {network.size}; "
+            "mend observation.terms"
+        )
+    return LoadedPolicy(contract, network)
+
+
+def read_contract(path: Path, machine: Machine) -> PolicyContract:
+    """Read a contract of either kind.
+
+    Raises:
+        CheckpointError: It is missing, damaged or incomplete.
+    """
+    try:
+        data = json.loads(path.read_text())
+        observation = data["observation"]
+        if observation is None:
+            raise CheckpointError(f"{path}: the policy's task cannot be deployed: it has no {ONNX}")
+        is_own = "order" in observation
+        terms = _list_own_terms(data, machine) if is_own else _list_given_terms(observation)
+        joints = tuple(data["joints"])
+        commands = data.get("command", {}).get("columns") or map(name_command_column, joints)
+        return PolicyContract(
+            source=path,
+            rate_hz=float(data["rate_hz"]),
+            joints=joints,
+            terms=terms,
+            commands=tuple(commands),
+            training=data.get("training_observations"),
+            data=data,
+        )
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{path} is missing; give the folder of a policy, or an ONNX file with its contract"
+        ) from None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(
+            f"{path}: this contract cannot be used ({type(error).__name__}: {error}); docs/doctor.md "
+            "lists its fields"
+        ) from error
+
+
+def _list_own_terms(data: Mapping[str, Any], machine: Machine) -> tuple[ObservationTerm, ...]:
+    """Return the terms of a bundle of this project."""
+    joints, num = tuple(data["joints"]), int(data["history"]["samples"])
+    units = dict(zip(machine.joint_names, (joint.unit for joint in machine.joints), strict=True))
+    scale = data["observation"]
+    positions = tuple(name_position_column(name, units[name]) for name in joints)
+    flows, advice = map(name_command_column, joints), map(name_advice_column, joints)
+    pitch = scale.get("pitch", {"mean_rad": 0.0, "std_rad": 1.0})
+    target = scale["target"]
+    known = {
+        "target_in_base_m": (
+            "target", TARGET_COLUMNS, 1, 0, target["mean_m"], target["std_m"], "first"
+        ),
+        "q": ("q", positions, num, 0, scale["q"]["mean"], scale["q"]["std"], "first"),
+        "u": ("u", tuple(flows), num, -1, scale["u"]["mean"], scale["u"]["std"], "zero"),
+        "pitch_rad": ("pitch", (PITCH_COLUMN,), 1, 0, pitch["mean_rad"], pitch["std_rad"], "first"),
+        "proposals": ("proposals", tuple(advice), num, -1, 0.0, 1.0, "zero"),
+    }  # fmt: skip
+    terms = []
+    for part in scale["order"]:
+        name, columns, samples, newest, mean, std, before = known[part.split()[0]]
+        terms.append(_make_term(name, columns, samples, newest, mean, std, None, before))
+    return tuple(terms)
+
+
+def _list_given_terms(observation: Mapping[str, Any]) -> tuple[ObservationTerm, ...]:
+    """Return the terms of a contract for any ONNX file."""
+    terms = []
+    for term in observation["terms"]:
+        before = term.get("before", "first")
+        if before not in ("first", "zero"):
+            raise ValueError(f"'before' of term {term['name']} is {before}, expected first or zero")
+        terms.append(
+            _make_term(
+                str(term["name"]),
+                tuple(term["columns"]),
+                int(term.get("samples", 1)),
+                int(term.get("newest", 0)),
+                term.get("mean", 0.0),
+                term.get("std", 1.0),
+                term.get("clip"),
+                before,
+            )
+        )
+    return tuple(terms)
+
+
+def _make_term(
+    name: str,
+    columns: Sequence[str],
+    samples: int,
+    newest: int,
+    mean: Any,
+    std: Any,
+    clip: float | None,
+    before: Filling,
+) -> ObservationTerm:
+    num = len(columns)
+    return ObservationTerm(
+        name=name,
+        columns=tuple(columns),
+        samples=samples,
+        newest=newest,
+        mean=np.broadcast_to(np.asarray(mean, float), (num,)),
+        std=np.broadcast_to(np.asarray(std, float), (num,)),
+        clip=clip,
+        before=before,
+    )

@@ -1,0 +1,226 @@
+"""Actuator evidence: whether the machine moves as one of those that the policy was trained with.
+
+The simulator is driven with the recorded commands, once as it is and once with the effects of the
+training drawn anew for each machine. A joint is blamed when it departs further from the simulator
+than nearly all of them. Axes: `M` drawn machines, `W` windows, `K` steps, `J` joints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from brokk_rl import open_loop
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
+from brokk_rl.errors import RecordingError
+from brokk_rl.history import History
+from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.open_loop import FreeRunWindows
+from brokk_rl.record import Recording
+from brokk_rl.scales import choose_horizon_s
+from brokk_rl.split import group_by_run
+from diagnosis.deployment.contract import TARGET_COLUMNS
+
+NUM_MACHINES = 200
+"""Machines that are drawn; one that is as they are exceeds all of them in 1 of 201 cases a joint."""
+QUANTILE, BEYOND = 0.98, 1.3
+"""Quantile of their departures, and the multiple of it from which a joint is blamed. Chosen by hand on
+the development logs of `benchmarks/doctor`."""
+HORIZON_SHARE = 0.5
+"""Length of the free runs, of those of the diagnosis: a run has few seconds without contact."""
+WINDOWS_APART = 0.4
+"""Time between two windows, of their length."""
+END_SHARE = 0.01
+"""Part of its travel within which a joint counts as being at its end."""
+GROUND_M, NEAR_M, ABOVE_M = 0.1, 0.4, 0.05
+"""The tool may touch: height above the ground, horizontal distance from the target, and height above it
+within that distance; the block is the wider of the two. Chosen by hand."""
+MIN_TRAVEL_SHARE = 0.005
+"""Part of its travel that a joint moves at least, recorded or simulated, to be judged; by hand."""
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """Departure of a joint from the simulator, RMS over free runs, rad or m.
+
+    Attributes:
+        joint: Its name.
+        recorded: Departure of the recorded machine.
+        typical: Median departure of the machines of training.
+        largest: Quantile `QUANTILE` of theirs.
+        moves: Whether it moved enough to be judged.
+    """
+
+    joint: str
+    recorded: float
+    typical: float
+    largest: float
+    moves: bool
+
+    @property
+    def blamed(self) -> bool:
+        """True if it departs further than the machines of the training."""
+        return self.moves and self.recorded > BEYOND * self.largest
+
+
+@dataclass(frozen=True)
+class MotionEvidence:
+    """Result of the comparison of motions.
+
+    Attributes:
+        joints: By joint, in machine order; empty where nothing can be said.
+        horizon_s: Length of the free runs.
+        cannot_tell: Why nothing can be said.
+    """
+
+    joints: tuple[JointMotion, ...]
+    horizon_s: float
+    cannot_tell: str
+
+    @property
+    def blamed(self) -> tuple[str, ...]:
+        """Joints that are blamed."""
+        return tuple(one.joint for one in self.joints if one.blamed)
+
+
+def check_motion(
+    recordings: Sequence[Recording],
+    machine: Machine,
+    actuator: Actuator | None,
+    effects: Mapping[str, Effect],
+    seed: int,
+) -> MotionEvidence:
+    """Compare recorded motion with the simulator and the machines of training.
+
+    Args:
+        recordings: The log or logs.
+        machine: The machine.
+        actuator: The simulator's actuator; `None`: none is known.
+        effects: Effects that the training draws, by name.
+        seed: Of the draws.
+    """
+    horizon_s = HORIZON_SHARE * choose_horizon_s(machine)
+    if actuator is None:
+        return MotionEvidence((), horizon_s, "no simulator was given: actuator=<its actuator>")
+    if not effects:
+        return MotionEvidence(
+            (), horizon_s, "no effects of the training were given: effect=[library]"
+        )
+    try:
+        apart_s = max(machine.period_s, WINDOWS_APART * horizon_s)
+        cut = open_loop.cut_windows(recordings, machine, horizon_s, apart_s)
+    except RecordingError as error:
+        return MotionEvidence((), horizon_s, str(error))
+    free = _find_free_windows(recordings, cut, machine, apart_s)
+    if not free.any():
+        return MotionEvidence(
+            (), horizon_s, f"no {horizon_s:g} s without an end of travel or possible contact"
+        )
+    cut = replace(cut, u=cut.u[free], q=cut.q[free], run=cut.run[free])
+    torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
+    cpu = torch.device("cpu")
+    plain = open_loop.roll_out(actuator, machine, cut, cpu)
+    many = _repeat_windows(cut, NUM_MACHINES)
+    with torch.random.fork_rng([]):
+        torch.manual_seed(seed)
+        drawn = open_loop.roll_out(
+            _DrawnMachines(actuator, effects, len(cut.q)), machine, many, cpu
+        )
+    drawn = drawn.reshape(NUM_MACHINES, *plain.shape)
+    recorded = _measure_rms(cut.measured - plain)
+    largest = _measure_rms(drawn - plain)
+    travel = machine.upper - machine.lower
+    moved = np.ptp(np.concatenate([plain, cut.measured], 1), axis=1).max(0)
+    joints = []
+    for j, name in enumerate(machine.joint_names):
+        joints.append(
+            JointMotion(
+                joint=name,
+                recorded=float(recorded[j]),
+                typical=float(np.median(largest[:, j])),
+                largest=float(np.quantile(largest[:, j], QUANTILE)),
+                moves=bool(moved[j] > MIN_TRAVEL_SHARE * travel[j]),
+            )
+        )
+    return MotionEvidence(tuple(joints), horizon_s, "")
+
+
+def _find_free_windows(
+    recordings: Sequence[Recording], cut: FreeRunWindows, machine: Machine, apart_s: float
+) -> np.ndarray:
+    """Return the windows in which no joint is at its end and the tool touches nothing, `(W,)`."""
+    margin = END_SHARE * (machine.upper - machine.lower)
+    stride, length = max(1, round(apart_s / machine.period_s)), cut.q.shape[1]
+    found = []
+    for parts in group_by_run(recordings).values():
+        for recording in parts:
+            q = recording.q.astype(float)
+            free = ((q > machine.lower + margin) & (q < machine.upper - margin)).all(1)
+            if machine.has_bodies:
+                free &= ~_may_touch(recording, machine)
+            for start in range(0, recording.num_samples - length + 1, stride):
+                found.append(bool(free[start : start + length].all()))
+    return np.array(found)
+
+
+def _may_touch(recording: Recording, machine: Machine) -> np.ndarray:
+    """Return the rows in which the tool is near the ground, or in or beside its target, `(T,)`."""
+    tip_m = compute_tool_kinematics(machine, recording.q.astype(float)).tip_in_base_m
+    touching = tip_m[:, 2] < GROUND_M
+    if all(name in recording.extra for name in TARGET_COLUMNS):
+        target_m = np.stack([recording.extra[name] for name in TARGET_COLUMNS], 1)
+        near = np.hypot(*(tip_m - target_m)[:, :2].T) < NEAR_M
+        touching |= near & (tip_m[:, 2] < target_m[:, 2] + ABOVE_M)
+    return touching
+
+
+def _measure_rms(difference: np.ndarray) -> np.ndarray:
+    """Return the root mean square over windows and steps, `(…, J)`."""
+    return np.sqrt(np.nanmean(difference**2, axis=(-3, -2)))
+
+
+def _repeat_windows(cut: FreeRunWindows, count: int) -> FreeRunWindows:
+    """Return all windows `count` times, one machine after the other."""
+    repeats = (count, 1, 1)
+    return FreeRunWindows(
+        np.tile(cut.u, repeats), np.tile(cut.q, repeats), np.tile(cut.run, count),
+        cut.num_history, cut.num_before,
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _DrawnMachines:
+    """An actuator with effects whose draws all windows of a machine share."""
+
+    actuator: Actuator
+    effects: Mapping[str, Effect]
+    num_windows: int
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ActuatorModel:
+        model = self.actuator.build(machine, num_envs, device)
+        for effect in self.effects.values():
+            model = effect.wrap(model, machine, num_envs, device)
+        return _SharedDraws(model, self.num_windows)
+
+
+class _SharedDraws:
+    def __init__(self, model: ActuatorModel, num_windows: int) -> None:
+        self._model, self._num_windows = model, num_windows
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        return self._model.state
+
+    def reset(self, mask: torch.Tensor) -> None:
+        self._model.reset(mask)
+        for path, value in self._model.state.items():
+            if "drawn" in path.split("."):
+                first = value[:: self._num_windows]
+                value.copy_(first.repeat_interleave(self._num_windows, 0))
+
+    def step(self, history: History) -> torch.Tensor:
+        return self._model.step(history)

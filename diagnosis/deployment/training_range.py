@@ -1,0 +1,111 @@
+"""Task evidence: whether a run lies where the policy's training has been.
+
+The bundle holds the range of what the policy observed in training (`training_observations` of its
+contract, written by `mode=export`). Axes: `T` rows of a log.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.observation import TARGET_DISTANCE, RangeTable
+from diagnosis.deployment.contract import PolicyContract
+from diagnosis.deployment.run_log import RunLog
+
+MARGIN = 0.05
+"""Part of the training's range by which a value may lie outside: a few hundred samples do not reach
+its ends. Chosen by hand."""
+LEAST_SHARE = 0.1
+"""Share of the rows outside from which the task is blamed. Chosen by hand."""
+
+
+@dataclass(frozen=True)
+class OutsideValue:
+    """A value that lies outside the range of training.
+
+    Attributes:
+        field: Which one, such as `target.distance` or `q.q3`.
+        share: Share of the rows outside.
+        begin: First row outside.
+        lowest: Lowest value of the log.
+        highest: Highest one.
+        low: Lowest value of the training.
+        high: Highest one.
+    """
+
+    field: str
+    share: float
+    begin: int
+    lowest: float
+    highest: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class RangeEvidence:
+    """Result of the comparison with the training's range.
+
+    Attributes:
+        outside: Values outside, the largest share first.
+        cannot_tell: Why nothing can be said; empty where it can.
+    """
+
+    outside: tuple[OutsideValue, ...]
+    cannot_tell: str
+
+    @property
+    def blamed(self) -> bool:
+        """True if the run lies outside of the training's range."""
+        return any(one.share >= LEAST_SHARE for one in self.outside)
+
+
+def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidence:
+    """Compare the newest values of a log with the range of training."""
+    if contract.training is None:
+        return RangeEvidence(
+            (),
+            "the bundle does not hold the range of its training's observations; export it again "
+            "(mode=export) from its checkpoint",
+        )
+    table: RangeTable = dict(contract.training["ranges"])
+    found = []
+    for name, values in list_newest_values(log, contract).items():
+        if name not in table:
+            continue
+        low, high = table[name]
+        margin = MARGIN * (high - low)
+        known = np.isfinite(values)
+        outside = known & ((values < low - margin) | (values > high + margin))
+        if outside.any():
+            found.append(
+                OutsideValue(
+                    field=name,
+                    share=float(outside.sum() / known.sum()),
+                    begin=int(np.flatnonzero(outside)[0]),
+                    lowest=float(values[known].min()),
+                    highest=float(values[known].max()),
+                    low=low,
+                    high=high,
+                )
+            )
+    found.sort(key=lambda one: -one.share)
+    return RangeEvidence(tuple(found), "")
+
+
+def list_newest_values(log: RunLog, contract: PolicyContract) -> dict[str, np.ndarray]:
+    """Return the values that training has ranges of, by name, each `(T,)`."""
+    found = {}
+    for name, values in log.signals.items():
+        if name == "target":
+            for column, letter in enumerate("xyz"):
+                found[f"target.{letter}"] = values[:, column]
+            found[TARGET_DISTANCE] = np.hypot(values[:, 0], values[:, 1])
+        elif name == "pitch":
+            found["pitch"] = values[:, 0]
+        elif name == "q":
+            for column, joint in enumerate(contract.joints):
+                found[f"q.{joint}"] = values[:, column]
+    return found

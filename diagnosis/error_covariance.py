@@ -1,0 +1,209 @@
+"""Covariance of the increments of a simulator's error, and its fit to residuals.
+
+Axes: `W` windows, `I` increments in a window, `B` blocks of `S` increments in a row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from brokk_rl.machine import Machine
+
+T_FREEDOM = 5.0
+"""Degrees of freedom of the t distribution that whitened errors are taken to have."""
+NO_BORDER = 1e300
+"""Last element of a bordered covariance: so large that the matrix stays positive definite."""
+COVARIANCE_WINDOWS = 3
+"""Windows in a row on which the noise is fitted."""
+MIN_TYPICAL_ERROR = 0.1
+"""Smallest typical error, over the root of the mean square."""
+
+
+def compute_loss(z: np.ndarray, axis: int | None = None) -> np.ndarray:
+    """Return the negative log likelihood of whitened errors, up to a constant, summed."""
+    return 0.5 * (T_FREEDOM + 1.0) * np.log1p(np.square(z) / T_FREEDOM).sum(axis)
+
+
+def weigh_residuals(z: np.ndarray) -> np.ndarray:
+    """Return the weights that turn squares of `z` into `loss` (iteratively reweighted least squares)."""
+    return (T_FREEDOM + 1.0) / (T_FREEDOM + np.square(z))
+
+
+@dataclass(frozen=True)
+class ErrorCovariance:
+    """Covariance of the increments of one joint's error, as a function of the simulated motion.
+
+    Attributes:
+        sensor: Standard deviation of each increment, rad or m.
+        change: The same over the change of speed between neighbouring increments.
+        wander: Relative standard deviation of the speed.
+        memory: Increments over which a wandering speed forgets.
+        reading: Standard deviation of each position as it is read, rad or m; it enters two
+            increments in a row with opposite signs.
+    """
+
+    sensor: float
+    change: float
+    wander: float
+    memory: float
+    reading: float = 0.0
+
+    def covariance(self, increments: np.ndarray) -> np.ndarray:
+        """Return the covariance of increments in a row, `(B, S, S)`, where the simulator moves by `increments` `(B, S)`."""
+        lag = _count_between(increments.shape[1])
+        read = self.reading**2 * np.clip(2.0 - 3.0 * lag, -1.0, 2.0) * (lag <= 1)
+        kept = self.remember(increments.shape[1])
+        return (
+            self.wander**2 * increments[:, :, None] * increments[:, None, :] * kept
+            + self.vary(increments)[:, :, None] * np.eye(increments.shape[1])
+            + read
+        )
+
+    def remember(self, size: int) -> np.ndarray:
+        """Return the correlation of a wandering speed between `size` increments in a row, `(S, S)`."""
+        return np.exp(-_count_between(size) / self.memory)
+
+    def vary(self, increments: np.ndarray) -> np.ndarray:
+        """Return the variance of each increment that it shares with no other, `(B, S)`."""
+        turn = np.abs(np.diff(increments, axis=1, prepend=increments[:, :1])) + np.abs(
+            np.diff(increments, axis=1, append=increments[:, -1:])
+        )
+        return self.sensor**2 + (self.change * turn) ** 2
+
+    def strayed(self, increments: np.ndarray) -> np.ndarray:
+        """Return the variance of the position after each increment, `(B, S)`, where each of `B` begins without an error."""
+        return np.diagonal(self.covariance(increments).cumsum(1).cumsum(2), axis1=1, axis2=2)
+
+    def whitener(self, increments: np.ndarray) -> np.ndarray:
+        """Return the inverse Cholesky factors of the covariance, `(B, S, S)`."""
+        return np.linalg.inv(np.linalg.cholesky(self.covariance(increments)))
+
+
+@dataclass(frozen=True)
+class LevelCovariance(ErrorCovariance):
+    """Covariance of increments where a loop holds the position, so that errors do not add up.
+
+    The error of the position itself is stationary: it has a part of each sample by itself
+    (`sensor`), one over the motion (`change`), and one that forgets over `memory` increments.
+
+    Attributes:
+        stray: Standard deviation of the error that forgets, rad or m.
+        window: Increments in a window; each window begins without an error.
+    """
+
+    stray: float = 0.0
+    window: int = 1
+
+    def covariance(self, increments: np.ndarray) -> np.ndarray:
+        """Return the covariance of increments in a row, `(B, S, S)`; see `ErrorCovariance`."""
+        size = increments.shape[1]
+        kept = self.remember(size)
+        moved = increments[:, :, None] * increments[:, None, :]
+        level = (self.stray**2 + self.change**2 * moved) * kept + self.sensor**2 * np.eye(size)
+        goes_on = (np.arange(size) % self.window != 0)[1:, None]
+        level[:, 1:] = level[:, 1:] - goes_on * level[:, :-1]
+        level[:, :, 1:] = level[:, :, 1:] - goes_on.T * level[:, :, :-1]
+        return level
+
+
+def _count_between(size: int) -> np.ndarray:
+    """Return how many increments lie between two of `size` in a row, `(S, S)`."""
+    return np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
+
+
+def join_windows(values: np.ndarray) -> np.ndarray:
+    """Return increments `(W, I)` with `COVARIANCE_WINDOWS` in a row, `(W / N, N I)`."""
+    together = min(COVARIANCE_WINDOWS, len(values))
+    return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
+
+
+def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
+    """Return the noise of one joint: maximum likelihood on errors and simulated increments, `(W, I)`, with outliers cut."""
+    # a joint that stands still most of the time, read by a coarse sensor, has a median error of 0
+    typical = (
+        max(1.4826 * np.median(np.abs(error)), MIN_TYPICAL_ERROR * np.sqrt(np.mean(error**2)))
+        + 1e-9
+    )
+    size = np.sqrt(np.mean(increments**2)) + 1e-9
+    error = np.clip(
+        error, -12.0 * typical - 0.3 * np.abs(increments), 12.0 * typical + 0.3 * np.abs(increments)
+    )
+
+    steps = increments.shape[1]
+    # The Cholesky factor of the covariance bordered by the error has the whitened error in its last row.
+    bordered = np.zeros((len(error), steps + 1, steps + 1))
+    bordered[:, -1, :-1] = error
+    products = increments[:, :, None] * increments[:, None, :]
+    diagonal = np.arange(steps)
+
+    def minus_log(x: np.ndarray) -> float:
+        noise = ErrorCovariance(*np.exp(x))
+        bordered[:, :-1, :-1] = noise.wander**2 * noise.remember(steps) * products
+        bordered[:, diagonal, diagonal] += noise.vary(increments) + 1e-18
+        bordered[:, -1, -1] = NO_BORDER
+        factor = np.linalg.cholesky(bordered)
+        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)[:, :-1]).sum()
+        z = factor[:, -1, :-1]
+        return float(compute_loss(z) + log_size + 0.02 * np.square(x[3] - np.log(10.0)) * 10)
+
+    start = np.log([typical, 0.05, max(0.01, 0.5 * np.sqrt(np.mean(error**2)) / size), 10.0])
+    low, high = (
+        np.log([typical / 10, 1e-4, 1e-4, 1.0]),
+        np.log([10 * typical + 1e-6, 1.0, 0.5, 200.0]),
+    )
+    found = minimize(
+        minus_log,
+        start,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": 40},
+    )
+    return ErrorCovariance(*np.exp(found.x))
+
+
+def fit_joint_noise(
+    errors: Sequence[np.ndarray], motions: Sequence[np.ndarray], machine: Machine
+) -> ErrorCovariance:
+    """Return the noise of one joint from increments of errors and of simulated motions, each `(W, I)`."""
+    error = np.concatenate([join_windows(one) for one in errors])
+    moved = np.concatenate([join_windows(one) for one in motions])
+    if machine.interface == "position":
+        return fit_level_noise(error, moved, errors[0].shape[1])
+    return fit_noise(error, moved)
+
+
+def fit_level_noise(error: np.ndarray, increments: np.ndarray, window: int) -> LevelCovariance:
+    """Return the noise of one joint whose position a loop holds; see `fit_noise`.
+
+    Args:
+        error: Increments of the error, windows in a row, `(W, I)`.
+        increments: Simulated increments, `(W, I)`.
+        window: Increments in a window.
+    """
+    level = np.cumsum(error.reshape(-1, window), 1)
+    typical = 1.4826 * np.median(np.abs(level))
+    typical = max(typical, MIN_TYPICAL_ERROR * np.sqrt(np.mean(level**2))) + 1e-9
+    most = 12.0 * typical
+    level = np.clip(level, -most, most)
+    error = np.diff(level, axis=1, prepend=0.0).reshape(error.shape)
+
+    def build(x: np.ndarray) -> LevelCovariance:
+        sensor, change, stray, memory = np.exp(x)
+        return LevelCovariance(sensor, change, 0.0, memory, 0.0, stray, window)
+
+    def minus_log(x: np.ndarray) -> float:
+        covariance = build(x).covariance(increments) + 1e-18 * np.eye(increments.shape[1])
+        factor = np.linalg.cholesky(covariance)
+        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
+        z = np.linalg.solve(factor, error[..., None])
+        return float(compute_loss(z) + log_size)
+
+    start = np.log([0.3 * typical, 0.05, typical, 5.0])
+    ends = [(typical / 30, 10 * typical), (1e-3, 2.0), (typical / 30, 10 * typical), (1.0, 200.0)]
+    bounds = [(np.log(low), np.log(high)) for low, high in ends]
+    found = minimize(minus_log, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40})
+    return build(found.x)

@@ -1,0 +1,132 @@
+"""`brokk mode=doctor_policy`: whether code, actuator or task makes a policy fail on the machine."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from brokk_rl import record
+from brokk_rl.contracts.actuator import Actuator, Effect
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from diagnosis.deployment import doctor, page
+from diagnosis.deployment.contract import load_policy
+from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
+
+log = logging.getLogger(__name__)
+
+
+@spec
+class DoctorRequest:
+    """Logs and policy to examine.
+
+    Attributes:
+        log: Glob or globs of recordings of the policy's run.
+        policy: Folder of the policy, `package:path`, or an ONNX file beside its contract.
+        others: Folders of policies that may have run instead.
+        target_in_base_m: Target where the log has no `target_x_m`; `null`: none is known.
+        sent: The commands of the log are those that the policy's loop sent; `false` where a person
+            moves the levers.
+    """
+
+    log: str | tuple[str, ...]
+    policy: str
+    others: tuple[str, ...]
+    target_in_base_m: tuple[float, float, float] | None
+    sent: bool
+
+
+@spec
+class DoctorPolicy:
+    """Examine a deployed policy by the log of its run.
+
+    Attributes:
+        session: Folder and seed.
+        machine: The machine.
+        actuator: Actuator of the simulator that trained the policy; `null`: motion is not judged.
+        effect: Effects that the training draws, by name.
+        doctor: Logs and policy.
+    """
+
+    session: Session
+    machine: Machine
+    actuator: Actuator | None
+    effect: dict[str, Effect]
+    doctor: DoctorRequest
+
+    def run(self) -> None:
+        """Write `doctor.json` and `doctor.html`.
+
+        Raises:
+            RecordingError: A log cannot be used.
+            CheckpointError: A policy cannot be used.
+            StorageError: Something could not be written.
+        """
+        found = self.examine()
+        folder = self.session.folder
+        found.write(folder)
+        page.write_page(found, folder)
+        print_answer(found, folder)
+
+    def examine(self) -> DoctorAnswer:
+        """Return the answer; errors as in `run`."""
+        asked = self.doctor
+        policy = load_policy(asked.policy, self.machine)
+        names = name_policies(asked.others)
+        others = {
+            name: load_policy(folder, self.machine)
+            for name, folder in zip(names, asked.others, strict=True)
+        }
+        return examine_deployment(
+            policy,
+            record.read_recordings(asked.log, self.machine),
+            self.machine,
+            others=others,
+            target_m=asked.target_in_base_m,
+            is_sent=asked.sent,
+            actuator=self.actuator,
+            effects=self.effect,
+            seed=self.session.stream("doctor"),
+        )
+
+
+def name_policies(folders: Sequence[str]) -> list[str]:
+    """Return a name for each policy folder: the last part of its path.
+
+    Raises:
+        ConfigError: Two have the same name.
+    """
+    names = [Path(folder.rpartition(":")[2]).name for folder in folders]
+    if len(set(names)) < len(names):
+        raise ConfigError(f"doctor.others: two folders have the same name: {', '.join(names)}")
+    return names
+
+
+def print_answer(found: DoctorAnswer, folder: Path) -> None:
+    """Show the verdict and the mistakes."""
+    console = Console()
+    console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False, markup=False)
+    if found.findings:
+        table = Table("kind", "field", "shows", "rows explained", box=None)
+        for one in found.findings:
+            table.add_row(
+                one.kind,
+                one.field,
+                f"{one.begin_s:.2f} to {one.end_s:.2f} s",
+                f"{one.explained:.1%}",
+            )
+        console.print(table)
+        for line in page.describe_remedies(found.findings):
+            console.print(line, highlight=False, markup=False)
+    for run in found.runs:
+        for line in (*run.cannot_tell, *run.notes):
+            console.print(f"not judged: {line}", highlight=False, markup=False)
+    console.print(
+        f"page: {folder / page.PAGE_FILE}, answer: {folder / doctor.ANSWER_FILE}", highlight=False
+    )

@@ -1,0 +1,123 @@
+"""A simulated camera on a mount that moves to where it sees the hole, for a desk."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from brokk_rl.contracts.vision import CameraView, TrackedHole
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.machine import Machine
+from brokk_rl.signals import Frame
+from brokk_rl.spec import spec
+from perception.mount.approach import plan_approach_motion
+from perception.mount.mounts import CameraMountSpec
+from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
+from perception.mount.occlusion import ArmShape
+from perception.render.stereo_camera import place_rig
+from perception.sources.simulator import SimulatedCamera, make_frame
+
+
+@spec
+class MovingCamera:
+    """Render the twin's block and arm from a mount that follows the hole.
+
+    Attributes:
+        camera: Rig, light and scene; the arm stands where the machine's sensors say.
+        mount: Carries the camera.
+        next_view: Chooses where it looks.
+        arm: Thickness of the arm.
+        machine: The machine.
+        hint_m: Error of the place at which the hole is expected before it was seen, 1 sigma.
+    """
+
+    camera: SimulatedCamera
+    mount: CameraMountSpec
+    next_view: ExpectedCovariance
+    arm: ArmShape
+    machine: Machine
+    hint_m: float
+
+    def check(self) -> None:
+        if self.hint_m <= 0:
+            raise ConfigError(f"source.hint_m: expected more than 0, got {self.hint_m}")
+
+    def build(self) -> MovingSource:
+        """Return the source, not yet opened."""
+        return MovingSource(self)
+
+
+class MovingSource:
+    """An open moving camera; see `FrameSource` and `AimedSource` of `brokk_rl.contracts.vision`."""
+
+    def __init__(self, settings: MovingCamera) -> None:
+        self._settings = settings
+        self._mount = settings.mount.build(settings.machine)
+        rig = settings.camera.rig
+        self._planner = settings.next_view.build(settings.machine, self._mount, rig, settings.arm)
+        self._source = settings.camera.build()
+        self._position, self._arrives_s = self._mount.start, -np.inf
+        self._q: np.ndarray | None = None
+        self._choice: ViewChoice | None = None
+        self._seen_s, self._num_missed, self._t_s = -np.inf, 0, 0.0
+        self._count, self._is_taken = -1, False
+
+    @property
+    def num_frames(self) -> None:
+        """No end."""
+        return None
+
+    def __enter__(self) -> MovingSource:
+        self._count = 0
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        self._count = -1
+
+    def aim(self, q: np.ndarray | None, hole: TrackedHole | None, t_s: float) -> CameraView | None:
+        """Choose where to look; see `AimedSource.aim`."""
+        self._t_s = t_s
+        if q is None or not np.isfinite(q).all():
+            return None
+        self._q, s = q, self._settings
+        if t_s < self._arrives_s:  # one motion at a time
+            return None if self._choice is None else self._choice.view
+        seen_s = -np.inf if hole is None else hole.seen_s
+        if self._is_taken:
+            self._num_missed = 0 if seen_s > self._seen_s else self._num_missed + 1
+        self._seen_s, self._is_taken = seen_s, False
+        scene = s.camera.task_scene
+        belief = HoleBelief.expect(np.array(scene[:3]), scene[5], s.hint_m)
+        if hole is not None:
+            belief = HoleBelief.take(hole)
+        step_s = s.next_view.horizon_s / (s.next_view.num_times - 1)
+        plan_q = plan_approach_motion(s.machine, q, belief.center_m, s.next_view.num_times, step_s)
+        self._choice = self._planner.choose(belief, self._position, plan_q, self._num_missed)
+        if self._choice.view.is_moving:
+            self._position = self._choice.position
+            self._arrives_s, self._num_missed = t_s + self._choice.view.travel_s, 0
+        return self._choice.view
+
+    def read_latest(self) -> Frame:
+        """Return a frame of the present scene from the present view.
+
+        Raises:
+            FrameError: the source is not open, the machine's positions are unknown, or the camera
+                is on its way.
+        """
+        if self._count < 0:
+            raise FrameError("moving camera: not open; use it in a `with` block")
+        if self._q is None:
+            raise FrameError("moving camera: the machine's positions are not known yet")
+        if self._t_s < self._arrives_s:
+            raise FrameError("moving camera: on its way, its pictures are not used")
+        s, number = self._settings, self._count
+        self._count, self._is_taken = number + 1, True
+        rig = s.camera.rig
+        placed = place_rig(
+            rig, self._mount.locate(self._position, self._q), (0, 0), (rig.width, rig.height)
+        )
+        self._source.show(s.camera.task_scene, s.arm.trace(s.machine, self._q))
+        shot = self._source.shot(np.random.default_rng((s.camera.seed, number)), placed)
+        return make_frame(shot, placed, self._t_s)

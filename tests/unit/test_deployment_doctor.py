@@ -1,0 +1,294 @@
+"""The deployment doctor: mistakes of a deployed loop are named, and a right one is left alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+from composed import option
+from onnx import TensorProto, helper, numpy_helper
+
+from brokk_rl.errors import CheckpointError
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording, write_recording
+from diagnosis.deployment import page
+from diagnosis.deployment.contract import LoadedPolicy, load_policy
+from diagnosis.deployment.doctor import DoctorAnswer, examine_deployment
+from diagnosis.deployment.run_log import measure_resolution
+from diagnosis.modes import why
+
+NUM_ROWS, SAMPLES = 120, 4
+TERMS = (("target", 3), ("q", 5 * SAMPLES), ("u", 5 * SAMPLES))
+Loop = Callable[[np.ndarray, int], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def machine() -> Machine:
+    return option("machine", "brokk170")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, machine: Machine) -> Path:
+    """A policy of another maker: a network of two layers with a contract that lists its terms."""
+    place, rng = tmp_path_factory.mktemp("policy"), np.random.default_rng(0)
+    size = sum(number for _, number in TERMS)
+    weights = {
+        "w1": rng.normal(0.0, 0.4, (size, 24)), "b1": rng.normal(0.0, 0.2, 24),
+        "w2": rng.normal(0.0, 0.3, (24, 5)), "b2": rng.normal(0.0, 0.1, 5),
+    }  # fmt: skip
+    nodes = [
+        helper.make_node("Gemm", ["observation", "w1", "b1"], ["h"]),
+        helper.make_node("Tanh", ["h"], ["a"]),
+        helper.make_node("Gemm", ["a", "w2", "b2"], ["o"]),
+        helper.make_node("Tanh", ["o"], ["command"]),
+    ]
+    floats = TensorProto.FLOAT
+    graph = helper.make_graph(
+        nodes, "policy",
+        [helper.make_tensor_value_info("observation", floats, ["B", size])],
+        [helper.make_tensor_value_info("command", floats, ["B", 5])],
+        [numpy_helper.from_array(value.astype(np.float32), name) for name, value in weights.items()],
+    )  # fmt: skip
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10)
+    onnx.save(model, place / "policy.onnx")
+    names = machine.joint_names
+    terms = [
+        {"name": "target", "columns": ["target_x_m", "target_y_m", "target_z_m"], "mean": [2.5, 0, 0.7], "std": 0.5},
+        {"name": "q", "columns": [f"q_{name}_rad" for name in names], "samples": SAMPLES, "mean": 0.3, "std": 0.7},
+        {"name": "u", "columns": [f"u_{name}" for name in names], "samples": SAMPLES, "newest": -1, "before": "zero"},
+    ]  # fmt: skip
+    ranges = {"target.distance": [2.0, 3.5], "q.q1": [-9.0, 9.0]}
+    contract = {
+        "rate_hz": 20, "joints": list(names), "observation": {"terms": terms},
+        "training_observations": {"count": 500, "ranges": ranges},
+    }  # fmt: skip
+    (place / "policy.json").write_text(json.dumps(contract))
+    return place
+
+
+@pytest.fixture(scope="module")
+def policy(folder: Path, machine: Machine) -> LoadedPolicy:
+    return load_policy(str(folder), machine)
+
+
+def run_loop(
+    policy: LoadedPolicy,
+    machine: Machine,
+    *,
+    see_q: Loop = lambda q, _: q,
+    see_target: Loop = lambda target, _: target,
+    send: Loop = lambda u, _: u,
+    vector: Loop = lambda v, _: v,
+    detail: str = "command",
+    target_m: tuple[float, ...] = (2.4, 0.3, 0.8),
+) -> Recording:
+    """Runs the policy on a machine that integrates its commands; the loop may make a mistake."""
+    rng = np.random.default_rng(1)
+    mean = {"target": np.array([2.5, 0, 0.7]), "q": 0.3, "u": 0.0}
+    std = {"target": 0.5, "q": 0.7, "u": 1.0}
+    q, before, rows = machine.home.copy(), np.zeros(5), []
+    past_q, past_u = None, np.zeros((SAMPLES, 5))
+    for k in range(NUM_ROWS):
+        measured = (q + rng.normal(0.0, 3e-4, 5)).astype(np.float32).astype(float)
+        target = np.array(target_m) + 0.4 * np.sin(0.07 * k + np.arange(3))
+        target = target.astype(np.float32).astype(float)
+        seen = see_q(measured, k)
+        past_q = np.tile(seen, (SAMPLES, 1)) if past_q is None else np.vstack([past_q[1:], seen])
+        past_u = np.vstack([past_u[1:], before]) if k else past_u
+        parts = {"target": see_target(target, k), "q": past_q, "u": past_u}
+        made = np.concatenate(
+            [np.ravel((parts[name] - mean[name]) / std[name]) for name, _ in TERMS]
+        )
+        made = vector(made, k).astype(np.float32)
+        command = policy.network.answer(made[None])[0]
+        sent = send(command, k)
+        rows.append((measured, sent, target, command, made))
+        before = sent.astype(np.float32).astype(float)
+        # A swing keeps all joints moving whatever the network says.
+        q = q + 0.05 * (0.3 * sent + 0.2 * np.sin(0.1 * k + np.arange(5)))
+    q_log, u, target, advice, obs = (np.stack(part) for part in zip(*rows, strict=True))
+    extra = {f"target_{axis}_m": target[:, i] for i, axis in enumerate("xyz")}
+    if detail != "command":
+        extra |= {f"advice_{name}": advice[:, j] for j, name in enumerate(machine.joint_names)}
+    if detail == "observation":
+        extra |= {f"obs_{j}": obs[:, j] for j in range(obs.shape[1])}
+    return Recording(
+        machine=machine.name,
+        joints=machine.joint_names,
+        units=("rad",) * 5,
+        rate_hz=20.0,
+        t_s=np.arange(NUM_ROWS) * 0.05,
+        u=u.astype(np.float32),
+        q=q_log.astype(np.float32),
+        extra={name: values.astype(np.float32) for name, values in extra.items()},
+    )
+
+
+def ask(policy: LoadedPolicy, recording: Recording, machine: Machine) -> DoctorAnswer:
+    return examine_deployment(
+        policy, [recording], machine, others={}, target_m=None, is_sent=True, actuator=None, effects={}, seed=0
+    )  # fmt: skip
+
+
+def turn_joint(values: np.ndarray, _: int) -> np.ndarray:
+    return values * np.array([1, 1, -1, 1, 1])
+
+
+FAULTS = {
+    "sign": ({"see_q": turn_joint}, "sign", "q.q3"),
+    "unit": ({"see_q": lambda q, _: np.rad2deg(q)}, "scale", "q"),
+    "offset": ({"see_q": lambda q, _: q + np.array([0, 0.2, 0, 0, 0])}, "default_pose", "q.q2"),
+    "frame": ({"see_target": lambda p, _: np.array([-p[1], p[0], p[2]])}, "frame", "target"),
+    "valves": ({"send": lambda u, _: u[[1, 0, 2, 3, 4]]}, "order", "command"),
+    "slow": ({"send": lambda u, _: 0.6 * u}, "scale", "command"),
+    "clip": ({"vector": lambda v, _: v.clip(-0.4, 0.4)}, "clip", "observation"),
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "detail"),
+    [*((name, "command") for name in FAULTS), ("sign", "observation"), ("frame", "observation")],
+)
+def test_a_mistake_is_named_with_its_field(
+    name: str, detail: str, policy: LoadedPolicy, machine: Machine
+) -> None:
+    hooks, kind, place = FAULTS[name]
+    found = ask(policy, run_loop(policy, machine, detail=detail, **hooks), machine)
+    assert found.verdict == "code"
+    assert [(one.kind, one.field) for one in found.findings] == [(kind, place)]
+    assert found.findings[0].begin_s < 0.5
+
+
+@pytest.mark.parametrize("detail", ["command", "advice", "observation"])
+def test_a_right_loop_is_left_alone(detail: str, policy: LoadedPolicy, machine: Machine) -> None:
+    found = ask(policy, run_loop(policy, machine, detail=detail), machine)
+    assert (found.verdict, found.findings) == ("nothing", ())
+
+
+def test_a_fitted_number_is_the_true_one(policy: LoadedPolicy, machine: Machine) -> None:
+    recording = run_loop(policy, machine, see_q=lambda q, _: q * np.array([1, 1, 1, 0.83, 1]))
+    (finding,) = ask(policy, recording, machine).findings
+    assert (finding.kind, finding.field) == ("scale", "q.q4")
+    assert finding.parameters["factor"] == pytest.approx(0.83, abs=2e-3)
+
+
+def test_a_signal_that_stops_is_told_with_its_time(policy: LoadedPolicy, machine: Machine) -> None:
+    kept = {}
+
+    def stop(q: np.ndarray, k: int) -> np.ndarray:
+        if k <= 70:
+            kept["q5"] = q[4]
+        return np.append(q[:4], kept["q5"])
+
+    (finding,) = ask(policy, run_loop(policy, machine, see_q=stop), machine).findings
+    assert (finding.kind, finding.field) == ("stale", "q.q5")
+    assert finding.begin_s == pytest.approx(3.55, abs=0.16)
+
+
+def test_a_mistake_without_a_name_gets_none(policy: LoadedPolicy, machine: Machine) -> None:
+    rng = np.random.default_rng(5)
+    recording = run_loop(policy, machine, vector=lambda v, _: v + 0.2 * rng.standard_normal(len(v)))
+    found = ask(policy, recording, machine)
+    assert found.verdict == "code"
+    assert [one.is_named for one in found.findings] == [False]
+
+
+def test_with_the_observation_another_network_is_told(
+    policy: LoadedPolicy, machine: Machine
+) -> None:
+    recording = run_loop(policy, machine, detail="observation")
+    rng = np.random.default_rng(6)
+    wrong = dict(recording.extra.items())
+    for name in machine.joint_names:
+        wrong[f"advice_{name}"] = rng.uniform(-1, 1, NUM_ROWS).astype(np.float32)
+    found = ask(policy, replace(recording, extra=wrong), machine)
+    assert found.findings[0].kind == "network"
+
+
+def test_a_target_out_of_the_training_is_the_task(policy: LoadedPolicy, machine: Machine) -> None:
+    found = ask(policy, run_loop(policy, machine, target_m=(5.5, 0.3, 0.8)), machine)
+    assert found.verdict == "task"
+    assert "target.distance" in found.reason
+
+
+def test_a_log_without_the_target_cannot_tell(policy: LoadedPolicy, machine: Machine) -> None:
+    found = ask(policy, replace(run_loop(policy, machine), extra={}), machine)
+    assert found.verdict == "cannot_tell"
+    assert "target_x_m" in found.reason
+
+
+def test_a_log_at_another_rate_is_the_code(policy: LoadedPolicy, machine: Machine) -> None:
+    recording = run_loop(policy, machine)
+    found = ask(policy, replace(recording, rate_hz=10.0, t_s=recording.t_s * 2), machine)
+    assert [(one.kind, one.field) for one in found.findings] == [("rate", "loop")]
+
+
+def test_rounding_of_the_log_is_no_mistake(policy: LoadedPolicy, machine: Machine) -> None:
+    recording = run_loop(policy, machine)
+    rounded = np.round(recording.q / 1e-3) * 1e-3
+    assert measure_resolution(rounded[:, 0].astype(float)) == pytest.approx(1e-3, rel=1e-2)
+    found = ask(policy, replace(recording, q=rounded.astype(np.float32)), machine)
+    assert found.verdict == "nothing"
+
+
+def test_a_vector_of_another_length_is_another_policy(
+    policy: LoadedPolicy, machine: Machine
+) -> None:
+    recording = run_loop(policy, machine, detail="observation")
+    longer = dict(recording.extra) | {"obs_43": np.zeros(NUM_ROWS, np.float32)}
+    (finding,) = ask(policy, replace(recording, extra=longer), machine).findings
+    assert (finding.kind, finding.field) == ("network", "observation")
+
+
+def test_the_page_of_the_whole_question_holds_verdict_and_next_step(
+    policy: LoadedPolicy, machine: Machine, tmp_path: Path
+) -> None:
+    found = ask(policy, run_loop(policy, machine, see_q=turn_joint), machine)
+    (tmp_path / "doctor").mkdir()
+    found.write(tmp_path / "doctor")
+    why.write_why_page(tmp_path, {"doctor": "Is the code to blame?"})
+    text = (tmp_path / why.WHY_PAGE).read_text()
+    assert "q.q3 has the wrong sign" in text
+    assert page.REMEDIES["sign"] in text
+
+
+def test_page_and_answer_hold_the_verdict(
+    policy: LoadedPolicy, machine: Machine, tmp_path: Path
+) -> None:
+    found = ask(policy, run_loop(policy, machine, see_q=turn_joint), machine)
+    found.write(tmp_path)
+    page.write_page(found, tmp_path)
+    told = json.loads((tmp_path / "doctor.json").read_text())
+    assert (told["verdict"], told["logs"][0]["findings"][0]["field"]) == ("code", "q.q3")
+    assert "q.q3 has the wrong sign" in (tmp_path / page.PAGE_FILE).read_text()
+
+
+def test_a_contract_that_does_not_fit_is_refused(
+    folder: Path, machine: Machine, tmp_path: Path
+) -> None:
+    contract = json.loads((folder / "policy.json").read_text())
+    contract["observation"]["terms"].pop()
+    (tmp_path / "policy.json").write_text(json.dumps(contract))
+    (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
+    with pytest.raises(CheckpointError, match="23 numbers, the network takes 43"):
+        load_policy(str(tmp_path), machine)
+
+
+def test_the_doctor_from_the_command(
+    brokk: Callable[..., object], policy: LoadedPolicy, folder: Path, machine: Machine
+) -> None:
+    write_recording(run_loop(policy, machine, send=lambda u, _: -u), Path("log.parquet"))
+    brokk(
+        "mode=doctor_policy",
+        "~actuator",
+        "doctor.log=log.parquet",
+        f"doctor.policy={folder}",
+        "session.out=out",
+    )
+    told = json.loads(Path("out/doctor.json").read_text())
+    assert [one["kind"] for one in told["logs"][0]["findings"]] == ["sign"]

@@ -1,0 +1,120 @@
+"""Joints commanded by torque: the mass against its differential equation, and its numbers from logs of a controller."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+from scipy.integrate import solve_ivp
+
+from actuators.recordings.log_signals import Signal
+from brokk_rl import record
+from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis.case import GapCase
+
+CPU = torch.device("cpu")
+TRUE = {"mass_kg": 60.0, "viscous_n_s_m": 120.0, "coulomb_n": 15.0, "offset_n": 5.0}
+
+
+@pytest.fixture(scope="module")
+def drive() -> Machine:
+    """A carriage that is commanded by a force."""
+    return option("machine", "emps")
+
+
+def run(model: Any, machine: Machine, u: np.ndarray, start: float) -> np.ndarray:
+    """Returns positions after each command `(T,)`, from rest."""
+    history = History(
+        q=torch.full((1, machine.num_history, 1), start), u=torch.zeros(1, machine.num_history, 1)
+    )
+    found = []
+    for command in u:
+        history.push_u(torch.full((1, 1), float(command)))
+        history.push_q(model.step(history))
+        found.append(float(history.q[0, -1, 0]))
+    return np.array(found)
+
+
+def test_a_mass_follows_its_differential_equation(drive: Machine) -> None:
+    model = replace(option("actuator", "force"), dead_time_s=0.0, **TRUE).build(drive, 1, CPU)
+    u = np.full(260, 0.2)
+    found = run(model, drive, u, 0.0)
+    force = 0.2 * drive.max_force[0] - TRUE["offset_n"] - TRUE["coulomb_n"]
+
+    def solve(t_s: float, y: np.ndarray) -> list[float]:
+        return [y[1], (force - TRUE["viscous_n_s_m"] * y[1]) / TRUE["mass_kg"]]
+
+    t_s = drive.period_s * np.arange(1, 261)
+    solved: Any = solve_ivp(solve, (0.0, t_s[-1]), [0.0, 0.0], t_eval=t_s, max_step=1e-3)
+    inside = solved.y[0] < drive.upper[0]
+    np.testing.assert_allclose(found[inside], solved.y[0][inside], atol=2e-3)
+    assert found[-1] == pytest.approx(drive.upper[0])
+
+
+def test_friction_holds_a_joint_and_brings_it_to_rest(drive: Machine) -> None:
+    model: Any = replace(option("actuator", "force"), **{**TRUE, "offset_n": 0.0}).build(
+        drive, 1, CPU
+    )
+    still = run(model, drive, np.full(50, 14.9 / drive.max_force[0]), 0.1)
+    np.testing.assert_array_equal(still, np.float32(0.1))
+    pushed = run(model, drive, np.r_[np.full(40, 0.3), np.zeros(200)], 0.05)
+    assert pushed[40] > 0.051
+    assert pushed[-1] == pushed[-2]
+
+
+def log_controller(machine: Machine, seed: int, seconds: float = 20.0) -> Recording:
+    """Returns a log of a PD controller at 5 ms on a mass that is solved at 1 ms, friction smooth about 0."""
+    rng, steps = np.random.default_rng(seed), round(seconds / machine.period_s)
+    rate, phase = rng.uniform(0.5, 3.0, 3), rng.uniform(0.0, 6.0, 3)
+    q, v, period_s = 0.12, 0.0, machine.period_s
+    found, commands = np.empty(steps), np.empty(steps)
+    for k in range(steps):
+        angle = rate * k * period_s + phase
+        target, speed = 0.12 + 0.025 * np.sin(angle).sum(), 0.025 * (rate * np.cos(angle)).sum()
+        found[k] = q
+        force = float(np.clip(4e4 * (target - q) + 3e3 * (speed - v), -300.0, 300.0))
+        commands[k] = force / machine.max_force[0]
+        for _ in range(5):
+            friction = TRUE["viscous_n_s_m"] * v + TRUE["coulomb_n"] * np.tanh(v / 1e-3)
+            v += 0.001 * (force - friction - TRUE["offset_n"]) / TRUE["mass_kg"]
+            q += 0.001 * v
+    noise = 1e-6 * rng.standard_normal(steps)
+    t_s = period_s * np.arange(steps)
+    return record.make_motion(machine, f"{seed}", t_s, commands[:, None], (found + noise)[:, None])
+
+
+def test_mass_friction_and_offset_are_read_off_a_controllers_log(
+    drive: Machine, tmp_path: Path
+) -> None:
+    logs = [log_controller(drive, seed) for seed in range(2)]
+    fitted = option("fit", "force").fit(drive, logs, [], tmp_path, 0, CPU)
+    for name, value in TRUE.items():
+        assert getattr(fitted, name)["carriage"] == pytest.approx(value, rel=0.05), name
+    assert (tmp_path / "force.yaml").is_file()
+    still = replace(logs[0], q=np.full_like(logs[0].q, 0.1))
+    with pytest.raises(RecordingError, match="carriage never moves"):
+        option("fit", "force").fit(drive, [still], [], tmp_path, 0, CPU)
+    with pytest.raises(ConfigError, match="cannot be filtered at a period"):
+        option("fit", "force", motion_hz=95.0).fit(drive, logs, [], tmp_path, 0, CPU)
+    # The diagnosis has no effect of such joints: it says so instead of naming one of a valve.
+    assert "commanded by torque" in GapCase(drive, [], logs).doubts()[0]
+
+
+def test_a_force_is_averaged_over_a_period() -> None:
+    signal = Signal("", np.arange(0.0, 0.02, 0.001), np.arange(20.0), "u")
+    np.testing.assert_allclose(
+        signal.average(np.array([0.0, 0.005, 0.01]), 0.005), [2.0, 7.0, 12.0]
+    )
+
+
+def test_a_force_drive_refuses_other_machines(machine: Machine) -> None:
+    with pytest.raises(ConfigError, match="is commanded by speed"):
+        option("actuator", "force").build(machine, 1, CPU)

@@ -1,0 +1,197 @@
+"""Joints commanded by position: the servo against its differential equation, effects on targets, the whole way of a command."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from composed import option
+from scipy.integrate import solve_ivp
+
+from actuators.excite.player import NominalLink
+from brokk_rl.checks.actuator import check_actuator_model
+from brokk_rl.commands import SpeedProgram, find_rest, read_targets, scale_targets, view_speeds
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.rl.speed_commands import accept_speeds
+from brokk_rl.signals import Command
+from diagnosis.effect_library import load_effects
+from diagnosis.error_covariance import LevelCovariance, fit_level_noise
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def arm() -> Machine:
+    """An arm of five position servos."""
+    return option("machine", "so101")
+
+
+def run(model: Any, machine: Machine, u: np.ndarray) -> np.ndarray:
+    """Returns positions after each command `(T, J)`, from rest at the first one."""
+    start = torch.as_tensor(read_targets(u[0], machine), dtype=torch.float32)
+    rows = torch.as_tensor(u, dtype=torch.float32)
+    shape = (1, machine.num_history, 1)
+    history = History(q=start.repeat(*shape), u=rows[0].repeat(*shape))
+    found = []
+    for command in rows:
+        history.push_u(command[None])
+        history.push_q(model.step(history))
+        found.append(history.q[0, -1].numpy().copy())
+    return np.array(found)
+
+
+def step_commands(machine: Machine, num: int = 40) -> np.ndarray:
+    u = np.full((num, machine.num_joints), -0.5)
+    u[5:] = 0.5
+    return u
+
+
+@pytest.mark.parametrize("damping", [0.4, 1.0, 2.5])
+def test_a_servo_follows_its_differential_equation(arm: Machine, damping: float) -> None:
+    servo = replace(
+        option("actuator", "servo"), dead_time_s=0.05, response_s=0.06, damping=damping, top_speed=50.0
+    )  # fmt: skip
+    found = run(servo.build(arm, 1, CPU), arm, step_commands(arm))[:, 0]
+    step_s = 5 * arm.period_s + 0.05
+
+    def solve(t_s: float, y: np.ndarray) -> list[float]:
+        target = 0.4 if t_s >= step_s else -0.4
+        return [y[1], (target - y[0]) / 0.06**2 - 2.0 * damping * y[1] / 0.06]
+
+    t_s = arm.period_s * np.arange(1, 41)
+    solved: Any = solve_ivp(solve, (0.0, t_s[-1]), [-0.4, 0.0], t_eval=t_s, max_step=1e-3)
+    np.testing.assert_allclose(found, solved.y[0], atol=3e-3)  # of a step by 0.8 rad
+
+
+def test_an_ideal_servo_is_at_its_target_after_a_period(arm: Machine) -> None:
+    u = np.random.default_rng(0).uniform(-0.1, 0.1, (30, arm.num_joints)).cumsum(0).clip(-1, 1)
+    found = run(replace(option("actuator", "servo"), top_speed=50.0).build(arm, 1, CPU), arm, u)
+    np.testing.assert_allclose(found, read_targets(u, arm), atol=1e-6)
+
+
+def test_play_and_sag_hold_the_joint_beside_its_target(arm: Machine) -> None:
+    servo = replace(option("actuator", "servo"), play_rad=0.02, sag_rad=0.03, sag_slope=0.1)
+    wave = np.sin(np.linspace(0.0, 3 * np.pi, 200))[:, None] * np.full(arm.num_joints, 0.5)
+    found = run(servo.build(arm, 1, CPU), arm, wave)
+    target = read_targets(wave, arm)
+    middle = (arm.lower + arm.upper) / 2
+    # up at row 20, down at row 100: half of the play behind, and the sag below
+    for row, side in ((20, -1.0), (100, 1.0)):
+        held = target[row] + side * 0.01
+        np.testing.assert_allclose(found[row], held - 0.03 - 0.1 * (held - middle), atol=1e-5)
+
+
+def test_effects_on_targets_are_what_the_servo_has_inside(arm: Machine) -> None:
+    """An ideal servo with effects around it is a servo with their numbers."""
+    ideal = replace(option("actuator", "servo"), top_speed=50.0)
+    wave = np.sin(np.linspace(0.0, 9.0, 150))[:, None] * np.full(arm.num_joints, 0.6)
+    around: Any = ideal.build(arm, 1, CPU)
+    kinds = {kind.name: kind for kind in load_effects(arm)}
+    values = {
+        "backlash": {"gap_rad": 0.02},
+        "sag": {"sag_rad": 0.03, "sag_slope": 0.1},
+        "dead_time": {"dead_time_s": 0.04},
+    }
+    for name, numbers in values.items():
+        around = kinds[name].wrap(around, arm, 1, CPU)
+        for key, value in numbers.items():
+            around.parameters[key].fill_(value)
+    inside = replace(ideal, dead_time_s=0.04, play_rad=0.02, sag_rad=0.03, sag_slope=0.1)
+    found, expected = (run(one, arm, wave) for one in (around, inside.build(arm, 1, CPU)))
+    # the play works on the sagged target: a tenth of half the play
+    np.testing.assert_allclose(found, expected, atol=1.1e-3)
+
+
+def test_effects_of_valves_are_refused_by_servos_and_the_other_way_round(
+    arm: Machine, machine: Machine
+) -> None:
+    known = {kind.name for kind in load_effects(arm)}
+    assert known == {
+        "backlash", "dead_time", "delay_jitter", "frame_loss", "lag", "quantisation", "rate_limit", "sag", "sensor_noise",
+    }  # fmt: skip
+    model = option("actuator", "servo").build(arm, 1, CPU)
+    with pytest.raises(ConfigError, match="commanded by position, where it does not occur"):
+        option("effect", "dead_band").wrap(model, arm, 1, CPU)
+    with pytest.raises(ConfigError, match="is commanded by speed"):
+        option("actuator", "servo").build(machine, 1, CPU)
+
+
+def test_one_machine_is_commanded_by_one_quantity(arm: Machine) -> None:
+    joints = (replace(arm.joints[0], command="torque", max_force=arm.joints[0].max_speed), *arm.joints[1:])  # fmt: skip
+    with pytest.raises(ConfigError, match="commanded by different quantities"):
+        replace(arm, joints=joints)
+    with pytest.raises(ConfigError, match="needs max_force"):
+        replace(arm.joints[0], command="torque")
+
+
+def test_the_interface_is_part_of_the_fingerprint_of_servos_only(arm: Machine) -> None:
+    valves = replace(arm, joints=tuple(replace(one, command="valve") for one in arm.joints))
+    assert valves.fingerprint()["joints"] != arm.fingerprint()["joints"]
+    # what a file of a valve has had since before there were interfaces
+    drives = replace(arm, joints=tuple(replace(one, command="velocity") for one in arm.joints))
+    assert drives.fingerprint()["joints"] != valves.fingerprint()["joints"]
+
+
+def test_a_program_of_speeds_becomes_targets_and_is_read_back(arm: Machine) -> None:
+    speeds = np.random.default_rng(1).uniform(-0.2, 0.2, (50, arm.num_joints))
+    program, q = SpeedProgram(arm), arm.home
+    u = np.array([program.command(one, q)[0] for one in speeds])
+    np.testing.assert_allclose(view_speeds(u, arm)[1:], speeds[1:], atol=1e-9)
+    np.testing.assert_allclose(scale_targets(read_targets(u, arm), arm), u, atol=1e-12)
+    # at the end of the travel a target goes no further
+    for _ in range(100):
+        at_end, carried_out = program.command(np.ones(arm.num_joints), q)
+    np.testing.assert_allclose(at_end, 1.0)
+    np.testing.assert_allclose(carried_out, 0.0)
+
+
+def test_a_nominal_servo_stays_and_follows(arm: Machine) -> None:
+    link = NominalLink(arm, 1)
+    rest = find_rest(arm.home[None], arm)
+    link.send(Command(rest))
+    np.testing.assert_allclose(link.read().q, arm.home[None])
+    for _ in range(10):
+        link.send(Command(np.zeros((1, arm.num_joints))))
+    np.testing.assert_allclose(link.read().q[0], (arm.lower + arm.upper) / 2)
+
+
+def test_errors_of_a_held_position_do_not_add_up() -> None:
+    generator = np.random.default_rng(2)
+    noise = LevelCovariance(0.002, 0.0, 0.0, 4.0, 0.0, 0.01, 20)
+    still = np.zeros((1, 60))
+    np.testing.assert_allclose(noise.strayed(still[:, :20]), 0.002**2 + 0.01**2)
+    root = np.linalg.cholesky(noise.covariance(still)[0])
+    error = (root @ generator.standard_normal((60, 40))).T
+    found = fit_level_noise(error, np.zeros_like(error), 20)
+    assert found.stray == pytest.approx(0.01, rel=0.2)
+    assert found.memory == pytest.approx(4.0, rel=0.5)
+
+
+def test_a_policy_commands_speeds_and_the_servo_gets_targets(
+    arm: Machine, machine: Machine
+) -> None:
+    ideal = replace(option("actuator", "servo"), top_speed=50.0)
+    model = accept_speeds(ideal.build(arm, 4, CPU), arm, 4, CPU)
+    check_actuator_model(model, arm, CPU)
+    model = accept_speeds(ideal.build(arm, 1, CPU), arm, 1, CPU)
+    speeds = np.random.default_rng(3).uniform(-0.3, 0.3, (30, arm.num_joints))
+    start = torch.as_tensor(arm.home, dtype=torch.float32)
+    history = History(
+        q=start.repeat(1, arm.num_history, 1), u=torch.zeros(1, arm.num_history, arm.num_joints)
+    )
+    for speed in speeds:
+        history.push_u(torch.as_tensor(speed[None], dtype=torch.float32))
+        history.push_q(model.step(history))
+    way = speeds.sum(0) * arm.max_speed * arm.period_s
+    np.testing.assert_allclose(history.q[0, -1].numpy(), arm.home + way, atol=1e-5)
+    # a machine that is commanded by speed keeps its model, one by torque is refused
+    known = option("actuator", "ideal").build(machine, 1, CPU)
+    assert accept_speeds(known, machine, 1, CPU) is known
+    drive = option("machine", "emps")
+    with pytest.raises(ConfigError, match="commanded by torque"):
+        accept_speeds(option("actuator", "force").build(drive, 1, CPU), drive, 1, CPU)

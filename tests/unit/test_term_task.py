@@ -1,0 +1,271 @@
+"""A task made of terms: its vector, its success, its masks and its contract, against numbers by hand."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import training as runs
+from kinematic import KinematicWorld
+
+from brokk_rl.checks import check_task
+from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.history import History
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.modes.evaluate import evaluate_policies
+from brokk_rl.observation import ObservationEncoder, PartsEncoder, restore_encoder
+from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.settings import Evaluation
+from brokk_rl.session import Session
+from brokk_rl.spec import spec
+from brokk_rl.task_description import describe_task, restore_task
+from deploy.policy.bundle import PolicyBundle
+from tasks.reward import RewardTerm
+from tasks.term_task import (
+    HeldCriterion,
+    JointAction,
+    ObservedTerm,
+    StartsNearHome,
+    TermState,
+    TermTask,
+    UniformCommand,
+)
+from tasks.term_task.process import compute_command
+from tasks.termination import Succeeded, TimeLimit
+
+CPU = torch.device("cpu")
+SHIPPED = Path(__file__).parents[2] / "tasks" / "policies" / "borehole_insertion"
+
+
+@spec
+class Turn(TermTask):
+    """Turn the first joint at a wanted speed."""
+
+
+def error(state: TermState) -> torch.Tensor:
+    return state.speed[:, 0] - state.command["speed"][:, 0]
+
+
+def is_turning(state: TermState) -> torch.Tensor:
+    return error(state).abs() < 0.01
+
+
+def penalty(state: TermState) -> torch.Tensor:
+    return -error(state).abs()
+
+
+def term(function: str, **changes: Any) -> ObservedTerm:
+    values: dict[str, Any] = {"samples": 1, "mean": 0.0, "std": 1.0, "noise": 0.0, "bias": 0.0}
+    return ObservedTerm(function=function, **values | changes)
+
+
+def make(**changes: Any) -> Turn:
+    fields: dict[str, Any] = {
+        "episode_s": 0.5,
+        "scene": {},
+        "start": StartsNearHome(spread=0.2, margin=0.05),
+        "command": {"speed": UniformCommand(lowest=(0.1,), highest=(0.2,))},
+        "observation": {
+            "joints": term("tasks.observations:joint_positions", samples=3, std=0.5),
+            "error": term(f"{__name__}:error", mean=1.0, std=2.0),
+            "off": None,
+        },
+        "privileged": {"force": term("tasks.observations:contact_force", std=1000.0)},
+        "action": JointAction(scale=0.5, mask=True),
+        "reward": {"penalty": RewardTerm(function=f"{__name__}:penalty", weight=2.0)},
+        "curriculum": None,
+        "success": HeldCriterion(function=f"{__name__}:is_turning", share=0.5, after_s=0.1),
+        "termination": {"time_limit": TimeLimit()},
+    }
+    return Turn(**fields | changes)
+
+
+class Stage:
+    """One environment whose first joint turns at the speeds that a test gives."""
+
+    def __init__(self, machine: Machine, **changes: Any) -> None:
+        self.process: Any = make(**changes).build(machine, 1, CPU)
+        self.world = KinematicWorld(machine, 1)
+        self.start = self.process.starts(1, 1)
+        still = self.start["q"][:, None].repeat(1, machine.num_history, 1)
+        self.history = History(q=still, u=torch.zeros_like(still))
+        self.process.reset(torch.ones(1, dtype=torch.bool), self.start)
+        self.first = self.process.observe(self.history)["policy"].clone()
+        self.period_s = machine.period_s
+
+    def turn(self, speed: float) -> Any:
+        q = self.history.q[:, -1].clone()
+        q[:, 0] += speed * self.period_s
+        self.history.push_q(q)
+        return self.process.step(self.history, self.world)
+
+
+@pytest.fixture
+def asked(machine: Machine) -> float:
+    return float(make().build(machine, 1, CPU).starts(1, 1)["command.speed"])
+
+
+def test_it_keeps_the_contract_of_tasks(machine: Machine) -> None:
+    check_task(make(), machine)
+    noisy = term("tasks.observations:tip_position", noise=0.01, bias=0.02, samples=2)
+    check_task(make(observation={"tip": noisy}, privileged={}), machine)
+
+
+def test_the_vector_holds_the_terms_in_order_oldest_sample_first(
+    machine: Machine, asked: float
+) -> None:
+    stage = Stage(machine)
+    lower, upper = torch.tensor(machine.lower[0]), torch.tensor(machine.upper[0])
+
+    def scale(q: torch.Tensor) -> float:
+        return float((2 * q - lower - upper) / (upper - lower) / 0.5)
+
+    q0 = stage.start["q"][0, 0]
+    assert stage.first.shape == (1, 3 * 5 + 1)
+    assert stage.first[0, [0, 5, 10]].tolist() == pytest.approx([scale(q0)] * 3), "at rest before"
+    assert float(stage.first[0, 15]) == pytest.approx((-asked - 1.0) / 2.0)
+    stage.turn(0.3)
+    seen = stage.process.observe(stage.history)
+    assert seen["policy"][0, [0, 5, 10]].tolist() == pytest.approx(
+        [scale(q0), scale(q0), scale(q0 + 0.3 * machine.period_s)]
+    )
+    assert float(seen["policy"][0, 15]) == pytest.approx((0.3 - asked - 1.0) / 2.0, abs=1e-4)
+    assert seen["privileged"].shape == (1, 1)
+
+
+def test_a_bias_stays_for_an_episode_and_noise_does_not(machine: Machine) -> None:
+    torch.manual_seed(0)
+    tip = term("tasks.observations:tip_position", bias=0.02)
+    process: Any = make(observation={"tip": tip}).build(machine, 256, CPU)
+    start, everywhere = process.starts(256, 1), torch.ones(256, dtype=torch.bool)
+    history = History(
+        q=start["q"][:, None].repeat(1, machine.num_history, 1),
+        u=torch.zeros(256, machine.num_history, 5),
+    )
+    true_m = Kinematics(machine).pose(start["q"]).tip_in_base_m
+    errors = []
+    for mask in (everywhere, ~everywhere, everywhere):
+        process.reset(mask, start)
+        errors.append(process.observe(history)["policy"] - true_m)
+    assert torch.equal(errors[0], errors[1]) and not torch.equal(errors[0], errors[2])
+    assert 0.019 < errors[0].abs().max() <= 0.0201 and abs(float(errors[0].mean())) < 0.002
+    noisy = replace(tip, bias=0.0, noise=0.01)
+    process = make(observation={"tip": noisy}).build(machine, 256, CPU)
+    process.reset(everywhere, start)
+    first, again = (process.observe(history)["policy"] - true_m for _ in range(2))
+    assert not torch.equal(first, again) and 0.009 < first.abs().max() <= 0.0101
+
+
+def test_success_needs_its_share_of_the_steps_that_count(machine: Machine, asked: float) -> None:
+    """Ten steps; two are not counted, and of the other eight half must hold."""
+    for num_good, expected in ((3, 0.0), (4, 1.0)):
+        stage = Stage(machine)
+        ends = [stage.turn(asked if 2 <= i < 2 + num_good else 0.0) for i in range(10)]
+        assert stage.process.episode["success_strict"].item() == expected
+        assert stage.process.episode["held_share"].item() == pytest.approx(num_good / 8)
+        assert [bool(end.timed_out) for end in ends] == [False] * 9 + [True]
+    early = Stage(machine)
+    for _ in range(2):
+        early.turn(asked)
+    assert early.process.episode["held_share"].item() == 0.0, "before after_s"
+
+
+def test_success_may_end_the_episode(machine: Machine, asked: float) -> None:
+    ends = {"success": Succeeded(), "time_limit": TimeLimit()}
+    stage = Stage(machine, termination=ends)
+    reasons = [int(stage.turn(asked).reason) for _ in range(6)]
+    assert stage.process.reasons == ("success", "fault", "time_limit")
+    assert reasons == [-1, -1, -1, -1, -1, 0], "four of the counted steps"
+
+
+def test_the_reward_is_the_weighted_sum(machine: Machine, asked: float) -> None:
+    stage = Stage(machine)
+    assert stage.turn(asked + 0.3).reward.item() == pytest.approx(2.0 * -0.3, abs=1e-4)
+    assert stage.process.episode["reward/penalty"].item() == pytest.approx(-0.6, abs=1e-4)
+
+
+def test_exclusive_joints_move_alone_where_their_command_is_the_largest(machine: Machine) -> None:
+    exclusive = torch.tensor(machine.is_exclusive)
+    output = torch.tensor([[0.2, 0.4, 0.0, 0.0, 0.3], [0.2, 0.4, 0.0, 0.0, -3.0]])
+    found = compute_command(JointAction(scale=0.5, mask=True), output, exclusive)
+    assert found.tolist() == [
+        pytest.approx([0.0, 0.2, 0.0, 0.0, 0.0]),
+        pytest.approx([0.1, 0.0, 0.0, 0.0, -1.0]),
+    ]
+    free = compute_command(JointAction(scale=0.5, mask=False), output, exclusive)
+    assert free[1].tolist() == pytest.approx([0.1, 0.2, 0.0, 0.0, -1.0])
+
+
+def test_the_contract_names_each_part_and_gives_the_vector_back(machine: Machine) -> None:
+    stage = Stage(machine)
+    described = json.loads(json.dumps(stage.process.describe()))
+    assert described["order"] == ["joints (3 x 5)", "error (1 x 1)"] and described["size"] == 16
+    assert described["parts"][1]["function"] == f"{__name__}:error"
+    encoder = restore_encoder(machine, described)
+    assert isinstance(encoder, PartsEncoder)
+    vector = stage.first.numpy()
+    samples = encoder.decode_inputs(vector)
+    assert samples["joints"].shape == (1, 3, 5) and samples["error"].shape == (1, 1, 1)
+    np.testing.assert_allclose(encoder.encode(samples), vector, atol=1e-6)
+
+
+def test_the_shipped_policy_has_the_paper_s_encoder(machine: Machine) -> None:
+    contract = json.loads((SHIPPED / "policy.json").read_text())
+    assert isinstance(restore_encoder(machine, contract["observation"]), ObservationEncoder)
+
+
+def test_its_description_gives_the_same_terms_back() -> None:
+    task = make()
+    other = make(
+        observation={"error": term("tasks.observations:commands")},
+        action=JointAction(scale=1.0, mask=False),
+    )
+    assert restore_task(other, describe_task(task)) == task
+
+
+def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(
+    machine: Machine, tmp_path: Path
+) -> None:
+    contract = json.loads((SHIPPED / "policy.json").read_text())
+    contract["observation"] = make().build(machine, 1, CPU).describe()  # type: ignore[attr-defined]
+    (tmp_path / "policy.json").write_text(json.dumps(contract))
+    with pytest.raises(CheckpointError, match=r"asks for joints \(3 x 5\), error \(1 x 1\)"):
+        PolicyBundle(str(tmp_path), machine)
+
+
+def test_a_task_without_a_classical_controller_is_evaluated_without_that_rival(
+    machine: Machine, tmp_path: Path
+) -> None:
+    class Resting:
+        def build(self, loop: Any, seed: int) -> Any:
+            return SimpleNamespace(act=lambda groups: torch.zeros(loop.num_envs, 5))
+
+    session = Session(out=str(tmp_path), seed=0, device="cpu")
+    how = Evaluation(episodes=4, seed=3, num_recorded=1, video=False)
+    policies: Any = {"resting": Resting(), "classical": ClassicalPolicy()}
+    found = evaluate_policies(runs.plant(machine, make()), how, session, policies)
+    assert list(found["policies"]) == list(found["tasks"]) == ["resting"]
+    assert found["terminations"] == {"fault": 0, "time_limit": 4}
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (lambda: term("tasks.observations:nothing"), "observation term .* cannot be found"),
+        (lambda: term("tasks.observations:commands", std=0.0), "std of the observation term"),
+        (lambda: UniformCommand(lowest=(0.0, 1.0), highest=(1.0,)), "as many lowest as highest"),
+        (lambda: make(termination={}), "expected a time limit"),
+        (lambda: make(observation={"error": None}), "expected one term or more"),
+        (lambda: make(episode_s=0.1), "task.episode_s"),
+    ],
+)
+def test_a_bad_value_is_refused(change: Any, told: str) -> None:
+    with pytest.raises(ConfigError, match=told):
+        change()
