@@ -217,7 +217,7 @@ class PerceivedTargets:
         rig = settings.camera.rig
         self._planner = settings.next_view.build(machine, self._mount, rig, settings.arm)
         self._finder = settings.finder.build()
-        self._attended = np.ones(num_envs, bool)
+        self._attended = np.zeros(num_envs, bool)
         self._steps = np.zeros(num_envs, int)
         self._before: np.ndarray | None = None
         self._episodes = np.zeros(num_envs, int)
@@ -241,8 +241,8 @@ class PerceivedTargets:
             self._steps[number] = 0
             self._episodes[number] += 1
 
-    def forget(self) -> None:
-        """Forget all episodes; see `TargetSensor.forget`."""
+    def begin(self) -> None:
+        """Forget all episodes, and look everywhere; see `TargetSensor.begin`."""
         self.watched, self.ended = [], []
         self._episodes[:], self._attended[:] = 0, True
 

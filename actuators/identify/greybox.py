@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from rich.progress import Progress
 from scipy.stats import qmc
 
 from actuators.identify.gauss_newton import (
@@ -28,6 +27,7 @@ from brokk_rl import open_loop, record
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json, write_text
 from brokk_rl.spec import spec
@@ -344,10 +344,8 @@ class _Search:
     def run(self, nominal: np.ndarray, seed: int) -> list[np.ndarray]:
         """Return where each start leads, each `(P, J)`."""
         config, began = self.config, time.monotonic()
-        with Progress(transient=True) as progress:
-            task = progress.add_task(
-                f"{config.name}: search", total=config.starts * config.iterations
-            )
+        total = config.starts * config.iterations
+        with ItemProgress(f"{config.name}: search", total) as progress:
             state = self._left() or {
                 "done": [],
                 "iteration": 0,
@@ -357,10 +355,9 @@ class _Search:
             done, iteration = [np.array(x) for x in state["done"]], state["iteration"]
             waiting = [np.array(x) for x in state["waiting"]]
             while waiting:
-                progress.update(
-                    task,
-                    completed=len(done) * config.iterations + iteration,
-                    description=f"{config.name}: start {len(done) + 1} of {config.starts}, step {iteration + 1}",
+                progress.reach(
+                    len(done) * config.iterations + iteration,
+                    f"{config.name}: start {len(done) + 1} of {config.starts}, step {iteration + 1}",
                 )
                 waiting[0], gain = take_step(self.runs, waiting[0], config.robust)
                 iteration += 1

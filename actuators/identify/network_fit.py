@@ -17,7 +17,6 @@ from typing import Literal
 
 import numpy as np
 import torch
-from rich.progress import Progress, TaskID
 
 from actuators.identify import training_data
 from actuators.identify.training_data import TrainingWindows
@@ -26,6 +25,7 @@ from actuators.models.checkpoint import ResumeFile, hash_recordings
 from actuators.models.network import Coupled, JointNetworks, Mlp
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
 from brokk_rl.rl.execution import capture_graph
 from brokk_rl.spec import spec
@@ -351,10 +351,9 @@ class _NetworkFitting:
         if found:
             log.info("going on with the fit that was interrupted after %.0f s", found["seconds"])
         place = _FitProgress(**(found or {}))
-        with Progress(transient=True) as progress:
-            task = progress.add_task("fit", total=sum(stage.updates for stage in self._stages))
+        with ItemProgress("fit", sum(stage.updates for stage in self._stages)) as progress:
             while place.stage < len(self._stages):
-                self._run_stage(place, interruption, progress, task)
+                self._run_stage(place, interruption, progress)
                 place.stage, place.update, place.stale = place.stage + 1, 0, 0
         return place.seconds
 
@@ -364,7 +363,7 @@ class _NetworkFitting:
         return {**self._descent.averaged.state_dict(), **self._kept}, self._best.tolist()
 
     def _run_stage(
-        self, place: _FitProgress, interruption: ResumeFile, progress: Progress, task: TaskID
+        self, place: _FitProgress, interruption: ResumeFile, progress: ItemProgress
     ) -> None:
         """Run the rest of the stage at `place`."""
         config, stage = self._config, self._stages[place.stage]
@@ -372,10 +371,8 @@ class _NetworkFitting:
             self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device
         )
         update = self._descent.updater(windows, stage.batch, config.still_share, config.busy_share)
-        before, total = (
-            sum(earlier.updates for earlier in self._stages[: place.stage]),
-            progress.tasks[task].total or 1,
-        )
+        before = sum(earlier.updates for earlier in self._stages[: place.stage])
+        total = sum(one.updates for one in self._stages)
         began = saved = time.monotonic()
         spent_s = place.seconds
         while place.update < stage.updates and place.stale < config.patience:
@@ -389,8 +386,9 @@ class _NetworkFitting:
             if place.update % config.validate_every == 0 or place.update == stage.updates:
                 place.stale = 0 if self._validate() else place.stale + 1
                 error = self._best.mean().item()
-                progress.update(task, description=f"fit, {stage.horizon_s:g} s, error {error:.4f}")
-            progress.update(task, completed=number + 1)
+                note = f"free runs of {stage.horizon_s:g} s, error {error:.4f}"
+                progress.reach(number, note=note)
+            progress.reach(number + 1)
             now = time.monotonic()
             place.seconds = spent_s + now - began
             if now - saved > config.save_every_s:

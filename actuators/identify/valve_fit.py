@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 import torch
 import yaml
-from rich.progress import Progress
 from scipy.optimize import least_squares
 
 from actuators.identify.speed_data import PLAYS, SpeedData
@@ -21,6 +20,7 @@ from actuators.models.valve import ValveActuator
 from brokk_rl.errors import ConfigError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
+from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
 from brokk_rl.session import write_text
 from brokk_rl.spec import spec
@@ -74,15 +74,14 @@ class ValveFit:
         data = SpeedData([*train, *validation], machine, np.array(self.actuator.knots))
         data.check_motion()
         dynamics = np.zeros((machine.num_joints, NUM_DYNAMICS))
-        with Progress(transient=True) as progress:
-            task = progress.add_task(f"{self.name}: dead times and lags", total=2)
+        with ItemProgress(f"{self.name}: dead times and lags", 2) as progress:
             known: list[list[np.ndarray]] | None = None
             limits = (self.longest_lag_s, self.iterations)
             for turn in range(2):
                 if turn:
                     known = data.factors(data.statics(dynamics, self.sweeps), dynamics)
                 dynamics = fit_all_dynamics(data, known, dynamics if turn else None, *limits)
-                progress.advance(task)
+                progress.advance()
         fitted = self._spec(data, dynamics)
         # through JSON, which makes lists of tuples as YAML wants them
         facts = json.loads(json.dumps(dataclasses.asdict(fitted)))  # pyright: ignore[reportArgumentType]

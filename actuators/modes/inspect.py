@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
 from actuators.identify import dead_time
@@ -23,6 +22,7 @@ from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.inspection import KINDS, Inspection, InspectionThresholds, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure
+from brokk_rl.progress import track_items
 from brokk_rl.record import Breach, Recording
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json
@@ -112,7 +112,7 @@ class Inspect:
             self._inspect_machine()
             return
         paths = record.find_files(self.inspect.recordings, "recording")
-        inspected = [self._look(path) for path in track(paths, "inspecting", transient=True)]
+        inspected = [self._look(path) for path in track_items(paths, "inspecting")]
         folder = self.session.folder
         result = {
             "schema": 1,

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl.contracts.preview import EffectLimit, EffectPreview, PreviewResult
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.record import Recording
 
 if TYPE_CHECKING:
@@ -52,13 +52,12 @@ def run_preview(
         log.info("no preview: its expected error is known for joints commanded by speed only")
         return None
     try:
-        with Progress(transient=True) as progress:
-            task = progress.add_task("preview", total=1.0)
+        with ItemProgress("preview", SHARE) as progress:
             return preview.assess(
                 motions,
                 machine,
                 generator,
-                lambda doing, done: progress.update(task, description=doing, completed=done),
+                lambda doing, done: progress.reach(done, doing),
                 are_measured,
             )
     except RecordingError as error:

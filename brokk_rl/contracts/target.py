@@ -41,8 +41,11 @@ class TargetSensor(Protocol):
         """Begin new episodes in the environments of `mask`, `(N,)` bool, at the task's starts."""
         ...
 
-    def forget(self) -> None:
-        """Forget all episodes; what follows does not depend on them."""
+    def begin(self) -> None:
+        """Forget all episodes, and sense in all environments from now on; before, nothing is sensed.
+
+        What follows does not depend on what was.
+        """
         ...
 
     def attend(self, mask: np.ndarray) -> None:
@@ -60,7 +63,7 @@ class TargetSensor(Protocol):
         ...
 
     def summarize(self) -> dict[str, Any]:
-        """Return figures of the episodes that ended since `forget`, as JSON data."""
+        """Return figures of the episodes that ended since `begin`, as JSON data."""
         ...
 
 

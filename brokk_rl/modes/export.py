@@ -48,7 +48,7 @@ class Export:
             ConfigError: The task cannot be deployed, or something was asked for that the policy
                 does not have.
         """
-        path = find_checkpoint(Path(self.checkpoint))
+        path = find_checkpoint(Path(self.checkpoint), "checkpoint")
         cpu = torch.device("cpu")
         content = read_checkpoint(path, cpu)
         self.machine.check_fingerprint(content.get("fingerprint", {}), str(path))

@@ -245,7 +245,7 @@ class Train:
             if distributed.read_rank().first:
                 (folder / PROGRESS).unlink(missing_ok=True)
             return None
-        return find_checkpoint(Path(self.resume))
+        return find_checkpoint(Path(self.resume), "resume")
 
 
 def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
@@ -323,8 +323,12 @@ def read_follower(folder: Path) -> dict[str, Any] | None:
     return yaml.safe_load(resolved.read_text()).get("follower") if resolved.exists() else None
 
 
-def find_checkpoint(path: Path) -> Path:
+def find_checkpoint(path: Path, key: str) -> Path:
     """Return `path` if it is a checkpoint, else the newest checkpoint of the run folder `path`.
+
+    Args:
+        path: A checkpoint or a run folder.
+        key: Key of the configuration that gave it, for the message.
 
     Raises:
         CheckpointError: There is none.
@@ -334,6 +338,6 @@ def find_checkpoint(path: Path) -> Path:
     found = list_checkpoints(path) if path.is_dir() else []
     if not found:
         raise CheckpointError(
-            f"resume={path}: there is no checkpoint (model_<iteration>.pt) to go on from"
+            f"{key}={path}: there is no checkpoint (model_<iteration>.pt), nor a run folder with one"
         )
     return found[-1]

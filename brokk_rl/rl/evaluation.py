@@ -99,7 +99,7 @@ def evaluate_policy(
     """
     torch.manual_seed(seed)
     if loop.sensor is not None:
-        loop.sensor.forget()
+        loop.sensor.begin()
     loop.begin(starts)
     loop.statistics()  # forget episodes of before
     num = loop.num_envs

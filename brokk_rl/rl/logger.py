@@ -13,10 +13,9 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from brokk_rl.errors import SimulationError
+from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.rl.tracking import Tracker
 
 PROGRESS = "progress.csv"
@@ -72,23 +71,16 @@ class TrainingLogger:
         self._num_unwritten = 0
         self._last_episode: dict[str, float] = {}
         self._clock = time.perf_counter()
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[figures]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-        )
-        self._bar = Progress(*columns, console=Console(stderr=True), disable=quiet)
-        self._bar_task = self._bar.add_task("training", total=1.0, figures="")
+        self._progress = ItemProgress("training", SHARE, quiet)
 
     def __enter__(self) -> TrainingLogger:
-        self._bar.start()
+        self._progress.__enter__()
+        self._progress.skip(self._share_done(self.env_steps, self.seconds))
         self._clock = time.perf_counter()
         return self
 
     def __exit__(self, *exc: object) -> None:
-        self._bar.stop()
+        self._progress.__exit__(*exc)
         self.flush()
 
     def init_logging_writer(self) -> None:
@@ -152,10 +144,9 @@ class TrainingLogger:
         if self.writer is not None:
             self.writer.log(figures, it)
         rate, success = figures["rate/env_steps_per_s"], figures.get("episode/success_strict", 0.0)
-        self._bar.update(
-            self._bar_task,
-            completed=self._share_done(self.env_steps, self.seconds),
-            figures=f"{rate:,.0f} steps/s  success {success:.2f}",
+        self._progress.reach(
+            self._share_done(self.env_steps, self.seconds),
+            note=f"{rate:,.0f} steps/s, success {success:.2f}",
         )
 
     def flush(self) -> None:

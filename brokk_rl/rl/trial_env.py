@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.progress import track
 
 from brokk_rl.contracts.actuator import Actuator, Effect, FollowerModel
 from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
@@ -14,6 +13,7 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import track_items
 from brokk_rl.record import Recording
 from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.rl.vec_env import ControlLoop
@@ -106,7 +106,7 @@ class SimulatedTrials:
             round(trials.limit_s / machine.period_s),
             np.full(len(trials.q), round(self.settle_s / machine.period_s)),
         )
-        for _ in track(range(steps), "simulated operators at work", transient=True):
+        for _ in track_items(range(steps), "simulated operators at work"):
             groups, _, done, _ = loop.step(policy.act(dict(groups.items())))  # type: ignore[arg-type]
             rows["q"].append(loop.end_q.numpy().copy())
             rows["force_n"].append(loop.end_force_n.numpy().copy())

@@ -18,9 +18,9 @@ from mcap.reader import make_reader
 from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import CompressionType, Writer
-from rich.progress import track
 
 from brokk_rl.errors import RecordingError
+from brokk_rl.progress import track_items
 from brokk_rl.record import find_files
 from brokk_rl.spec import spec
 from deploy.recorder.capture import FACTS, DurableBlfWriter
@@ -298,6 +298,6 @@ class CaptureRecovery:
             raise RecordingError(
                 "recover.input: two captures lie in folders of the same name; recover one after the other"
             )
-        for path, name in track(list(zip(paths, names, strict=True)), "recovering", transient=True):
+        for path, name in track_items(list(zip(paths, names, strict=True)), "recovering"):
             count = KINDS[path.suffix](path, folder / name)
             log.info("%s: %d messages recovered into %s", path, count, folder / name)

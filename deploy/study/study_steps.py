@@ -6,11 +6,10 @@ import logging
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.progress import track
-
 from brokk_rl.contracts.operator import Operator, TrialGround
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import track_items
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from deploy.study import design as designs
@@ -128,9 +127,7 @@ class Steps:
     def _report(self, machine: Machine, session: Session) -> None:
         data = folders.read_study(self._home(session))
         machine.check_fingerprint(data.plan["fingerprint"], f"the study in {data.folder}")
-        found = analyse(
-            data, machine, lambda trials: track(trials, "measuring trials", transient=True)
-        )
+        found = analyse(data, machine, lambda trials: track_items(trials, "measuring trials"))
         path = report.write_report(session.folder, data, found)
         folders.note_report(data.folder, session.folder)
         for remark in found.remarks:

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from rich.progress import track
 
 from brokk_rl.contracts.link import Connection
 from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.progress import track_items
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
@@ -105,7 +105,7 @@ class Twins:
         running = np.ones(num, bool)
         with Crew("deploy.study.twins:make_desks", parts, rows, num) as crew:
             now, found = crew.ask("seen", running), dict[int, Recording]()
-            for _ in track(range(steps), "simulated operators at the twin", transient=True):
+            for _ in track_items(range(steps), "simulated operators at the twin"):
                 # Operators are models over all trials at once, so their inputs are stacked.
                 q = np.stack([now[n][0] for n in range(num)])
                 advice = np.stack([now[n][1] if trials.guided[n] else nothing for n in range(num)])

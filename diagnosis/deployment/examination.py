@@ -173,7 +173,7 @@ def decide_verdict(
     if motion.blamed and not outside:
         joints = ", ".join(motion.blamed)
         return "actuator", (
-            f"{code}Under the recorded commands {joints} moved otherwise than each machine that the "
+            f"{code}Under the recorded commands {joints} moved otherwise than nearly all machines that the "
             "training draws."
         )
     if outside:

@@ -216,7 +216,7 @@ def _add_motion(page: Report, motion: MotionEvidence) -> None:
     page.add_picture(
         _draw_motion(motion),
         f"Departure from the simulator over free runs of {motion.horizon_s:g} s, RMS. Machines of the "
-        "training differ from it too; a joint that departs more than all of them is blamed.",
+        "training differ from it too; a joint that departs by 30 % more than 98 % of them is blamed.",
     )
 
 
@@ -227,7 +227,7 @@ def _draw_motion(motion: MotionEvidence) -> Figure:
     largest = [one.largest for one in motion.joints]
     axis.bar(places - 0.2, [one.recorded for one in motion.joints], 0.36, label="log",
              color=[RED if one.blamed else BLUE for one in motion.joints])  # fmt: skip
-    axis.bar(places + 0.2, largest, 0.36, color=GREY, alpha=0.45, label="training, largest")
+    axis.bar(places + 0.2, largest, 0.36, color=GREY, alpha=0.45, label="training, 98 % of them")
     axis.bar(
         places + 0.2,
         [one.typical for one in motion.joints],

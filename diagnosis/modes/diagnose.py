@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit, CurveFit, Excitation
@@ -17,6 +16,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import use_workers
+from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis import answer, baseline, case, effect_library, pipeline, report, report_checks
@@ -79,13 +79,13 @@ class Diagnose:
         """
         kinds = effect_library.load_effects(self.machine, self.diagnosis.effects)
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
-        with Progress(transient=True) as progress, use_workers(self.diagnosis.workers):
-            task, reached = progress.add_task("fitting the simulator", total=1.0), 0.0
+        with (
+            ItemProgress("fitting the simulator", SHARE) as progress,
+            use_workers(self.diagnosis.workers),
+        ):
 
             def tell(doing: str, done: float) -> None:
-                nonlocal reached
-                reached = max(reached, done)  # a step may be repeated
-                progress.update(task, description=doing, completed=reached)
+                progress.reach(done, doing)
 
             base = self._base(given, kinds, tell)
             generator = self.session.generator("diagnosis")

@@ -111,7 +111,7 @@ def name_policies(folders: Sequence[str]) -> list[str]:
 def print_answer(found: DoctorAnswer, folder: Path) -> None:
     """Show the verdict and the mistakes."""
     console = Console()
-    console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
+    console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False, markup=False)
     if found.findings:
         table = Table("kind", "field", "shows", "rows explained", box=None)
         for one in found.findings:
@@ -123,10 +123,10 @@ def print_answer(found: DoctorAnswer, folder: Path) -> None:
             )
         console.print(table)
         for line in page.describe_remedies(found.findings):
-            console.print(line, highlight=False)
+            console.print(line, highlight=False, markup=False)
     for run in found.runs:
         for line in (*run.cannot_tell, *run.notes):
-            console.print(f"not judged: {line}", highlight=False)
+            console.print(f"not judged: {line}", highlight=False, markup=False)
     console.print(
         f"page: {folder / page.PAGE_FILE}, answer: {folder / doctor.ANSWER_FILE}", highlight=False
     )

@@ -88,10 +88,13 @@ class Why:
         write_json(folder / WHY_FILE, result.to_json())
         console = Console()
         console.print(
-            f"{result.doctor['verdict']}: {result.doctor['reason']}", style="bold", highlight=False
+            f"{result.doctor['verdict']}: {result.doctor['reason']}",
+            style="bold",
+            highlight=False,
+            markup=False,
         )
         for line in result.changes:
-            console.print(line, highlight=False)
+            console.print(line, highlight=False, markup=False)
         console.print(f"page: {self.session.folder / WHY_PAGE}", highlight=False)
 
     def _play(self, stages: Mapping[str, StoryStage]) -> None:

@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 import yaml
-from rich.progress import Progress
 from rich.table import Table
 
 from actuators.excite.schedule import Approach
@@ -366,13 +365,9 @@ class Exam:
         fit = PenaltyFit(
             self.machine, kinds, classes, of_machine, settings.trials, seed, settings.workers
         )
-        with Progress(transient=True) as progress:
-            task = progress.add_task(
-                f"{settings.trials} prices on {len(cases)} cases", total=settings.trials // 2 * 2
-            )
-            found = fit.fitted(
-                cases, settings.prices, settings.certainty, lambda: progress.advance(task)
-            )
+        title = f"{settings.trials} prices on {len(cases)} cases"
+        with ItemProgress(title, settings.trials // 2 * 2) as progress:
+            found = fit.fitted(cases, settings.prices, settings.certainty, progress.advance)
             parts = split_by_family(cases)
             apart = []
             for part in parts:

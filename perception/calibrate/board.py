@@ -9,11 +9,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rich.progress import Progress
 
 from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.calibrate import arm, clock_offset, evaluation, transforms, verdict
@@ -274,10 +274,9 @@ class BoardCalibration:
     def _find_boards(self) -> tuple[list[BoardObservation], list[PoseResidual]]:
         """Return the boards in the frames, and the frames without one."""
         tracker, found, refused = self.board.build(), [], []
-        with self.source.build() as source, Progress(transient=True) as progress:
-            task = progress.add_task("boards", total=source.num_frames)
+        with self.source.build() as source, ItemProgress("boards", source.num_frames) as progress:
             while True:
-                progress.advance(task)
+                progress.advance()
                 try:
                     frame = source.read_latest()
                     if frame is None:

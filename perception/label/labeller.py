@@ -14,10 +14,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from rich.progress import Progress
 
 from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.progress import ItemProgress
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import dataset
@@ -203,8 +203,7 @@ class BlockLabelling:
     def _write(self, cuboid: Cuboid, footage: _Footage, folder: Path) -> None:
         (folder / OVERLAYS).mkdir(parents=True, exist_ok=True)
         poses = footage.poses
-        with Progress(transient=True) as progress:
-            task = progress.add_task("masks", total=len(poses))
+        with ItemProgress("masks", len(poses)) as progress:
             for frame in self._read_frames(set(poses)):
                 name, pose = Path(frame.name).name, poses[frame.name].world_from_camera
                 label, share = self._build_label(cuboid, frame, pose)
@@ -223,7 +222,7 @@ class BlockLabelling:
                     truth = _build_truth(cuboid, frame, pose, outline_px or 0.0, self.noise_per_m)
                     stem = folder / FRAMES / name
                     dataset.write_frame(stem, frame.color, None, label=label, truth=truth)
-                progress.advance(task)
+                progress.advance()
 
     def _find_fault(self, match: OutlineMatch | None, share: float | None) -> str | None:
         """Return why a frame is left out, `None` where it is not."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import math
 import time
@@ -14,7 +15,6 @@ from typing import Any, Literal
 
 import numpy as np
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from brokk_rl.contracts.vision import (
@@ -33,6 +33,7 @@ from brokk_rl.contracts.vision import (
     WholePictureFinder,
 )
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
@@ -196,11 +197,12 @@ class Perceive:
         self, source_spec: FrameSourceSpec
     ) -> Iterator[tuple[str, Frame | None, str | None]]:
         """Yield name, frame and, in place of a frame that cannot be used, the reason."""
-        with source_spec.build() as source, Progress(transient=True) as progress:
+        with contextlib.ExitStack() as stack:
+            source = stack.enter_context(source_spec.build())
             # A live source has no number of frames.
             counts = [source.num_frames, self.perceive.frames]
             total = min((count for count in counts if count is not None), default=None)
-            task = progress.add_task("looking", total=total)
+            progress = stack.enter_context(ItemProgress("looking", total))
             number = 0
             while total is None or number < total:
                 name = f"{number:05d}"
@@ -214,7 +216,7 @@ class Perceive:
                         return
                     yield Path(frame.name).name or name, frame, None
                 number += 1
-                progress.update(task, completed=number)
+                progress.reach(number)
 
     def _write(self, folder: Path, entries: list[FrameEntry], finder: BoreholeFinder) -> None:
         """Write `holes.json`, and `explain.txt` unless only ellipses were asked for."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from rich.progress import Progress
-
 from brokk_rl.errors import ConfigError
+from brokk_rl.progress import track_items
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from perception.render.frame_renderer import FrameRenderer
@@ -62,11 +61,10 @@ class Render:
         numbers = range(self.render.first, self.render.first + self.render.count)
         scenes = self.studio.prepare(folder, self.session, numbers.stop)
         done = 0
-        with Progress(transient=True) as progress:
-            for number in progress.track(numbers, description=f"{len(numbers)} frames"):
-                stem = folder / f"{number:05d}"
-                if self.studio.has(stem):
-                    continue
-                self.studio.shoot(stem, scenes.view(number))
-                done += 1
+        for number in track_items(numbers, "frames"):
+            stem = folder / f"{number:05d}"
+            if self.studio.has(stem):
+                continue
+            self.studio.shoot(stem, scenes.view(number))
+            done += 1
         log.info("%d frames rendered, %d were there; see %s", done, len(numbers) - done, folder)

@@ -10,15 +10,8 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
+from brokk_rl.progress import ItemProgress
 from perception.segment.network import THRESHOLD
 from perception.segment.unet import CHANNELS, UNet
 from perception.segment.window import center_window, cover_picture
@@ -128,16 +121,9 @@ def match_pieces(said: np.ndarray, known: np.ndarray) -> tuple[int, int, int]:
 @contextmanager
 def show_progress(done: int, total: int) -> Iterator[Callable[[], None]]:
     """Show the progress of a training; yield the function that advances it by one update."""
-    columns = (
-        TextColumn("training"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, transient=True) as bar:
-        task = bar.add_task("training", total=total, completed=done)
-        yield lambda: bar.advance(task)
+    with ItemProgress("training", total) as progress:
+        progress.skip(done)
+        yield progress.advance
 
 
 def draw_samples(

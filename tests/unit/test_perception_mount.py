@@ -17,6 +17,7 @@ from perception.mount.next_view import HoleBelief
 from perception.mount.occlusion import Capsules, compute_visible_share, sample_circle
 from perception.render.scene_ranges import view_from
 from perception.render.stereo_camera import place_rig
+from perception.target_sensor import WatchedHole
 
 RIG = option("rig", "zed_2i_1080p")
 ARM = option("target", "perceived").arm
@@ -186,3 +187,42 @@ def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) ->
         away = HOLE_M - camera_m
         bearing = np.arctan2(away[1], away[0]) - np.arctan2(ahead[1], ahead[0])
         assert abs(np.angle(np.exp(1j * bearing))) < 0.5
+
+
+def watch(machine: Machine) -> WatchedHole:
+    settings = replace(option("target", "perceived"), delay_s=0.35, hint_m=0.03)
+    mount = settings.mount.build(machine)
+    scene = np.array([*HOLE_M, 0.0, 1.0, 0.05])
+    return WatchedHole(settings, mount, scene, np.random.default_rng(0))
+
+
+def detect(center_m: np.ndarray) -> HolePose:
+    cov = 0.001**2 * np.eye(3)
+    return HolePose(center_m, UP, 0.05, cov, np.zeros((3, 3)), "base", 0.9, 0.0)
+
+
+def test_what_a_picture_shows_is_known_after_the_delay_and_near_the_pointed_place_alone(
+    machine: Machine,
+) -> None:
+    eye = watch(machine)
+    assert 0.0 < np.linalg.norm(eye.center_m - HOLE_M) < 0.15
+    eye.wait_for([detect(HOLE_M + np.array([0.4, 0.0, 0.0]))], 0.0)
+    eye.learn(0.4)
+    assert eye.hole is None
+    eye.wait_for([detect(HOLE_M)], 1.0)
+    eye.learn(1.3)
+    assert eye.hole is None
+    eye.learn(1.35)
+    np.testing.assert_allclose(eye.center_m, HOLE_M)
+    assert [frame["seen"] for frame in eye.history] == [True, True]
+
+
+def test_a_picture_that_was_not_taken_is_no_miss(machine: Machine) -> None:
+    eye = watch(machine)
+    for t_s, holes in ((0.0, ()), (0.5, None), (1.0, ())):
+        eye.wait_for(holes, t_s)
+    eye.learn(2.0)
+    assert eye.num_missed == 2
+    eye.wait_for([detect(HOLE_M)], 2.0)
+    eye.learn(3.0)
+    assert eye.num_missed == 0

@@ -15,11 +15,13 @@ import pytest
 from composed import names, option
 
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.session import Session
 from perception import dataset
-from perception.render.block_sampler import build_frame
+from perception.render.block_sampler import build_frame, draw_block
 from perception.render.drilled_block import Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.materials import Material
+from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
@@ -62,7 +64,12 @@ def kind(name: str) -> SceneRanges:
 
 def studio(name: str, rig: StereoRig, depth: str = "exact") -> FrameRenderer:
     return FrameRenderer(
-        rig=rig, scene=kind(name), stereo=option("stereo", "sgbm"), depth=depth, pair=True
+        rig=rig,
+        scene=kind(name),
+        stereo=option("stereo", "sgbm"),
+        depth=depth,
+        pair=True,
+        surfaces=NO_PHOTOGRAPHS,
     )  # type: ignore[arg-type]
 
 
@@ -268,17 +275,40 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Stereo
     face = cv2.erode((views[0].solid == 0).astype(np.uint8), np.ones((21, 21))).astype(bool)
     face &= ~cv2.dilate(views[0].mouth.astype(np.uint8), np.ones((21, 21))).astype(bool)
     error, known = {}, {}
-    for name, matcher in (("refined", stereo), ("plain", replace(stereo, refinements=0))):
+    half = replace(stereo, shrink=2)
+    for name, matcher in (
+        ("refined", stereo),
+        ("plain", replace(stereo, refinements=0)),
+        ("half", half),
+    ):
         depth = matcher.depth_m(left, right, 1056.0, 0.12)
         wrong = (1056.0 * 0.12 * (1 / depth - 1 / views[0].depth_m))[face]
         known[name], error[name] = np.isfinite(wrong).mean(), wrong[np.isfinite(wrong)]
-    assert known["refined"] > 0.9
+    assert known["refined"] > 0.9 and known["half"] > 0.9
+    assert abs(np.median(error["half"])) < 0.04
     assert abs(np.median(error["refined"])) < 0.02 < abs(np.median(error["plain"]))
     spread = 1.48 * np.median(np.abs(error["refined"] - np.median(error["refined"])))
     assert 0.03 < spread < 0.35  # 0.29 px on real pairs with dense truth
     assert np.isnan(
         stereo.depth_m(left, right, 1056.0, 0.12)[:, :20]
     ).all()  # what the right camera does not see
+
+
+def test_chips_break_the_rim_and_dents_lie_beside_it() -> None:
+    ranges = kind("struck").block
+    target, normal = np.array([0.0, 0.0, 2.0]), np.array([0.0, -0.5, -0.9])
+    for seed in range(5):
+        block = draw_block(ranges, target, normal, 0.0, np.random.default_rng(seed))
+        (hole,) = block.holes
+        away = np.array([np.linalg.norm((one.center_m - hole.center_m)[:2]) for one in block.chips])
+        # a ball's radius on the face follows from its height above it
+        height = np.array([(one.center_m - hole.center_m)[2] for one in block.chips])
+        wide = np.sqrt(np.array([one.radius_m for one in block.chips]) ** 2 - height**2)
+        on_rim = np.isclose(away, hole.radius_m)
+        assert ranges.chips[0] <= on_rim.sum() <= ranges.chips[1]
+        assert ranges.dents[0] <= (~on_rim).sum() <= ranges.dents[1]
+        assert (away - wide)[~on_rim].min() >= hole.radius_m - 1e-9, "a dent leaves the rim whole"
+        assert (wide[on_rim] <= ranges.chip_m[1] + 1e-9).all()
 
 
 def test_dust_takes_contrast_as_it_says() -> None:
@@ -309,10 +339,14 @@ def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
 
 
 @pytest.mark.parametrize("name", names("scene"))
-def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: StereoRig) -> None:
-    chance = np.random.default_rng(3)
-    for _ in range(1 if name != "varied" else 3):
-        shot = studio(name, rig).shot(compose_scene(kind(name), rig, chance), chance)
+def test_truth_and_masks_agree_in_every_kind_of_scene(
+    name: str, rig: StereoRig, tmp_path: Path
+) -> None:
+    maker = studio(name, rig)
+    scenes = maker.prepare(tmp_path / "frames", Session(out=".", seed=3, device="cpu"), 1)
+    for number in range(1 if name != "varied" else 3):
+        view = scenes.view(number)
+        shot = maker.shot(view.scene, view.generator, view.base_from_camera)
         assert shot.color.shape == shot.right.shape == (270, 480, 3)
         assert (
             not (shot.label.hole_mask & ~shot.label.block).any()
@@ -321,7 +355,7 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(name: str, rig: StereoRig)
         if not any(hole.hidden < 1 for hole in shot.truth.holes):
             assert not shot.label.hole_mask.any()
         for hole in shot.truth.holes[:1]:
-            center, base = np.array(hole.center_m), rig.base_from_camera
+            center, base = np.array(hole.center_m), view.base_from_camera
             assert np.array(hole.axis) @ center < 0  # out of the hole, towards the camera
             np.testing.assert_allclose(
                 base[:3, :3] @ center + base[:3, 3], hole.center_in_base_m, atol=1e-9

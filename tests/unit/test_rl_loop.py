@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import training as runs
 from composed import option
 from torch._dynamo.exc import BackendCompilerFailed
 
+from brokk_rl.contracts.target import TargetReading
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -292,3 +295,52 @@ def test_a_task_that_cannot_bring_its_starts_near_says_so(machine: Machine) -> N
     loop.task = object()  # type: ignore[assignment]
     with pytest.raises(ConfigError, match=r"rl\.near_starts: the task \(object\) has no method"):
         loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3)), 1)
+
+
+class _Pointing:
+    """A sensor of two machines: the first knows a place 0.3 m beside its hole, the second nothing."""
+
+    def __init__(self) -> None:
+        self.shift_m = np.array([0.0, 0.3, 0.0])
+        self.target_m = np.zeros((2, 3))
+        self.planned, self.num_reads = np.zeros(0), 0
+
+    def reset(self, mask: np.ndarray, start: dict[str, np.ndarray]) -> None:
+        self.target_m[mask] = start["target_m"][mask] + self.shift_m
+
+    def begin(self) -> None: ...
+
+    def attend(self, mask: np.ndarray) -> None: ...
+
+    def read(self, q: np.ndarray, measured_q: np.ndarray, plan: Any) -> TargetReading:
+        self.num_reads += 1
+        if self.num_reads == 100:
+            self.planned = plan(self.target_m, 13, 1.0)
+            np.testing.assert_array_equal(self.planned[:, 0], measured_q)
+        return TargetReading(self.target_m, np.array([True, False]))
+
+    def summarize(self) -> dict[str, Any]:
+        return {}
+
+
+def test_a_policy_goes_where_a_sensor_sees_the_hole_and_rests_where_it_sees_none(
+    machine: Machine,
+) -> None:
+    sensor = _Pointing()
+    spec: Any = SimpleNamespace(sense=lambda machine, num_envs, seed: sensor)
+    task = replace(option("task", "borehole_insertion"), episode_s=60.0)
+    torch.manual_seed(0)
+    loop = replace(runs.plant(machine, task), target=spec).build(CPU, 2, 2, 5)
+    policy, groups = ClassicalPolicy().build(loop, 0), loop.get_observations()
+    begun = loop.history.q[:, -1].clone()
+    for _ in range(150):
+        groups, *_ = loop.step(policy.act(dict(groups.items())))  # type: ignore[arg-type]
+    tip_m = Kinematics(machine, CPU).pose(loop.history.q[:, -1]).tip_in_base_m.numpy()
+    target_m = loop.task.state["start.target_m"].numpy()
+    # the block does not lie where the sensor believes it: the tool stays over it
+    np.testing.assert_allclose(tip_m[0, :2], target_m[0, :2] + sensor.shift_m[:2], atol=0.1)
+    assert torch.equal(loop.history.u[1], torch.zeros_like(loop.history.u[1]))
+    np.testing.assert_allclose(loop.history.q[1, -1], begun[1], atol=0.01)
+    # the plan ends where the sensor believes the hole
+    end_m = Kinematics(machine, CPU).pose(torch.as_tensor(sensor.planned[:, -1])).tip_in_base_m
+    np.testing.assert_allclose(end_m[:, :2], sensor.target_m[:, :2], atol=0.05)

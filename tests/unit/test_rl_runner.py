@@ -80,7 +80,7 @@ def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None
         "model_20.pt",
         "model_100.pt",
     ]
-    assert find_checkpoint(tmp_path).name == "model_100.pt"
+    assert find_checkpoint(tmp_path, "resume").name == "model_100.pt"
 
 
 @pytest.mark.parametrize(
@@ -223,9 +223,9 @@ def test_a_refused_checkpoint_leaves_the_progress_alone(checkpoint: Path, machin
 def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path, machine: Machine) -> None:
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(CheckpointError, match="there is no checkpoint"):
-            find_checkpoint(path)
+            find_checkpoint(path, "resume")
     with pytest.raises(CheckpointError, match="there is no checkpoint"):
-        read_checkpoint(find_checkpoint(tmp_path / "model_3.pt"), "cpu")
+        read_checkpoint(find_checkpoint(tmp_path / "model_3.pt", "resume"), "cpu")
 
 
 def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: Path) -> None:
