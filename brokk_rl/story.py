@@ -171,7 +171,7 @@ def add_stages(page: Report, folder: Path, titles: Mapping[str, str]) -> None:
         if record is None:
             rows.append([name, title, None])
             continue
-        seconds = _measure_seconds(record)
+        seconds = measure_seconds(record)
         whole_s += seconds or 0.0
         rows.append(
             [
@@ -189,7 +189,8 @@ def add_stages(page: Report, folder: Path, titles: Mapping[str, str]) -> None:
         )
 
 
-def _measure_seconds(record: Mapping[str, Any]) -> float | None:
+def measure_seconds(record: Mapping[str, Any]) -> float | None:
+    """Return the duration of a stage by its `session.json`; `None` where it has not ended."""
     if not record.get("ended"):
         return None
     begun, ended = (datetime.fromisoformat(record[key]) for key in ("started", "ended"))

@@ -28,6 +28,7 @@ from perception.mount.mounts import MountError
 from perception.mount.next_view import HoleBelief
 from perception.mount.occlusion import Capsules
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.scene_ranges import Scene, view_from
 from perception.render.scene_sampler import compose_scene
 from perception.render.solids import Box, Cylinder
@@ -119,7 +120,12 @@ class Camera:
         rig = place_rig(self._rig, pose, (int(corner[0]), int(corner[1])), WINDOW_PX)
         scene = view_from(self._scene, np.linalg.inv(pose) @ self._rig.base_from_camera)
         studio = FrameRenderer(
-            rig=rig, scene=self._kind, stereo=self._stereo, depth="matched", pair=True
+            rig=rig,
+            scene=self._kind,
+            stereo=self._stereo,
+            surfaces=NO_PHOTOGRAPHS,
+            depth="matched",
+            pair=True,
         )
         frame = make_frame(studio.shot(scene, generator), rig, 0.0)
         try:

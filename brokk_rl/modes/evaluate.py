@@ -13,7 +13,7 @@ from rich.table import Table
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.target import TargetSensorSpec
-from brokk_rl.contracts.task import Policy, Task
+from brokk_rl.contracts.task import Policy, Task, supports_classical_control
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -133,7 +133,6 @@ def evaluate_policies(
     starts: Starts | None = None
     evaluated: dict[str, PolicyEvaluation] = {}
     for name, policy in policies.items():
-        log.info("evaluating %s over %d episodes", name, evaluation.episodes)
         key = descriptions[name].fingerprint()
         if key not in loops:
             # effects and followers draw from it, too
@@ -143,6 +142,14 @@ def evaluate_policies(
             loop.capture()
             loops[key] = loop, loop.state_dict()
         loop, fresh = loops[key]
+        is_rival = evaluated and isinstance(policy, ClassicalPolicy)
+        process: object = loop.task
+        if is_rival and not supports_classical_control(process):
+            log.info(
+                "the task (%s) has no classical controller to compare with", descriptions[name].name
+            )
+            continue
+        log.info("evaluating %s over %d episodes", name, evaluation.episodes)
         starts = starts or {key: value.clone() for key, value in loop.starts.items()}
         loop.load_state_dict(fresh)  # every policy meets the same machines and persons
         actor = policy.build(loop, session.seed)
@@ -159,7 +166,7 @@ def evaluate_policies(
         "follower": name_spec(config.follower),
         "policy": first,
         "task": descriptions[first].to_json(),
-        "tasks": {name: found.fingerprint() for name, found in descriptions.items()},
+        "tasks": {name: descriptions[name].fingerprint() for name in evaluated},
         "policies": table,
     }
     write_json(session.folder / "evaluation.json", results)

@@ -24,7 +24,7 @@ import numpy as np
 import torch
 
 from brokk_rl.errors import StorageError
-from brokk_rl.kinematics import Kinematics
+from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.posed_scene import SHOWN_GROUPS, PosedScene
@@ -50,6 +50,9 @@ MARK_RADIUS_M, MARK_RGBA = 0.06, (0.1, 0.75, 0.35, 0.8)
 """Ball that marks a target without a block: seen beside the arm, smaller than the breaker."""
 TARGET_VIEW = (2.6, 130.0, -20.0)
 """Close-up of such a target: distance in m, azimuth and elevation in degrees. Chosen by eye."""
+TOOL_VIEW = (1.2, 30.0, -30.0)
+"""The same for the tool of a task without target: along the arm from above, so that what stands
+before the tool does not hide it."""
 VIDEO_QUALITY = 7
 """Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
 SCHEMATIC_DPI = 100
@@ -317,18 +320,22 @@ class SceneRenderer:
 
 
 def draw_rendered(job: RenderJob) -> DrawFrames:
-    """Return a function that renders steps: overview, close-up of the target, commands."""
+    """Return a function that renders steps: overview, close-up of target or tool, commands."""
     from PIL import Image, ImageDraw, ImageFont
 
     lines, font, (width, height) = write_captions(job), ImageFont.load_default(FONT_SIZE), SIZE
     split = width - CLOSE_WIDTH
     outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
-    close = "close" if job.mark_m is None else _look_at(job.mark_m)
+    fixed = None if job.mark_m is None else _look_at(job.mark_m, TARGET_VIEW)
 
     def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
         with SceneRenderer(job.machine, job.objects) as renderer:
             for step in steps:
                 renderer.set_pose(job.q[step], job.scene)
+                close = "close" if job.has_block else fixed
+                if close is None:  # neither a block nor a target: the tool
+                    tool = compute_tool_kinematics(job.machine, job.q[step])
+                    close = _look_at(tool.tip_in_base_m, TOOL_VIEW)
                 views = (
                     renderer.render("overview", split, height, job.mark_m),
                     renderer.render(close, CLOSE_WIDTH, height, job.mark_m),
@@ -343,11 +350,11 @@ def draw_rendered(job: RenderJob) -> DrawFrames:
     return draw
 
 
-def _look_at(target_m: np.ndarray) -> mujoco.MjvCamera:
-    """Return a camera that looks at a target from beside the arm."""
+def _look_at(point_m: np.ndarray, view: tuple[float, float, float]) -> mujoco.MjvCamera:
+    """Return a camera that looks at a point from a distance (m), azimuth and elevation (degrees)."""
     camera = mujoco.MjvCamera()
-    camera.lookat[:] = target_m
-    camera.distance, camera.azimuth, camera.elevation = TARGET_VIEW
+    camera.lookat[:] = point_m
+    camera.distance, camera.azimuth, camera.elevation = view
     return camera
 
 
@@ -356,11 +363,13 @@ def _draw_command_bars(
 ) -> None:
     """Draw one bar per joint in the lower left corner, from the middle to the command."""
     outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
+    left = 28 + max(32, *(int(pen.textlength(name, font=font)) for name in names))
     for row, (name, value) in enumerate(zip(names, u, strict=True)):
         y = height - 20 - 24 * (len(names) - row)
         pen.text((16, y - 4), name, fill="white", font=font, **outline)
-        pen.rectangle((60, y, 200, y + 14), fill=(60, 60, 60))
-        ends = sorted((130.0, 130.0 + 70.0 * float(np.clip(value, -1.0, 1.0))))
+        pen.rectangle((left, y, left + 140, y + 14), fill=(60, 60, 60))
+        middle = left + 70.0
+        ends = sorted((middle, middle + 70.0 * float(np.clip(value, -1.0, 1.0))))
         pen.rectangle((ends[0], y + 1, ends[1], y + 13), fill=(250, 170, 10))
 
 

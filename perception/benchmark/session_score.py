@@ -117,7 +117,7 @@ def score_holes(
         best = min(left, key=lambda one: _measure_away(one, center_m), default=None)
         if best is None or _measure_away(best, center_m) > NEAR_M:
             continue
-        left.remove(best)
+        left = [one for one in left if one is not best]
         away = np.array(best["center_m"]) - center_m
         cov = np.array(best["cov_m2"])
         errors.append(

@@ -27,6 +27,8 @@ SCALE_STD = 0.002
 """Prior of the part that grows with the disparity: 0.2 mm of 10 cm on paper; chosen by hand."""
 ROUNDS, TUKEY = 5, 4.685
 """Rounds of reweighting, and Tukey's biweight, 95 % efficient with Gaussian noise."""
+PLACE = 0.02
+"""Views that differ by less, in x/z, y/z and relative distance, are of one rest; by hand."""
 FLOOR_PX = 0.02
 """Least standard deviation of a view's mean: corners share a bias of the detector; by hand."""
 
@@ -117,8 +119,10 @@ def estimate_disparity_error(views: list[BoardDisparity]) -> DisparityError | No
     """Return the error that views of a board at several distances agree on.
 
     Returns:
-        `None` for fewer than `MIN_VIEWS` views, or for a board that is always as far away.
+        `None` for fewer than `MIN_VIEWS` places of the board, or for one that is always as far
+        away.
     """
+    views = _merge_rests(views)
     if len(views) < MIN_VIEWS:
         return None
     expected = np.array([one.expected_px for one in views])
@@ -140,6 +144,27 @@ def estimate_disparity_error(views: list[BoardDisparity]) -> DisparityError | No
     std_px = float(np.sqrt(np.diag(np.linalg.inv(information))[:3].max()))
     constant, across, down, scale = (float(one) for one in solution)
     return DisparityError((constant, across, down), std_px, scale, len(views))
+
+
+def _merge_rests(views: list[BoardDisparity]) -> list[BoardDisparity]:
+    """Return one view for each place of the board: those of a rest share their errors."""
+    rests: list[list[BoardDisparity]] = []
+    for view in views:
+        last = rests[-1][0] if rests else None
+        if last is not None and _is_same_place(view, last):
+            rests[-1].append(view)
+        else:
+            rests.append([view])
+    merged = []
+    for rest in rests:
+        numbers = np.mean([(one.excess_px, one.expected_px, one.x, one.y) for one in rest], 0)
+        merged.append(BoardDisparity(*(float(one) for one in numbers)))
+    return merged
+
+
+def _is_same_place(one: BoardDisparity, other: BoardDisparity) -> bool:
+    aside = max(abs(one.x - other.x), abs(one.y - other.y))
+    return aside < PLACE and abs(one.expected_px / other.expected_px - 1.0) < PLACE
 
 
 def correct_depth(

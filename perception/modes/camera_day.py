@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from brokk_rl import plot, story
 from brokk_rl.errors import ConfigError
 from brokk_rl.report import Report, Tone
-from brokk_rl.session import Session
+from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.spec import spec
 from perception import dataset
 from perception.benchmark.session_score import SessionScore, score_session
@@ -28,7 +28,7 @@ from perception.modes.calibrate import FILE as CALIBRATION
 from perception.render.board_on_arm import TRUTH
 from perception.render.stereo_camera import StereoRig
 
-DAY_FILE = "camera_day.html"
+DAY_FILE, FIGURES_FILE = "camera_day.html", "camera_day.json"
 GROUPS = ("rig",)
 """Groups that stages can take from the day."""
 PICTURE_PX = 900
@@ -83,7 +83,7 @@ class CameraDay:
 
 
 def write_day(folder: Path, titles: Mapping[str, str]) -> None:
-    """Write `camera_day.html`.
+    """Write `camera_day.html`, and its figures as `camera_day.json`.
 
     Args:
         folder: Run folder of the day, with one folder a stage.
@@ -107,6 +107,29 @@ def write_day(folder: Path, titles: Mapping[str, str]) -> None:
     _add_holes(page, folder, scores)
     story.add_stages(page, folder, titles)
     page.write(folder / DAY_FILE)
+    write_json(folder / FIGURES_FILE, _collect_figures(folder, scores, list(titles)))
+
+
+def _collect_figures(
+    folder: Path, scores: Mapping[str, SessionScore], stages: list[str]
+) -> dict[str, Any]:
+    """Return the figures of the page as plain data: holes of each stage, and minutes."""
+    rows = {}
+    for name, score in scores.items():
+        rows[name] = {
+            "holes": score.num_holes,
+            "found": score.num_found,
+            "false": score.num_false,
+            "position_m_median": score.compute_position_m(50),
+            "position_m_p95": score.compute_position_m(95),
+            "inside_3_sigma": score.count_inside(3.0),
+        }
+    seconds = {}
+    for name in stages:
+        record = read_record(folder / name)
+        if record is not None:
+            seconds[name] = story.measure_seconds(record)
+    return {"schema": 1, "perceived": rows, "stage_s": seconds}
 
 
 def _summarize_day(scores: Mapping[str, SessionScore]) -> tuple[str, Tone]:

@@ -23,7 +23,7 @@ from perception.render.materials import Material
 from perception.render.printed_board import build_plate
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import add_surroundings
-from perception.render.scene_sequence import StagedScene, build_pose, move_solids
+from perception.render.scene_sequence import StagedScene, build_pose
 from perception.render.solids import Cylinder, Solid, SolidPose
 from perception.render.stereo_camera import StereoRig, measure_disparity_error
 
@@ -118,7 +118,7 @@ class BoardScenes:
         settings, generator = self._settings, self._session.generator(f"scene/{number}")
         q = self._read_joints(number / settings.rate_hz + settings.clock_s)
         plate = build_plate(settings.board, self._compute_board(q), settings.margin_m)
-        solids = (*move_solids(self._draw_arm(q), self._camera_from_base), plate)
+        solids = (*self._draw_arm(q), plate)
         # The surroundings are drawn by the same numbers for each frame.
         scenery = self._session.generator("scene/surroundings")
         target = self._compute_board(np.array(settings.middle))[:3, 3]
@@ -209,9 +209,10 @@ class BoardScenes:
         )
 
     def _draw_arm(self, q: np.ndarray) -> list[Solid]:
-        """Return links and tool as cylinders, base frame."""
+        """Return links and tool as cylinders, camera coordinates."""
         tool = compute_tool_kinematics(self._settings.machine, q[None])
-        points = [*tool.joints_in_base_m[0], tool.tip_in_base_m[0]]
+        in_base_m = np.stack([*tool.joints_in_base_m[0], tool.tip_in_base_m[0]])
+        points = in_base_m @ self._camera_from_base[:3, :3].T + self._camera_from_base[:3, 3]
         solids: list[Solid] = []
         for number, (begin, end) in enumerate(itertools.pairwise(points)):
             along = end - begin

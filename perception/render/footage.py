@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -13,12 +15,12 @@ from brokk_rl.spec import spec
 from perception.label.camera_pose import Charuco
 from perception.render.drilled_block import DrilledBlock
 from perception.render.printed_board import PrintedPlate, build_plate
-from perception.render.scene_ranges import Range, Scene, SceneRanges, draw_uniform
+from perception.render.scene_ranges import Range, SceneRanges, draw_uniform, view_from
 from perception.render.scene_sampler import compose_scene, compute_hidden_share
-from perception.render.scene_sequence import StagedScene, build_pose, move_light, move_solids
+from perception.render.scene_sequence import StagedScene, build_pose
 from perception.render.stereo_camera import StereoRig
 
-CAMERAS, PLACING = "cameras.yaml", "placing.yaml"
+CAMERAS, PLACING, MEASURED = "cameras.yaml", "placing.yaml", "measured.yaml"
 TRIES = 2000
 """Camera places that are drawn until one shows block and board."""
 BORDER_PX = 8
@@ -97,9 +99,10 @@ class FootageScenes:
         generator = self._session.generator(f"scene/{number}")
         first_from_camera = self._draw_place(generator)
         motion = np.linalg.inv(first_from_camera)
-        scene = self._scene
-        solids = move_solids((*scene.solids, self._plate), motion)
-        block = solids[scene.solids.index(self._block)]
+        staged = replace(self._scene, solids=(*self._scene.solids, self._plate))
+        scene = view_from(staged, motion)
+        block = scene.block
+        assert block is not None
         to_face = block.pose.center_m - motion[:3, 3]
         conditions = scene.conditions | {
             "distance_m": float(np.linalg.norm(motion[:3, :3] @ self._aim + motion[:3, 3])),
@@ -108,20 +111,18 @@ class FootageScenes:
             ),
             "arm": 0.0,
         }
-        moved = Scene(
-            solids=solids,
-            block=block,
-            light=move_light(scene.light, motion),
-            exposure=scene.exposure,
-            sky=scene.sky,
-            hidden=tuple(compute_hidden_share(solids, block, hole) for hole in block.holes),
-            hidden_discs=tuple(compute_hidden_share(solids, block, disc) for disc in block.discs),
+        moved = replace(
+            scene,
+            hidden=tuple(compute_hidden_share(scene.solids, block, hole) for hole in block.holes),
+            hidden_discs=tuple(
+                compute_hidden_share(scene.solids, block, disc) for disc in block.discs
+            ),
             conditions=conditions,
         )
         return StagedScene(moved, self._rig.base_from_camera @ first_from_camera, generator)
 
     def write_records(self, folder: Path, count: int) -> None:
-        """Write true camera poses, and clicks in the first frame, as `mode=label` takes them."""
+        """Write true camera poses, clicks for `mode=label`, and holes on the board for `mode=score_camera`."""
         poses = {}
         for number in range(count):
             poses[f"{number:05d}"] = self.view(number).base_from_camera.tolist()
@@ -142,6 +143,27 @@ class FootageScenes:
             "mouths": mouths,
         }
         write_text(folder / PLACING, yaml.safe_dump(placing, sort_keys=False))
+        write_text(folder / MEASURED, yaml.safe_dump(self._measure_holes(), sort_keys=False))
+
+    def _measure_holes(self) -> dict[str, Any]:
+        """Return the holes in the board's frame, as a caliper would measure them."""
+        board, plate = self._settings.board, self._plate
+        size_m = np.array([board.columns, board.rows]) * board.square_m
+        corner = plate.pose.point(np.array([*(-size_m / 2), -plate.half_m[2]]))
+        holes = []
+        for number, hole in enumerate(self._block.holes, 1):
+            center = self._block.pose.point(hole.center_m)
+            local = (center - corner) @ plate.pose.rotation
+            axis = self._block.pose.rotation @ hole.outward @ plate.pose.rotation
+            holes.append(
+                {
+                    "name": f"hole {number}",
+                    "center_m": local.round(6).tolist(),
+                    "axis": axis.round(6).tolist(),
+                    "radius_m": float(hole.radius_m),
+                }
+            )
+        return {"std_m": 0.0, "holes": holes}
 
     def _click(self, points_m: np.ndarray, generator: np.random.Generator) -> list[list[float]]:
         """Return where a person clicks who misses points of the first frame by `click_px`."""

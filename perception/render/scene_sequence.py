@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from brokk_rl.session import Session
-from perception.render.ray_tracer import Light
 from perception.render.scene_ranges import Scene, SceneRanges
 from perception.render.scene_sampler import compose_scene
-from perception.render.solids import SolidPose
 from perception.render.stereo_camera import StereoRig
 
 
@@ -81,24 +78,3 @@ def build_pose(rotation: np.ndarray, shift_m: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = rotation, shift_m
     return pose
-
-
-def move_solids(solids: Sequence[Any], motion: np.ndarray) -> tuple[Any, ...]:
-    """Return solids in other coordinates.
-
-    Args:
-        solids: They have a `pose`.
-        motion: From the old coordinates to the new, `(4, 4)`.
-    """
-    moved = []
-    for solid in solids:
-        rotation = motion[:3, :3] @ solid.pose.rotation
-        center_m = motion[:3, :3] @ solid.pose.center_m + motion[:3, 3]
-        moved.append(replace(solid, pose=SolidPose(rotation, center_m)))
-    return tuple(moved)
-
-
-def move_light(light: Light, motion: np.ndarray) -> Light:
-    """Return a light in other coordinates; see `move_solids`."""
-    to_sun = motion[:3, :3] @ light.to_sun
-    return replace(light, to_sun=to_sun, shade=move_solids(light.shade, motion))

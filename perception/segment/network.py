@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from brokk_rl.contracts.vision import Masks
@@ -30,6 +31,8 @@ THRESHOLD = 0.5
 SMALLEST_PIECE = 0.2
 """Least piece of a partly hidden block, as a part of the largest one, that the second run must
 show. Chosen by hand."""
+LEAST_BLOCK = 0.003
+"""Least piece of a block, as a part of the picture; that of `depth_plane`, where it is `min_area`."""
 MAX_CLOSE_RUNS, STABLE = 2, 0.1
 """Largest number of runs on the block alone; change of its box, as a part of its size, below which
 no other one follows. Chosen by hand."""
@@ -47,11 +50,14 @@ class Onnx:
         weights: An ONNX file of `mode=train_perception`: a path, or the name of one that ships with
             the package.
         margin: Room around the block in the second run, as a part of its box; `null`: one run.
+        gate: Another such file, which learned from many pictures without a block: a piece of block
+            that it does not see is dropped; `null` for none.
         threads: CPU threads.
     """
 
     weights: str
     margin: float | None
+    gate: str | None
     threads: int
 
     def check(self) -> None:
@@ -65,6 +71,15 @@ class Onnx:
         Raises:
             CheckpointError: there is no such network, or it is none of ours.
         """
+        gate = None if self.gate is None else self._open_network(self.gate, None)
+        return self._open_network(self.weights, gate)
+
+    def _open_network(self, weights: str, gate: NetworkSegmenter | None) -> NetworkSegmenter:
+        """Return one network.
+
+        Raises:
+            CheckpointError: see `build`.
+        """
         import onnxruntime
         from onnxruntime.capi.onnxruntime_pybind11_state import (
             Fail,
@@ -73,7 +88,7 @@ class Onnx:
             NoSuchFile,
         )
 
-        path = find_weights(self.weights)
+        path = find_weights(weights)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = self.threads
         try:
@@ -94,7 +109,7 @@ class Onnx:
         def infer(picture: np.ndarray) -> np.ndarray:
             return session.run(None, {"picture": picture[None]})[0][0]  # type: ignore[index]
 
-        return NetworkSegmenter(infer, size_px, self.margin)
+        return NetworkSegmenter(infer, size_px, self.margin, gate)
 
 
 @spec
@@ -140,18 +155,33 @@ class NetworkSegmenter:
         infer: The network.
         size_px: Width and height of its input.
         margin: Room around the block in the second run; `None` for one run.
+        gate: Drops pieces of block that it does not see; `None` for none.
     """
 
-    def __init__(self, infer: Infer, size_px: tuple[int, int], margin: float | None) -> None:
-        self._infer, self._size_px, self._margin = infer, size_px, margin
+    def __init__(
+        self,
+        infer: Infer,
+        size_px: tuple[int, int],
+        margin: float | None,
+        gate: NetworkSegmenter | None = None,
+    ) -> None:
+        self._infer, self._size_px, self._margin, self._gate = infer, size_px, margin, gate
 
     def segment(self, frame: Frame) -> Masks:
         """Return both masks."""
+        masks = self._segment_alone(frame)
+        if self._gate is None or not (masks.block > THRESHOLD).any():
+            return masks
+        seen = self._gate.segment(frame).block > THRESHOLD
+        return _drop_pieces(masks, lambda pieces, count: np.isin(range(count), pieces[seen]))
+
+    def _segment_alone(self, frame: Frame) -> Masks:
+        """Return both masks, without the gate."""
         window = cover_picture(frame.color.shape, self._size_px)
         block, holes = (np.zeros(frame.color.shape[:2], np.float32) for _ in range(2))
         self._write_masks(frame, window, block, holes)
         if self._margin is None:
-            return Masks(block, holes)
+            return _drop_specks(block, holes)
         box = bound_block(block, THRESHOLD, SMALLEST_PIECE)
         if box is None:
             part = np.zeros_like(block)
@@ -170,7 +200,7 @@ class NetworkSegmenter:
                 before[2:]
             ):
                 break
-        return Masks(block, holes)
+        return _drop_specks(block, holes)
 
     def _write_masks(
         self, frame: Frame, window: Window, block: np.ndarray, holes: np.ndarray
@@ -179,6 +209,33 @@ class NetworkSegmenter:
         seen = self._infer(as_input(window.take(frame.color, self._size_px)))
         window.put(seen[0], block)
         window.put(seen[1], holes)
+
+
+def _drop_specks(block: np.ndarray, holes: np.ndarray) -> Masks:
+    """Return masks without pieces of block that are too small."""
+    least = LEAST_BLOCK * block.size
+    return _drop_pieces(
+        Masks(block, holes),
+        lambda pieces, count: np.bincount(pieces.ravel(), minlength=count) >= least,
+    )
+
+
+def _drop_pieces(masks: Masks, choose: Callable[[np.ndarray, int], np.ndarray]) -> Masks:
+    """Return masks with some pieces of block; where none is left there are no holes.
+
+    Args:
+        masks: Both masks.
+        choose: From the number of each pixel's piece, `(h, w)`, 0 beside all, and their count, to
+            which pieces are kept, `(count,)` bool.
+    """
+    count, numbers = cv2.connectedComponents((masks.block > THRESHOLD).astype(np.uint8))
+    pieces = np.asarray(numbers, int)
+    kept = choose(pieces, count)
+    kept[0] = True
+    block = np.where(kept[pieces], masks.block, np.float32(0.0))
+    if masks.hole_mask is None or kept[1:].any():
+        return Masks(block, masks.hole_mask)
+    return Masks(block, np.zeros_like(masks.hole_mask))
 
 
 def as_input(picture: np.ndarray) -> np.ndarray:

@@ -41,6 +41,8 @@ ENLARGED = 1.5
 the block instead, as sharp as the segmenter sees one in a large frame."""
 PART_OF_MEMORY = 0.5
 """Views that take no more of a device's free memory are kept there."""
+PICTURES = (".png", ".jpg", ".jpeg")
+"""Endings of pictures without a block."""
 THREADS = 16
 """That read frames, at most: a machine may count more processors than it lends."""
 
@@ -208,23 +210,54 @@ def list_frames(folders: str | Sequence[str]) -> list[Path]:
     return stems
 
 
+def list_pictures(folders: str | Sequence[str]) -> list[Path]:
+    """Return the pictures in and below folders, sorted.
+
+    Raises:
+        FrameError: a folder holds none.
+    """
+    found: list[Path] = []
+    for folder in (folders,) if isinstance(folders, str) else folders:
+        here = [path for path in sorted(Path(folder).rglob("*")) if _is_picture(path)]
+        if not here:
+            raise FrameError(
+                f"training.negatives: no picture ({', '.join(PICTURES)}) in '{folder}' (seen from "
+                f"{Path.cwd()}); expected photographs without a block"
+            )
+        found += here
+    return found
+
+
+def _is_picture(path: Path) -> bool:
+    return path.suffix.lower() in PICTURES and not path.name.startswith(".")
+
+
 def read_views(
-    stems: Sequence[Path], size_px: tuple[int, int], margin: float, seed: int
+    stems: Sequence[Path],
+    size_px: tuple[int, int],
+    margin: float,
+    seed: int,
+    negatives: bool = False,
 ) -> TrainingViews:
     """Read frames, some at a time, and keeps their two views.
 
     Args:
-        stems: Frames, paths without endings.
+        stems: Frames, paths without endings; of negatives, paths of pictures.
         size_px: Width and height of the network's picture.
         margin: Room around the block in the closer view, as a part of its box, before the room to
             crop.
         seed: Of the closer view of frames without a block, which shows any part of them.
+        negatives: They are pictures without a block, which need no mask.
+
+    Raises:
+        FrameError: a picture or a mask cannot be read.
     """
     width, height = (round(ROOM * side) for side in size_px)
     layers = np.empty((len(stems), len(LOOKS), 5, height, width), np.uint8)
+    read = _read_negative if negatives else _read_frame
 
     def fill(number: int) -> str:
-        picture, known, condition = _read_frame(stems[number])
+        picture, known, condition = read(stems[number])
         generator = np.random.default_rng((seed, number))
         for look, window in enumerate(_choose_windows(known, (width, height), margin, generator)):
             layers[number, look, :3] = window.take(picture, (width, height)).transpose(2, 0, 1)
@@ -260,6 +293,24 @@ def _read_frame(stem: Path) -> tuple[np.ndarray, np.ndarray, str]:
     condition = dataset.read_truth(stem).scene if dataset.is_whole(stem) else "unknown"
     known = np.stack([label.block, label.hole_mask], axis=-1).astype(np.uint8) * np.uint8(255)
     return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), known, condition
+
+
+def _read_negative(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
+    """Return a picture without a block as `_read_frame` does."""
+    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if picture is None:
+        raise FrameError(f"{path}: no picture that OpenCV can read")
+    known = np.zeros((*picture.shape[:2], 2), np.uint8)
+    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), known, "negative"
+
+
+def join_views(one: TrainingViews, other: TrainingViews) -> TrainingViews:
+    """Return the frames of both."""
+    return TrainingViews(
+        torch.cat([one.layers, other.layers]),
+        (*one.conditions, *other.conditions),
+        (*one.names, *other.names),
+    )
 
 
 def _choose_windows(

@@ -14,7 +14,7 @@ import torch
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from perception.segment.network import find_weights
+from perception.segment.network import LEAST_BLOCK, THRESHOLD, find_weights
 from perception.segment.unet import UNet, compute_loss, read_checkpoint
 from perception.train import evaluation, export
 from perception.train import samples as training_data
@@ -23,7 +23,7 @@ from perception.train.samples import Crop, Samples, TrainingViews
 
 STATE = "training.pt"
 """State of an interrupted training."""
-FREE = ("frames", "validation", "hold_out", "max_seconds", "validate_every")
+FREE = ("frames", "negatives", "validation", "hold_out", "max_seconds", "validate_every")
 """Settings that may differ on resuming; frames and validation are compared by content."""
 
 log = logging.getLogger(__name__)
@@ -35,6 +35,8 @@ class SegmenterTraining:
 
     Attributes:
         frames: Folder, or list of folders, of frames with masks, those below them too.
+        negatives: Folder, or list of folders, of pictures without a block, such as photographs;
+            one in `hold_out` is judged by. `null` for none.
         validation: Folders to judge by; `null` sets a part of `frames` aside.
         hold_out: Without `validation`, one part in so many is kept from the training: a run of
             frames at the end.
@@ -62,6 +64,7 @@ class SegmenterTraining:
     """
 
     frames: str | tuple[str, ...]
+    negatives: str | tuple[str, ...] | None
     validation: str | tuple[str, ...] | None
     hold_out: int
     size_px: tuple[int, int]
@@ -122,6 +125,7 @@ class _Training:
         # Before anything random: weights, views and samples follow from the session's seed.
         session.seed_all()
         self._train, self._unseen = self._views()
+        self._negatives = self._take_negatives()
         self._network = self._build_network().to(self._device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         # `fused` moves all weights in one kernel.
         self._optimizer = torch.optim.AdamW(
@@ -209,6 +213,28 @@ class _Training:
         both = training_data.read_views([*stems, *unseen], settings.size_px, settings.margin, seed)
         return both.part(slice(0, len(stems))), both.part(slice(len(stems), None))
 
+    def _take_negatives(self) -> torch.Tensor | None:
+        """Learn from most of the pictures without a block; return the others as the segmenter sees them.
+
+        Returns:
+            `(F, 2, 3, h, w)`, `None` where there are no negatives.
+        """
+        settings, seed = self._settings, self._session.stream("views")
+        if settings.negatives is None:
+            return None
+        paths = training_data.list_pictures(settings.negatives)
+        unseen = paths[:: settings.hold_out]
+        learned = [path for path in paths if path not in set(unseen)]
+        views = []
+        for some in (learned, unseen):
+            views.append(
+                training_data.read_views(
+                    some, settings.size_px, settings.margin, seed, negatives=True
+                )
+            )
+        self._train = training_data.join_views(self._train, views[0])
+        return evaluation.crop_segmenter_views(views[1], settings.size_px)[0]
+
     def _step(self, picture: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         self._network.train()
         for group in self._optimizer.param_groups:
@@ -259,15 +285,23 @@ class _Training:
         probabilities = evaluation.predict(network, pictures, self._device)
         figures = evaluation.compute_metrics(probabilities, known, self._unseen.conditions)["all"]
         block, mouth = figures["block"] or 0.0, figures["mouth"] or 0.0
+        quiet = self._measure_quiet(network)
         self._curve.append(
-            {"update": self._update, "loss": mean_loss, "block": block, "mouth": mouth}
+            {
+                "update": self._update,
+                "loss": mean_loss,
+                "block": block,
+                "mouth": mouth,
+                "quiet": quiet,
+            }
         )
         if mean_loss is not None and not math.isfinite(mean_loss):
             raise CheckpointError(
                 f"the training diverged before update {self._update}; try a smaller training.rate"
             )
-        if block + mouth > self._best["score"]:
-            self._best = {"score": block + mouth, "update": self._update}
+        score = block + mouth + (quiet or 0.0)
+        if score > self._best["score"]:
+            self._best = {"score": score, "update": self._update}
             # On the processor: the best weights must not occupy the card twice.
             self._best_tensors = {name: value.cpu().clone() for name, value in self._mean.items()}
         passed = "" if mean_loss is None else f"loss {mean_loss:.4f}, "
@@ -278,6 +312,14 @@ class _Training:
             block,
             mouth,
         )
+
+    def _measure_quiet(self, network: UNet) -> float | None:
+        """Return the share of unseen negatives on which the network names no block."""
+        if self._negatives is None:
+            return None
+        probabilities = evaluation.predict(network, self._negatives, self._device)
+        named = (probabilities[:, :, 0] > THRESHOLD).float().mean((2, 3)).amax(1)
+        return float((named < LEAST_BLOCK).float().mean())
 
     def _finish(self, pictures: torch.Tensor, known: torch.Tensor) -> dict[str, Any]:
         network = UNet(self._settings.widths)

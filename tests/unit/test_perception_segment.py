@@ -18,6 +18,7 @@ from brokk_rl.signals import Frame
 from perception import dataset
 from perception.dataset import FrameLabel
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.scene_sampler import compose_scene
 from perception.segment import network as segment_network
 from perception.segment.depth_plane import snap_to_edges
@@ -249,7 +250,12 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
     for seed in (101, 102, 103):
         chance, kind = np.random.default_rng(seed), option("scene", "clean")
         studio = FrameRenderer(
-            rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False
+            rig=rig,
+            scene=kind,
+            stereo=option("stereo", "sgbm"),
+            depth="none",
+            pair=False,
+            surfaces=NO_PHOTOGRAPHS,
         )
         shot = studio.shot(compose_scene(kind, rig, chance), chance)
         frame = Frame(

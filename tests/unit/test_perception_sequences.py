@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ import pytest
 import yaml
 from composed import option
 
-from brokk_rl import record
+from brokk_rl import record, story
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
@@ -24,6 +25,7 @@ from perception.label.camera_pose import Charuco
 from perception.render.board_on_arm import BoardOnArm
 from perception.render.footage import Footage
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.stereo_camera import StereoRig
 
 SMALL = ("rig.width=640", "rig.height=360", "rig.focal_px=264.0")
@@ -48,7 +50,12 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     kind: BoardOnArm = option("scene", "board_on_arm")
     scenes = kind.open(rig, SESSION)
     studio = FrameRenderer(
-        rig=rig, scene=kind, stereo=option("stereo", "sgbm"), depth="none", pair=False
+        rig=rig,
+        scene=kind,
+        stereo=option("stereo", "sgbm"),
+        depth="none",
+        pair=False,
+        surfaces=NO_PHOTOGRAPHS,
     )
     corners_m, corners_px, view, _ = find_corners(kind.board, studio, scenes, 3)
     assert len(corners_m) > 20
@@ -126,3 +133,42 @@ def test_a_score_counts_each_hole_once() -> None:
     assert score.errors[0].sigmas == pytest.approx(1.5)
     assert score.compute_position_m(50) == pytest.approx(0.003)
     assert json.dumps(score.count_inside(1.0)) == "0"
+
+
+def test_a_camera_day_runs_its_stages_once_and_goes_on(
+    brokk: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    played: list[list[str]] = []
+
+    class Stage:
+        def __init__(self, words: list[str]) -> None:
+            out = Path(words[-1].partition("=")[2])
+            played.append([out.name, *words[words.index("brokk_rl") + 1 :]])
+            self._code = int(out.name == "labels" and len(played) < 5)
+            out.mkdir(exist_ok=True)
+            end = "failed" if self._code else "finished"
+            times = {"started": "2024-05-01T08:00:00+00:00", "ended": "2024-05-01T08:01:00+00:00"}
+            record = {"outcome": end, "mode": "render", "command": words, **times}
+            (out / "session.json").write_text(json.dumps(record))
+
+        def __enter__(self) -> Stage:
+            return self
+
+        def __exit__(self, *exc: Any) -> None:
+            pass
+
+        def wait(self) -> int:
+            return self._code
+
+    monkeypatch.setattr(story, "subprocess", SimpleNamespace(Popen=Stage))
+    failed = brokk("experiment=camera_day", "session.out=day")
+    assert failed.code == 2 and "resume=day session.out=day" in failed.err
+    assert [one[0] for one in played] == ["board", "calibration", "footage", "labels"]
+    assert f"rig=@{tmp_path}/day/given/rig.yaml" in played[0]
+    assert brokk("experiment=camera_day", "session.out=day", "resume=day").code == 0
+    assert [one[0] for one in played[4:]] == [
+        "labels", "network", "site", "uncalibrated", "perceived", "own_network",
+    ]  # fmt: skip
+    assert "The day goes on." in (tmp_path / "day/camera_day.html").read_text()
+    figures = json.loads((tmp_path / "day/camera_day.json").read_text())
+    assert figures["stage_s"]["board"] == 60.0 and figures["perceived"] == {}

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import training as runs
 from kinematic import KinematicWorld
 
 from brokk_rl.checks import check_task
@@ -17,7 +19,11 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.observation import ObservationEncoder, PartsEncoder, restore_encoder
+from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.settings import Evaluation
+from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from brokk_rl.task_description import describe_task, restore_task
 from deploy.policy.bundle import PolicyBundle
@@ -232,6 +238,21 @@ def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     with pytest.raises(CheckpointError, match=r"asks for joints \(3 x 5\), error \(1 x 1\)"):
         PolicyBundle(str(tmp_path), machine)
+
+
+def test_a_task_without_a_classical_controller_is_evaluated_without_that_rival(
+    machine: Machine, tmp_path: Path
+) -> None:
+    class Resting:
+        def build(self, loop: Any, seed: int) -> Any:
+            return SimpleNamespace(act=lambda groups: torch.zeros(loop.num_envs, 5))
+
+    session = Session(out=str(tmp_path), seed=0, device="cpu")
+    how = Evaluation(episodes=4, seed=3, num_recorded=1, video=False)
+    policies: Any = {"resting": Resting(), "classical": ClassicalPolicy()}
+    found = evaluate_policies(runs.plant(machine, make()), how, session, policies)
+    assert list(found["policies"]) == list(found["tasks"]) == ["resting"]
+    assert found["terminations"] == {"fault": 0, "time_limit": 4}
 
 
 @pytest.mark.parametrize(

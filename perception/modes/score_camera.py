@@ -1,0 +1,221 @@
+"""`brokk mode=score_camera`: holes found in a recorded session against holes measured by hand.
+
+A board lies on the drilled face or beside it, in its plane. Each frame sees the board, and so the
+measured holes have a place in each frame. Real sessions and rendered ones are different rows.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from brokk_rl.contracts.vision import FinderSpec, FrameSourceSpec
+from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.session import Session, write_json
+from brokk_rl.spec import spec
+from perception.benchmark.session_score import SessionScore, merge_scores, score_holes
+from perception.label.camera_pose import CameraTrackerSpec
+
+log = logging.getLogger(__name__)
+
+FILE = "score.json"
+EXAMPLE = """expected YAML such as
+  std_m: 0.0005   # of the measured centres
+  holes:          # in the board's frame: from its corner, x along the top, y down, z into the face
+    - {name: A, center_m: [1.120, 0.310, 0.004], axis: [0, 0, -1], radius_m: 0.05}"""
+
+
+@dataclass(frozen=True)
+class MeasuredHole:
+    """A hole in the board's frame: centre, axis out of the hole, m."""
+
+    name: str
+    center_m: np.ndarray
+    axis: np.ndarray
+
+
+@spec
+class ScoreOptions:
+    """Truth of a session and the row that it becomes.
+
+    Attributes:
+        truth: YAML file of the measured holes.
+        kind: `real` or `rendered`: rows of one kind are never mixed with the other's.
+        name: Name of the row: camera, place and day.
+        table: JSON file of rows that this one is added to; `null`: `score.json` alone.
+    """
+
+    truth: str
+    kind: Literal["real", "rendered"]
+    name: str
+    table: str | None
+
+    def check(self) -> None:
+        if not self.name:
+            raise ConfigError("score.name: expected a name such as zed2i_quarry_may")
+
+
+@spec
+class ScoreCamera:
+    """Find the holes of a session's frames, and compare them with those measured by hand.
+
+    Attributes:
+        session: Folder to write into.
+        perception: Finder of boreholes.
+        source: The frames.
+        board: The board in view.
+        score: Truth and row.
+    """
+
+    session: Session
+    perception: FinderSpec
+    source: FrameSourceSpec
+    board: CameraTrackerSpec
+    score: ScoreOptions
+
+    def run(self) -> float | None:
+        """Write `score.json`, add the row to the table, and show all rows, the real ones first.
+
+        Returns:
+            The median error of the centre, m; `None` where nothing was found.
+
+        Raises:
+            ConfigError: the truth cannot be read.
+            FrameError: no frame shows the board.
+        """
+        holes, std_m = read_measured(Path(self.score.truth))
+        scores, refused = self._score_frames(holes)
+        if not scores:
+            raise FrameError(
+                f"score_camera: no frame can be judged; the first: {next(iter(refused.values()), 'none')}"
+            )
+        total = merge_scores(scores)
+        row = self._build_row(total, std_m, len(refused))
+        errors = [vars(one) for one in total.errors]
+        content = {"schema": 1, **row, "refused": refused, "errors": errors}
+        write_json(self.session.folder / FILE, content)
+        rows = [row]
+        if self.score.table is not None:
+            rows = _add_row(Path(self.score.table), row)
+        _show(rows)
+        return total.compute_position_m(50)
+
+    def _score_frames(self, holes: list[MeasuredHole]) -> tuple[list[SessionScore], dict[str, str]]:
+        """Return the scores of frames, and why others were left out."""
+        finder, tracker = self.perception.build(), self.board.build()
+        scores: list[SessionScore] = []
+        refused: dict[str, str] = {}
+        with self.source.build() as source, Progress(transient=True) as progress:
+            task, number = progress.add_task("frames", total=source.num_frames), 0
+            while True:
+                progress.update(task, completed=number)
+                number += 1
+                try:
+                    frame = source.read_latest()
+                    if frame is None:
+                        return scores, refused
+                    camera_from_board = np.linalg.inv(tracker.locate(frame).world_from_camera)
+                    found = finder.find(frame)
+                except FrameError as error:
+                    refused[f"{number - 1:05d}"] = str(error)
+                    continue
+                true = []
+                for hole in holes:
+                    center = camera_from_board[:3, :3] @ hole.center_m + camera_from_board[:3, 3]
+                    axis = camera_from_board[:3, :3] @ hole.axis
+                    true.append((center, axis, float(np.linalg.norm(center))))
+                detected = []
+                for one in found.holes:
+                    hole_in_camera = {
+                        "center_m": one.center_m,
+                        "axis": one.axis,
+                        "cov_m2": one.cov_m2,
+                    }
+                    detected.append(hole_in_camera)
+                scores.append(score_holes(Path(frame.name).name, detected, true))
+
+    def _build_row(self, score: SessionScore, std_m: float, num_refused: int) -> dict[str, Any]:
+        median_m, high_m = (score.compute_position_m(part) for part in (50, 95))
+        normal = [one.normal_rad for one in score.errors]
+        return {
+            "kind": self.score.kind,
+            "name": self.score.name,
+            "frames": score.num_frames,
+            "refused_frames": num_refused,
+            "holes": score.num_holes,
+            "found": score.num_found,
+            "false": score.num_false,
+            "position_m_median": median_m,
+            "position_m_p95": high_m,
+            "normal_rad_median": float(np.median(normal)) if normal else None,
+            "inside_3_sigma": score.count_inside(3.0),
+            "truth_std_m": std_m,
+        }
+
+
+def read_measured(path: Path) -> tuple[list[MeasuredHole], float]:
+    """Return measured holes, and the standard deviation of their centres, m.
+
+    Raises:
+        ConfigError: the file cannot be read; the message shows the expected form.
+    """
+    try:
+        told = yaml.safe_load(path.read_text())
+        holes = []
+        for number, one in enumerate(told["holes"], 1):
+            center = np.asarray(one["center_m"], float)
+            axis = np.asarray(one.get("axis", (0.0, 0.0, -1.0)), float)
+            if center.shape != (3,) or axis.shape != (3,) or not np.linalg.norm(axis) > 0:
+                raise ValueError(f"hole {number}: center_m and axis need three numbers each")
+            holes.append(
+                MeasuredHole(str(one.get("name", number)), center, axis / np.linalg.norm(axis))
+            )
+        std_m = float(told["std_m"])
+        if not holes or not math.isfinite(std_m):
+            raise ValueError("no holes")
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigError(
+            f"score.truth={path}: {type(error).__name__} {error}; {EXAMPLE}"
+        ) from error
+    return holes, std_m
+
+
+def _add_row(path: Path, row: dict[str, Any]) -> list[dict[str, Any]]:
+    """Add a row to a table, in place of one of the same kind and name; return all rows."""
+    rows = []
+    if path.is_file():
+        try:
+            rows = list(json.loads(path.read_text())["rows"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ConfigError(
+                f"score.table={path}: expected a table of this mode ({error})"
+            ) from error
+    kept = [one for one in rows if (one["kind"], one["name"]) != (row["kind"], row["name"])]
+    rows = sorted([*kept, row], key=lambda one: (one["kind"], one["name"]))
+    write_json(path, {"schema": 1, "rows": rows})
+    return rows
+
+
+def _show(rows: list[dict[str, Any]]) -> None:
+    table = Table(box=None)
+    for name in ("kind", "session", "frames", "found", "no hole", "median", "95 %", "inside 3 σ"):
+        table.add_column(name, justify="left" if name in ("kind", "session") else "right")
+    for row in rows:
+        errors = []
+        for key in ("position_m_median", "position_m_p95"):
+            errors.append("–" if row[key] is None else f"{1000 * row[key]:.1f} mm")
+        found = f"{row['found']} of {row['holes']}"
+        inside = f"{row['inside_3_sigma']} of {row['found']}"
+        frames, false = str(row["frames"]), str(row["false"])
+        table.add_row(row["kind"], row["name"], frames, found, false, *errors, inside)
+    Console().print(table)

@@ -1,0 +1,208 @@
+"""Sessions of any stereo camera: recorded to disk as they were, scored by holes measured by hand, learned from without a block."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from brokk_rl.contracts.vision import FrameDetections, HolePose
+from brokk_rl.errors import ConfigError
+from brokk_rl.session import Session
+from brokk_rl.signals import Frame
+from perception.label.camera_pose import CameraPose
+from perception.modes.score_camera import ScoreCamera, ScoreOptions, read_measured
+from perception.render.materials import Material, read_photograph
+from perception.render.photographed_surfaces import PhotographedSurfaces
+from perception.segment.network import NetworkSegmenter
+from perception.train.samples import list_pictures, read_views
+
+SIZE_PX = (96, 64)
+
+
+@pytest.fixture
+def lens(tmp_path: Path) -> Path:
+    path = tmp_path / "lens.yaml"
+    path.write_text("K: [[80, 0, 47.5], [0, 80, 31.5], [0, 0, 1]]\ndist: []\nbaseline_m: 0.12\n")
+    return path
+
+
+def draw_pair(number: int) -> np.ndarray:
+    """Returns a left and a right picture side by side, blue first."""
+    chance = np.random.default_rng(number)
+    return chance.integers(0, 255, (SIZE_PX[1], 2 * SIZE_PX[0], 3)).astype(np.uint8)
+
+
+def test_a_stereo_video_becomes_frames(
+    brokk: Callable[..., Any], tmp_path: Path, lens: Path
+) -> None:
+    path = tmp_path / "walk.avi"
+    size = (2 * SIZE_PX[0], SIZE_PX[1])
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"FFV1"), 5, size)
+    if not video.isOpened():
+        pytest.skip("this OpenCV writes no FFV1")
+    for number in range(5):
+        video.write(draw_pair(number))
+    video.release()
+    out = tmp_path / "out"
+    done = brokk(
+        "mode=record_camera", f"capture.input={path}", f"lens={lens}", "every=2", "count=2", f"session.out={out}"
+    )  # fmt: skip
+    assert done.code == 0, done.err
+    assert yaml.safe_load((out / "frames/camera.yaml").read_text())["baseline_m"] == 0.12
+    assert len(list((out / "frames").glob("*.color.png"))) == 2
+    both = [cv2.imread(str(out / f"frames/00001.{side}.png")) for side in ("color", "right")]
+    assert both[0] is not None and both[1] is not None
+    np.testing.assert_allclose(np.concatenate(both, 1), draw_pair(2), atol=12)  # YUV of the codec
+    refused = brokk("mode=record_camera", "capture.input=gone.mp4", f"lens={lens}", "session.out=x")
+    assert refused.code == 2 and "gone.mp4" in refused.err
+
+
+def test_exported_files_are_paired_by_their_number(
+    brokk: Callable[..., Any], tmp_path: Path, lens: Path
+) -> None:
+    for number in (9, 10):
+        left, right = np.split(draw_pair(number), 2, 1)
+        cv2.imwrite(str(tmp_path / f"left{number}.png"), left)
+        cv2.imwrite(str(tmp_path / f"right{number}.png"), right)
+        depth = np.full(SIZE_PX[::-1], 1500, np.uint16)
+        depth[0, 0] = 0
+        cv2.imwrite(str(tmp_path / f"depth{number}.png"), depth)
+    words = (
+        "mode=record_camera",
+        "capture=zed_export",
+        f"capture.folder={tmp_path}",
+        f"lens={lens}",
+    )
+    done = brokk(*words, "capture.depth=depth*.png", "session.out=out")
+    assert done.code == 0, done.err
+    frames = tmp_path / "out/frames"
+    stored = np.load(frames / "00001.depth.npy")
+    assert np.isnan(stored[0, 0]) and stored[5, 5] == pytest.approx(1.5)
+    right = cv2.imread(str(frames / "00001.right.png"))
+    assert right is not None
+    np.testing.assert_array_equal(right, np.split(draw_pair(10), 2, 1)[1])
+    (tmp_path / "right10.png").unlink()
+    refused = brokk(*words, "session.out=again")
+    assert refused.code == 2 and "numbered 10" in refused.err
+
+
+def score(tmp_path: Path, kind: Any, name: str, found_m: tuple[float, ...]) -> float | None:
+    """Scores one frame whose camera is 2 m before the board, which has a hole 0.3 m to its right."""
+    (tmp_path / "measured.yaml").write_text(
+        "std_m: 0.0005\nholes: [{name: A, center_m: [0.3, 0.0, 0.0], radius_m: 0.05}]\n"
+    )
+    black = np.zeros((8, 8, 3), np.uint8)
+    frames = iter(
+        [Frame(black, black[..., 0].astype(np.float32), np.eye(3), None, 0.0, name="a/0")]
+    )
+    pose = np.eye(4)
+    pose[2, 3] = -2.0
+    hole = HolePose(
+        np.array(found_m), np.array([0.0, 0.0, -1.0]), 0.05, np.eye(3) * 1e-6, np.zeros((3, 3)), "camera", 1.0, 0.0,
+    )  # fmt: skip
+
+    class Source:
+        num_frames = 1
+
+        def __enter__(self) -> Source:
+            return self
+
+        def __exit__(self, *exc: Any) -> None:
+            pass
+
+        def read_latest(self) -> Frame | None:
+            return next(frames, None)
+
+    parts: dict[str, Any] = {
+        "perception": SimpleNamespace(find=lambda frame: FrameDetections([hole])),
+        "source": Source(),
+        "board": SimpleNamespace(locate=lambda frame: CameraPose(pose, 0.1)),
+    }
+    built = {key: SimpleNamespace(build=lambda part=part: part) for key, part in parts.items()}
+    options = ScoreOptions(
+        truth=str(tmp_path / "measured.yaml"), kind=kind, name=name, table=str(tmp_path / "table.json"),
+    )  # fmt: skip
+    session = Session(out=str(tmp_path / name), seed=0, device="cpu")
+    (tmp_path / name).mkdir(exist_ok=True)
+    return ScoreCamera(session=session, score=options, **built).run()
+
+
+def test_real_and_rendered_sessions_are_different_rows(tmp_path: Path) -> None:
+    assert score(tmp_path, "rendered", "quarry", (0.3, 0.0, 2.0005)) == pytest.approx(0.0005)
+    assert score(tmp_path, "real", "quarry", (0.3, 0.003, 2.0)) == pytest.approx(0.003)
+    assert score(tmp_path, "real", "quarry", (0.3, 0.004, 2.0)) == pytest.approx(0.004)
+    rows = json.loads((tmp_path / "table.json").read_text())["rows"]
+    assert [(row["kind"], row["inside_3_sigma"]) for row in rows] == [("real", 0), ("rendered", 1)]
+    assert rows[0]["position_m_median"] == pytest.approx(0.004)
+    (tmp_path / "wrong.yaml").write_text("holes: [{center_m: [1, 2]}]\nstd_m: 0.1\n")
+    with pytest.raises(ConfigError, match=r"hole 1.*expected YAML such as"):
+        read_measured(tmp_path / "wrong.yaml")
+
+
+def test_pictures_without_a_block_have_empty_masks(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "a.jpg"), draw_pair(1))
+    views = read_views(list_pictures(str(tmp_path)), (64, 32), 0.15, 0, negatives=True)
+    assert len(views) == 1 and views.conditions == ("negative",)
+    assert views.layers[0, :, :3].any() and not views.layers[0, :, 3:].any()
+
+
+@pytest.mark.parametrize(("side", "named"), [(2, False), (12, True)])
+def test_a_speck_is_no_block(side: int, named: bool) -> None:
+    def infer(picture: np.ndarray) -> np.ndarray:
+        found = np.zeros((2, 32, 64), np.float32)
+        found[:, 8 : 8 + side, 8 : 8 + side] = 0.9
+        return found
+
+    frame = Frame(
+        np.zeros((320, 640, 3), np.uint8), np.zeros((320, 640), np.float32), np.eye(3), None, 0.0
+    )
+    masks = NetworkSegmenter(infer, (64, 32), None).segment(frame)
+    assert bool((masks.block > 0.5).any()) is named
+    assert bool((np.asarray(masks.hole_mask) > 0.5).any()) is named
+
+
+def test_a_photograph_keeps_brightness_and_colour(tmp_path: Path) -> None:
+    picture = np.zeros((64, 64, 3), np.uint8)
+    picture[:, :32] = (40, 80, 160)  # blue first: a reddish half, a dark half
+    picture[:, 32:] = (20, 40, 80)
+    cv2.imwrite(str(tmp_path / "rust.png"), picture)
+    photograph = read_photograph(tmp_path / "rust.png")
+    surface = Material((0.4, 0.4, 0.4), 0.2, 0.001, photograph=photograph)
+    places = np.array([[0.1, 0.2], [0.9, 0.2]], np.float32)
+    fine = surface.albedo(places, np.full(2, 1e-4, np.float32))
+    assert fine[0, 0] > fine[0, 1] > fine[0, 2], "red stays red"
+    assert fine[0, 1] > 3.0 * fine[1, 1], "gamma 2.2: half of the code is a fifth of the light"
+    far = surface.albedo(places, np.full(2, 10.0, np.float32))
+    np.testing.assert_allclose(far[0], far[1], rtol=0.01)
+    with pytest.raises(ConfigError, match="found none"):
+        PhotographedSurfaces(folder=str(tmp_path / "no"), share=1.0, block_share=0.0, size_m=(1, 2))
+
+
+def test_a_gate_drops_the_blocks_that_it_does_not_see() -> None:
+    def build(*places: int) -> NetworkSegmenter:
+        def infer(picture: np.ndarray) -> np.ndarray:
+            found = np.zeros((2, 32, 64), np.float32)
+            for left in places:
+                found[:, 8:20, left : left + 12] = 0.9
+            return found
+
+        return NetworkSegmenter(infer, (64, 32), None, gates.pop() if gates else None)
+
+    frame = Frame(
+        np.zeros((32, 64, 3), np.uint8), np.zeros((32, 64), np.float32), np.eye(3), None, 0.0
+    )
+    gates: list[NetworkSegmenter] = []
+    gates.append(build(42))
+    masks = build(4, 40).segment(frame)
+    assert not (masks.block[:, :32] > 0.5).any() and (masks.block[:, 40:52] > 0.5).any()
+    gates.append(build())
+    masks = build(4, 40).segment(frame)
+    assert not (masks.block > 0.5).any() and not np.asarray(masks.hole_mask).any()
