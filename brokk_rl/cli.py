@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import errno
 import logging
 import math
@@ -174,6 +175,7 @@ def check_values(cfg: DictConfig) -> None:
     """
     if missing := OmegaConf.missing_keys(cfg) - {"session.out"}:
         raise ConfigError(_explain_missing_value(min(missing)))
+    cfg = copy.deepcopy(cfg)  # a node that takes in another one resolves that one in its place
     for name in CHECKED_FIRST.split():
         node = OmegaConf.select(cfg, name, throw_on_missing=False)
         if not isinstance(node, DictConfig):

@@ -79,7 +79,8 @@ def write_summary(out: Path) -> None:
             row["frames"] = frames
             row["seen_share"] = sum(one["seen_share"] * one["frames"] for one in seen) / frames
             row["never_seen"] = sum(one["never_seen"] for one in seen)
-        if "true" in rows and "success" in rows["true"]:
+    for row in rows.values():
+        if "true" in rows:
             row["of_true"] = row["success"] / rows["true"]["success"]
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False

@@ -338,6 +338,6 @@ def find_checkpoint(path: Path, key: str) -> Path:
     found = list_checkpoints(path) if path.is_dir() else []
     if not found:
         raise CheckpointError(
-            f"{key}={path}: expected a checkpoint (model_<iteration>.pt) or a run folder with one"
+            f"{key}={path}: there is no checkpoint (model_<iteration>.pt), nor a run folder with one"
         )
     return found[-1]

@@ -163,6 +163,10 @@ class Charuco:
 
     def check(self) -> None:
         _check_board(self.dictionary, self.min_corners)
+        if min(self.columns, self.rows) < 2:
+            raise ConfigError(
+                f"board: expected 2 or more columns and rows, got {self.columns} and {self.rows}"
+            )
         if not 0 < self.marker_m < self.square_m:
             raise ConfigError(
                 f"board: expected 0 < marker_m < square_m, got {self.marker_m} and {self.square_m}"

@@ -65,6 +65,8 @@ COMPARE = ("mode=compare", "compare.runs=nowhere")
             ("'effect.backlash' has no 'width'",),
         ),
         (("mode=null",), ("must be a string",)),
+        (("mode=study", "study.do=report", "study.folder=x"), ("x holds no study",)),
+        (("mode=board", "board.rows=0"), ("expected 2 or more columns and rows, got",)),
         (("--config-dir", "nowhere", "mode=list"), ("nowhere",)),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,

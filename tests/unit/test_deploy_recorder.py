@@ -64,6 +64,8 @@ def write(
                 "t_s": begun_s + t_s,
                 "reason": "valid" if t_s > 0.5 else "history is filling",
                 "u": [0.1] * 5,
+                "target_in_base_m": [2.6, 0.0, 0.75],
+                "observation": [t_s, 2.0] if t_s > 0.5 else [],
             }
             log.add(TEXT + json.dumps(advice).encode())
         if k % 50 == 0:
@@ -90,6 +92,19 @@ def test_a_capture_becomes_the_recording_of_what_happened(machine: Machine, tmp_
         again.extra["advice_q1"][20] == pytest.approx(0.1)
         and again.metadata["source"] == "capture: test"
     )
+
+
+def test_rows_lie_on_the_decisions_and_hold_what_the_policy_saw(
+    machine: Machine, tmp_path: Path
+) -> None:
+    write(tmp_path, machine)
+    (found,) = READER.read(tmp_path / MCAP, machine)
+    assert found.extra["target_x_m"][20] == pytest.approx(2.6)
+    assert np.isnan(found.extra["target_x_m"][5])
+    seen_s = found.extra["obs_0"][15:40]
+    # q1 is 0.1 t: position and observation of a row are of the same moment.
+    assert found.q[15:40, 0] == pytest.approx(0.1 * seen_s, abs=1.5e-3)
+    assert found.extra["obs_1"][20] == 2.0
 
 
 def test_a_gap_splits_the_recording(machine: Machine, tmp_path: Path) -> None:
