@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import cuboid
@@ -219,7 +220,9 @@ def test_a_training_ends_in_time_with_its_rate_at_nothing(
         trainer._Training, "_rate", lambda self: rates.append(rate(self)) or rates[-1]
     )
     clock = iter(range(1000))
-    monkeypatch.setattr(trainer.time, "monotonic", lambda: float(next(clock)))  # a second an update
+    # a second an update; the clock of others goes on
+    own = SimpleNamespace(monotonic=lambda: float(next(clock)))
+    monkeypatch.setattr(trainer, "time", own)
     done = brokk(
         "mode=train_perception", f"training.frames={frames}", *SMALL, "training.updates=10000", "training.max_seconds=8",
         "training.validate_every=3", "session.out=run",
