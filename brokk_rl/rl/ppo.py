@@ -196,7 +196,7 @@ class DevicePPO(PPO):
                 state["step"] = state["step"].to(self.device, torch.float32)
 
     def _parts(self) -> Sequence[Callable[[], None]]:
-        """Return the parts of a mini-batch, captured on a GPU.
+        """Return the parts of a pass over all mini-batches, captured on a GPU.
 
         The calls before the capture leave no trace.
         """
