@@ -22,8 +22,6 @@ CommandInterface = Literal["valve", "velocity", "position", "torque"]
 """Quantity that a command of a joint sets. A command of 1 is for `valve` and `velocity` the joint's
 `max_speed`, for `position` a target at the upper end of its travel (-1: the lower end), for `torque`
 its `max_force`. `valve` is a speed that the load may change, `velocity` one that a drive regulates."""
-SPEED_INTERFACES: tuple[CommandInterface, ...] = ("valve", "velocity")
-"""Interfaces whose command is a speed: at 0 the joint rests."""
 
 
 @spec
@@ -304,7 +302,9 @@ class Machine:
 
 
 def _name_family(command: CommandInterface) -> Literal["speed", "position", "torque"]:
-    return "speed" if command in SPEED_INTERFACES else command
+    if command == "position" or command == "torque":
+        return command
+    return "speed"
 
 
 def _list_traits(joint: Joint) -> list[object]:

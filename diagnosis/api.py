@@ -197,8 +197,8 @@ def _build_mode(
         thresholds=_load_option("thresholds", "default"),
         excitation={name: _load_option("excitation", name) for name in EXCITATIONS},
         diagnosis=DiagnosisSubject(  # pyright: ignore[reportCallIssue]
-            case=str(folder),
-            field=None,
+            case=None,
+            field="",  # recordings are given, none is read
             unseen=None,
             effects=None if effects is None else tuple(effects),
             workers=workers,

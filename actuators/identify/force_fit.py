@@ -10,6 +10,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -136,16 +137,16 @@ class ForceFit:
         period_s, edge = machine.period_s, round(EDGE_S / machine.period_s)
         if recording.num_samples < 4 * edge:
             return None
-        numerator, denominator = butter(4, 2.0 * self.motion_hz * period_s)
-        q = filtfilt(numerator, denominator, recording.q[:, j].astype(float))
-        force = filtfilt(numerator, denominator, recording.u[:, j].astype(float))
+        low_pass: Any = butter(4, 2.0 * self.motion_hz * period_s)
+        q = filtfilt(*low_pass, recording.q[:, j].astype(float))
+        force = filtfilt(*low_pass, recording.u[:, j].astype(float))
         force = force * machine.max_force[j]
         rows = np.arange(len(q))
         # A command that is held over a period acts at its middle.
         force = np.interp(rows, rows + 0.5 + delay_s / period_s, force)
         speed = np.gradient(q, period_s)
         columns = [np.gradient(speed, period_s), speed, np.sign(speed), np.ones_like(speed)]
-        numerator, denominator = butter(2, 2.0 * self.force_hz * period_s)
+        low_pass = butter(2, 2.0 * self.force_hz * period_s)
         inside = slice(edge, -edge, max(1, round(0.5 / (self.force_hz * period_s))))
-        x = filtfilt(numerator, denominator, np.stack(columns, 1), axis=0)[inside]
-        return x, filtfilt(numerator, denominator, force)[inside]
+        x = filtfilt(*low_pass, np.stack(columns, 1), axis=0)[inside]
+        return x, filtfilt(*low_pass, force)[inside]

@@ -159,9 +159,10 @@ def _find_free_windows(
     for parts in group_by_run(recordings).values():
         for recording in parts:
             q = recording.q.astype(float)
-            free = ((q > machine.lower + margin) & (q < machine.upper - margin)).all(1)
+            inside = (q > machine.lower + margin) & (q < machine.upper - margin)
+            free = np.asarray(inside.all(1))
             if machine.has_bodies:
-                free &= ~_may_touch(recording, machine)
+                free = free & ~_may_touch(recording, machine)
             for start in range(0, recording.num_samples - length + 1, stride):
                 found.append(bool(free[start : start + length].all()))
     return np.array(found)

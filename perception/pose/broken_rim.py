@@ -58,6 +58,9 @@ ON_RIM, SURE_WHOLE, LEAST_DOUBT = 2.0, 0.5, 0.3
 """Standard deviations within which an edge lies on the rim itself; part of a rim with such edges
 from which its place hardly rests on the depth of the others; a break of even depth looks as whole,
 so a part of the doubt stays."""
+CLEARLY_M, CLEARLY_ODDS = 0.006, 10.0
+"""Least depth of the surroundings of a rim, and its least log odds over the depth of the face, from
+which a rim that looks whole is broken all around."""
 LEAST_UNLIKE = 0.02
 """Part of the variance in which both pictures differ anyway, by interpolation."""
 
@@ -304,6 +307,21 @@ def _collect_edges(
         mean_log_odds - mean_log_odds.max(),
         _measure_spread(odds.sum(0)),
     )
+
+
+def is_below_face(
+    gray: np.ndarray, chart: rim.PlaneChart, both: StereoPatch, ellipse: np.ndarray
+) -> bool:
+    """Return whether the surroundings of a rim, an ellipse `(5,)`, lie clearly below the face.
+
+    A break of even depth all around looks like a whole rim in one picture.
+    """
+    profiles = rim.find_profile_edges(gray, ellipse, rim.NARROW_PX, chart)
+    if profiles is None:
+        return False
+    odds = compare_depths(both, chart, profiles, float(np.sqrt(ellipse[2] * ellipse[3]))).sum(0)
+    is_deep = DEPTHS_M[int(np.argmax(odds))] >= CLEARLY_M
+    return bool(is_deep and odds.max() - odds[0] > CLEARLY_ODDS)
 
 
 def compare_depths(

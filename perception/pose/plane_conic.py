@@ -238,12 +238,13 @@ class PlaneConicEstimator:
         # What is missing of a rim is hidden, or broken off.
         seen = 0.0 if circle is None else circle.coverage
         row = as_row(ellipse) if circle is None else circle.ellipse
-        if 1.0 - seen - measure_hidden_part(face, row, frame) > s.broken:
-            chart = rim.build_chart(
-                face.point(np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])),
-                face.m,
-                frame.camera_matrix,
-            )
+        ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
+        chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
+        is_broken = 1.0 - seen - measure_hidden_part(face, row, frame) > s.broken
+        if s.broken < 1.0 and both is not None and broken_rim.is_below_face(gray, chart, both, row):
+            # The circle lies below the face: a refusal is better than its place.
+            is_broken, circle, seen = True, None, 0.0
+        if is_broken:
             broken = broken_rim.fit_broken_rim(
                 gray, chart, both, np.zeros(2), s.radius_m, s.center_px
             )
