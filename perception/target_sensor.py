@@ -255,7 +255,7 @@ class PerceivedTargets:
         due = np.flatnonzero(self._attended & (self._steps % self._every == 0))
         if len(due):
             self._look(due, q, measured_q)
-            self._choose_views(due, plan)
+            self._choose_views(due, measured_q, plan)
         self._before = q.copy()
         now_s = self._steps * self._machine.period_s
         for number in np.flatnonzero(self._attended):
@@ -315,7 +315,7 @@ class PerceivedTargets:
         turn_rad = float(np.arccos(np.clip(cosine, -1.0, 1.0)))
         return turn_rad <= self._settings.steady_rad_s * self._machine.period_s
 
-    def _choose_views(self, due: np.ndarray, plan: MotionPlan) -> None:
+    def _choose_views(self, due: np.ndarray, q: np.ndarray, plan: MotionPlan) -> None:
         s = self._settings.next_view
         target_m = np.stack([eye.center_m for eye in self.watched])
         if len(self._mount.views) < 2:
@@ -325,9 +325,10 @@ class PerceivedTargets:
         for number in due:
             eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             if t_s >= eye.arrives_s - 1e-9:  # one motion at a time
-                choice = self._planner.choose(
-                    eye.believe(), eye.position, planned[number], eye.num_missed
-                )
+                plan_q = planned[number]
+                if eye.hole is None:  # the machine rests until the hole was seen
+                    plan_q = np.repeat(q[number][None], s.num_times, 0)
+                choice = self._planner.choose(eye.believe(), eye.position, plan_q, eye.num_missed)
                 eye.move(choice, t_s)
 
 

@@ -236,6 +236,7 @@ def test_a_network_that_ships_is_loaded_by_its_name(
         option("perception/segmenter", "onnx").build()
     export.write_checkpoint(tmp_path / export.TENSORS, network, header)
     export.write_onnx(tmp_path / export.ONNX, network, header, torch.rand(1, 3, 32, 64))
+    export.write_onnx(tmp_path / "gate.onnx", network, header, torch.rand(1, 3, 32, 64))
     frame = cuboid.seen(cuboid.looking((-1.6, 0.3, 0.8), (0.1, 0.0, 0.3)), (160, 90)).frame
     one, other = (
         option("perception/segmenter", name).build().segment(frame) for name in ("onnx", "unet")
