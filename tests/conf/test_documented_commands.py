@@ -45,6 +45,8 @@ NOT_COMPOSED = {
 WITHOUT_VALUES = {
     "mode=identify fit=coupled …": "the values before the dots stand in the line above it",
     "mode=diagnose …": "the values before the dots stand in the block above it",
+    "diagnosis.case=": "the folder is the reader's",
+    "subject.model=arm.urdf": "the file is the reader's",
     '"$': "a variable of the shell holds a value that must be given",
 }
 """Parts of commands that leave out such values: groups and fields are checked alone."""
@@ -189,7 +191,7 @@ def write_option_files(overrides: list[str]) -> None:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """An empty working directory beside the package `mine` of `mode=new`, installed."""
+    """A working directory that holds the project `mine` of `mode=new`, installed."""
     site, projects = (tmp_path_factory.mktemp(name) for name in ("site", "projects"))
     forget_package("mine")
     NewPackage(new=PackageRequest(name="mine", folder=str(projects))).run()
@@ -201,7 +203,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         ]  # made in the tutorial
         install_package(site, "mine", files, patch)
         extensions.register_options([])
-        patch.chdir(tmp_path_factory.mktemp("desk"))
+        patch.chdir(projects)
         with hydra.initialize_config_module("conf", version_base="1.3"):
             yield
 
