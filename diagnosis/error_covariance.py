@@ -115,10 +115,14 @@ def _count_between(size: int) -> np.ndarray:
     return np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
 
 
-def join_windows(values: np.ndarray) -> np.ndarray:
-    """Return increments `(W, I)` with `COVARIANCE_WINDOWS` in a row, `(W / N, N I)`."""
-    together = min(COVARIANCE_WINDOWS, len(values))
-    return values[: len(values) // together * together].reshape(-1, together * values.shape[1])
+def join_windows(recordings: Sequence[np.ndarray]) -> np.ndarray:
+    """Return increments `(W, I)` of recordings with `COVARIANCE_WINDOWS` in a row, `(W / N, N I)`.
+
+    Fewer are joined where no recording has so many; shorter recordings than that are left out.
+    """
+    together = min(COVARIANCE_WINDOWS, max(map(len, recordings)))
+    whole = [one[: len(one) // together * together] for one in recordings]
+    return np.concatenate([one.reshape(-1, together * one.shape[1]) for one in whole])
 
 
 def fit_noise(error: np.ndarray, increments: np.ndarray) -> ErrorCovariance:
@@ -169,8 +173,7 @@ def fit_joint_noise(
     errors: Sequence[np.ndarray], motions: Sequence[np.ndarray], machine: Machine
 ) -> ErrorCovariance:
     """Return the noise of one joint from increments of errors and of simulated motions, each `(W, I)`."""
-    error = np.concatenate([join_windows(one) for one in errors])
-    moved = np.concatenate([join_windows(one) for one in motions])
+    error, moved = join_windows(errors), join_windows(motions)
     if machine.interface == "position":
         return fit_level_noise(error, moved, errors[0].shape[1])
     return fit_noise(error, moved)

@@ -6,8 +6,8 @@
 
 `make` runs each policy in a deployed loop of its own making (`faults.py`), on a simulated machine with
 contact and with the effects of the training, forty times with a fault, and twenty times without one over
-all policies. The labels are written once, with their hash in `seal.txt`; `answer` refuses to run where the
-folder holds the key of the labels, and gets the logs in an order of chance.
+all policies. The labels are written once, with their hash in `seal.txt`; `answer` takes
+the logs in an order of chance and does not open the labels, which lie unencrypted in the same folder.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ from actuators.models.valve import PoseFeatures
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from diagnosis import effect_library, gap, nonadditive_refit
-from diagnosis.error_covariance import ErrorCovariance, compute_loss, fit_noise
+from diagnosis.error_covariance import ErrorCovariance, compute_loss, fit_noise, join_windows
 from diagnosis.residuals import INCREMENT_SAMPLES, build_rays, to_increments
 from diagnosis.responses import Response, choose_rays, fit_faults, fit_sizes, score_responses
 from diagnosis.search import SubsetTable, bind_shared_sizes, choose_set
@@ -36,6 +36,13 @@ def test_errors_of_a_wandering_speed_are_white_after_division_by_their_noise() -
     found = fit_noise(error, way)
     assert found.sensor == pytest.approx(truth.sensor, rel=0.2)
     assert found.wander == pytest.approx(truth.wander, rel=0.25)
+
+
+def test_recordings_of_two_and_three_windows_are_joined_alike() -> None:
+    two, three, four = (np.arange(20.0 * n).reshape(n, 20) for n in (2, 3, 4))
+    np.testing.assert_array_equal(join_windows([two, three]), three.reshape(1, 60))
+    np.testing.assert_array_equal(join_windows([three, four])[1], four[:3].ravel())
+    np.testing.assert_array_equal(join_windows([two[:1], two])[0], two.ravel())
 
 
 def test_what_a_coarse_reading_adds_to_one_increment_it_takes_from_the_next() -> None:
