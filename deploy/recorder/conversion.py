@@ -200,7 +200,10 @@ def _read_advice(
         "observation": [f"obs_{number}" for number in range(widths["observation"])],
     }
     # The advice in force at each row is the last one before it. A decision may come a little late.
-    last = np.searchsorted(t_s, grid_s + LATE_SHARE * machine.period_s, side="right") - 1
+    latest_s = grid_s + LATE_SHARE * machine.period_s
+    last = np.searchsorted(t_s, latest_s, side="right") - 1
+    # An observation belongs to its decision alone: a loop that has ended, or rests, sees nothing.
+    decided = (last >= 0) & (latest_s - t_s[last.clip(0)] < machine.period_s)
     extra = {}
     for field, width in widths.items():
         given = np.full((len(rows), width), np.nan)
@@ -208,7 +211,8 @@ def _read_advice(
             # Advice that was not valid was not shown.
             if values["reason"] == "valid" and len(values.get(field, ())) == width:
                 given[row] = values[field]
-        held = np.where((last >= 0)[:, None], given[last.clip(0)], np.nan).astype(np.float32)
+        holds = decided if field == "observation" else last >= 0
+        held = np.where(holds[:, None], given[last.clip(0)], np.nan).astype(np.float32)
         if np.isfinite(held).any() or field == "u":
             extra |= dict(zip(columns[field], held.T, strict=True))
     return extra

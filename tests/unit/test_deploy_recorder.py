@@ -28,7 +28,12 @@ READER = CaptureLogReader(longest_gap_s=0.15, shortest_s=1.0)
 
 
 def write(
-    folder: Path, machine: Machine, seconds: float = 3.0, gap_s: float = 0.0, close: bool = True
+    folder: Path,
+    machine: Machine,
+    seconds: float = 3.0,
+    gap_s: float = 0.0,
+    close: bool = True,
+    advice_until_s: float = np.inf,
 ) -> CaptureWriter:
     """Writes a capture of a machine whose first joint follows a known path: q1 = 0.1 t, flow a step of 0.5 at 1.025 s."""
     bus, log = (
@@ -58,7 +63,7 @@ def write(
             data += FRAME.pack(begun_s + t_s, bus.layouts[name].frame_id, 0, len(payload)) + payload
         counter += 1
         log.add(FRAMES + data)
-        if k % 5 == 0:
+        if k % 5 == 0 and t_s < advice_until_s:
             advice = {
                 "topic": "advice",
                 "t_s": begun_s + t_s,
@@ -105,6 +110,14 @@ def test_rows_lie_on_the_decisions_and_hold_what_the_policy_saw(
     # q1 is 0.1 t: position and observation of a row are of the same moment.
     assert found.q[15:40, 0] == pytest.approx(0.1 * seen_s, abs=1.5e-3)
     assert found.extra["obs_1"][20] == 2.0
+
+
+def test_after_its_last_decision_a_policy_sees_nothing(machine: Machine, tmp_path: Path) -> None:
+    write(tmp_path, machine, advice_until_s=2.0)
+    (found,) = READER.read(tmp_path / MCAP, machine)
+    seen = np.isfinite(found.extra["obs_0"])
+    assert seen[15:38].all() and not seen[42:].any() and found.num_samples > 50
+    assert np.isfinite(found.extra["advice_q1"][42:]).all(), "advice stays in force until withdrawn"
 
 
 def test_a_gap_splits_the_recording(machine: Machine, tmp_path: Path) -> None:
