@@ -4,7 +4,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from typing import Any, TypeVar, Union, dataclass_transform
 
 from brokk_rl.errors import ConfigError
@@ -20,7 +20,7 @@ def spec(cls: type[T]) -> type[T]:
     such as 48e6 given for an integer becomes an integer. NaN and any other mismatch raise a
     `ConfigError` that names the field, the expected type and the value. A spec may define
     `check(self)` for rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
-    defaults here.
+    defaults here, but for what files from before a field existed mean.
     """
     cls.__post_init__ = _post_init  # type: ignore[attr-defined]
     return dataclass(frozen=True, kw_only=True)(cls)
@@ -45,8 +45,9 @@ def restore_spec(kind: type[T], values: Mapping[str, Any]) -> T:
     """
     hints = typing.get_type_hints(kind)
     names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    if names != values.keys():
-        odd = ", ".join(sorted(names ^ values.keys()))
+    needed = {field.name for field in fields(kind) if field.default is MISSING}  # type: ignore[arg-type]
+    if wrong := (values.keys() - names) | (needed - values.keys()):
+        odd = ", ".join(sorted(wrong))
         raise ConfigError(f"{kind.__name__}: unknown or missing fields: {odd}")
     return kind(**{name: restore_value(hints[name], value) for name, value in values.items()})
 

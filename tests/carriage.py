@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+from composed import option
 
 from actuators.recordings.column_map import Column, ColumnMap, CommandColumn, JointColumns
+from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 NUM = 200
+PERIOD_S = 0.01
+
+
+def make_carriage() -> Machine:
+    """Returns a machine of one joint behind a valve, at 100 Hz; the shipped drive has a force and 200 Hz."""
+    drive = option("machine", "emps")
+    joint = replace(drive.joints[0], command="valve", max_force=None)
+    return replace(drive, joints=(joint,), period_s=PERIOD_S, dead_time_s=PERIOD_S)
 
 
 def make_map(
@@ -35,7 +47,7 @@ def make_map(
 def make_signals() -> dict[str, np.ndarray]:
     """Returns times, commands and positions at the machine's rate, exact in 32 bits."""
     k = np.arange(NUM)
-    return {"t": k * 0.01, "u": np.round(np.sin(k / 9) * 64) / 128, "q": (k % 32) / 256}
+    return {"t": k * PERIOD_S, "u": np.round(np.sin(k / 9) * 64) / 128, "q": (k % 32) / 256}
 
 
 def check(recording: Recording, atol: float = 1e-6) -> None:

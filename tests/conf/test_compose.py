@@ -27,7 +27,7 @@ def composed(*overrides: str) -> DictConfig:
 
 @pytest.mark.parametrize(("group", "name"), PARTS)
 def test_every_option_composes_and_is_what_its_spec_says(group: str, name: str) -> None:
-    cfg = composed("~mode", f"+{group}@subject={name}").subject
+    cfg = composed("~mode", "+machine=brokk170", f"+{group}@subject={name}").subject
     if "_target_" in cfg and not OmegaConf.missing_keys(cfg) - {"out"}:
         instantiate(cfg, _convert_="all", **({"out": "somewhere"} if group == "session" else {}))
 

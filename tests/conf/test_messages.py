@@ -58,7 +58,7 @@ COMPARE = ("mode=compare", "compare.runs=nowhere")
         (("task=goal_pose", "task.hole.radius_m=1"), ("'task' has no 'hole'", "tolerance")),
         (
             ("mode=perceive", "perception/segmenter=onnx", "perception.segmenter.wrong=1"),
-            ("'perception.segmenter' has no 'wrong'", "choices: margin, threads, weights"),
+            ("'perception.segmenter' has no 'wrong'", "choices: gate, margin, threads, weights"),
         ),
         (
             ("-m", "effect=[backlash],[lag]", "effect.backlash.width=1"),

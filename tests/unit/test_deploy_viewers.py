@@ -34,6 +34,7 @@ SAID: dict[str, dict[str, Any]] = {
     "advice": {
         "reason": "valid", "u": [0.1, 0.0, -0.2, 0.0, 0.3], "lever_rad": [0.1, 0.2, 0.0, -0.1], "button_right": True,
         "target_in_base_m": list(TARGETS[0].center_in_base_m), "infer_s": 0.002,
+        "observation": [0.5, -0.25, 1.0],
     },
     "guard": {"state": "LATCHED", "trip": "remote missing", "cause": "remote missing", "joint": "q2"},
     "fault": {"frame_id": 4660, "fault": "wrong CRC"},

@@ -12,8 +12,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 import scipy.io
-from carriage import NUM, check, make_map, make_signals
-from composed import option
+from carriage import NUM, check, make_carriage, make_map, make_signals
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -27,7 +26,7 @@ from brokk_rl.machine import Machine
 @pytest.fixture(scope="module")
 def carriage() -> Machine:
     """A machine of one joint."""
-    return option("machine", "emps")
+    return make_carriage()
 
 
 def write_csv(path: Path, signals: dict[str, np.ndarray]) -> None:

@@ -13,8 +13,7 @@ import can
 import cantools
 import numpy as np
 import pytest
-from carriage import check, make_map, make_signals
-from composed import option
+from carriage import check, make_carriage, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
@@ -44,7 +43,7 @@ uint32 nanosec
 @pytest.fixture(scope="module")
 def carriage() -> Machine:
     """A machine of one joint."""
-    return option("machine", "emps")
+    return make_carriage()
 
 
 def make_topic_map(command: str, position: str, time: str = "log_time") -> Any:

@@ -16,6 +16,7 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
 from actuators.models.lag import FirstOrderLag
+from actuators.recordings.preview_report import run_preview
 from brokk_rl import record
 from brokk_rl.contracts.preview import EffectLimit, PreviewResult
 from brokk_rl.errors import RecordingError
@@ -262,14 +263,26 @@ def test_too_short_motions_are_refused(axis: Machine) -> None:
         assess(preview(), axis, [part])
 
 
-@pytest.mark.parametrize("name", ["mini_excavator", "emps"])
-def test_machines_without_masses_have_a_preview(name: str) -> None:
-    machine = option("machine", name)
+def test_machines_without_masses_have_a_preview() -> None:
+    machine = option("machine", "mini_excavator")
     some = motions(machine, 120.0, 1, "reversals")
     result = assess(replace(option("preview", "default"), excitations={}), machine, some)
     joint = machine.joint_names[0]
     assert limit(result, "creep", joint).number == "drift_rad_s"
     assert limit(result, "backlash", joint).unit == "m" and limit(result, "backlash", joint).is_told
+
+
+@pytest.mark.parametrize("name", ["emps", "so101"])
+def test_joints_commanded_by_targets_or_torques_have_no_preview(
+    name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    machine = option("machine", name)
+    some = motions(machine, 120.0, 1, "reversals")
+    assert some, "there is motion: the interface alone is the reason"
+    caplog.set_level("INFO")
+    generator = np.random.default_rng(0)
+    assert run_preview(option("preview", "default"), some, machine, generator, True) is None
+    assert "known for joints commanded by speed only" in caplog.text
 
 
 FAST = (
