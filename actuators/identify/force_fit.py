@@ -137,16 +137,21 @@ class ForceFit:
         period_s, edge = machine.period_s, round(EDGE_S / machine.period_s)
         if recording.num_samples < 4 * edge:
             return None
-        low_pass: Any = butter(4, 2.0 * self.motion_hz * period_s)
-        q = filtfilt(*low_pass, recording.q[:, j].astype(float))
-        force = filtfilt(*low_pass, recording.u[:, j].astype(float))
+        q = _filter_low_pass(recording.q[:, j].astype(float), 4, self.motion_hz, period_s)
+        force = _filter_low_pass(recording.u[:, j].astype(float), 4, self.motion_hz, period_s)
         force = force * machine.max_force[j]
         rows = np.arange(len(q))
         # A command that is held over a period acts at its middle.
         force = np.interp(rows, rows + 0.5 + delay_s / period_s, force)
         speed = np.gradient(q, period_s)
         columns = [np.gradient(speed, period_s), speed, np.sign(speed), np.ones_like(speed)]
-        low_pass = butter(2, 2.0 * self.force_hz * period_s)
         inside = slice(edge, -edge, max(1, round(0.5 / (self.force_hz * period_s))))
-        x = filtfilt(*low_pass, np.stack(columns, 1), axis=0)[inside]
-        return x, filtfilt(*low_pass, force)[inside]
+        x = _filter_low_pass(np.stack(columns, 1), 2, self.force_hz, period_s)
+        return x[inside], _filter_low_pass(force, 2, self.force_hz, period_s)[inside]
+
+
+def _filter_low_pass(values: np.ndarray, order: int, cut_hz: float, period_s: float) -> np.ndarray:
+    """Return `values` without their faster parts and without a delay; time is the first axis."""
+    coefficients: Any = butter(order, 2.0 * cut_hz * period_s)
+    numerator, denominator = coefficients
+    return filtfilt(numerator, denominator, values, axis=0)

@@ -29,9 +29,9 @@ from brokk_rl.task_description import TaskDescription
 log = logging.getLogger(__name__)
 
 ITERATIONS_PER_ROUND = 10
-"""Iterations between two changes of the desired divergence; processes that train together must
-agree on it."""
-
+"""Iterations between two changes of the desired divergence, at most."""
+ROUNDS_OF_ANNEAL = 10
+"""Changes over the end that a plateau begins, at least: a short end is followed too."""
 
 NUM_ANSWERS = 256
 """Observations at most, of as many environments, that a checkpoint holds with the network's own
@@ -100,7 +100,8 @@ class TrainingRunner(OnPolicyRunner):
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
         while num := self.group.broadcast_first(self._count_iterations(steps)):
-            if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
+            begins_round = self.current_learning_iteration % self._count_round(steps) == 0
+            if self.group.broadcast_first(begins_round):
                 share = self.group.broadcast_first(self._measure_share())
                 self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
                 self._follow_schedules(share)
@@ -127,12 +128,25 @@ class TrainingRunner(OnPolicyRunner):
         if teacher and isinstance(self.alg, DevicePPO):
             self.alg.set_imitation(teacher.weight_at(share_spent))
 
+    def _count_round(self, steps: int) -> int:
+        """Return the iterations between two changes of `desired_kl`: fewer in a short end.
+
+        Args:
+            steps: Control steps of one iteration.
+        """
+        if self.training.plateau is None or self._levelled_at is None:
+            return ITERATIONS_PER_ROUND
+        anneal = self._levelled_at * self.training.plateau.anneal / steps
+        return min(ITERATIONS_PER_ROUND, max(1, int(anneal / ROUNDS_OF_ANNEAL)))
+
     def _measure_share(self) -> float:
         """Return the spent share of the training; its end begins with a plateau."""
         training, book = self.training, self._book
         share = training.budget.share_spent(book.env_steps, book.seconds)
         if training.plateau and self._levelled_at is None:
-            row = find_plateau(book.rows, training.plateau)
+            # rows of whole rounds: how often a checkpoint is written must not change training
+            whole = len(book.rows) - len(book.rows) % ITERATIONS_PER_ROUND
+            row = find_plateau(book.rows[:whole], training.plateau)
             if row is not None:
                 self._levelled_at = int(float(row["env_steps"]))
                 log.info("success no longer grows after %d control steps", self._levelled_at)
@@ -155,12 +169,12 @@ class TrainingRunner(OnPolicyRunner):
         """
         book = self._book
         budget, interval = self.training.budget, self.training.save_interval
-        num = min(
-            part - self.current_learning_iteration % part
-            for part in (ITERATIONS_PER_ROUND, interval)
-        )
         if self._measure_share() >= 1.0:
             return 0
+        num = min(
+            part - self.current_learning_iteration % part
+            for part in (self._count_round(steps), interval)
+        )
         ends = [budget.max_env_steps] if budget.max_env_steps else []
         if self.training.plateau and self._levelled_at is not None:
             ends.append(math.ceil(self._levelled_at * (1.0 + self.training.plateau.anneal)))

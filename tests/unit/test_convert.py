@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from composed import option
+from conftest import Done
 
 from actuators.recordings.column_map import Column, ColumnMap, CommandColumn
 from brokk_rl import record
@@ -218,7 +219,7 @@ def test_optional_columns_are_read_and_may_have_empty_cells(
     assert np.isfinite(recording.extra["oil_c"][5:]).all()
 
 
-def test_convert_from_the_command(brokk: Callable[..., object], excavator: Machine) -> None:
+def test_convert_from_the_command(brokk: Callable[..., Done], excavator: Machine) -> None:
     Path("logs").mkdir()
     logged(Path("logs"), [*lines(8.0, 0.0), *lines(6.0, 30.0)])
     logged(Path("logs"), lines(), name="lift.csv")
@@ -236,7 +237,7 @@ def test_convert_from_the_command(brokk: Callable[..., object], excavator: Machi
     assert [recording.run for recording in recordings] == ["dig", "dig", "lift"]
 
 
-def test_one_bad_log_leaves_no_recording_of_the_others(brokk: Callable[..., object]) -> None:
+def test_one_bad_log_leaves_no_recording_of_the_others(brokk: Callable[..., Done]) -> None:
     logged(Path(), lines(), name="a.csv")
     logged(Path(), put(7, 1, "off"), name="b.csv")
     done = brokk(
@@ -252,7 +253,7 @@ def test_one_bad_log_leaves_no_recording_of_the_others(brokk: Callable[..., obje
 
 
 def test_a_map_and_a_machine_that_do_not_belong_together_are_said(
-    brokk: Callable[..., object],
+    brokk: Callable[..., Done],
 ) -> None:
     logged(Path(), lines())
     done = brokk("mode=convert", "machine=mini_excavator", "convert.input=*.csv")
@@ -260,7 +261,7 @@ def test_a_map_and_a_machine_that_do_not_belong_together_are_said(
     assert "choose machine=… and import=… that belong together" in done.err
 
 
-def test_two_logs_of_one_name_are_refused(brokk: Callable[..., object]) -> None:
+def test_two_logs_of_one_name_are_refused(brokk: Callable[..., Done]) -> None:
     for folder in ("monday", "tuesday"):
         Path(folder).mkdir()
         logged(Path(folder), lines())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +21,8 @@ from brokk_rl.sim.fault_recorder import Fault, FaultRecorder, load_fault
 from brokk_rl.sim.fault_replay import describe_cause, play_fault
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
+from tasks.reward import RewardTerm
+from tasks.step_state import StepState
 
 NATIVE = NativeSimulator(num_worlds=4, substeps=5, num_threads=1)
 FUSED = WarpSimulator(
@@ -127,11 +130,9 @@ def test_the_strongest_contact_of_the_last_step_is_named(machine: Machine) -> No
     assert "contact of" in cause and "chisel" in cause
 
 
-def make_loop(machine: Machine) -> ControlLoop:
+def make_loop(machine: Machine, task: Any = None) -> ControlLoop:
     torch.manual_seed(0)
-    loop = runs.plant(machine, option("task", "borehole_insertion"), NATIVE).build(
-        runs.CPU, 4, 64, 5
-    )
+    loop = runs.plant(machine, task, NATIVE).build(runs.CPU, 4, 64, 5)
     loop.record_faults(20)
     return loop
 
@@ -156,12 +157,16 @@ def test_a_training_writes_the_fault_and_the_command(
     assert faults.read_statistics()["fault_rate"] == 0.0  # released
 
 
+def divide_by_zero(state: StepState) -> torch.Tensor:
+    return (state.u - state.u_before).abs().sum(1) / 0.0
+
+
 def test_a_reward_term_that_is_not_finite_stops_the_run_by_name(
     machine: Machine, tmp_path: Path
 ) -> None:
-    loop = make_loop(machine)
-    term, weight = loop.task._terms["command_change"]  # a term of the task's own
-    loop.task._terms["command_change"] = (lambda tool: term(tool) / 0.0, weight)
+    task = option("task", "borehole_insertion")
+    broken = RewardTerm(function=f"{__name__}:divide_by_zero", weight=-0.01)
+    loop = make_loop(machine, replace(task, reward=task.reward | {"command_change": broken}))
     loop.step(torch.zeros(4, 5))  # 0 / 0
     with pytest.raises(SimulationError, match="reward term command_change was not finite"):
         FaultLog(loop, tmp_path / "faults", "rank0_").read_statistics()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from composed import option
+from conftest import Done
 
 from actuators.recordings.column_names import read_column_name
 from brokk_rl import record
@@ -52,7 +53,7 @@ def read_guesses(folder: str) -> dict[str, dict[str, str]]:
 
 
 def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
-    brokk: Callable[..., object],
+    brokk: Callable[..., Done],
 ) -> None:
     write_servo_log(Path("logs/a.csv"))
     done = brokk("mode=import", "log.input=logs", "log.name=leg", "session.out=leg")
@@ -84,7 +85,7 @@ def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
 
 
 def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
-    brokk: Callable[..., object],
+    brokk: Callable[..., Done],
 ) -> None:
     rows = make_targets()
     commands, speeds = np.tanh(3 * rows), np.cumsum(delay(np.tanh(3 * rows)), 0) / RATE_HZ
@@ -110,9 +111,7 @@ def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
     assert not list(Path().rglob("*.parquet"))
 
 
-def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(
-    brokk: Callable[..., object],
-) -> None:
+def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[..., Done]) -> None:
     targets = make_targets()
     write_table(
         Path("a.csv"),
@@ -135,7 +134,7 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_valve_commands_get_neutral_full_and_sign_from_the_logs(
-    brokk: Callable[..., object], sign: int
+    brokk: Callable[..., Done], sign: int
 ) -> None:
     generator = np.random.default_rng(0)
     levels = np.repeat(generator.choice([0.0, 0.0, 0.6, -0.5, 1.0, -1.0], 60), 25)
@@ -150,7 +149,7 @@ def test_valve_commands_get_neutral_full_and_sign_from_the_logs(
     assert {key: command[key] for key in expected} == pytest.approx(expected)
 
 
-def test_commands_that_go_one_way_only_are_said(brokk: Callable[..., object]) -> None:
+def test_commands_that_go_one_way_only_are_said(brokk: Callable[..., Done]) -> None:
     generator = np.random.default_rng(0)
     levels = np.repeat(generator.choice([0.0, 0.0, 0.6, 1.0], 60), 25)
     q = np.cumsum(delay(levels, 4) - 0.4) / RATE_HZ * 0.1  # falls back by its weight
@@ -166,9 +165,7 @@ def test_commands_that_go_one_way_only_are_said(brokk: Callable[..., object]) ->
     assert done.code == 0, done.err
 
 
-def test_joints_that_are_never_commanded_are_left_out_and_said(
-    brokk: Callable[..., object],
-) -> None:
+def test_joints_that_are_never_commanded_are_left_out_and_said(brokk: Callable[..., Done]) -> None:
     targets = make_targets()
     still = np.full(len(targets), 0.5)
     write_table(
@@ -187,7 +184,7 @@ def test_joints_that_are_never_commanded_are_left_out_and_said(
     assert list(yaml.safe_load(Path("draft/column_map.yaml").read_text())["joints"]) == ["a"]
 
 
-def test_a_damaged_log_leaves_no_map(brokk: Callable[..., object]) -> None:
+def test_a_damaged_log_leaves_no_map(brokk: Callable[..., Done]) -> None:
     write_servo_log(Path("a.csv"))
     lines = Path("a.csv").read_text().splitlines()
     lines[900] = lines[900].replace(",", ";", 3)
@@ -198,13 +195,13 @@ def test_a_damaged_log_leaves_no_map(brokk: Callable[..., object]) -> None:
     assert not list(Path().rglob("column_map.yaml"))
 
 
-def test_one_of_machine_and_map_alone_is_refused(brokk: Callable[..., object]) -> None:
+def test_one_of_machine_and_map_alone_is_refused(brokk: Callable[..., Done]) -> None:
     done = brokk("mode=import", "log.input=a.csv", "machine=brokk170")
     assert done.code == 2
     assert "import=… is missing" in done.err
 
 
-def test_a_log_without_commands_lists_its_columns(brokk: Callable[..., object]) -> None:
+def test_a_log_without_commands_lists_its_columns(brokk: Callable[..., Done]) -> None:
     rows = np.arange(100.0)
     write_table(Path("a.csv"), {"t": rows / 50, "q": np.sin(rows), "vir": rows})
     done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
@@ -233,7 +230,7 @@ def test_names_are_read_as_words(table: str, column: str, expected: tuple[str | 
 
 
 def test_logs_of_the_model_excavator_give_the_map_that_a_person_wrote(
-    brokk: Callable[..., object], machine: Machine
+    brokk: Callable[..., Done], machine: Machine
 ) -> None:
     """A recording of the shipped machine as CSV is guessed column by column."""
     generator = np.random.default_rng(1)

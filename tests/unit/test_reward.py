@@ -18,6 +18,12 @@ YES, NO = torch.tensor([True]), torch.tensor([False])
 @pytest.fixture
 def state() -> ToolState:
     return ToolState(
+        q=torch.zeros(1, 5),
+        lower=-torch.ones(5),
+        upper=torch.ones(5),
+        steps=torch.tensor([4.0]),
+        max_steps=100,
+        is_first=NO,
         tip_m=torch.tensor([[2.5, 0.0, 0.9]]),
         pitch_rad=torch.tensor([1.25]),
         target_m=torch.tensor([[2.5, 0.2, 0.75]]),  # 0.2 and 0.15 make 0.25

@@ -69,7 +69,7 @@ def test_a_failure_is_no_time_out(machine: Machine) -> None:
     loop = make(machine)
     loop.step(torch.zeros(8, 5))
     loop.world.q[3, 0] = float(machine.upper[0])
-    loop.episode_length_buf = torch.full((8,), loop.max_episode_length - 1)
+    loop.episode_length_buf = torch.ones(8, dtype=torch.long) * (loop.max_episode_length - 1)
     _, _, done, extras = loop.step(torch.zeros(8, 5))
     assert done.all() and extras["time_outs"].tolist() == [index != 3 for index in range(8)]
     assert loop.task.reasons[int(loop.reason[3])] == "joint_limit"

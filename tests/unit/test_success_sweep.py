@@ -64,17 +64,17 @@ def test_a_training_ends_with_an_anneal_after_a_plateau_and_repeats(
     steps = 16 * runs.STEPS
     plateau = Plateau(above=0.0, episodes=2, least_gain=1.0, anneal=0.5)
     training = runs.small(
-        max_env_steps=900 * steps, plateau=plateau, settling=0.5, save_interval=99
+        max_env_steps=900 * steps, plateau=plateau, settling=0.5, keep_checkpoints=1
     )
     wanted = training.runner["algorithm"]["desired_kl"]
     ends = []
-    for name in ("one", "two"):
-        runner = runs.train(machine, tmp_path / name, training)
+    for name, interval in (("one", 99), ("two", 7)):  # checkpoints change nothing
+        runner = runs.train(machine, tmp_path / name, replace(training, save_interval=interval))
         found = find_plateau(runs.progress(tmp_path / name), plateau)
         assert found is not None
-        ends.append([float(found["env_steps"]), runner._book.env_steps])
-        # the schedule follows every ten iterations, and a tenth of the divergence is its end
-        assert wanted * 0.1 <= runner.alg.desired_kl < wanted * 0.6
+        ends.append([float(found["env_steps"]), runner._book.env_steps, runner.alg.desired_kl])
+        # a tenth of the divergence is the end, and the last of ten changes or more comes near it
+        assert wanted * 0.1 <= runner.alg.desired_kl < wanted * 0.3
     assert ends[0] == ends[1]
     assert ends[0][0] * 1.5 <= ends[0][1] < ends[0][0] * 1.5 + 11 * steps < 900 * steps
 
