@@ -45,7 +45,7 @@ def measure(folder: Path) -> dict[str, object]:
         for step in range(NUM_MOMENTS * APART):
             if step % APART == 0:
                 vectors.append(groups["policy"].numpy().copy())
-            groups = loop.step(actor.act(dict(groups.items())))[0]
+            groups = loop.step(actor.act(groups.to_dict()))[0]
     stacked = np.concatenate(vectors)
     encoder = restore_encoder(machine, contract["observation"])
     assert isinstance(encoder, ObservationEncoder), "a policy of a tool-pose task"

@@ -36,6 +36,7 @@ from perception.calibrate.disparity_error import (
 )
 from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
 from perception.render.stereo_camera import StereoRig
 
@@ -110,10 +111,12 @@ def shoot(
 ) -> tuple[Frame, Any]:
     """Return a frame of a scene by a rig with this error, and its truth."""
     generator = session.generator(f"clean/{distance_m:g}/{number}")
+    assert isinstance(studio.scene, SceneRanges), "the default is one of random scenes"
     sight = replace(studio.scene.sight, distance_m=(distance_m, distance_m))
     rig = replace(studio.rig, error=error)
-    studio = replace(studio, rig=rig, scene=replace(studio.scene, sight=sight))
-    shot = studio.shot(compose_scene(studio.scene, rig, generator), generator)
+    scene = replace(studio.scene, sight=sight)
+    studio = replace(studio, rig=rig, scene=scene)
+    shot = studio.shot(compose_scene(scene, rig, generator), generator)
     frame = Frame(
         color=shot.color,
         depth_m=shot.depth_m,

@@ -42,6 +42,7 @@ from brokk_rl.signals import Frame
 from perception.benchmark.scoring import FinderScore, score_frame
 from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
@@ -161,6 +162,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     """Returns what each option makes of one scene."""
     studio = renderer(task.condition, task.distance_m)
     generator = scenes(task.seed).generator(f"scene/{task.number}")
+    assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
     frame = Frame(
         color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,

@@ -192,11 +192,11 @@ def test_a_touch_in_the_picture_becomes_the_target_and_a_name_too(
     )
     wanted = RequestHandler(
         exchange,
-        RecordingControl(exchange, tmp_path, lambda folder: None),
+        RecordingControl(exchange, tmp_path, lambda folder: pytest.fail("nothing is recorded")),
         aim,
         armed=False,
         commands=False,
-    )  # type: ignore[arg-type,return-value]
+    )
     center_m = np.array(TARGETS[1].center_in_base_m)
     point = OperatorRequest("point", "{:.4f},{:.4f}".format(*seen_at(FRAME, center_m)))
     assert not feed.submit(point), "there is no picture yet"

@@ -114,7 +114,8 @@ def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> N
     )
     truth = dataset.SceneTruth("test", {}, (hole,), (), {})
     seen, _ = score_frame(finder_with(masks), frame, truth)
-    assert seen.is_perfect and seen.row()["position_mm_median"] < 2.0
+    error_mm = seen.row()["position_mm_median"]
+    assert seen.is_perfect and error_mm is not None and error_mm < 2.0
     blind = option("perception", "plane_conic").build()
     missed, found = score_frame(
         blind, replace(frame, depth_m=np.full_like(frame.depth_m, np.nan)), truth

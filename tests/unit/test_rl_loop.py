@@ -191,7 +191,7 @@ def test_every_policy_meets_the_same_holes_and_the_same_errors(machine: Machine)
 
 def test_an_untrained_policy_depends_on_its_seed_alone(machine: Machine) -> None:
     loop = make(machine)
-    seen = dict(loop.get_observations().items())
+    seen = loop.get_observations().to_dict()
     untrained = UntrainedPolicy(training=runs.small(max_seconds=1.0))
     before = torch.get_rng_state()
     first, again, other = (untrained.build(loop, seed).act(seen) for seed in (1, 1, 2))
