@@ -10,8 +10,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
-from actuators.models.transport import check_dead_time, select_commands_in_force
+from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.transport import select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -71,20 +71,13 @@ class ForceDriveModel:
                 f"actuator: a force drive takes torques, but machine '{machine.name}' is commanded by {machine.interface}; "
                 "choose another actuator=…, or write command: torque and max_force at its joints"
             )
-        nominal = {}
-        for name in NUMBERS:
-            value = getattr(config, name)
-            given = machine.dead_time_s if value is None else value
-            nominal[name] = expand_per_joint(given, machine, f"actuator.{name}")
-        if (nominal["mass_kg"] <= 0).any():
-            raise ConfigError(f"actuator.mass_kg: expected > 0, got {nominal['mass_kg'].tolist()}")
-        for name in ("viscous_n_s_m", "coulomb_n"):
-            if (nominal[name] < 0).any():
-                raise ConfigError(
-                    f"actuator.{name}: expected 0 or more, got {nominal[name].tolist()}"
-                )
-        longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
-        check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
+        nominal = read_parameters(
+            config,
+            NUMBERS,
+            machine,
+            positive=("mass_kg",),
+            not_negative=("viscous_n_s_m", "coulomb_n"),
+        )
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"
         )

@@ -5,13 +5,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
-from actuators.models.transport import (
-    check_dead_time,
-    open_valve,
-    select_commands_in_force,
-    split_run_commands,
-)
+from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.transport import open_valve, select_commands_in_force, split_run_commands
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -106,24 +101,18 @@ class FirstOrderLagModel:
     def __init__(
         self, config: FirstOrderLag, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        names = ("dead_band_extend", "dead_band_retract", "gain", "time_constant_s")
-        nominal = {
-            name: expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
-            for name in names
-        }
-        dead_time_s = machine.dead_time_s if config.dead_time_s is None else config.dead_time_s
-        nominal["dead_time_s"] = expand_per_joint(dead_time_s, machine, "actuator.dead_time_s")
-        for name in names[:2]:
+        bands = ("dead_band_extend", "dead_band_retract")
+        nominal = read_parameters(
+            config,
+            (*bands, "gain", "time_constant_s", "dead_time_s"),
+            machine,
+            not_negative=("time_constant_s",),
+        )
+        for name in bands:
             if ((nominal[name] < 0) | (nominal[name] >= 1)).any():
                 raise ConfigError(
                     f"actuator.{name}: expected dead bands in [0, 1), got {nominal[name].tolist()}"
                 )
-        if (nominal["time_constant_s"] < 0).any():
-            raise ConfigError(
-                f"actuator.time_constant_s: expected 0 or more, got {nominal['time_constant_s'].tolist()}"
-            )
-        longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
-        check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"
         )

@@ -1,11 +1,13 @@
 """Parameters of an actuator: one value or one per joint, and drawn per episode if asked for."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 
 from actuators.models.random_draws import hash_uniform
+from actuators.models.transport import check_dead_time
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 
@@ -41,6 +43,42 @@ def expand_per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarra
             f"{where}: no value for {', '.join(missing)} of machine '{machine.name}'; add them, or '{OTHER}'"
         )
     return np.array([float(value.get(name, value.get(OTHER, 0.0))) for name in known])
+
+
+def read_parameters(
+    config: Any,
+    names: Sequence[str],
+    machine: Machine,
+    *,
+    positive: Collection[str] = (),
+    not_negative: Collection[str] = (),
+) -> dict[str, np.ndarray]:
+    """Return the numbers of an actuator's spec for every joint, `(J,)` each, checked.
+
+    Args:
+        config: The spec, with `spread`. A `dead_time_s` of `None` takes the machine's.
+        names: Fields to read, `dead_time_s` among them.
+        machine: The machine.
+        positive: Fields that must be above 0.
+        not_negative: Fields that must be 0 or more.
+
+    Raises:
+        ConfigError: a number is out of its range, a joint is missing or unknown, or the machine's
+            history does not hold the dead time.
+    """
+    found = {}
+    for name in names:
+        value = getattr(config, name)
+        if value is None and name == "dead_time_s":
+            value = machine.dead_time_s
+        found[name] = expand_per_joint(value, machine, f"actuator.{name}")
+        if name in positive and (found[name] <= 0).any():
+            raise ConfigError(f"actuator.{name}: expected > 0, got {found[name].tolist()}")
+        if name in not_negative and (found[name] < 0).any():
+            raise ConfigError(f"actuator.{name}: expected 0 or more, got {found[name].tolist()}")
+    longest_s = found["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
+    check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
+    return found
 
 
 class SpreadParameters:

@@ -19,8 +19,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
-from actuators.models.transport import check_dead_time, select_commands_in_force, split_run_commands
+from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.transport import select_commands_in_force, split_run_commands
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -90,21 +90,13 @@ class ServoModel:
                 f"actuator: a servo follows positions, but machine '{machine.name}' is commanded by {machine.interface}; "
                 "choose another actuator=…, or write command: position at its joints"
             )
-        nominal = {}
-        for name in NUMBERS:
-            value = getattr(config, name)
-            given = machine.dead_time_s if value is None else value
-            nominal[name] = expand_per_joint(given, machine, f"actuator.{name}")
-        for name in ("response_s", "play_rad"):
-            if (nominal[name] < 0).any():
-                raise ConfigError(
-                    f"actuator.{name}: expected 0 or more, got {nominal[name].tolist()}"
-                )
-        for name in ("damping", "top_speed"):
-            if (nominal[name] <= 0).any():
-                raise ConfigError(f"actuator.{name}: expected > 0, got {nominal[name].tolist()}")
-        longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
-        check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
+        nominal = read_parameters(
+            config,
+            NUMBERS,
+            machine,
+            positive=("damping", "top_speed"),
+            not_negative=("response_s", "play_rad"),
+        )
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"
         )

@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
-from actuators.models.transport import check_dead_time, select_commands_in_force, split_run_commands
+from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.transport import select_commands_in_force, split_run_commands
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import build_joint_weight
 from brokk_rl.history import History
@@ -215,19 +215,7 @@ class ValveModel:
     def __init__(
         self, config: ValveActuator, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        given = {name: getattr(config, name) for name in NUMBERS}
-        given["dead_time_s"] = (
-            machine.dead_time_s if config.dead_time_s is None else config.dead_time_s
-        )
-        nominal = {
-            name: expand_per_joint(value, machine, f"actuator.{name}")
-            for name, value in given.items()
-        }
-        for name, value in nominal.items():
-            if (value < 0).any():
-                raise ConfigError(f"actuator.{name}: expected 0 or more, got {value.tolist()}")
-        longest_s = nominal["dead_time_s"].max() * (1.0 + config.spread.get("dead_time_s", 0.0))
-        check_dead_time(float(longest_s), machine, "actuator.dead_time_s")
+        nominal = read_parameters(config, NUMBERS, machine, not_negative=NUMBERS)
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"
         )

@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 
 from diagnosis.deployment.contract import LoadedPolicy
 from diagnosis.deployment.distortions import (
-    FACTORS,
     LEVELS,
     MAX_DELAY,
     MAX_HOLD,
@@ -15,6 +14,7 @@ from diagnosis.deployment.distortions import (
     Distortion,
     describe_order,
     keep_fixed,
+    list_factors,
     list_groups,
     list_permutations,
     make_fixed,
@@ -25,7 +25,6 @@ from diagnosis.deployment.transforms import (
     clip_columns,
     delay_rows,
     hold_rows,
-    scale_columns,
     shift_command,
     smooth_rows,
 )
@@ -43,25 +42,7 @@ def list_command_distortions(policy: LoadedPolicy) -> list[Distortion]:
         found.append(Distortion("order", "command", text, make(keep_fixed(arrange_columns(order)))))
     for columns, label in list_groups(names):
         place = "command" + label
-        found.append(
-            Distortion(
-                "sign",
-                place,
-                f"{place} has the wrong sign",
-                make(keep_fixed(scale_columns(columns, -1.0))),
-            )
-        )
-        found.append(
-            Distortion(
-                "scale",
-                place,
-                f"{place} is multiplied by {{value}}",
-                make(lambda value, columns=columns: scale_columns(columns, value)),
-                FACTORS,
-                True,
-                "factor",
-            )
-        )
+        found += list_factors(place, columns, make)
         found.append(
             Distortion(
                 "clip",
@@ -82,11 +63,6 @@ def list_command_distortions(policy: LoadedPolicy) -> list[Distortion]:
                 (-0.3, -0.1, -0.03, 0.03, 0.1, 0.3),
                 True,
                 "offset",
-            )
-        )
-        found.append(
-            Distortion(
-                "stale", place, f"{place} is zero", make(keep_fixed(scale_columns(columns, 0.0)))
             )
         )
     delays = tuple(float(number) for number in range(1, MAX_DELAY + 1))

@@ -108,6 +108,30 @@ def list_input_distortions(
     return found
 
 
+def list_factors(
+    place: str, columns: list[int], make: Callable[[Callable[[float], Transform]], Build]
+) -> list[Distortion]:
+    """Return a wrong sign, a wrong scale and a missing value of some columns.
+
+    Args:
+        place: Field of the distortions.
+        columns: The columns.
+        make: Makes the change from a transform by its number.
+    """
+    turned = make(keep_fixed(scale_columns(columns, -1.0)))
+    missing = make(keep_fixed(scale_columns(columns, 0.0)))
+
+    def scale(value: float) -> Transform:
+        return scale_columns(columns, value)
+
+    multiplied = f"{place} is multiplied by {{value}}"
+    return [
+        Distortion("sign", place, f"{place} has the wrong sign", turned),
+        Distortion("scale", place, multiplied, make(scale), FACTORS, True, "factor"),
+        Distortion("stale", place, f"{place} is always zero", missing),
+    ]
+
+
 def _list_scalings(term: ObservationTerm, names: list[str]) -> list[Distortion]:
     """Return wrong signs, scales, offsets and bounds of a term."""
     found = []
@@ -117,14 +141,7 @@ def _list_scalings(term: ObservationTerm, names: list[str]) -> list[Distortion]:
 
     for columns, label in list_groups(names):
         place = term.name + label
-        found.append(
-            Distortion(
-                "sign",
-                place,
-                f"{place} has the wrong sign",
-                make(keep_fixed(scale_columns(columns, -1.0))),
-            )
-        )
+        found += list_factors(place, columns, make)
         for unit, factor in UNIT_FACTORS.items():
             found.append(
                 Distortion(
@@ -134,25 +151,6 @@ def _list_scalings(term: ObservationTerm, names: list[str]) -> list[Distortion]:
                     make(keep_fixed(scale_columns(columns, factor))),
                 )
             )
-        found.append(
-            Distortion(
-                "scale",
-                place,
-                f"{place} is multiplied by {{value}}",
-                make(lambda value, columns=columns: scale_columns(columns, value)),
-                FACTORS,
-                True,
-                "factor",
-            )
-        )
-        found.append(
-            Distortion(
-                "stale",
-                place,
-                f"{place} is always zero",
-                make(keep_fixed(scale_columns(columns, 0.0))),
-            )
-        )
         found.append(
             Distortion(
                 "default_pose",
