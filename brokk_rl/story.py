@@ -24,7 +24,7 @@ HANDED_ON_FOLDER = "given"
 """Folder with the files that stages take from the story."""
 FOLDER_PLACEHOLDER = "{folder}"
 DEVICE = "device"
-"""What a stage takes besides groups: the device of the session."""
+"""Key of `session` that every stage takes although it is no group."""
 
 
 @spec

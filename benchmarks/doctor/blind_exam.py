@@ -42,7 +42,7 @@ POLICIES = {
     "goal_pose": (ROOT / "benchmarks/doctor/policies/goal_pose", "goal_pose"),
 }
 OTHERS = {"goal_pose_early": ROOT / "benchmarks/doctor/policies/goal_pose_early"}
-"""A checkpoint of before, without an exam of its own."""
+"""An earlier checkpoint of the pose policy, which sits no exam of its own."""
 OTHER = {"residual": "direct", "direct": "residual", "goal_pose": "goal_pose_early"}
 """Network that was copied by mistake."""
 NUM_WORKERS = 2
@@ -50,8 +50,8 @@ NUM_CLEAN = 20
 NUM_STEPS = 300
 """Control periods of a log, 15 s."""
 DETAILS = ("command", "advice", "observation")
-"""What a log holds beside positions and the target: the command in force; also the policy's advice; also
-what the network saw."""
+"""Kinds of logs. Each holds positions, the target and the command in force; the second also the policy's
+advice, the third also the observation."""
 ROUNDED = 1e-4
 """Positions of some logs are rounded to so much when they are written, rad."""
 MOVES_RAD = 0.15
@@ -308,7 +308,7 @@ def make_logs(
                 labels.append(label)
             for case, label, rows in zip(batch, labels, drive(site, batch, found), strict=True):
                 pitch_rad = float(site.pitch_rad[case["row"]])
-                if acts(case, rows, pitch_rad):
+                if is_visible(case, rows, pitch_rad):
                     done[case["row"]] = rows, dict(case) | label, pitch_rad
         if len(done) == len(cases):
             return [done[row] for row in range(len(cases))]
@@ -339,7 +339,7 @@ def draw_fault(
     }
 
 
-def acts(case: dict[str, Any], rows: dict[str, np.ndarray], pitch_rad: float) -> bool:
+def is_visible(case: dict[str, Any], rows: dict[str, np.ndarray], pitch_rad: float) -> bool:
     """Returns whether the fault of a case changed anything: the command, or the motion of its joints."""
     if case["kind"] in ("clean", "task"):
         return True

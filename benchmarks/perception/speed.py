@@ -1,4 +1,4 @@
-"""How long a 1080p frame takes from both pictures to holes, on some threads, without the network.
+"""Time of a 1080p frame from both pictures to holes, stage by stage, without the network.
 
     taskset -c 0,1 python benchmarks/perception/speed.py <out.json> --count 6 --threads 2 --shrink 2
 

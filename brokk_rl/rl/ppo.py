@@ -49,10 +49,10 @@ class DevicePPO(PPO):
     """
 
     fuse: bool = False
-    """Whether `torch.compile` fuses acting and the loss; set it before the first step."""
+    """True: `torch.compile` fuses acting and the loss. Set it before the first step."""
     _rollout: CapturedRollout | None = None
     _epoch: Sequence[Callable[[], None]] | None = None
-    """What one pass over all mini-batches consists of."""
+    """Steps of one pass over all mini-batches, in their order."""
     _samples: dict[str, torch.Tensor] | None = None
     """Stored steps in the order of the mini-batches; see `shuffle`."""
     _gathered: torch.Tensor

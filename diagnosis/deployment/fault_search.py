@@ -47,8 +47,8 @@ NUM_SCREENED = 40
 NUM_REFINED = 12
 """Mistakes, the best of the first comparison, that are replayed on all rows. Chosen by hand."""
 NUM_FIRST, PAIR_GAIN = 2, 0.3
-"""Of pairs: mistakes that are tried as the first of two, and the share of the difference that such a
-mistake removes at least. Chosen by hand."""
+"""Limits of the search for two mistakes at once: how many are tried as the first, and the share of the
+loss that a first one removes at least. Chosen by hand."""
 TOLERANCE_REFINED = 1e-5
 """Relative tolerance of a refined number."""
 

@@ -50,7 +50,7 @@ GRIDS, FINEST = ((7, 0.08), (6, 0.02)), (5, 0.005)
 RADII = (0.0,), (-0.06, -0.03, 0.0, 0.03, 0.06)
 """Departures of the radius on these grids, relative."""
 MOST_GRIDS = 4
-"""Times that the finest grid may move or widen."""
+"""Largest number of moves and widenings of the finest grid."""
 STRAIGHT, SHALLOW = 1e-6, 0.1
 """Tangent of the obliquity from which the direction of a displacement is known, and from which it
 matters."""

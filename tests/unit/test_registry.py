@@ -174,7 +174,7 @@ def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
 
 
 def test_fields_of_earlier_versions_become_the_current_ones() -> None:
-    """What moved keeps its value, what was not there gets the value by which the version acted."""
+    """A field that moved keeps its value; a new one gets the value by which that version acted."""
     terms = load_option("task", "borehole_insertion").termination
     for ends in (True, False):
         old = {
