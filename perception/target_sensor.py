@@ -231,13 +231,13 @@ class PerceivedTargets:
         for number in np.flatnonzero(mask):
             stream = (self._seed, int(number), int(self._episodes[number]))
             generator = np.random.default_rng(stream)
-            eye = WatchedHole(self._settings, self._mount, start["scene"][number], generator)
+            one = WatchedHole(self._settings, self._mount, start["scene"][number], generator)
             if len(self.watched) <= number:
-                self.watched.append(eye)
+                self.watched.append(one)
             else:
                 if self._attended[number]:
                     self.ended.append(self.watched[number])
-                self.watched[number] = eye
+                self.watched[number] = one
             self._steps[number] = 0
             self._episodes[number] += 1
 
@@ -261,21 +261,21 @@ class PerceivedTargets:
         for number in np.flatnonzero(self._attended):
             self.watched[number].learn(float(now_s[number]))
         self._steps[self._attended] += 1
-        target_m = np.stack([eye.center_m for eye in self.watched])
-        is_known = np.array([eye.hole is not None for eye in self.watched])
+        target_m = np.stack([one.center_m for one in self.watched])
+        is_known = np.array([one.hole is not None for one in self.watched])
         return TargetReading(target_m, is_known & self._attended)
 
     def summarize(self) -> dict[str, Any]:
         """Return figures of the episodes; see `TargetSensor.summarize`."""
-        frames = [frame for eye in self.ended for frame in eye.history]
+        frames = [frame for one in self.ended for frame in one.history]
         known = [frame for frame in frames if frame["error_m"] is not None]
-        last = [eye.history[-1] for eye in self.ended if eye.history and eye.hole is not None]
+        last = [one.history[-1] for one in self.ended if one.history and one.hole is not None]
         errors_m = [float(np.linalg.norm(frame["error_m"])) for frame in last]
         return {
             "frames": len(frames),
             "seen_share": float(np.mean([frame["seen"] for frame in frames])) if frames else None,
             "known_share": len(known) / len(frames) if frames else None,
-            "never_seen": sum(eye.hole is None for eye in self.ended),
+            "never_seen": sum(one.hole is None for one in self.ended),
             "last_error_m": {
                 "median": float(np.median(errors_m)) if errors_m else None,
                 "p95": float(np.quantile(errors_m, 0.95)) if errors_m else None,
@@ -286,15 +286,15 @@ class PerceivedTargets:
         """Take and search the pictures that are due."""
         asked: list[tuple[int, _Exposure]] = []
         for number in due:
-            eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
+            one, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
             seed = (self._seed, int(number), int(self._steps[number]))
             chain_m = self._settings.arm.trace(self._machine, q[number])
-            if t_s < eye.arrives_s - 1e-9 or not self._is_steady(eye, int(number), q):
-                eye.wait_for(None, t_s)
+            if t_s < one.arrives_s - 1e-9 or not self._is_steady(one, int(number), q):
+                one.wait_for(None, t_s)
                 continue
-            exposure = eye.expose(q[number], measured_q[number], chain_m, t_s, seed)
+            exposure = one.expose(q[number], measured_q[number], chain_m, t_s, seed)
             if exposure is None:
-                eye.wait_for((), t_s)
+                one.wait_for((), t_s)
             else:
                 asked.append((int(number), exposure))
         with use_workers(self._settings.num_processes):
@@ -304,11 +304,11 @@ class PerceivedTargets:
         for (number, exposure), holes in zip(asked, found, strict=True):
             self.watched[number].wait_for(holes, exposure.t_s)
 
-    def _is_steady(self, eye: WatchedHole, number: int, q: np.ndarray) -> bool:
+    def _is_steady(self, one: WatchedHole, number: int, q: np.ndarray) -> bool:
         """Return whether the arm does not swing the camera faster than a picture allows."""
         if self._before is None or self._steps[number] == 0:
             return True
-        poses = self._mount.locate(eye.position, np.stack([self._before[number], q[number]]))
+        poses = self._mount.locate(one.position, np.stack([self._before[number], q[number]]))
         if poses.ndim == 2:
             return True
         cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1.0) / 2.0
@@ -317,19 +317,19 @@ class PerceivedTargets:
 
     def _choose_views(self, due: np.ndarray, q: np.ndarray, plan: MotionPlan) -> None:
         s = self._settings.next_view
-        target_m = np.stack([eye.center_m for eye in self.watched])
+        target_m = np.stack([one.center_m for one in self.watched])
         if len(self._mount.views) < 2:
             return
         step_s = s.horizon_s / (s.num_times - 1)
         planned = plan(target_m, s.num_times, step_s)
         for number in due:
-            eye, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
-            if t_s >= eye.arrives_s - 1e-9:  # one motion at a time
+            one, t_s = self.watched[number], float(self._steps[number] * self._machine.period_s)
+            if t_s >= one.arrives_s - 1e-9:  # one motion at a time
                 plan_q = planned[number]
-                if eye.hole is None:  # the machine rests until the hole was seen
+                if one.hole is None:  # the machine rests until the hole was seen
                     plan_q = np.repeat(q[number][None], s.num_times, 0)
-                choice = self._planner.choose(eye.believe(), eye.position, plan_q, eye.num_missed)
-                eye.move(choice, t_s)
+                choice = self._planner.choose(one.believe(), one.position, plan_q, one.num_missed)
+                one.move(choice, t_s)
 
 
 def _search(
