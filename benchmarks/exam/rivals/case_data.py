@@ -81,7 +81,9 @@ def read_windows(folder: Path, arm: Arm, stride_s: float) -> Windows:
         tool = None
         if "ee_x_m" in names:
             tool = np.stack([table[f"ee_{axis}_m"].to_numpy() for axis in "xyz"], 1)
-        for begin in range(history, len(q_rows := positions) - steps, round(stride_s / arm.period_s)):
+        for begin in range(
+            history, len(q_rows := positions) - steps, round(stride_s / arm.period_s)
+        ):
             u.append(commands[begin - history : begin + steps])
             q.append(q_rows[begin : begin + steps + 1])
             if tool is not None:

@@ -14,7 +14,14 @@ from typing import Any
 
 from case_data import Change
 
-ONE_WAY = {"dead_band": 1, "lag": 1, "dead_time": 1, "creep": 1, "flow_sharing": 1, "saturation": -1}
+ONE_WAY = {
+    "dead_band": 1,
+    "lag": 1,
+    "dead_time": 1,
+    "creep": 1,
+    "flow_sharing": 1,
+    "saturation": -1,
+}
 """Effects that exist in one direction only, and the sign of their numbers' change."""
 ALL_JOINTS = ("flow_sharing", "base_tilt")
 """Effects of the whole machine."""
@@ -35,13 +42,7 @@ TARGETS = {
     "base_tilt": "kinematics.BaseTilt",
 }
 """Effects of the library by name, nearest to the machine last."""
-NOTHING = {
-    "gain": 1.0,
-    "extend_gain": 1.0,
-    "retract_gain": 1.0,
-    "level": 1.0,
-    "scale": 1.0,
-}
+NOTHING = {"gain": 1.0, "extend_gain": 1.0, "retract_gain": 1.0, "level": 1.0, "scale": 1.0}
 """Values that change nothing; 0 for all others."""
 PROBABILITY = 0.9
 """Stated for each name: none of the rivals gives a probability."""

@@ -93,11 +93,11 @@ def fit_drives(drives: SpeedDrives, windows: Windows) -> np.ndarray:
     """Return the mean of the last generation: numbers of `BOUNDS` by joint, then the delay."""
     joints = windows.q.shape[2]
     low = np.concatenate([np.full(joints, low) for low, _ in BOUNDS.values()] + [[DELAY_STEPS[0]]])
-    high = np.concatenate([np.full(joints, high) for _, high in BOUNDS.values()] + [[DELAY_STEPS[1]]])
-    unit = np.tile([-1.0, 1.0], (len(low), 1))
-    search = cmaes.CMA(
-        np.zeros(len(low)), SIGMA, bounds=unit, seed=0, population_size=CANDIDATES
+    high = np.concatenate(
+        [np.full(joints, high) for _, high in BOUNDS.values()] + [[DELAY_STEPS[1]]]
     )
+    unit = np.tile([-1.0, 1.0], (len(low), 1))
+    search = cmaes.CMA(np.zeros(len(low)), SIGMA, bounds=unit, seed=0, population_size=CANDIDATES)
 
     def scale(x: np.ndarray) -> np.ndarray:
         return low + (x + 1.0) / 2.0 * (high - low)
@@ -115,7 +115,9 @@ def fit_drives(drives: SpeedDrives, windows: Windows) -> np.ndarray:
 def simulate_vectors(drives: SpeedDrives, vectors: np.ndarray) -> np.ndarray:
     """Return the free runs of parameter vectors, `(P, 4 J + 1)`."""
     parts = np.split(vectors[:, :-1], len(BOUNDS), axis=1)
-    return drives.simulate(dict(zip(BOUNDS, parts, strict=True)), np.round(vectors[:, -1]).astype(int))
+    return drives.simulate(
+        dict(zip(BOUNDS, parts, strict=True)), np.round(vectors[:, -1]).astype(int)
+    )
 
 
 def find_changes(case: Path, arm: Arm) -> list[Change]:
