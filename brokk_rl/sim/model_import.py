@@ -241,14 +241,14 @@ class _ModelReader:
 
     def _describe_commands(self, joints: list[dict[str, Any]]) -> None:
         """Add `command` to each joint: that of its actuator, a guess where the model has none."""
-        found = [self._read_command(joint) for joint in self._chain]
-        if None in found or len({command for command, _ in found if command}) > 1:
+        found = [one for one in map(self._read_command, self._chain) if one is not None]
+        if len(found) < len(joints) or len({command for command, _ in found}) > 1:
             found = [("valve", 0.0)] * len(joints)
             self._remarks.append(
                 "command: valve is a guess; write velocity, position or torque (with max_force) at the joints of "
                 "other drives."
             )
-        for values, (command, force) in zip(joints, filter(None, found), strict=True):
+        for values, (command, force) in zip(joints, found, strict=True):
             values["command"] = command
             if command == "torque":
                 values["max_force"] = _make_dimension(force, self._path.name, "medium")

@@ -123,6 +123,7 @@ class Change:
         joint: The joint.
         value: The number with the change.
         change: Its distance from the value that changes nothing.
+        error: Standard error of the change by the rival's own account; 1 where it gives none.
     """
 
     effect: str
@@ -130,12 +131,16 @@ class Change:
     joint: str
     value: float
     change: float
+    error: float
 
 
 def write_changes(changes: list[Change], out: Path) -> None:
     """Write all fitted changes, whatever is named of them."""
     out.mkdir(parents=True, exist_ok=True)
-    rows: list[dict[str, Any]] = [vars(change) for change in changes]
+    rows: list[dict[str, Any]] = []
+    for change in changes:
+        numbers = {name: float(getattr(change, name)) for name in ("value", "change", "error")}
+        rows.append({**vars(change), **numbers})
     (out / "changes.json").write_text(json.dumps(rows, indent=1) + "\n")
 
 

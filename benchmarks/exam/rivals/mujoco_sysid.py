@@ -43,7 +43,11 @@ STARTS = {
 """Start and bounds of each number of a joint; bounds are several times the exam's ranges."""
 DEMAND = (0.3, 0.0, 1.0)
 """The same of the flow of a joint over that of the pump."""
-POSES = 400
+UNKNOWN = 1e6
+"""Error of a number that the recordings do not show."""
+TRACKER_M = 0.002
+"""Noise of a measured tool point, m: of a total station."""
+POSES = 1000
 """Poses of the kinematic problem; 17 unknowns."""
 
 
@@ -150,25 +154,45 @@ class WindowRollout:
         return [residual if x.ndim > 1 else residual[:, 0]], None, None
 
 
-def fit_drives(arm: Arm, windows: Windows, start: np.ndarray | None) -> ParameterDict:
-    """Return the numbers that `mujoco.sysid.optimize` finds for these windows."""
+Errors = dict[str, np.ndarray]
+"""Standard error of each number, by its name."""
+
+
+def compute_errors(
+    found: ParameterDict, jacobian: np.ndarray, residual: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Return the standard errors that the toolbox states."""
+    _, halves = sysid.calculate_intervals([residual], jacobian)
+    errors, begin = {}, 0
+    for name, parameter in found.parameters.items():
+        end = begin + parameter.size
+        errors[name] = np.minimum(halves[begin:end] / 1.96, UNKNOWN)
+        begin = end
+    return errors
+
+
+def fit_drives(
+    arm: Arm, windows: Windows, start: np.ndarray | None
+) -> tuple[ParameterDict, Errors]:
+    """Return the numbers that `mujoco.sysid.optimize` finds for these windows, and their errors."""
     spec, parameters = build_spec(arm), list_parameters(arm)
     if start is not None:
         parameters.update_from_vector(start)
         parameters.move_off_bounds()
     runs = WindowRollout(arm, windows)
-    found, _ = sysid.optimize(
+    found, result = sysid.optimize(
         parameters,
         lambda x, p: runs.compute_residual(x, p, spec),
         optimizer="mujoco",
         verbose=False,
         max_iters=ITERATIONS,
     )
-    return found
+    residual = runs.compute_residual(found.as_vector(), found.copy(), spec)[0][0]
+    return found, compute_errors(found, result.jac, residual)
 
 
-def fit_kinematics(arm: Arm, windows: Windows) -> ParameterDict:
-    """Return encoder zeros and scales, extra link lengths and the tilt of the base."""
+def fit_kinematics(arm: Arm, windows: Windows) -> tuple[ParameterDict, Errors]:
+    """Return encoder zeros and scales, extra link lengths, the tilt of the base, and errors."""
     if windows.ee is None:
         raise ValueError("the tool point was not measured")
     q, seen = windows.q.reshape(-1, len(arm.joints)), windows.ee.reshape(-1, 3)
@@ -217,17 +241,18 @@ def fit_kinematics(arm: Arm, windows: Windows) -> ParameterDict:
                 mujoco.mj_kinematics(model, data)
                 points[k] = data.site_xpos[tool]
             # a light pull to the drawing: zero of the slew and tilt of the base are nearly alike
-            errors = (points - seen).ravel() / 0.005
+            errors = (points - seen).ravel() / TRACKER_M
             columns.append(np.concatenate([errors, (column - start) / spread]))
         residual = np.stack(columns, 1)
         return [residual if x.ndim > 1 else residual[:, 0]], None, None
 
     start = parameters.as_vector()
     spread = np.concatenate([zeros + 0.02, zeros + 0.03, zeros + 0.02, np.full(2, 0.03)])
-    found, _ = sysid.optimize(
+    found, result = sysid.optimize(
         parameters, compute_residual, optimizer="mujoco", verbose=False, max_iters=ITERATIONS
     )
-    return found
+    residual = compute_residual(found.as_vector(), found.copy())[0][0]
+    return found, compute_errors(found, result.jac, residual)
 
 
 def find_changes(case: Path, arm: Arm) -> list[Change]:
@@ -237,32 +262,40 @@ def find_changes(case: Path, arm: Arm) -> list[Change]:
         "reference": read_windows(case / "reference", arm, REFERENCE_STRIDE_S),
         "field": read_windows(case / "field", arm, FIELD_STRIDE_S),
     }
-    nominal = fit_drives(arm, halves["reference"], None)
-    present = fit_drives(arm, halves["field"], nominal.as_vector())
+    nominal, nominal_error = fit_drives(arm, halves["reference"], None)
+    present, present_error = fit_drives(arm, halves["field"], nominal.as_vector())
     changes = []
     for j, joint in enumerate(arm.joints):
         was = {name: float(nominal[name].value[j]) for name in STARTS}
         now = {name: float(present[name].value[j]) for name in STARTS}
         sides = {side: now[f"{side}_gain"] / was[f"{side}_gain"] for side in ("extend", "retract")}
         both = float(np.sqrt(sides["extend"] * sides["retract"]))
-        changes.append(Change("flow_gain", "gain", joint, both, both - 1.0))
+        error = {
+            name: float(np.hypot(nominal_error[name][j], present_error[name][j])) for name in STARTS
+        }
+        relative = {side: error[f"{side}_gain"] / now[f"{side}_gain"] for side in sides}
+        half = 0.5 * float(np.hypot(relative["extend"], relative["retract"]))
+        changes.append(Change("flow_gain", "gain", joint, both, both - 1.0, half))
         for side, ratio in sides.items():
             change = ratio / both
-            changes.append(Change("asymmetry", f"{side}_gain", joint, change, change - 1.0))
+            changes.append(Change("asymmetry", f"{side}_gain", joint, change, change - 1.0, half))
             band = now[f"{side}_band"] - was[f"{side}_band"]
-            changes.append(Change("dead_band", side, joint, max(band, 0.0), band))
+            changes.append(
+                Change("dead_band", side, joint, max(band, 0.0), band, error[f"{side}_band"])
+            )
         level = min(now["level"] / was["level"], 1.0)
-        changes.append(Change("saturation", "level", joint, level, level - 1.0))
+        changes.append(Change("saturation", "level", joint, level, level - 1.0, error["level"]))
         for effect, parameter, name in (
             ("lag", "time_constant_s", "lag_s"),
             ("dead_time", "dead_time_s", "delay_s"),
             ("creep", "sink_rad_s", "sink"),
         ):
             away = now[name] - was[name]
-            changes.append(Change(effect, parameter, joint, max(away, 0.0), away))
+            changes.append(Change(effect, parameter, joint, max(away, 0.0), away, error[name]))
         away = float(present["demand"].value[0] - nominal["demand"].value[0])
         value = float(present["demand"].value[0]) if away > 0 else 0.0
-        changes.append(Change("flow_sharing", "demand", joint, value, away))
+        wide = float(np.hypot(nominal_error["demand"][0], present_error["demand"][0]))
+        changes.append(Change("flow_sharing", "demand", joint, value, away, wide))
     if halves["field"].ee is not None and np.isfinite(halves["field"].ee).all():
         changes += find_kinematic_changes(arm, halves)
     return changes
@@ -270,7 +303,8 @@ def find_changes(case: Path, arm: Arm) -> list[Change]:
 
 def find_kinematic_changes(arm: Arm, halves: dict[str, Windows]) -> list[Change]:
     """Return the changes of encoders, links and base."""
-    was, now = fit_kinematics(arm, halves["reference"]), fit_kinematics(arm, halves["field"])
+    was, was_error = fit_kinematics(arm, halves["reference"])
+    now, now_error = fit_kinematics(arm, halves["field"])
     changes = []
     for effect, parameter, none in (
         ("encoder_bias", "bias_rad", 0.0),
@@ -279,8 +313,10 @@ def find_kinematic_changes(arm: Arm, halves: dict[str, Windows]) -> list[Change]
     ):
         for j, joint in enumerate(arm.joints):
             away = float(now[parameter].value[j] - was[parameter].value[j])
-            changes.append(Change(effect, parameter, joint, none + away, away))
+            error = float(np.hypot(was_error[parameter][j], now_error[parameter][j]))
+            changes.append(Change(effect, parameter, joint, none + away, away, error))
     for k, parameter in enumerate(("roll_rad", "pitch_rad")):
         away = float(now["tilt_rad"].value[k] - was["tilt_rad"].value[k])
-        changes.append(Change("base_tilt", parameter, "machine", away, away))
+        error = float(np.hypot(was_error["tilt_rad"][k], now_error["tilt_rad"][k]))
+        changes.append(Change("base_tilt", parameter, "machine", away, away, error))
     return changes

@@ -1,7 +1,8 @@
 """The rule by which a fit of parameters becomes names of effects.
 
-A rival returns every number it fits. A number counts as changed when it moves further than
-`threshold` times its spread over cases without a visible gap. Spread and threshold come from a
+A rival returns every number it fits, and its error where it states one. A number counts as changed
+when it moves further than `threshold` times its error and its spread where nothing was done; the
+spread is in parts of the stated error. Spread and threshold come from a
 development exam, `choose_rule.py`. Numbers that only grow with an effect count in that direction.
 """
 
@@ -53,7 +54,7 @@ def measure_change(change: Change, spreads: dict[str, float]) -> float:
     sign = ONE_WAY.get(change.effect, 0)
     if sign and change.change * sign <= 0:
         return 0.0
-    return abs(change.change) / spreads[f"{change.effect}.{change.parameter}"]
+    return abs(change.change) / change.error / spreads[f"{change.effect}.{change.parameter}"]
 
 
 def select_effects(
@@ -80,7 +81,8 @@ def write_answer(changes: list[Change], rule: dict[str, Any], out: Path) -> None
         parameters: dict[str, dict[str, Any]] = defaultdict(dict)
         for change in changes:
             if change.effect == effect and change.joint in [*joints, "machine"]:
-                half = 1.96 * rule["spreads"][f"{effect}.{change.parameter}"]
+                spread = rule["spreads"][f"{effect}.{change.parameter}"]
+                half = 1.96 * spread * change.error
                 ci95 = [change.value - half, change.value + half]
                 parameters[change.parameter][change.joint] = {"mean": change.value, "ci95": ci95}
         selected.append(

@@ -126,21 +126,21 @@ def find_changes(case: Path, arm: Arm) -> list[Change]:
     reference = read_windows(case / "reference", arm, REFERENCE_STRIDE_S)
     field = read_windows(case / "field", arm, FIELD_STRIDE_S)
     # the valve curve is what the simulator was built with: the reference's
-    fitted = mujoco_sysid.fit_drives(arm, reference, None)
+    fitted, _ = mujoco_sysid.fit_drives(arm, reference, None)
     nominal = {name: fitted[name].value for name in [*mujoco_sysid.STARTS, "demand"]}
     found = fit_drives(SpeedDrives(arm, field, nominal), field)
     armature, viscous, friction, bias = np.split(found[:-1], len(BOUNDS))
     changes = []
     for j, joint in enumerate(arm.joints):
         gain = NO_LOAD / (1.0 + viscous[j])
-        changes.append(Change("flow_gain", "gain", joint, gain, gain - 1.0))
+        changes.append(Change("flow_gain", "gain", joint, gain, gain - 1.0, 1.0))
         away = armature[j] / (1.0 + viscous[j]) - nominal["lag_s"][j]
-        changes.append(Change("lag", "time_constant_s", joint, max(away, 0.0), away))
+        changes.append(Change("lag", "time_constant_s", joint, max(away, 0.0), away, 1.0))
         sides = 0.5 * (nominal["extend_gain"][j] + nominal["retract_gain"][j])
         band = friction[j] / (NO_LOAD * sides)
         for side in ("extend", "retract"):
-            changes.append(Change("dead_band", side, joint, band, band))
+            changes.append(Change("dead_band", side, joint, band, band, 1.0))
         away = float(round(found[-1])) * arm.period_s / STEPS
-        changes.append(Change("dead_time", "dead_time_s", joint, max(away, 0.0), away))
-        changes.append(Change("encoder_bias", "bias_rad", joint, bias[j], bias[j]))
+        changes.append(Change("dead_time", "dead_time_s", joint, max(away, 0.0), away, 1.0))
+        changes.append(Change("encoder_bias", "bias_rad", joint, bias[j], bias[j], 1.0))
     return changes
