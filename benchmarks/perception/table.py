@@ -71,6 +71,7 @@ class Task:
     failures: Path
     pictures: int
     shown: str
+    render: tuple[str, ...]
 
 
 def main() -> None:
@@ -97,6 +98,12 @@ def main() -> None:
         type=int,
         default=12,
         help="at most so many pictures of failures of each row of the first option",
+    )
+    parser.add_argument(
+        "--render",
+        nargs="+",
+        default=(),
+        help="overrides of mode=render, such as rig/sensor=mosaic; another <out> for each",
     )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
@@ -127,6 +134,7 @@ def main() -> None:
                             given.out / "failures",
                             given.pictures,
                             given.options[0],
+                            tuple(given.render),
                         )
                     )
     if tasks:
@@ -160,7 +168,7 @@ def ready() -> None:
 
 def look(task: Task) -> list[dict[str, Any]]:
     """Returns what each option makes of one scene."""
-    studio = renderer(task.condition, task.distance_m)
+    studio = renderer(task.condition, task.distance_m, task.render)
     generator = scenes(task.seed).generator(f"scene/{task.number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
@@ -202,13 +210,14 @@ def show_failure(
 
 
 @functools.cache
-def renderer(condition: str, distance_m: float) -> FrameRenderer:
+def renderer(condition: str, distance_m: float, render: tuple[str, ...]) -> FrameRenderer:
     scene, *overrides = VARIATIONS.get(condition, (condition,))
     return composed(
         "studio",
         "mode=render",
         f"scene={scene}",
         *overrides,
+        *render,
         f"scene.sight.distance_m=[{distance_m},{distance_m}]",
     )
 

@@ -10,10 +10,10 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import DrilledBlock
 from perception.render.ray_tracer import Light
 from perception.render.solids import Solid, SolidPose
-from perception.render.stereo_camera import CameraExposure
 
 Range = tuple[float, float]
 Count = tuple[int, int]

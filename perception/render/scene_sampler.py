@@ -8,6 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from perception.render.block_sampler import build_frame, draw_bars, draw_block
+from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
 from perception.render.ray_tracer import Light
@@ -19,7 +20,7 @@ from perception.render.scene_ranges import (
     draw_uniform,
 )
 from perception.render.solids import Box, Cylinder, PlaneSolid, Solid, SolidPose
-from perception.render.stereo_camera import CameraExposure, StereoRig
+from perception.render.stereo_camera import StereoRig
 
 _CLEAR = 1.6
 """Where the arm hides nothing it stays away from the rim's centre by this factor of the rim's size

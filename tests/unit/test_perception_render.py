@@ -18,6 +18,14 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from perception import dataset
 from perception.render.block_sampler import build_frame, draw_block
+from perception.render.camera_sensor import (
+    CameraExposure,
+    LinearCamera,
+    MosaicCamera,
+    blur_motion,
+    draw_dust,
+    take_picture,
+)
 from perception.render.drilled_block import Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.materials import Material
@@ -26,7 +34,7 @@ from perception.render.ray_tracer import Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
 from perception.render.solids import Box, Cylinder, PlaneSolid, SolidPose
-from perception.render.stereo_camera import CameraExposure, StereoRig, draw_dust, take_picture
+from perception.render.stereo_camera import StereoRig
 
 GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
 STONE = Material((0.5, 0.5, 0.5), 0.25, 0.0006, 2)
@@ -268,7 +276,9 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Stereo
     )
     views = [tracer.view(camera) for camera in (full.left, full.right)]
     left, right = (
-        take_picture(view.radiance, view.depth_m, exposure, draw_dust(0.0, chance), chance)
+        take_picture(
+            view.radiance, view.depth_m, exposure, draw_dust(0.0, chance), LinearCamera(), chance
+        )
         for view in views
     )
     stereo = option("stereo", "sgbm")
@@ -320,7 +330,12 @@ def test_dust_takes_contrast_as_it_says() -> None:
         1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0
     )  # a quarter is left after 2 m
     taken = take_picture(
-        light, depth, thick, draw_dust(0.0, np.random.default_rng(0)), np.random.default_rng(0)
+        light,
+        depth,
+        thick,
+        draw_dust(0.0, np.random.default_rng(0)),
+        LinearCamera(),
+        np.random.default_rng(0),
     )
     assert taken[0, 0, 0] == pytest.approx(255 * (0.2 / 4 + 0.6 * 3 / 4), abs=1)
     assert taken[0, -1, 0] == pytest.approx(255 * (0.8 / 4 + 0.6 * 3 / 4), abs=1)
@@ -330,12 +345,84 @@ def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
     light, depth = np.full((200, 200, 3), 0.5, np.float32), np.ones((200, 200), np.float32)
     dim = CameraExposure(0.15, 0.0, 0.0, 0.0, 0.0, 8000.0, 8.0, 1.0, 0.0)
     taken = take_picture(
-        light, depth, dim, draw_dust(0.0, np.random.default_rng(0)), np.random.default_rng(1)
+        light,
+        depth,
+        dim,
+        draw_dust(0.0, np.random.default_rng(0)),
+        LinearCamera(),
+        np.random.default_rng(1),
     ).astype(float)
     # 0.075 of 8000 electrons are 600; their noise sqrt(600 + 8^2) is 25.8 electrons or 0.82 of 255
     # steps, rounding adds 1 / 12
     assert taken.mean() == pytest.approx(0.075 * 255, abs=0.1)
     assert taken.std() == pytest.approx(np.hypot(25.77 / 8000 * 255, np.sqrt(1 / 12)), rel=0.05)
+
+
+def plain_mosaic(**changes: Any) -> MosaicCamera:
+    """Returns a colour camera without errors, noise or processing beyond its mosaic."""
+    plain = MosaicCamera(
+        gain=1.0, color_gain=(2.0, 1.0, 1.6), color_error=(1.0, 1.0, 1.0), focus_px=0.0, motion_px=(0.0, 0.0),
+        full_well_e=1e9, read_noise_e=0.0, photo_response=0.0, bits=16, gamma=1.0, sharpening=0.0,
+        jpeg_quality=100, pattern=0,
+    )  # fmt: skip
+    return replace(plain, **changes)
+
+
+BRIGHT = CameraExposure(1.0, 0.0, 0.0, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0)
+
+
+def test_a_mosaic_keeps_an_even_colour_and_each_camera_its_own_gains() -> None:
+    light = np.broadcast_to(np.array([0.5, 0.4, 0.2], np.float32), (40, 64, 3)).copy()
+    taken = plain_mosaic().develop(light, BRIGHT, np.random.default_rng(0))
+    np.testing.assert_allclose(taken[5:-5, 5:-5].mean((0, 1)) / 255, [0.5, 0.4, 0.2], atol=0.006)
+    other = plain_mosaic(gain=1.1, color_error=(0.9, 1.0, 1.2))
+    taken = other.develop(light, BRIGHT, np.random.default_rng(0))
+    expected = 1.1 * np.array([0.5 * 0.9, 0.4, 0.2 * 1.2])
+    np.testing.assert_allclose(taken[5:-5, 5:-5].mean((0, 1)) / 255, expected, atol=0.006)
+
+
+def test_raw_noise_of_a_mosaic_is_that_of_its_electrons() -> None:
+    # Red sees 0.5 / 2 of 8000 e: 2000 e, whose noise with 5 e of reading and 1 % of unevenness is
+    # sqrt(2000 + 25 + 20^2) = 49.2 e. Green: 4000 e, sqrt(4000 + 25 + 40^2) = 75.0 e.
+    camera = plain_mosaic(full_well_e=8000.0, read_noise_e=5.0, photo_response=0.01, pattern=7)
+    raw = 8000.0 * camera.read_out(
+        np.full((600, 600, 3), 0.5, np.float32), np.random.default_rng(0)
+    )
+    assert raw[::2, ::2].mean() == pytest.approx(2000, rel=0.002)
+    assert raw[::2, ::2].std() == pytest.approx(49.2, rel=0.02)
+    assert raw[::2, 1::2].std() == pytest.approx(75.0, rel=0.02)
+    # Another picture of the same camera: unevenness is the same, the rest is new.
+    again = 8000.0 * camera.read_out(
+        np.full((600, 600, 3), 0.5, np.float32), np.random.default_rng(1)
+    )
+    assert (raw - again)[::2, ::2].std() == pytest.approx(np.sqrt(2 * 2025), rel=0.02)
+
+
+def test_motion_smears_a_point_along_its_way() -> None:
+    light = np.zeros((21, 31, 3), np.float32)
+    light[10, 15] = 1.0
+    smeared = blur_motion(light, (6.0, 0.0))[..., 0]
+    columns = np.arange(31.0)
+    weight = smeared.sum(0)
+    assert smeared.sum() == pytest.approx(1.0, abs=1e-4)
+    assert (columns * weight).sum() == pytest.approx(15.0, abs=1e-3)
+    # A line of 6 px has a variance of 6^2 / 12; linear interpolation adds about 1 / 6.
+    assert ((columns - 15) ** 2 * weight).sum() == pytest.approx(3.0 + 1 / 6, abs=0.1)
+    assert smeared[:9].sum() == smeared[12:].sum() == 0.0
+
+
+def test_a_sensor_draws_one_pair_for_a_seed_and_another_for_each_frame() -> None:
+    sensor = option("rig/sensor", "mosaic")
+    chance = np.random.default_rng(3)
+    first, second = sensor.draw_pair(chance), sensor.draw_pair(chance)
+    assert first[0] != second[0] and first[0].gain != first[1].gain
+    assert first[0].motion_px == first[1].motion_px, "the rig shakes as one"
+    assert first == sensor.draw_pair(np.random.default_rng(3))
+    one = replace(sensor, seed=5)
+    first, second = one.draw_pair(chance), one.draw_pair(chance)
+    assert replace(first[1], motion_px=(0, 0)) == replace(second[1], motion_px=(0, 0))
+    with pytest.raises(ConfigError, match="jpeg_quality"):
+        replace(sensor, jpeg_quality=(0, 90))
 
 
 @pytest.mark.parametrize("name", names("scene"))
