@@ -20,7 +20,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, plane, rim
-from perception.pose.appearance import Interior
+from perception.pose.appearance import Interior, WallGlow
 from perception.pose.plane import FacePlane
 from perception.pose.rim import RimCircle
 
@@ -34,6 +34,8 @@ FORGIVEN, AT_FIRST = 0.55, 1.4
 for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
 BROKEN_SEEN = 0.6
 """Least part of a broken rim with edges: its pieces may lie at any depth, so texture has some too."""
+IN_DUST = "log-likelihood ratio of a hole to a flat disc"
+"""Reason for a refusal in dust: it cannot be told, or it is a disc."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which occluders of its rim are searched."""
 
@@ -48,7 +50,10 @@ class AppearanceGates:
         darker: Surroundings darker by more than this, over the brightness of the face, exclude
             dust.
         contrast: Least contrast of a veiled hole in standard deviations of the face's grain; a
-            stain has less. Not asked where both cameras see that it is deep.
+            stain has less.
+        hole_log_ratio: Least log-likelihood ratio of a veiled hole to a flat disc, by the light on
+            its wall (`appearance.WallGlow`). Neither this nor `contrast` is asked where the
+            parallax alone is evidence enough.
         mouth: Least mean of the segmenter's hole mask inside, where there is one.
         sure_mouth: Mean of the hole mask from which it decides where depth cannot be seen.
         slope: Slope of brightness inside (`Interior`) that alone is evidence enough; evidence is
@@ -63,6 +68,7 @@ class AppearanceGates:
     veiled: float
     darker: float
     contrast: float
+    hole_log_ratio: float
     mouth: float
     sure_mouth: float
     slope: float
@@ -289,7 +295,11 @@ class PlaneConicEstimator:
         undecided = inside.darkness > s.looks.veiled or (
             covered > UNDECIDED and inside.unknown > UNDECIDED
         )
-        refused = self._check_appearance(inside, parallax, masks, row, ellipse, undecided)
+        glow = None
+        if inside.darkness > s.looks.veiled:
+            place = (frame.camera_matrix, face, circle.center_m, circle.radius_m)
+            glow = appearance.measure_wall_glow(gray, frame.depth_m, row, *place)
+        refused = self._check_appearance(inside, parallax, glow, masks, row, ellipse, undecided)
         if refused:
             return refused
         # A network that marks mouths has decided already; without it the doubt stays.
@@ -370,12 +380,16 @@ class PlaneConicEstimator:
         self,
         inside: Interior,
         parallax: float,
+        glow: WallGlow | None,
         masks: Masks,
         row: np.ndarray,
         ellipse: Ellipse,
         undecided: bool,
     ) -> Rejection | None:
-        """Return the gate of the appearance that a hole misses, `None` where it passes all."""
+        """Return the gate of the appearance that a hole misses, `None` where it passes all.
+
+        `glow` is known where the inside is veiled, `None` elsewhere.
+        """
         looks = self.settings.looks
 
         def refuse(reason: str, value: float, limit: float) -> Rejection:
@@ -402,14 +416,18 @@ class PlaneConicEstimator:
         has_parallax = bool(np.isfinite(from_parallax))
         evidence += from_parallax if has_parallax else 0.0
         # Dust and haze brighten the inside; there darkness alone does not decide.
-        if inside.darkness > looks.veiled:
+        if glow is not None:
             if is_sure:
                 return None
             if inside.around < inside.darkness - looks.darker:
                 return refuse("brightness inside over outside", inside.darkness, looks.veiled)
-            if inside.contrast >= looks.contrast or (has_parallax and evidence >= 1.0):
+            if has_parallax and from_parallax >= 1.0:
                 return None
-            return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
+            if inside.contrast < looks.contrast:
+                return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
+            if glow.log_ratio < looks.hole_log_ratio:
+                return refuse(IN_DUST, glow.log_ratio, looks.hole_log_ratio)
+            return None
         # Nothing can be seen that would decide: the hole passes with a lower score.
         if undecided and not has_parallax and (is_sure or not has_mask):
             return None
