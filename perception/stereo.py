@@ -21,14 +21,14 @@ _LARGEST_STEP_PX = 0.5
 """Largest step of refinement; longer ones leave the linear range. Chosen by hand."""
 _LARGEST_CHANGE_PX = 1.0
 """Total change from which the match was wrong. Chosen by hand."""
-_LEAST_GAIN = 0.1
-"""Part of the predicted error of a face that a further step must remove. Chosen by hand."""
 _LEAST_SLOPE = 0.01
 """Least mean squared gradient for refinement, (grey levels a pixel)². Chosen by hand."""
 
-PATCH_PX, PATCHES, LEAST_PATCHES, FLAT_PX = 25, 150, 8, 1.5
-"""Side of a patch in which disparities are compared with a plane, most of them, fewest that decide,
-and largest deviation of a flat one, px. Chosen by hand."""
+PATCH_PX, BLOCK_PX, FLAT_PX = 25, 5, 1.5
+"""Side of a patch in which disparities are compared with a plane, side of the blocks within it, and
+largest deviation of a flat patch, px. Chosen by hand."""
+PATCHES, LEAST_PATCHES = 150, 8
+"""Most patches, which limits the time, and fewest that decide. Chosen by hand."""
 EVEN_PX = 3.0
 """Range of disparities from which their true fractions count as evenly distributed. Chosen by hand."""
 WINDOWS = 25.0
@@ -61,6 +61,8 @@ class Stereo:
         speckle_px: Least pixels of a patch that stands alone in depth; 0 keeps all.
         speckle_range_px: Largest step within such a patch.
         refinements: Most steps of least squares; fewer where they gain nothing; 0 for none.
+        least_gain: Part of the predicted error of a face that a further step must remove; the last
+            step is the first one that removes less. Minus infinity takes all steps.
         refinement_px: Side of the window of a step; odd.
         farthest_m: Largest depth.
     """
@@ -74,6 +76,7 @@ class Stereo:
     speckle_px: int
     speckle_range_px: int
     refinements: int
+    least_gain: float
     refinement_px: int
     farthest_m: float
 
@@ -208,9 +211,9 @@ class Stereo:
             now = np.where(np.abs(found - start) < _LARGEST_CHANGE_PX, found, np.nan)
             error_px = predict_face_error(now)
             if error_px is not None and best_px is not None:
-                if error_px > best_px:
+                if self.least_gain > 0 and error_px > best_px:
                     break
-                if error_px > (1.0 - _LEAST_GAIN) * best_px:
+                if error_px > (1.0 - self.least_gain) * best_px:
                     return now.astype(np.float32)
             best, best_px = now, error_px
         return best.astype(np.float32)
@@ -249,7 +252,11 @@ def predict_face_error(disparity: np.ndarray) -> float | None:
     if np.ptp(np.percentile(patches[flat].mean(1), (5, 95))) < EVEN_PX:
         return None
     noise_px = float(np.median(np.sqrt((away[flat] ** 2).mean(1))))
-    harmonic = abs(np.exp(2j * np.pi * patches[flat]).mean())
+    # Noise weakens the harmonic: means of blocks have little, and keep the fractions.
+    blocks = patches[flat].reshape(
+        -1, PATCH_PX // BLOCK_PX, BLOCK_PX, PATCH_PX // BLOCK_PX, BLOCK_PX
+    )
+    harmonic = abs(np.exp(2j * np.pi * blocks.mean((2, 4))).mean())
     return float(np.hypot(harmonic / (np.pi * np.sqrt(2.0)), noise_px / np.sqrt(WINDOWS)))
 
 

@@ -172,7 +172,14 @@ class PlaneConicEstimator:
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
             agreed = alignment.align_plane(
-                both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m * frame.depth_shrink
+                both,
+                face,
+                frame,
+                allowed,
+                row,
+                s.inner,
+                s.cell_px,
+                s.matcher_bias_per_m * frame.depth_shrink,
             )
             # `None` says that the pictures disagree: then parallax means nothing either.
             both, face = (None, face) if agreed is None else (both, agreed)
