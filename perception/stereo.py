@@ -114,13 +114,13 @@ class Stereo:
         one = np.asarray(cv2.cvtColor(left, cv2.COLOR_RGB2GRAY))
         other = np.asarray(cv2.cvtColor(right, cv2.COLOR_RGB2GRAY))
         part = PicturePart(0, 0, width, height)
-        found = self.match_part(one, other, part, 0.0, focal_px * baseline_m / self.nearest_m)
+        pull_px = np.float32(focal_px * baseline_m)
+        found = self._match_shrunk(one, other, part, 0.0, float(pull_px) / self.nearest_m)
         # No disparity is infinitely far; the limits below remove it.
         with np.errstate(divide="ignore", invalid="ignore"):
-            depth = focal_px * baseline_m / found
-        return np.where(
-            (found > 0) & (depth >= self.nearest_m) & (depth <= self.farthest_m), depth, np.nan
-        ).astype(np.float32)
+            depth = pull_px / found
+            known = (found > 0) & (depth >= self.nearest_m) & (depth <= self.farthest_m)
+        return self._enlarge(np.where(known, depth, np.float32(np.nan)), part)
 
     def match_part(
         self,
@@ -139,6 +139,17 @@ class Stereo:
             least_px: Least disparity that is searched.
             largest_px: Largest one.
         """
+        return self._enlarge(self._match_shrunk(left, right, part, least_px, largest_px), part)
+
+    def _match_shrunk(
+        self,
+        left: np.ndarray,
+        right: np.ndarray,
+        part: PicturePart,
+        least_px: float,
+        largest_px: float,
+    ) -> np.ndarray:
+        """Return the same for the shrunk part; disparities are those of the whole pictures."""
         width, s = left.shape[1], self.shrink
         columns, rows = max(1, part.width // s), max(1, part.height // s)
         first = int(least_px / s)
@@ -168,10 +179,13 @@ class Stereo:
         found = np.where(known, found, np.nan).astype(np.float32)
         if self.refinements:
             found = self._refined(one, other, found)
-        found = s * (found[:, count:] + first)
-        if s > 1:
-            # Nearest: a mean of two surfaces is a place where nothing is.
-            found = found.repeat(s, 0).repeat(s, 1)[: part.height, : part.width]
+        return s * (found[:, count:] + np.float32(first))
+
+    def _enlarge(self, shrunk: np.ndarray, part: PicturePart) -> np.ndarray:
+        """Return a map of a part in its full resolution; NaN in a last, incomplete row or column."""
+        # Nearest: a mean of two surfaces is a place where nothing is.
+        found = shrunk.repeat(self.shrink, 0).repeat(self.shrink, 1) if self.shrink > 1 else shrunk
+        found = found[: part.height, : part.width]
         missing = (0, part.height - len(found)), (0, part.width - len(found[0]))
         return np.pad(found, missing, constant_values=np.nan) if np.any(missing) else found
 

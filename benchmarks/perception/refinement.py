@@ -22,6 +22,7 @@ import numpy as np
 from speed import configured
 
 from perception.render.scene_sampler import compose_scene
+from perception.sources.folder import read_picture
 from perception.stereo import Stereo, predict_face_error
 
 CONDITIONS = ("clean", "haze", "dark")
@@ -43,12 +44,9 @@ def main() -> None:
     stereo: Stereo = configured("stereo", "mode=render")
     rows = []
     if given.real is not None:
-        pictures = [
-            cv2.cvtColor(cv2.imread(f"{given.real}_{side}.png"), cv2.COLOR_BGR2RGB)
-            for side in ("left", "right")
-        ]
+        left, right = (read_picture(Path(f"{given.real}_{side}.png")) for side in ("left", "right"))
         truth_px = np.load(f"{given.real}_disp.npz")["arr_0"]
-        rows.append({"pair": "motorcycle", **judge(stereo, *pictures, truth_px, NEAREST_PX)})
+        rows.append({"pair": "motorcycle", **judge(stereo, left, right, truth_px, NEAREST_PX)})
     for condition in CONDITIONS:
         studio = replace(configured("studio", "mode=render", f"scene={condition}"), depth="exact")
         generator = np.random.default_rng(7)
