@@ -58,7 +58,7 @@ VARIATIONS = {
 """Conditions that are a scene with overrides."""
 SHOWN = (
     "recall", "precision", "decoys_accepted", "position_mm_median", "position_mm_p95", "times_better", "normal_deg_p95",
-    "along_inside_1_sigma", "across_inside_1_sigma", "normal_inside_1_sigma", "beyond_3_sigma", "false", "ms_median",
+    "along_inside_1_sigma", "across_inside_1_sigma", "normal_inside_1_sigma", "false", "ms_median",
 )  # fmt: skip
 BASELINE = "paper"
 

@@ -22,9 +22,6 @@ ONE_SIGMA_2D = 1.515
 THREE_SIGMA_2D = 3.439
 """Radius that holds 99.73 % of it, as 3 standard deviations do in one dimension."""
 
-THREE_SIGMA_2D = 3.439
-"""Radius that holds 99.73 % of one."""
-
 
 @dataclass
 class FinderScore:
@@ -84,11 +81,6 @@ class FinderScore:
             "along_beyond_3_sigma": _share_beyond(self.along_sigmas, 3.0),
             "across_beyond_3_sigma": _share_beyond(self.across_sigmas, THREE_SIGMA_2D),
             "normal_beyond_3_sigma": _share_beyond(self.normal_sigmas, THREE_SIGMA_2D),
-            "beyond_3_sigma": _share_beyond(
-                (self.along_sigmas, 3.0),
-                (self.across_sigmas, THREE_SIGMA_2D),
-                (self.normal_sigmas, THREE_SIGMA_2D),
-            ),
             "ms_median": _compute_percentile(np.array(self.ms.get("total", [])), 50),
         }
 
@@ -223,9 +215,3 @@ def _share(sigmas: Sequence[float], limit: float) -> float | None:
 
 def _share_beyond(sigmas: Sequence[float], limit: float) -> float | None:
     return float(np.mean(np.array(sigmas) > limit)) if sigmas else None
-
-
-def _share_beyond(*limited: tuple[Sequence[float], float]) -> float | None:
-    """Return the part of holes of which any error lies beyond its limit."""
-    beyond = np.array([np.array(sigmas) > limit for sigmas, limit in limited])
-    return float(np.mean(beyond.any(0))) if beyond.size else None
