@@ -19,7 +19,7 @@ from brokk_rl.extensions import register_options
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
 from exam import dataset
-from exam.generate import CaseRecorder, Half, restrict_machine
+from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
 from exam.run_cases import MACHINE_FILE, describe_spec
 
 
@@ -46,7 +46,7 @@ def main(opened: Path, num_cases: int, folder: Path) -> None:
         restrict_machine(mode.machine, published["known"]),
     )
     names: tuple[Half, ...] = ("reference", "field", "withheld")
-    halves = {name: getattr(settings, name) for name in names}
+    halves: dict[Half, HalfPlan] = {name: getattr(settings, name) for name in names}
     questions = mode.questions(published["salt"])[:num_cases]
     cases = dataset.CaseSet(recorder, questions, halves, mode.machine, folder)
     folder.mkdir(parents=True, exist_ok=True)
