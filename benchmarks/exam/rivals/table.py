@@ -116,6 +116,7 @@ def summarise(
         false += len(one.named) - len(one.hits)
     row["effects_named"] = {"value": hits, "of": there}
     row["names_false"] = {"value": false, "of": len(labels)}
+    row["names_f1"] = round(2 * hits / max(there + hits + false, 1), 3)
     closed = [one["closed"] for one in examined.values() if one["closed"] is not None]
     # a repair that makes the error many times larger counts as one that doubles the gap
     row["closed_mean"] = float(np.mean(np.clip(closed, -1.0, 1.0))) if closed else None
