@@ -458,16 +458,26 @@ EFFECTS_FILE = "effects.yaml"
 def write_effects(answer: Answer, kinds: Sequence[EffectType], path: Path) -> None:
     """Write the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
 
+    Effects inside of an MJCF file are named in a note: training has no simulator around which they are.
+
     Raises:
         StorageError: it could not be written.
     """
     by_name = {kind.name: kind for kind in kinds}
-    chosen = sorted(answer.selected, key=lambda one: by_name[one.effect].order)
+    around = [
+        one
+        for one in answer.selected
+        if one.effect in by_name and by_name[one.effect].target.side != "simulator"
+    ]
+    chosen = sorted(around, key=lambda one: by_name[one.effect].order)
     lines = [
         "# @package effect",
         f"# {answer.verdict}: {answer.reason}",
         "# taken by effect=@<this file>",
     ]
+    for one in answer.selected:
+        if one not in around:
+            lines.append(f"# {one.effect}: a number of the MJCF file, see mode=change_simulator")
     text = (
         yaml.safe_dump(
             {one.effect: _build_node(one, by_name[one.effect]) for one in chosen}, sort_keys=False

@@ -8,37 +8,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
+from arm import ARM, NOISE_RAD, draw_targets, make_machine, record_arm
 
 from brokk_rl import open_loop
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Dimension, Joint, Machine
+from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 from diagnosis import api, baseline, effect_library
 
-ARM = """
-<mujoco model="two_links">
-  <compiler angle="radian"/>
-  <option timestep="0.005" integrator="implicitfast"/>
-  <worldbody>
-    <body pos="0 0 0.3">
-      <joint name="shoulder" axis="0 1 0" range="-1.6 1.6" damping="0.2"/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1.0" contype="0"/>
-      <body pos="0.3 0 0">
-        <joint name="elbow" axis="0 1 0" range="-1.6 1.6" damping="0.1"/>
-        <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.5" contype="0"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position joint="shoulder" kp="60" kv="4"/>
-    <position joint="elbow" kp="30" kv="1.5"/>
-  </actuator>
-</mujoco>
-"""
-NOISE_RAD = 2e-4
 PENDULUM = """
 import numpy as np
 
@@ -50,76 +29,6 @@ def step(state, command):
         angle = angle + 0.005 * speed
     return np.stack([angle, speed], axis=-1)
 """
-
-
-def make_machine(*names: str) -> Machine:
-    """Returns a machine of position servos at 50 Hz, known by its joints."""
-
-    def number(value: float) -> Dimension:
-        return Dimension(value=value, source="test", confidence="high")
-
-    joints = tuple(
-        Joint(
-            name=name,
-            part=None,
-            kind="hinge",
-            lower=number(-1.5),
-            upper=number(1.5),
-            home=0.0,
-            max_speed=number(3.0),
-            body=None,
-            command="position",
-        )
-        for name in names
-    )
-    return Machine(
-        name="two_links",
-        title="two links",
-        mjcf=None,
-        period_s=0.02,
-        dead_time_s=0.0,
-        num_history=26,
-        joints=joints,
-        tool_m=None,
-        exclusive=(),
-        levers=(),
-    )
-
-
-def draw_targets(generator: np.random.Generator, count: int, joints: int) -> np.ndarray:
-    """Returns targets that step and ramp, `(T, J)`."""
-    found = np.zeros((count, joints))
-    for j in range(joints):
-        at, k = 0.0, 0
-        while k < count:
-            goal, speed = generator.uniform(-0.9, 0.9), generator.choice([0.6, 1.5, 1e3])
-            for _ in range(int(generator.integers(15, 80))):
-                at += float(np.clip(goal - at, -speed * 0.02, speed * 0.02))
-                if k < count:
-                    found[k, j] = at
-                k += 1
-    return found
-
-
-def record_arm(
-    machine: Machine, change: Callable[[Any], None], delay: int, seed: int, seconds: float = 16.0
-) -> Recording:
-    """Returns a recording of the arm with a fault, stepped by MuJoCo in a loop of its own."""
-    generator = np.random.default_rng(seed)
-    spec = mujoco.MjSpec.from_string(ARM)
-    change(spec)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    count = round(seconds / machine.period_s)
-    targets, q = draw_targets(generator, count, 2), np.zeros((count, 2))
-    for k in range(count):
-        q[k] = data.qpos
-        data.ctrl[:] = targets[max(0, k - delay)]
-        for _ in range(4):
-            mujoco.mj_step(model, data)
-    t_s = np.arange(count) * machine.period_s
-    q += generator.normal(0.0, NOISE_RAD, q.shape)
-    return make_motion(machine, f"run {seed}", t_s, (targets / 1.5).astype(np.float32), q)
 
 
 def keep(spec: Any) -> None:
@@ -273,7 +182,7 @@ def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: 
     with pytest.raises(ConfigError, match="no joint 'wrist'; it has shoulder, elbow"):
         simulator.load(make_machine("wrist"))
     with pytest.raises(ConfigError, match="is no multiple of the time step"):
-        simulator.load(replace(make_machine("shoulder"), period_s=0.018))
+        simulator.load(replace(make_machine("shoulder"), period_s=0.019))
     arm.write_text(ARM.replace('<position joint="elbow" kp="30" kv="1.5"/>', ""))
     other = arm.with_name("other.xml")
     other.write_text(arm.read_text())
