@@ -84,21 +84,48 @@ def draw_targets(generator: np.random.Generator, count: int, joints: int) -> np.
 
 
 def record_arm(
-    machine: Machine, change: Callable[[Any], None], delay: int, seed: int, seconds: float = 16.0
+    machine: Machine,
+    change: Callable[[Any], None],
+    delay: int,
+    seed: int,
+    seconds: float = 16.0,
+    play_rad: float = 0.0,
 ) -> Recording:
-    """Returns a recording of the arm with a fault, stepped by MuJoCo in a loop of its own."""
+    """Returns a recording of the arm with a fault, stepped by MuJoCo in a loop of its own.
+
+    The delay is in control periods; the elbow holds its target within the play.
+    """
     generator = np.random.default_rng(seed)
     spec = mujoco.MjSpec.from_string(ARM)
     change(spec)
     model = spec.compile()
     data = mujoco.MjData(model)
     count = round(seconds / machine.period_s)
-    targets, q = draw_targets(generator, count, 2), np.zeros((count, 2))
+    targets, q, held = draw_targets(generator, count, 2), np.zeros((count, 2)), 0.0
     for k in range(count):
         q[k] = data.qpos
-        data.ctrl[:] = targets[max(0, k - delay)]
+        target = targets[max(0, k - delay)]
+        held = min(max(held, target[1] - play_rad / 2), target[1] + play_rad / 2)
+        data.ctrl[:] = target[0], held
         for _ in range(10):
             mujoco.mj_step(model, data)
     t_s = np.arange(count) * machine.period_s
     q += generator.normal(0.0, NOISE_RAD, q.shape)
     return make_motion(machine, f"run {seed}", t_s, (targets / 1.5).astype(np.float32), q)
+
+
+def keep(spec: Any) -> None:
+    """The arm as in the file."""
+
+
+def rub(spec: Any) -> None:
+    """Adds friction of 0.5 Nm at the elbow."""
+    spec.joint("elbow").frictionloss = 0.5
+
+
+def weaken(spec: Any) -> None:
+    """Takes 40 % of the stiffness of the shoulder's drive."""
+    drive = spec.actuators[0]
+    gain, bias = drive.gainprm.copy(), drive.biasprm.copy()
+    gain[0], bias[1] = 0.6 * gain[0], 0.6 * bias[1]
+    drive.gainprm, drive.biasprm = gain, bias

@@ -125,6 +125,14 @@ class OwnSimulator:
         """Return effects on numbers inside of the simulator, by name; none for a function."""
         return dict(EFFECTS) if self.path is not None else {}
 
+    def list_left_out(self) -> dict[str, str]:
+        """Return the effects that cannot be applied around the simulator, by name, each with its reason."""
+        if self.path is not None:
+            return {}
+        return dict.fromkeys(
+            EFFECTS, f"{self.source} has no numbers that could be changed; an MJCF file has"
+        )
+
 
 class OwnSimulatorModel:
     """A plant as an actuator model.

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from arm import ARM, NOISE_RAD, make_machine, record_arm
+from arm import ARM, NOISE_RAD, make_machine, record_arm, rub
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
@@ -64,11 +64,6 @@ def name_effects() -> Answer:
         next_experiment=None,
         reason="test",
     )
-
-
-def rub(spec: Any) -> None:
-    """Adds friction at the elbow."""
-    spec.joint("elbow").frictionloss = FRICTION_NM
 
 
 def change_arm(folder: Path, networks: bool) -> dict[str, Any]:

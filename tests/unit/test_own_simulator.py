@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import runpy
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from arm import ARM, NOISE_RAD, draw_targets, make_machine, record_arm
+from arm import ARM, NOISE_RAD, draw_targets, keep, make_machine, record_arm, rub, weaken
 
 from brokk_rl import open_loop
 from brokk_rl.errors import ConfigError
@@ -18,34 +20,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 from diagnosis import api, baseline, effect_library
 
-PENDULUM = """
-import numpy as np
-
-def step(state, command):
-    angle, speed = state[..., 0], state[..., 1]
-    for _ in range(4):  # 5 ms each: a servo of 30 Nm/rad holds 1 kg at 0.3 m
-        torque = 30.0 * (command[..., 0] - angle) - 2.0 * speed - 9.81 * 0.3 * np.sin(angle)
-        speed = speed + 0.005 * torque / 0.09
-        angle = angle + 0.005 * speed
-    return np.stack([angle, speed], axis=-1)
-"""
-
-
-def keep(spec: Any) -> None:
-    """The arm as in the file."""
-
-
-def rub(spec: Any) -> None:
-    """Adds friction at the elbow."""
-    spec.joint("elbow").frictionloss = 0.5
-
-
-def weaken(spec: Any) -> None:
-    """Takes 40 % of the stiffness of the shoulder's drive."""
-    drive = spec.actuators[0]
-    gain, bias = drive.gainprm.copy(), drive.biasprm.copy()
-    gain[0], bias[1] = 0.6 * gain[0], 0.6 * bias[1]
-    drive.gainprm, drive.biasprm = gain, bias
+PAGE = (Path(__file__).parents[2] / "docs/tutorials/your_simulator.md").read_text()
+PENDULUM, RECORDER = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)[:2]
+(PENDULUM_FILE,) = re.findall(r"^```xml\n(.*?)^```", PAGE, re.M | re.S)
+"""Examples of the tutorial."""
 
 
 @pytest.fixture
@@ -58,7 +36,7 @@ def arm(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def pendulum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A function of ten lines in the current folder."""
+    """The function of the tutorial in the current folder."""
     (tmp_path / "my_pendulum.py").write_text(PENDULUM)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
@@ -155,6 +133,24 @@ def test_a_pendulum_written_by_hand_explains_its_own_delay(pendulum: str) -> Non
     assert after < 0.05 * before
 
 
+def test_function_and_file_of_the_tutorial_are_the_same_pendulum(
+    pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pendulum.xml").write_text(PENDULUM_FILE)
+    (tmp_path / "record.py").write_text(RECORDER)
+    runpy.run_path(str(tmp_path / "record.py"))
+    log = np.genfromtxt(tmp_path / "raw/run_0.csv", delimiter=",", names=True)
+    targets, q = log["hinge_target_rad"][:, None], log["hinge_position_rad"]
+    machine = make_machine("hinge")
+    for source in (pendulum, "pendulum.xml"):
+        plant = api._load_simulator(source).load(machine)
+        state = plant.start(np.zeros((1, 1)), np.zeros((1, 1)))
+        path = plant.read(plant.run(state, targets[None]))[0][0, :, 0]
+        # The recorder is two periods late, and its noise has 0.5 mrad.
+        assert np.sqrt(np.mean(np.square(path[:-3] - q[3:]))) < 1.5e-3
+        assert np.sqrt(np.mean(np.square(path[:-1] - q[1:]))) > 2e-2
+
+
 def test_steps_and_a_planned_run_agree(arm: Path) -> None:
     machine = make_machine("shoulder", "elbow")
     recording = record_arm(machine, keep, 0, seed=3, seconds=5.0)
@@ -196,6 +192,10 @@ def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
     for source, found in ((pendulum, set()), (arm, inside)):
         kinds = effect_library.load_effects(machine, None, api._load_simulator(source))
         assert {kind.name for kind in kinds} & inside == found
+    with pytest.raises(
+        ConfigError, match="'joint_friction' cannot be simulated: my_pendulum:step has no numbers"
+    ):
+        effect_library.load_effects(machine, ["joint_friction"], api._load_simulator(pendulum))
 
 
 @pytest.mark.slow
