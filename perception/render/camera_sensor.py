@@ -86,6 +86,11 @@ class LinearCamera:
 class LinearSensor:
     """Two equal cameras without colour filters; the scene gives noise and response."""
 
+    @property
+    def usual_gamma(self) -> float:
+        """Exponent of the tone curve: a user of the pictures takes them for linear."""
+        return 1.0
+
     def draw_pair(self, generator: np.random.Generator) -> tuple[LinearCamera, LinearCamera]:
         """Return the left and the right camera; nothing about them is drawn."""
         del generator
@@ -219,6 +224,11 @@ class MosaicSensor:
     sharpening: Range
     jpeg_quality: tuple[int, int]
     seed: int | None
+
+    @property
+    def usual_gamma(self) -> float:
+        """Exponent of the tone curve that a user of the pictures expects."""
+        return (self.gamma[0] + self.gamma[1]) / 2
 
     def check(self) -> None:
         if min(self.full_well_e[0], self.gamma[0], self.red_gain[0], self.blue_gain[0]) <= 0:
