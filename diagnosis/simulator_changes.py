@@ -1,4 +1,4 @@
-"""What a diagnosis found, as ranges for domain randomisation and as priors for MuJoCo's sysid.
+"""Findings of a diagnosis as ranges for domain randomisation and as priors for sysid of MuJoCo.
 
 Ranges are ranked by the success that each effect costs, where that was measured, else by its part of the
 gap.
@@ -16,8 +16,9 @@ import yaml
 
 from brokk_rl.errors import RecordingError
 from brokk_rl.session import write_text
-from diagnosis.answer import Answer, Selected
+from diagnosis.answer import Answer
 from diagnosis.effect_library import EffectType
+from diagnosis.effects_file import build_node
 
 # Chosen by hand: an interval says how sure a number is on the day of the recordings; a machine changes.
 LEAST_SPREAD = 0.2
@@ -133,7 +134,10 @@ def write_randomisation(
             inside.append(name)
             lines.append("#   a number of the MJCF file: its range is in randomisation.json")
         else:
-            nodes[name] = _build_node(selected, by_name[name], own)
+            values: dict[str, dict[str, list[float]]] = {}
+            for row in own:
+                values.setdefault(row.number, {})[row.joint] = [row.low, row.high]
+            nodes[name] = build_node(selected, by_name[name], values)
     text = yaml.safe_dump(nodes, sort_keys=False) if nodes else ""
     write_text(path, "\n".join(lines) + "\n" + text)
     return inside
@@ -146,25 +150,6 @@ def describe_cost(one: RandomisationRange) -> str:
     if one.gap_closed is not None:
         return f"success not measured; closes {one.gap_closed:.2f} of the gap"
     return "success not measured; free runs do not show it"
-
-
-def _build_node(
-    one: Selected, kind: EffectType, ranges: Sequence[RandomisationRange]
-) -> dict[str, Any]:
-    target = kind.target
-    node: dict[str, Any] = {"_target_": f"{target.__module__}.{target.__name__}"}
-    if "joints" in target.__annotations__:
-        node["joints"] = list(one.joints) or "all"
-    for name, number in target.numbers.items():
-        off = number.typical if number.none is None else number.none
-        own = {row.joint: [row.low, row.high] for row in ranges if row.number == name}
-        if not own:
-            node[name] = off
-        elif number.per_joint:
-            node[name] = own | {"other": off}
-        else:
-            node[name] = next(iter(own.values()))
-    return node
 
 
 SYSID_HEAD = '''"""Priors for mujoco.sysid from a diagnosis: nominal value and bounds of each changed number.

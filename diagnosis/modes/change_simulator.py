@@ -1,4 +1,4 @@
-"""`brokk mode=change_simulator`: what a diagnosis found, as changes of the simulator that was diagnosed."""
+"""`brokk mode=change_simulator`: writes findings of a diagnosis as changes of the simulator that was diagnosed."""
 
 from __future__ import annotations
 
