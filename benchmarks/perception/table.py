@@ -48,6 +48,7 @@ from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
+from perception.sources.simulator import make_frame
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 VARIATIONS = {
@@ -61,6 +62,8 @@ SHOWN = (
     "along_inside_1_sigma", "across_inside_1_sigma", "normal_inside_1_sigma", "false", "ms_median",
 )  # fmt: skip
 BASELINE = "paper"
+ALL = "all"
+"""Condition of the rows over all conditions."""
 
 
 @dataclass(frozen=True)
@@ -176,11 +179,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     generator = scenes(task.seed).generator(f"scene/{task.number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
-    frame = Frame(
-        color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
-        t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,
-        disparity_std_px=0.0,  # the rig is perfect
-    )  # fmt: skip
+    frame = make_frame(shot, studio.rig, 0.0)
     lines = []
     for option in task.options:
         finder = build_finder(option)
@@ -272,13 +271,13 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
-    """Returns the rows of the table, each with how many times smaller its median error is than that of the baseline."""
+    """Returns the rows of each condition and of all, with the factor by which the median error is below the baseline's."""
     tallies: dict[tuple, FinderScore] = defaultdict(FinderScore)
     for line in read(path):
         if line["option"] in options:
-            tallies[line["option"], line["condition"], line["distance_m"]] += FinderScore(
-                **line["tally"]
-            )
+            for condition in (line["condition"], ALL):
+                key = line["option"], condition, line["distance_m"]
+                tallies[key] += FinderScore(**line["tally"])
     found_conditions = dict.fromkeys(key[1] for key in tallies)
     order = {name: number for number, name in enumerate((*options, *CONDITIONS, *found_conditions))}
     found = []
