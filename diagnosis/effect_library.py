@@ -68,9 +68,10 @@ class EffectType:
         return self.target.stage
 
     @property
-    def order(self) -> tuple[int, int]:
+    def order(self) -> tuple[int, int, int]:
         """Place from the machine outwards."""
-        return SIDE_ORDER.get(self.target.side, 3), int(self.target.stage == "timing")
+        side = SIDE_ORDER.get(self.target.side, 3)
+        return side, int(self.target.stage == "timing"), getattr(self.target, "layer", 0)
 
     @property
     def running(self) -> str | None:

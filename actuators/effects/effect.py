@@ -49,6 +49,8 @@ class EffectSpec:
             all commands of a run can be given to it at once.
         recent: Number of newest commands that it looks at, where it changes the newest only and
             asks for no positions but in `begin`; `None`: any. See `EffectChain.plan_run`.
+        layer: Place among the effects of its side, from the machine outwards; a command passes the
+            largest first.
         placed: Whether its `begin` asks for the positions of the joints.
         weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
@@ -71,6 +73,7 @@ class EffectSpec:
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
+    layer: ClassVar[int] = 0
     placed: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
