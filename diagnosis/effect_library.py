@@ -31,7 +31,7 @@ from diagnosis.answer import Estimate
 
 log = logging.getLogger(__name__)
 
-SIDE_ORDER = {"joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
+SIDE_ORDER = {"drive": -1, "joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
 """From the machine outwards; delays of a command lie outside of what the valve makes of it."""
 
 
@@ -198,7 +198,14 @@ def _check_simulable(kind: EffectType, machine: Machine) -> None:
 
 
 class StationaryModel:
-    """A machine that does not move."""
+    """A machine that does not move.
+
+    Attributes:
+        changes: Changes of the numbers of a drive, which do nothing here.
+    """
+
+    def __init__(self) -> None:
+        self.changes: dict[str, torch.Tensor] = {}
 
     @property
     def state(self) -> dict[str, torch.Tensor]:

@@ -21,6 +21,10 @@ from diagnosis.search import MIN_SIZE, EffectSet, PenaltyFunction, Subset
 MAX_FIT_STEPS = 6
 """Steps of a fit at most. It was 4 before; no comparison is recorded."""
 
+DRIVE_FIT_STEPS = 30
+"""The same for mass and friction of a drive: numbers of one differential equation trade against each
+other, so that the way to the best ones is long."""
+
 REFIT_STEPS = 2
 """The same for the residuals without some effects, which needs no exact sizes."""
 
@@ -140,6 +144,8 @@ def fit_set(
     every = np.ones((1, len(residuals.fold)))
     halves = np.stack([residuals.fold != 0, residuals.fold != 1]).astype(float)
     fit = _Fit(residuals, found, mask)
+    if any(ray.kind.target.side == "drive" for ray in found):
+        steps = max(steps, DRIVE_FIT_STEPS)
     whole = fit.descended(fit.nearest(sizes)[None], every, steps)
     # Fits to a half begin and are centred at the whole: a half may say nothing about a size.
     apart = fit.descended(np.repeat(whole, 2, 0), halves, max(1, steps // 2), whole)

@@ -22,7 +22,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
-Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
+Side = Literal["command", "drive", "speed", "joints", "measurement", "kinematics"]
 MOTION: tuple[Side, ...] = ("speed", "joints")
 """Sides that change the increment which the inner model returns."""
 ANY_INTERFACE = frozenset({"speed", "position", "torque"})
@@ -49,6 +49,7 @@ class EffectSpec:
             all commands of a run can be given to it at once.
         recent: Number of newest commands that it looks at, where it changes the newest only and
             asks for no positions but in `begin`; `None`: any. See `EffectChain.plan_run`.
+        drives: Number of the drive that each of its numbers changes; drive side only.
         layer: Place among the effects of its side, from the machine outwards; a command passes the
             largest first.
         placed: Whether its `begin` asks for the positions of the joints.
@@ -73,6 +74,7 @@ class EffectSpec:
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
+    drives: ClassVar[Mapping[str, str]] = MappingProxyType({})
     layer: ClassVar[int] = 0
     placed: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
@@ -228,6 +230,9 @@ class EffectChain:
         self._others = {n: e for n, e in reversed(commanding.items()) if not e.delays}
         self.commands: dict[str, Any] = self._others | self._delays
         self.motions: dict[str, Any] = {name: e for name, e in effects.items() if e.side in MOTION}
+        self._drives = {name: e for name, e in effects.items() if e.side == "drive"}
+        for name, effect in self._drives.items():
+            change_drive(inner, effect, self.get_values(name), where)
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
         self.is_weighed = machine.has_bodies and any(e.weighed for e in self.motions.values())
@@ -260,6 +265,8 @@ class EffectChain:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
+        for name, effect in self._drives.items():
+            change_drive(self.inner, effect, self.get_values(name), name)
         if not (self.commands or self.motions):
             return self.inner.step(history)
         fresh = self._fresh
@@ -447,6 +454,24 @@ class EffectChain:
         if counter is None or name not in self._salts:
             return None
         return counter + self._salts[name]
+
+
+def change_drive(
+    model: Any, effect: EffectSpec, value: Mapping[str, torch.Tensor], where: str
+) -> None:
+    """Write the numbers of an effect into the `changes` of the drive within `model`.
+
+    Raises:
+        ConfigError: the model inside is no drive, so that it has no such number.
+    """
+    while hasattr(model, "inner"):
+        model = model.inner
+    if not hasattr(model, "changes"):
+        raise ConfigError(
+            f"{where}: it changes mass or friction of a drive, and {type(model).__name__} has none; choose actuator=force"
+        )
+    for name, changed in effect.drives.items():
+        model.changes[changed] = value[name]
 
 
 def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:

@@ -61,6 +61,8 @@ class ForceDriveModel:
     Attributes:
         parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
             candidates side by side.
+        changes: Changes of them by effects, `(N, J)` by name: a factor on the mass, force added to
+            the others.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class ForceDriveModel:
             nominal, config.spread, num_envs, device, "actuator.spread"
         )
         self.parameters = self._parameters.value
+        self.changes: dict[str, torch.Tensor] = {}
         self._period_s = machine.period_s
 
         def tensor(values: object) -> torch.Tensor:
@@ -111,7 +114,7 @@ class ForceDriveModel:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        value, period_s = self.parameters, self._period_s
+        value, period_s = self._change_numbers(), self._period_s
         earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / period_s)
         force = torch.lerp(later, earlier, part) * self._max_force - value["offset_n"]
         q = history.q[:, -1]
@@ -130,6 +133,14 @@ class ForceDriveModel:
         self._speed.copy_(speed.masked_fill(held != moved, 0.0))
         self._fresh.fill_(False)
         return held
+
+    def _change_numbers(self) -> dict[str, torch.Tensor]:
+        """Return the numbers with the changes by effects, `(N, J)`."""
+        value = dict(self.parameters)
+        for name, change in self.changes.items():
+            own = value[name]
+            value[name] = own * change if name == "mass_kg" else own + change
+        return value
 
     @property
     def delay_s(self) -> torch.Tensor:
