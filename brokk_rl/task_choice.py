@@ -17,7 +17,7 @@ from hydra.core.override_parser.types import Override
 from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
-from brokk_rl.task_description import compare_tables, name_target, read_task_name
+from brokk_rl.task_description import compare_tables, name_target, read_task_name, require_policy
 
 NAMED = ("experiment", "ablation", "preset", "search")
 """Groups whose options may change the task."""
@@ -96,6 +96,8 @@ def _read_policy_task(cfg: DictConfig) -> str | None:
         path = Path(str(checkpoint))
         return read_task_name(path.parent if path.suffix == ".pt" else path)
     if folder is not None:
+        if OmegaConf.select(cfg, "policy.folder", default=None) == folder:
+            require_policy(registry.resolve_package_path(str(folder)))
         return read_task_name(registry.resolve_package_path(str(folder)))
     return None
 

@@ -30,6 +30,8 @@ from brokk_rl.spec import restore_value
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
+CONTRACT = "policy.json"
+"""File of a policy: task, machine, rate, order and scale of observations and commands."""
 TRAINING = "brokk_rl.modes.train.Train"
 """Mode whose `resolved.yaml` holds the task of the policy beside it."""
 
@@ -218,12 +220,25 @@ def read_training_config(folder: Path) -> dict[str, Any] | None:
     return data if isinstance(data, dict) and data.get("_target_") == TRAINING else None
 
 
+def require_policy(folder: Path) -> None:
+    """Refuse a folder without a policy; needs no torch.
+
+    Raises:
+        CheckpointError: It holds none.
+    """
+    if not (folder / CONTRACT).exists():
+        raise CheckpointError(
+            f"{folder} holds no policy ({CONTRACT} is missing); "
+            "give the folder of a finished training run"
+        )
+
+
 def read_task_name(folder: Path) -> str | None:
     """Return the name of the task of the policy or run in `folder`; `None` where it is unknown.
 
     A folder that cannot be read has none either: whoever reads it next says why.
     """
-    path = folder / "policy.json"
+    path = folder / CONTRACT
     try:
         contract = json.loads(path.read_text()) if path.is_file() else None
         found = read_description(folder, contract)

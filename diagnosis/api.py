@@ -13,9 +13,10 @@ extra `diagnose` is enough: neither simulator nor training is imported.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,7 @@ def identify(
 def diagnose(
     field: RecordingSet,
     folder: str | Path,
-    simulator: str | Path | Actuator | None = None,
+    simulator: str | Path | Actuator | Callable[..., Any] | None = None,
     reference: RecordingSet | None = None,
     unseen: RecordingSet | None = None,
     fit: str | Path | ActuatorFit | None = None,
@@ -113,7 +114,8 @@ def diagnose(
     Args:
         field: Recordings of the machine as it is.
         folder: For the files of the fit.
-        simulator: Option of `actuator`; not needed with a reference.
+        simulator: Option of `actuator`, or a simulator of your own: a function `step(state, command)` or
+            its name `module:function`, or the path of an MJCF file; not needed with a reference.
         reference: Recordings that the simulator was built from; it is fitted to them.
         unseen: More of the field, to which nothing is fitted.
         fit: Option of `fit`: the simulator with a reference, else the flexible model of the floor;
@@ -133,7 +135,9 @@ def diagnose(
     return asked.find_causes(GapCase(field.machine, before, field.recordings, later))
 
 
-def simulate(actuator: str | Path | Actuator, recordings: RecordingSet) -> list[np.ndarray]:
+def simulate(
+    actuator: str | Path | Actuator | Callable[..., Any], recordings: RecordingSet
+) -> list[np.ndarray]:
     """Return the positions that a model predicts for the commands of each recording, `(T, J)`.
 
     The model sees the measured positions of its history and of one second of warm-up, which are
@@ -142,7 +146,7 @@ def simulate(actuator: str | Path | Actuator, recordings: RecordingSet) -> list[
     Raises:
         RecordingError: A recording is shorter than history and warm-up.
     """
-    model: Actuator = _load_option("actuator", actuator)
+    model: Actuator = _load_simulator(actuator)
     machine, found = recordings.machine, []
     before = open_loop.count_samples_before(machine)
     for one in recordings.recordings:
@@ -173,6 +177,17 @@ def _load_option(group: str, option: Any) -> Any:
     return extensions.load_option(group, f"@{name}" if name.endswith((".yaml", ".yml")) else name)
 
 
+def _load_simulator(simulator: str | Path | Actuator | Callable[..., Any] | None) -> Any:
+    """Return the spec of an option, of a function or of an MJCF file."""
+    if isinstance(simulator, FunctionType):
+        simulator = f"{simulator.__module__}:{simulator.__qualname__}"
+    if isinstance(simulator, str | Path) and (
+        ":" in str(simulator) or str(simulator).endswith(".xml")
+    ):
+        return replace(_load_option("actuator", "own"), source=str(simulator))
+    return _load_option("actuator", simulator)
+
+
 def _choose_fit(fit: str | Path | ActuatorFit | None, machine: Machine) -> ActuatorFit:
     if fit is None:
         fit = FITS[machine.interface]
@@ -182,7 +197,7 @@ def _choose_fit(fit: str | Path | ActuatorFit | None, machine: Machine) -> Actua
 def _build_mode(
     machine: Machine,
     folder: str | Path,
-    simulator: str | Path | Actuator | None,
+    simulator: str | Path | Actuator | Callable[..., Any] | None,
     fit: str | Path | ActuatorFit | None,
     effects: Sequence[str] | None,
     seed: int,
@@ -193,7 +208,9 @@ def _build_mode(
         session=Session(out=str(folder), seed=seed, device="cpu"),  # pyright: ignore[reportCallIssue]
         machine=machine,
         fit=_choose_fit(fit, machine),
-        actuator=_load_option("actuator", simulator),
+        actuator=_load_simulator(simulator),
+        simulator=None,
+        own=_load_option("actuator", "own"),
         curve_fit=_load_option("curve_fit", "valve"),
         thresholds=_load_option("thresholds", "default"),
         excitation={name: _load_option("excitation", name) for name in EXCITATIONS},

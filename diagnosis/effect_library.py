@@ -31,7 +31,15 @@ from diagnosis.answer import Estimate
 
 log = logging.getLogger(__name__)
 
-SIDE_ORDER = {"drive": -1, "joints": 0, "speed": 1, "command": 2, "measurement": 4, "kinematics": 5}
+SIDE_ORDER = {
+    "simulator": -1,
+    "drive": -1,
+    "joints": 0,
+    "speed": 1,
+    "command": 2,
+    "measurement": 4,
+    "kinematics": 5,
+}
 """From the machine outwards; delays of a command lie outside of what the valve makes of it."""
 
 
@@ -137,8 +145,15 @@ class EffectType:
         return np.clip(value, *self.limits(name))
 
 
-def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[EffectType]:
+def load_effects(
+    machine: Machine, names: Sequence[str] | None = None, simulator: Actuator | None = None
+) -> list[EffectType]:
     """Return the effects of the registry that can be simulated on `machine`, or of these `names`.
+
+    Args:
+        machine: The machine.
+        names: Names to choose; `None`: all.
+        simulator: Adds effects on its own numbers, if it has a method `list_effects`.
 
     Raises:
         ConfigError: a name is unknown, or an effect cannot be imported.
@@ -160,6 +175,9 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[E
         target = getattr(target, "find_variant", lambda _, own=target: own)(machine)
         if target is not None:
             found[option.name] = EffectType(option.name, target, machine)
+    inside = getattr(simulator, "list_effects", dict)()
+    for name, target in inside.items():
+        found[name] = EffectType(name, target, machine)
     for name in names or ():
         if name not in found:
             raise ConfigError(
@@ -167,6 +185,9 @@ def load_effects(machine: Machine, names: Sequence[str] | None = None) -> list[E
             )
     usable = []
     for kind in (found[name] for name in names or found):
+        if kind.name in inside:
+            usable.append(kind)
+            continue
         try:
             _check_simulable(kind, machine)
             usable.append(kind)

@@ -10,9 +10,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import select_commands_in_force
-from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -68,11 +67,7 @@ class ForceDriveModel:
     def __init__(
         self, config: ForceDrive, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        if machine.interface != "torque":
-            raise ConfigError(
-                f"actuator: a force drive takes torques, but machine '{machine.name}' is commanded by {machine.interface}; "
-                "choose another actuator=…, or write command: torque and max_force at its joints"
-            )
+        check_interface(machine, "torque", "a force drive takes torques")
         nominal = read_parameters(
             config,
             NUMBERS,

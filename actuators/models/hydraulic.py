@@ -26,7 +26,12 @@ import math
 import numpy as np
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, expand_per_joint
+from actuators.models.parameters import (
+    PerJoint,
+    SpreadParameters,
+    check_interface,
+    expand_per_joint,
+)
 from actuators.models.transport import check_dead_time, open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
@@ -133,6 +138,7 @@ class HydraulicModel:
     def __init__(
         self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
+        check_interface(machine, "speed", "hydraulics set speeds")
         nominal = {}
         for name in PER_JOINT:
             nominal[name] = expand_per_joint(getattr(config, name), machine, f"actuator.{name}")

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import open_valve, select_commands_in_force, split_run_commands
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -24,7 +24,12 @@ class Ideal:
     speed_scale: float
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "IdealModel":
-        """Return a model for `num_envs` environments on `device`."""
+        """Return a model for `num_envs` environments on `device`.
+
+        Raises:
+            ConfigError: the machine is not commanded by speed.
+        """
+        check_interface(machine, "speed", "an ideal drive follows speeds")
         return IdealModel(self, machine, device)
 
 
@@ -101,6 +106,7 @@ class FirstOrderLagModel:
     def __init__(
         self, config: FirstOrderLag, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
+        check_interface(machine, "speed", "a lagging drive follows speeds")
         bands = ("dead_band_extend", "dead_band_retract")
         nominal = read_parameters(
             config,

@@ -14,9 +14,36 @@ from brokk_rl.machine import Machine
 OTHER = "other"
 """Key for the joints that a per-joint table does not name."""
 
+SUITABLE = {
+    "speed": "actuator=lag or another model of a speed",
+    "position": "actuator=servo",
+    "torque": "actuator=force",
+}
+"""Actuators for each interface, as an error names them."""
+COMMANDS = {"speed": "valve or velocity", "position": "position", "torque": "torque with max_force"}
+"""Commands of a joint that have each interface."""
+
 PerJoint = float | dict[str, float]
 """One number for all joints, or a table by joint name; `other` stands for the joints it does not
 name."""
+
+
+def check_interface(machine: Machine, interface: str, title: str) -> None:
+    """Refuse a machine whose commands set another quantity.
+
+    Args:
+        machine: The machine.
+        interface: Quantity that the model's commands set, a value of `Machine.interface`.
+        title: The model and what its commands are, such as "a servo follows positions".
+
+    Raises:
+        ConfigError: the machine is commanded by something else.
+    """
+    if machine.interface != interface:
+        raise ConfigError(
+            f"actuator: {title}, but machine '{machine.name}' is commanded by {machine.interface}; choose "
+            f"{SUITABLE[machine.interface]}, or write another command at its joints: {COMMANDS[interface]}"
+        )
 
 
 def expand_per_joint(value: PerJoint, machine: Machine, where: str) -> np.ndarray:

@@ -19,9 +19,8 @@ from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import select_commands_in_force, split_run_commands
-from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -85,11 +84,7 @@ class ServoModel:
     def __init__(
         self, config: Servo, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        if machine.interface != "position":
-            raise ConfigError(
-                f"actuator: a servo follows positions, but machine '{machine.name}' is commanded by {machine.interface}; "
-                "choose another actuator=…, or write command: position at its joints"
-            )
+        check_interface(machine, "position", "a servo follows positions")
         nominal = read_parameters(
             config,
             NUMBERS,

@@ -21,7 +21,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, read_parameters
+from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import select_commands_in_force, split_run_commands
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import build_joint_weight
@@ -215,6 +215,7 @@ class ValveModel:
     def __init__(
         self, config: ValveActuator, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
+        check_interface(machine, "speed", "a valve sets speeds")
         nominal = read_parameters(config, NUMBERS, machine, not_negative=NUMBERS)
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"

@@ -86,6 +86,7 @@ def rendered(condition: str, distance_m: float, number: int) -> Frame:
     studio = configured(
         "studio",
         "mode=render",
+        "rig/sensor=linear",  # as for earlier figures
         f"scene={condition}",
         f"scene.sight.distance_m=[{distance_m},{distance_m}]",
     )

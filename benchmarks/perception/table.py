@@ -44,6 +44,7 @@ from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
+from perception.sources.simulator import make_frame
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 VARIATIONS = {
@@ -57,6 +58,8 @@ SHOWN = (
     "along_inside_1_sigma", "across_inside_1_sigma", "normal_inside_1_sigma", "false", "ms_median",
 )  # fmt: skip
 BASELINE = "paper"
+ALL = "all"
+"""Condition of the rows over all conditions."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +74,7 @@ class Task:
     failures: Path
     pictures: int
     shown: str
+    render: tuple[str, ...]
 
 
 def main() -> None:
@@ -97,6 +101,12 @@ def main() -> None:
         type=int,
         default=12,
         help="at most so many pictures of failures of each row of the first option",
+    )
+    parser.add_argument(
+        "--render",
+        nargs="+",
+        default=(),
+        help="overrides of mode=render, such as rig/sensor=mosaic; another <out> for each",
     )
     given = parser.parse_args()
     given.out.mkdir(parents=True, exist_ok=True)
@@ -127,6 +137,7 @@ def main() -> None:
                             given.out / "failures",
                             given.pictures,
                             given.options[0],
+                            tuple(given.render),
                         )
                     )
     if tasks:
@@ -160,15 +171,11 @@ def ready() -> None:
 
 def look(task: Task) -> list[dict[str, Any]]:
     """Returns what each option makes of one scene."""
-    studio = renderer(task.condition, task.distance_m)
+    studio = renderer(task.condition, task.distance_m, task.render)
     generator = scenes(task.seed).generator(f"scene/{task.number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
-    frame = Frame(
-        color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
-        t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,
-        disparity_std_px=0.0,  # the rig is perfect
-    )  # fmt: skip
+    frame = make_frame(shot, studio.rig, 0.0)
     lines = []
     for option in task.options:
         finder = build_finder(option)
@@ -202,13 +209,14 @@ def show_failure(
 
 
 @functools.cache
-def renderer(condition: str, distance_m: float) -> FrameRenderer:
+def renderer(condition: str, distance_m: float, render: tuple[str, ...]) -> FrameRenderer:
     scene, *overrides = VARIATIONS.get(condition, (condition,))
     return composed(
         "studio",
         "mode=render",
         f"scene={scene}",
         *overrides,
+        *render,
         f"scene.sight.distance_m=[{distance_m},{distance_m}]",
     )
 
@@ -247,13 +255,13 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
-    """Returns the rows of the table, each with how many times smaller its median error is than that of the baseline."""
+    """Returns the rows of each condition and of all, with the factor by which the median error is below the baseline's."""
     tallies: dict[tuple, FinderScore] = defaultdict(FinderScore)
     for line in read(path):
         if line["option"] in options:
-            tallies[line["option"], line["condition"], line["distance_m"]] += FinderScore(
-                **line["tally"]
-            )
+            for condition in (line["condition"], ALL):
+                key = line["option"], condition, line["distance_m"]
+                tallies[key] += FinderScore(**line["tally"])
     found_conditions = dict.fromkeys(key[1] for key in tallies)
     order = {name: number for number, name in enumerate((*options, *CONDITIONS, *found_conditions))}
     found = []

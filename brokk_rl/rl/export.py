@@ -20,8 +20,9 @@ from brokk_rl.contracts.task import DeployableTask
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
-from brokk_rl.rl.policy import CONTRACT, GOLDEN, ONNX, TOLERANCE, PlainActor
+from brokk_rl.rl.policy import GOLDEN, ONNX, TOLERANCE, PlainActor
 from brokk_rl.session import write_json
+from brokk_rl.task_description import CONTRACT
 
 MAX_EDGE_SHARE = 0.005
 """Share of observations that may differ by more: at the edge of a mask or of the dead band the last

@@ -40,11 +40,17 @@ from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import write_json
 from brokk_rl.spec import spec
-from brokk_rl.task_description import TaskDescription, apply_behaviour, read_description
+from brokk_rl.task_description import (
+    CONTRACT,
+    TaskDescription,
+    apply_behaviour,
+    read_description,
+    require_policy,
+)
 
 log = logging.getLogger(__name__)
 
-WEIGHTS, CONTRACT, ONNX = "policy.safetensors", "policy.json", "policy.onnx"
+WEIGHTS, ONNX = "policy.safetensors", "policy.onnx"
 GOLDEN = "golden.json"
 SCHEMA = 2
 """Version of `policy.json`. Files of version 1 do not describe the task; they are read too."""
@@ -367,11 +373,7 @@ def locate_bundle(folder: str) -> Path:
 
 def read_contract(folder: Path, machine: Machine) -> dict[str, Any]:
     """Return the contract of the bundle in `folder`; errors as in `TrainedPolicy.build`."""
-    if not (folder / CONTRACT).exists():
-        raise CheckpointError(
-            f"{folder} holds no policy ({CONTRACT} is missing); "
-            "give the folder of a finished training run"
-        )
+    require_policy(folder)
     try:
         contract = json.loads((folder / CONTRACT).read_text())
     except (OSError, ValueError) as error:

@@ -105,6 +105,7 @@ class _ModelReader:
         """Return the machine."""
         tool_m = self._find_tool()
         joints = [self._describe_joint(row) for row in range(len(self._chain))]
+        self._describe_commands(joints)
         source = self._path.name
         values = {
             "name": self._name,
@@ -237,6 +238,37 @@ class _ModelReader:
                 ),
             },
         }
+
+    def _describe_commands(self, joints: list[dict[str, Any]]) -> None:
+        """Add `command` to each joint: that of its actuator, a guess where the model has none."""
+        found = [one for one in map(self._read_command, self._chain) if one is not None]
+        if len(found) < len(joints) or len({command for command, _ in found}) > 1:
+            found = [("valve", 0.0)] * len(joints)
+            self._remarks.append(
+                "command: valve is a guess; write velocity, position or torque (with max_force) at the joints of "
+                "other drives."
+            )
+        for values, (command, force) in zip(joints, found, strict=True):
+            values["command"] = command
+            if command == "torque":
+                values["max_force"] = _make_dimension(force, self._path.name, "medium")
+
+    def _read_command(self, joint: int) -> tuple[str, float] | None:
+        """Return what the actuator of a joint is commanded by and its largest force; `None` without one."""
+        model = self._model
+        for actuator in range(model.nu):
+            is_own = model.actuator_trnid[actuator, 0] == joint
+            if not is_own or model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
+                continue
+            stiffness, damping = -model.actuator_biasprm[actuator, 1:3]
+            if stiffness > 0:
+                return "position", 0.0
+            if damping > 0:
+                return "velocity", 0.0
+            gain = model.actuator_gainprm[actuator, 0] * model.actuator_gear[actuator, 0]
+            force = abs(gain) * float(model.actuator_ctrlrange[actuator, 1])
+            return ("torque", force) if force > 0 else None
+        return None
 
     def _sum_masses(self, row: int) -> tuple[float, np.ndarray, np.ndarray]:
         """Return mass (kg), centre (m, from the joint) and inertia about it of a link."""

@@ -219,6 +219,12 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
         observation = data["observation"]
         if observation is None:
             raise CheckpointError(f"{path}: the policy's task cannot be deployed: it has no {ONNX}")
+        if "parts" in observation:
+            raise CheckpointError(
+                f"{path}: the observation has terms of the task's own "
+                f"({', '.join(part['name'] for part in observation['parts'])}), whose columns in a log are not known; give "
+                f"the {ONNX} beside a contract that names them (docs/doctor.md)"
+            )
         is_own = "order" in observation
         terms = _list_own_terms(data, machine) if is_own else _list_given_terms(observation)
         joints = tuple(data["joints"])

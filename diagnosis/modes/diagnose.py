@@ -41,6 +41,8 @@ class Diagnose:
         fit: Fit of the simulator to `reference/`; without a reference, the flexible model that gives
             the floor.
         actuator: The simulator that `diagnosis.field` is held against.
+        simulator: A simulator of your own in its place: `module:function`, or an MJCF file.
+        own: The actuator that runs it.
         curve_fit: Reads the speed curves of machine and simulator.
         thresholds: When a stretch of a recording is worth telling.
         excitation: Experiments that could follow, by name.
@@ -51,10 +53,28 @@ class Diagnose:
     machine: Machine
     fit: ActuatorFit
     actuator: Actuator | None
+    simulator: str | None
+    own: Actuator
     curve_fit: CurveFit
     thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
     diagnosis: DiagnosisSubject
+
+    def check(self) -> None:
+        if self.simulator is None:
+            return
+        if self.actuator is not None:
+            raise ConfigError(
+                f"give either actuator=… or simulator={self.simulator}: one is held against the recordings"
+            )
+        replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+    @property
+    def base(self) -> Actuator | None:
+        """The simulator that is held against the field; `None` where there is a reference."""
+        if self.simulator is None:
+            return self.actuator
+        return replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def run(self) -> None:
         """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.
@@ -77,7 +97,7 @@ class Diagnose:
             RecordingError: there is too little data to fit a simulator to.
             ConfigError: an effect is unknown, or there is neither a reference nor an actuator.
         """
-        kinds = effect_library.load_effects(self.machine, self.diagnosis.effects)
+        kinds = self._load_effects()
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
         with (
             ItemProgress("fitting the simulator", SHARE) as progress,
@@ -110,11 +130,14 @@ class Diagnose:
             StorageError: something could not be written.
         """
         folder = self.session.folder
-        kinds = effect_library.load_effects(self.machine, self.diagnosis.effects)
+        kinds = self._load_effects()
         outcome.save(folder)
         pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
         with use_workers(self.diagnosis.workers):
             report.write_report(outcome, folder, self.machine)
+
+    def _load_effects(self) -> list[EffectType]:
+        return effect_library.load_effects(self.machine, self.diagnosis.effects, self.base)
 
     def _case(self) -> GapCase:
         subject = self.diagnosis
@@ -122,9 +145,9 @@ class Diagnose:
         if subject.case is not None:
             return replace(case.load_case(Path(subject.case), self.machine), unseen=unseen)
         assert subject.field is not None, "checked by Subject"
-        if self.actuator is None:
+        if self.base is None:
             raise ConfigError(
-                "diagnosis.field needs a simulator to hold it against: add actuator=<name>"
+                "diagnosis.field needs a simulator to hold it against: add actuator=<name>, or simulator=<your own>"
             )
         return GapCase(self.machine, [], case.read_recordings(subject.field, self.machine), unseen)
 
@@ -143,12 +166,13 @@ class Diagnose:
 
         if given.reference:
             return baseline.fit_baseline(given, self.fit, folder / "base", seed, device, refine)
-        if self.actuator is None:
+        simulator = self.base
+        if simulator is None:
             raise ConfigError(
                 "there is neither a reference nor an actuator to hold the field against"
             )
         return baseline.accept_simulator(
-            given, self.actuator, self.fit, folder / "flexible", seed, device
+            given, simulator, self.fit, folder / "flexible", seed, device
         )
 
 

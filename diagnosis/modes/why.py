@@ -47,7 +47,8 @@ class Why:
         evaluation: How to evaluate what an effect costs.
         log: Glob or globs of recordings of the policy's runs.
         policy: `folder`: the policy.
-        simulator: Actuator of the simulator that trained it, as `actuator=` takes it.
+        simulator: Actuator of the simulator that trained it, as `actuator=` takes it; or a simulator of
+            your own, `module:function` or an MJCF file.
         sent: The commands of the log are those that the policy's loop sent.
         target_in_base_m: Target where the log has none.
         resume: Run folder of an interrupted run to go on with; the same as `session.out`.
@@ -102,10 +103,16 @@ class Why:
         titles = {name: stage.title for name, stage in stages.items()}
         run_story(self.session, stages, lambda: write_why_page(folder, titles))
 
+    def _choose_simulator(self) -> list[str]:
+        """Return the overrides that choose the simulator."""
+        if ":" in self.simulator or self.simulator.endswith(".xml"):
+            return ["actuator=own", f"actuator.source={json.dumps(self.simulator)}"]
+        return [f"actuator={self.simulator}"]
+
     def _examine(self) -> StoryStage:
         command = [
             "mode=doctor_policy", f"doctor.log={_quote(self.log)}",
-            f"doctor.policy={self.policy['folder']}", f"actuator={self.simulator}",
+            f"doctor.policy={self.policy['folder']}", *self._choose_simulator(),
             f"doctor.sent={str(self.sent).lower()}",
         ]  # fmt: skip
         if self.target_in_base_m is not None:
@@ -114,7 +121,7 @@ class Why:
 
     def _diagnose(self) -> StoryStage:
         command = [
-            "mode=diagnose", f"diagnosis.field={_quote(self.log)}", f"actuator={self.simulator}"
+            "mode=diagnose", f"diagnosis.field={_quote(self.log)}", *self._choose_simulator()
         ]  # fmt: skip
         return _make_stage("Which effect does the simulator lack?", command, ("machine", "device"))
 
@@ -133,7 +140,7 @@ class Why:
 
     def _evaluate(self, title: str, effects: str) -> StoryStage:
         command = [
-            "mode=evaluate", f"policy.folder={self.policy['folder']}", f"actuator={self.simulator}",
+            "mode=evaluate", f"policy.folder={self.policy['folder']}", *self._choose_simulator(),
             f"effect={effects}", "~policy@rivals.classical", "+rivals={}",
         ]  # fmt: skip
         return _make_stage(title, command, ("machine", "evaluation", "device"))

@@ -19,6 +19,8 @@ NEAR_M = 0.05
 it lies is its error."""
 ONE_SIGMA_2D = 1.515
 """Radius that holds 68.3 % of a round Gaussian in two dimensions, in standard deviations of one."""
+THREE_SIGMA_2D = 3.439
+"""Radius that holds 99.73 % of it, as 3 standard deviations do in one dimension."""
 
 
 @dataclass
@@ -76,6 +78,9 @@ class FinderScore:
             "along_inside_1_sigma": _share(self.along_sigmas, 1.0),
             "across_inside_1_sigma": _share(self.across_sigmas, ONE_SIGMA_2D),
             "normal_inside_1_sigma": _share(self.normal_sigmas, ONE_SIGMA_2D),
+            "along_beyond_3_sigma": _share_beyond(self.along_sigmas, 3.0),
+            "across_beyond_3_sigma": _share_beyond(self.across_sigmas, THREE_SIGMA_2D),
+            "normal_beyond_3_sigma": _share_beyond(self.normal_sigmas, THREE_SIGMA_2D),
             "ms_median": _compute_percentile(np.array(self.ms.get("total", [])), 50),
         }
 
@@ -206,3 +211,7 @@ def _compute_percentile(values: np.ndarray, percent: float) -> float | None:
 
 def _share(sigmas: Sequence[float], limit: float) -> float | None:
     return float(np.mean(np.array(sigmas) <= limit)) if sigmas else None
+
+
+def _share_beyond(sigmas: Sequence[float], limit: float) -> float | None:
+    return float(np.mean(np.array(sigmas) > limit)) if sigmas else None

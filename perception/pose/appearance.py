@@ -16,6 +16,8 @@ face. Chosen by hand."""
 WIDE = 8.0
 """Radii of the surroundings, in which something else is dark too unless there is dust. Chosen by
 hand."""
+FAINTEST = 0.1
+"""Least logarithm of the contrast, so that a hole in dense dust has no boundless slope."""
 CLEARLY_M = 0.03
 """Least distance behind the face at which depth belongs to the inside of a hole, whatever the
 noise. Chosen by hand."""
@@ -28,7 +30,8 @@ class Interior:
     Attributes:
         darkness: Brightness of its darkest quarter over that of the face around it.
         slope: Change of brightness over one radius, over the contrast between face and darkest
-            quarter, in the direction in which the hole goes on behind the face. The camera sees
+            quarter, in the direction in which the hole goes on behind the face; both of the
+            logarithm, so that the exponent of the camera's tone curve cancels. The camera sees
             the lit end of the wall near the far rim and the dark depth at the near rim: clearly
             negative in a hole, about zero on a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
@@ -93,14 +96,14 @@ def measure_interior(
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
         away = _list_pixels(inside, left, top) - (x, y)
         along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        # Dust brightens hole and face by the same gradient: take the face's off.
-        drift = _fit_brightness_gradient(part[ring], _list_pixels(ring, left, top) - (x, y))
-        drift = drift * min(darkness, 1.0)
-        values = values - away @ drift
+        # Uneven light changes hole and face by the same factor: take the face's change off.
+        level = np.log(part[ring] + 1.0)
+        drift = _fit_brightness_gradient(level, _list_pixels(ring, left, top) - (x, y))
+        values = np.log(values + 1.0) - away @ drift
+        contrast = float(np.log((face + 1.0) / (face * darkness + 1.0)))
         apart = along - along.mean()
-        slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(
-            face * (1.0 - darkness), 1.0
-        )
+        slope = float(apart @ values / max(float(apart @ apart), 1e-9))
+        slope /= max(contrast, FAINTEST)
     around = _measure_darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(
         darkness, slope, deeper, unknown, around, _measure_contrast(smooth[ring], face * darkness)
@@ -158,7 +161,7 @@ def _list_pixels(there: np.ndarray, left: int, top: int) -> np.ndarray:
 
 
 def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Fit the gradient of brightness `(P,)` over places `(P, 2)`, `(2,)` grey levels a pixel.
+    """Fit the gradient of values `(P,)` over places `(P, 2)`, `(2,)` a pixel.
 
     Robust: outliers count little (Cauchy weights).
     """
@@ -169,5 +172,6 @@ def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray
         heavy = away * weight[:, None]
         fitted = np.linalg.lstsq(heavy.T @ away, heavy.T @ values, rcond=None)[0]
         off = np.abs(values - away @ fitted)
-        weight = 1.0 / (1.0 + (off / max(1.5 * float(np.median(off)), 0.3)) ** 2)
+        # Not zero on a face without grain.
+        weight = 1.0 / (1.0 + (off / max(1.5 * float(np.median(off)), 1e-3)) ** 2)
     return fitted[:2]

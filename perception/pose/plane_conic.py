@@ -153,12 +153,12 @@ class PlaneConicEstimator:
         self._without_depth: PoseEstimator | None = (
             settings.without_depth.build() if settings.without_depth else None
         )
-        self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray] | None = None
+        self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s, row = self.settings, as_row(ellipse)
-        gray, allowed = self._prepare(frame, masks)
+        gray, light, allowed = self._prepare(frame, masks)
         face = self._fit_face(frame, allowed, row, ellipse)
         if face is None:
             assert self._without_depth is not None
@@ -180,10 +180,10 @@ class PlaneConicEstimator:
             shape = self._check_shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        circle = self._fit_circle(gray, frame, face, both, ellipse, has_good_shape=shape)
+        circle = self._fit_circle(light, frame, face, both, ellipse, has_good_shape=shape)
         if isinstance(circle, Rejection):
             return circle
-        return self._describe_hole(gray, frame, masks, face, circle, both, ellipse)
+        return self._describe_hole(light, frame, masks, face, circle, both, ellipse)
 
     def _fit_face(
         self, frame: Frame, allowed: np.ndarray, row: np.ndarray, ellipse: Ellipse
@@ -215,7 +215,7 @@ class PlaneConicEstimator:
 
     def _fit_circle(
         self,
-        gray: np.ndarray,
+        light: np.ndarray,
         frame: Frame,
         face: FacePlane,
         both: alignment.StereoPatch | None,
@@ -226,7 +226,7 @@ class PlaneConicEstimator:
         s = self.settings
         # On the plane a circle has only three unknowns.
         circle = rim.fit_rim_circle(
-            gray,
+            light,
             as_row(ellipse),
             frame.camera_matrix,
             face.m,
@@ -241,12 +241,16 @@ class PlaneConicEstimator:
         ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
         chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
         is_broken = 1.0 - seen - measure_hidden_part(face, row, frame) > s.broken
-        if s.broken < 1.0 and both is not None and broken_rim.is_below_face(gray, chart, both, row):
+        if (
+            s.broken < 1.0
+            and both is not None
+            and broken_rim.is_below_face(light, chart, both, row)
+        ):
             # The circle lies below the face: a refusal is better than its place.
             is_broken, circle, seen = True, None, 0.0
         if is_broken:
             broken = broken_rim.fit_broken_rim(
-                gray, chart, both, np.zeros(2), s.radius_m, s.center_px
+                light, chart, both, np.zeros(2), s.radius_m, s.center_px
             )
             # Its coverage counts the broken parts too.
             if broken is not None and broken.coverage >= max(seen, BROKEN_SEEN):
@@ -267,7 +271,7 @@ class PlaneConicEstimator:
 
     def _describe_hole(
         self,
-        gray: np.ndarray,
+        light: np.ndarray,
         frame: Frame,
         masks: Masks,
         face: FacePlane,
@@ -279,7 +283,7 @@ class PlaneConicEstimator:
         s, row = self.settings, circle.ellipse
         # Appearance is measured in the fitted circle: the first ellipse may follow the shade
         # within.
-        inside = appearance.measure_interior(gray, frame.depth_m, row, frame.camera_matrix, face)
+        inside = appearance.measure_interior(light, frame.depth_m, row, frame.camera_matrix, face)
         parallax, covered = float("nan"), 0.0
         if both is not None:
             parallax, covered = alignment.measure_parallax(
@@ -329,14 +333,15 @@ class PlaneConicEstimator:
         along_m2 = center_m[2] ** 4 * float(ray @ shifted.cov @ ray)
         return along_m2 * np.outer(ray, ray), shifted.normal_cov_rad2()
 
-    def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray]:
-        """Return the grey picture and the pixels of the face, cached for all ellipses of a frame."""
+    def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return grey picture, linear light and pixels of the face, cached for a frame's ellipses."""
         if self._seen is None or self._seen[0] is not frame or self._seen[1] is not masks:
             allowed = masks.block > 0.5
             # A mouth shows the inside of the hole, whose depth is not that of the face.
             if masks.hole_mask is not None:
                 allowed &= masks.hole_mask < 0.5
-            self._seen = frame, masks, convert_to_gray(frame), allowed
+            gray = convert_to_gray(frame)
+            self._seen = frame, masks, gray, linearize(gray, frame.gamma), allowed
         return self._seen[2:]
 
     def _check_shape(
@@ -460,6 +465,16 @@ def as_row(ellipse: Ellipse) -> np.ndarray:
 def convert_to_gray(frame: Frame) -> np.ndarray:
     """Return the frame's picture in grey, `(h, w)` uint8."""
     return cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+
+
+def linearize(gray: np.ndarray, gamma: float) -> np.ndarray:
+    """Return the light of a grey picture `(h, w)` uint8, `(h, w)` float32, 255 for white.
+
+    A tone curve moves the steepest place of a blurred edge towards the dark: a rim would become
+    smaller, and its centre would move where the hole is not equally dark all around.
+    """
+    levels = 255.0 * (np.arange(256) / 255.0) ** gamma
+    return np.asarray(cv2.LUT(gray, levels.astype(np.float32)))
 
 
 def average_inside(picture: np.ndarray, row: np.ndarray) -> float:

@@ -14,12 +14,13 @@ from brokk_rl.spec import spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.render.board_on_arm import BoardOnArm
+from perception.render.camera_sensor import draw_dust, take_picture
 from perception.render.footage import Footage
 from perception.render.photographed_surfaces import PhotographedSurfaces
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
 from perception.render.scene_sequence import RandomScenes, SceneSequence, StagedScene
-from perception.render.stereo_camera import StereoRig, draw_dust, take_picture
+from perception.render.stereo_camera import StereoRig
 from perception.stereo import Stereo
 
 
@@ -95,6 +96,7 @@ class FrameRenderer:
             scenes.base_from_camera,
             rig.baseline_m,
             disparity_std_px=rig.disparity_std_px,
+            gamma=rig.sensor.usual_gamma,
         )
         scenes.write_records(folder.parent, count)
         return scenes
@@ -129,15 +131,17 @@ class FrameRenderer:
         """
         tracer = Tracer(scene.solids, scene.light, scene.sky)
         left = tracer.view(self.rig.left)
-        density = draw_dust(scene.exposure.patchiness, generator)
+        exposure = scene.exposure
+        cameras = self.rig.sensor.draw_pair(generator)
+        density = draw_dust(exposure.patchiness, generator)
         color, partner = (
-            take_picture(left.radiance, left.depth_m, scene.exposure, density, generator),
+            take_picture(left.radiance, left.depth_m, exposure, density, cameras[0], generator),
             None,
         )
         if self.pair:
             right = tracer.view(self.rig.right)
             partner = take_picture(
-                right.radiance, right.depth_m, scene.exposure, density, generator
+                right.radiance, right.depth_m, exposure, density, cameras[1], generator
             )
         depth = left.depth_m
         if partner is not None and self.depth == "matched":

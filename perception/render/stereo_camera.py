@@ -1,4 +1,4 @@
-"""The stereo camera: geometry of the pair, and from radiance to a noisy picture."""
+"""The stereo camera: geometry of the pair."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+from perception.render.camera_sensor import LinearSensor, MosaicSensor
 from perception.render.ray_tracer import Pinhole
 
 
@@ -92,6 +93,7 @@ class StereoRig:
         yaw_rad: Turn of the view about the vertical, from base x towards y.
         pitch_rad: How far it looks down.
         error: Departure of the pair from perfect rectification.
+        sensor: Makes the pictures of both cameras from light.
     """
 
     width: int
@@ -102,6 +104,7 @@ class StereoRig:
     yaw_rad: float
     pitch_rad: float
     error: PairMisalignment
+    sensor: LinearSensor | MosaicSensor
 
     def check(self) -> None:
         if min(self.width, self.height) < 16 or self.focal_px <= 0 or self.baseline_m <= 0:
@@ -230,86 +233,3 @@ def measure_disparity_error(rig: StereoRig) -> tuple[float, float, float]:
     design = np.column_stack([np.ones(len(flat)), flat])
     constant, across, down = np.linalg.lstsq(design, wrong_px, rcond=None)[0]
     return float(constant), float(across), float(down)
-
-
-@dataclass(frozen=True)
-class CameraExposure:
-    """Settings of one picture of a scene.
-
-    Attributes:
-        gain: Signal for unit radiance; 1 saturates.
-        extinction_per_m: Of the dusty air: the transmitted part of the light after z metres is
-            exp(-extinction z).
-        airlight: Radiance of the dust itself.
-        patchiness: Standard deviation of the dust's density over the picture, relative; it drifts
-            before the block.
-        blur_px: Standard deviation of the point spread.
-        full_well_e: Electrons at saturation; decides the shot noise.
-        read_noise_e: Noise in the dark, electrons.
-        gamma: Exponent of the camera's response; 1 is linear, 2.2 that of most colour cameras.
-        vignetting: Part of the light that is missing in the corners.
-    """
-
-    gain: float
-    extinction_per_m: float
-    airlight: float
-    patchiness: float
-    blur_px: float
-    full_well_e: float
-    read_noise_e: float
-    gamma: float
-    vignetting: float
-
-
-def take_picture(
-    radiance: np.ndarray,
-    depth_m: np.ndarray,
-    exposure: CameraExposure,
-    density: np.ndarray,
-    generator: np.random.Generator,
-) -> np.ndarray:
-    """Return the picture that a camera takes of a view, RGB, `(h, w, 3)` uint8.
-
-    Args:
-        radiance: Linear light, `(h, w, 3)` float32.
-        depth_m: `(h, w)`, NaN where nothing is.
-        exposure: How it is taken.
-        density: Small picture of the dust's density, about 1; see `dust`.
-        generator: Source of the noise.
-    """
-    height, width = depth_m.shape
-    light = radiance
-    if exposure.extinction_per_m > 0:
-        thick = cv2.resize(density, (width, height), interpolation=cv2.INTER_CUBIC)
-        way = np.nan_to_num(depth_m, nan=1e3) * exposure.extinction_per_m * np.maximum(thick, 0.0)
-        left = np.exp(-way)[..., None].astype(np.float32)
-        light = light * left + np.float32(exposure.airlight) * (1.0 - left)
-    if exposure.blur_px > 0:
-        light = cv2.GaussianBlur(light, (0, 0), exposure.blur_px)
-    if exposure.vignetting > 0:
-        x, y = (
-            np.linspace(-1, 1, width, dtype=np.float32),
-            np.linspace(-1, 1, height, dtype=np.float32),
-        )
-        light = (
-            light
-            * (1.0 - np.float32(exposure.vignetting / 2) * (x[None] ** 2 + y[:, None] ** 2))[
-                ..., None
-            ]
-        )
-    signal = np.clip(light * np.float32(exposure.gain), 0.0, 1.0)
-    spread = np.sqrt(
-        signal / np.float32(exposure.full_well_e)
-        + np.float32((exposure.read_noise_e / exposure.full_well_e) ** 2)
-    )
-    signal = np.clip(
-        signal + spread * generator.standard_normal(signal.shape, np.float32), 0.0, 1.0
-    )
-    if exposure.gamma != 1.0:
-        signal = signal ** np.float32(1.0 / exposure.gamma)
-    return (255.0 * signal + 0.5).astype(np.uint8)
-
-
-def draw_dust(patchiness: float, generator: np.random.Generator) -> np.ndarray:
-    """Return the density of drifting dust over a picture, `(6, 10)` float32, mean about 1."""
-    return (1.0 + patchiness * generator.standard_normal((6, 10))).astype(np.float32)

@@ -68,6 +68,7 @@ class CameraModel:
     cov: np.ndarray | None = None
     disparity_std_px: float | None = None
     disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gamma: float = validation.USUAL_GAMMA
 
 
 def read_camera(path: Path) -> CameraModel:
@@ -90,7 +91,7 @@ def read_camera(path: Path) -> CameraModel:
         )
     where = str(path)
     optional: dict[str, Any] = {}
-    for name in ("baseline_m", "T_base_cam", "disparity_std_px"):
+    for name in ("baseline_m", "T_base_cam", "disparity_std_px", "gamma"):
         if told.get(name) is not None:
             optional[name] = told[name]
     return CameraModel(
@@ -103,6 +104,7 @@ def read_camera(path: Path) -> CameraModel:
         disparity_std_px=validation.check_disparity_std(optional["disparity_std_px"], where)
         if "disparity_std_px" in optional
         else None,
+        gamma=validation.check_gamma(optional.get("gamma", validation.USUAL_GAMMA), where),
     )
 
 
@@ -201,6 +203,7 @@ class FolderSource:
             color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
             distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem), camera_cov=camera.cov,
             disparity_std_px=camera.disparity_std_px, disparity_error_px=error_px,
+            gamma=camera.gamma,
         )  # fmt: skip
 
     def _depth(

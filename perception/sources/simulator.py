@@ -28,6 +28,7 @@ def make_frame(shot: RenderedFrame, rig: StereoRig, t_s: float) -> Frame:
     return Frame(
         color=shot.color, depth_m=shot.depth_m, camera_matrix=rig.left.matrix, base_from_camera=rig.base_from_camera,
         t_s=t_s, right=shot.right, baseline_m=rig.baseline_m, disparity_std_px=rig.disparity_std_px,
+        gamma=rig.sensor.usual_gamma,
     )  # fmt: skip
 
 

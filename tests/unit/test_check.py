@@ -116,6 +116,29 @@ def test_our_own_mjcf_gives_our_own_machine(machine: Machine) -> None:
 
 
 @pytest.mark.parametrize(
+    ("actuator", "interface", "force"),
+    [
+        ("", "speed", np.nan),
+        ('<position joint="{}" kp="5"/>', "position", np.nan),
+        ('<velocity joint="{}" kv="5"/>', "speed", np.nan),
+        ('<motor joint="{}" gear="10" ctrlrange="-2 2"/>', "torque", 20.0),
+    ],
+)
+def test_an_mjcf_says_what_commands_its_joints(
+    actuator: str, interface: str, force: float, tmp_path: Path
+) -> None:
+    body = '<body><joint name="{}" axis="0 1 0"/><geom size="0.1"/>{}</body>'
+    text = body.format("lift", body.format("tilt", ""))
+    drives = "".join(actuator.format(name) for name in ("lift", "tilt"))
+    path = tmp_path / "arm.xml"
+    path.write_text(f"<mujoco><worldbody>{text}</worldbody><actuator>{drives}</actuator></mujoco>")
+    found = import_model(path, "arm")
+    assert found.build().interface == interface
+    assert found.build().max_force == pytest.approx([force, force], nan_ok=True)
+    assert any("valve is a guess" in remark for remark in found.remarks) == (not actuator)
+
+
+@pytest.mark.parametrize(
     ("text", "told"),
     [
         ("<robot", "cannot read it"),

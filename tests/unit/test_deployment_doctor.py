@@ -292,3 +292,14 @@ def test_the_doctor_from_the_command(
     )
     told = json.loads(Path("out/doctor.json").read_text())
     assert [one["kind"] for one in told["logs"][0]["findings"]] == ["sign"]
+
+
+def test_a_task_made_of_terms_is_refused_by_the_names_of_its_terms(
+    tmp_path: Path, machine: Machine
+) -> None:
+    parts = [{"name": "distance", "samples": 1, "width": 3, "mean": 0.0, "std": 1.0}]
+    observation = {"size": 3, "order": ["distance (1 x 3)"], "parts": parts}
+    contract = {"rate_hz": 20, "joints": list(machine.joint_names), "observation": observation}
+    (tmp_path / "policy.json").write_text(json.dumps(contract))
+    with pytest.raises(CheckpointError, match=r"terms of the task's own \(distance\)"):
+        load_policy(str(tmp_path), machine)

@@ -18,15 +18,28 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from perception import dataset
 from perception.render.block_sampler import build_frame, draw_block
+from perception.render.camera_sensor import (
+    CameraExposure,
+    LinearCamera,
+    MosaicCamera,
+    blur_motion,
+    draw_dust,
+    take_picture,
+)
 from perception.render.drilled_block import Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.hole_light import (
+    compute_bounced_light,
+    compute_view_factors,
+    measure_sunlight,
+)
 from perception.render.materials import Material
 from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
-from perception.render.ray_tracer import Light, Pinhole, Tracer
+from perception.render.ray_tracer import GroundBounce, Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
 from perception.render.solids import Box, Cylinder, PlaneSolid, SolidPose
-from perception.render.stereo_camera import CameraExposure, StereoRig, draw_dust, take_picture
+from perception.render.stereo_camera import StereoRig
 
 GREY = Material((0.5, 0.5, 0.5), 0.0, 0.001)
 STONE = Material((0.5, 0.5, 0.5), 0.25, 0.0006, 2)
@@ -268,7 +281,9 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Stereo
     )
     views = [tracer.view(camera) for camera in (full.left, full.right)]
     left, right = (
-        take_picture(view.radiance, view.depth_m, exposure, draw_dust(0.0, chance), chance)
+        take_picture(
+            view.radiance, view.depth_m, exposure, draw_dust(0.0, chance), LinearCamera(), chance
+        )
         for view in views
     )
     stereo = option("stereo", "sgbm")
@@ -320,7 +335,12 @@ def test_dust_takes_contrast_as_it_says() -> None:
         1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0
     )  # a quarter is left after 2 m
     taken = take_picture(
-        light, depth, thick, draw_dust(0.0, np.random.default_rng(0)), np.random.default_rng(0)
+        light,
+        depth,
+        thick,
+        draw_dust(0.0, np.random.default_rng(0)),
+        LinearCamera(),
+        np.random.default_rng(0),
     )
     assert taken[0, 0, 0] == pytest.approx(255 * (0.2 / 4 + 0.6 * 3 / 4), abs=1)
     assert taken[0, -1, 0] == pytest.approx(255 * (0.8 / 4 + 0.6 * 3 / 4), abs=1)
@@ -330,12 +350,119 @@ def test_noise_in_the_dark_is_that_of_the_electrons() -> None:
     light, depth = np.full((200, 200, 3), 0.5, np.float32), np.ones((200, 200), np.float32)
     dim = CameraExposure(0.15, 0.0, 0.0, 0.0, 0.0, 8000.0, 8.0, 1.0, 0.0)
     taken = take_picture(
-        light, depth, dim, draw_dust(0.0, np.random.default_rng(0)), np.random.default_rng(1)
+        light,
+        depth,
+        dim,
+        draw_dust(0.0, np.random.default_rng(0)),
+        LinearCamera(),
+        np.random.default_rng(1),
     ).astype(float)
     # 0.075 of 8000 electrons are 600; their noise sqrt(600 + 8^2) is 25.8 electrons or 0.82 of 255
     # steps, rounding adds 1 / 12
     assert taken.mean() == pytest.approx(0.075 * 255, abs=0.1)
     assert taken.std() == pytest.approx(np.hypot(25.77 / 8000 * 255, np.sqrt(1 / 12)), rel=0.05)
+
+
+def plain_mosaic(**changes: Any) -> MosaicCamera:
+    """Returns a colour camera without errors, noise or processing beyond its mosaic."""
+    plain = MosaicCamera(
+        gain=1.0, color_gain=(2.0, 1.0, 1.6), color_error=(1.0, 1.0, 1.0), focus_px=0.0, motion_px=(0.0, 0.0),
+        full_well_e=1e9, read_noise_e=0.0, photo_response=0.0, bits=16, gamma=1.0, sharpening=0.0,
+        jpeg_quality=100, pattern=0,
+    )  # fmt: skip
+    return replace(plain, **changes)
+
+
+BRIGHT = CameraExposure(1.0, 0.0, 0.0, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0)
+
+
+def test_a_mosaic_keeps_an_even_colour_and_each_camera_its_own_gains() -> None:
+    light = np.broadcast_to(np.array([0.5, 0.4, 0.2], np.float32), (40, 64, 3)).copy()
+    taken = plain_mosaic().develop(light, BRIGHT, np.random.default_rng(0))
+    np.testing.assert_allclose(taken[5:-5, 5:-5].mean((0, 1)) / 255, [0.5, 0.4, 0.2], atol=0.006)
+    other = plain_mosaic(gain=1.1, color_error=(0.9, 1.0, 1.2))
+    taken = other.develop(light, BRIGHT, np.random.default_rng(0))
+    expected = 1.1 * np.array([0.5 * 0.9, 0.4, 0.2 * 1.2])
+    np.testing.assert_allclose(taken[5:-5, 5:-5].mean((0, 1)) / 255, expected, atol=0.006)
+
+
+def test_raw_noise_of_a_mosaic_is_that_of_its_electrons() -> None:
+    # Red sees 0.5 / 2 of 8000 e: 2000 e, whose noise with 5 e of reading and 1 % of unevenness is
+    # sqrt(2000 + 25 + 20^2) = 49.2 e. Green: 4000 e, sqrt(4000 + 25 + 40^2) = 75.0 e.
+    camera = plain_mosaic(full_well_e=8000.0, read_noise_e=5.0, photo_response=0.01, pattern=7)
+    raw = 8000.0 * camera.read_out(
+        np.full((600, 600, 3), 0.5, np.float32), np.random.default_rng(0)
+    )
+    assert raw[::2, ::2].mean() == pytest.approx(2000, rel=0.002)
+    assert raw[::2, ::2].std() == pytest.approx(49.2, rel=0.02)
+    assert raw[::2, 1::2].std() == pytest.approx(75.0, rel=0.02)
+    # Another picture of the same camera: unevenness is the same, the rest is new.
+    again = 8000.0 * camera.read_out(
+        np.full((600, 600, 3), 0.5, np.float32), np.random.default_rng(1)
+    )
+    assert (raw - again)[::2, ::2].std() == pytest.approx(np.sqrt(2 * 2025), rel=0.02)
+
+
+def test_motion_smears_a_point_along_its_way() -> None:
+    light = np.zeros((21, 31, 3), np.float32)
+    light[10, 15] = 1.0
+    smeared = blur_motion(light, (6.0, 0.0))[..., 0]
+    columns = np.arange(31.0)
+    weight = smeared.sum(0)
+    assert smeared.sum() == pytest.approx(1.0, abs=1e-4)
+    assert (columns * weight).sum() == pytest.approx(15.0, abs=1e-3)
+    # A line of 6 px has a variance of 6^2 / 12; linear interpolation adds about 1 / 6.
+    assert ((columns - 15) ** 2 * weight).sum() == pytest.approx(3.0 + 1 / 6, abs=0.1)
+    assert smeared[:9].sum() == smeared[12:].sum() == 0.0
+
+
+def test_a_sensor_draws_one_pair_for_a_seed_and_another_for_each_frame() -> None:
+    sensor = option("rig/sensor", "mosaic")
+    chance = np.random.default_rng(3)
+    first, second = sensor.draw_pair(chance), sensor.draw_pair(chance)
+    assert first[0] != second[0] and first[0].gain != first[1].gain
+    assert first[0].motion_px == first[1].motion_px, "the rig shakes as one"
+    assert first == sensor.draw_pair(np.random.default_rng(3))
+    one = replace(sensor, seed=5)
+    first, second = one.draw_pair(chance), one.draw_pair(chance)
+    assert replace(first[1], motion_px=(0, 0)) == replace(second[1], motion_px=(0, 0))
+    with pytest.raises(ConfigError, match="jpeg_quality"):
+        replace(sensor, jpeg_quality=(0, 90))
+
+
+def test_light_in_a_white_hole_is_that_outside_and_a_dark_one_sends_none_on() -> None:
+    factors, mouth = compute_view_factors(0.05, 0.35)
+    np.testing.assert_allclose(factors.sum(1) + mouth, 1.0, atol=1e-12)
+    # Where nothing is lost, light is the same everywhere: an isothermal enclosure.
+    white = compute_bounced_light(0.05, 0.35, 1.0, 1.0, 1.0)
+    np.testing.assert_allclose(white.light[:, 0] + mouth, 1.0, atol=1e-9)
+    dark = compute_bounced_light(0.05, 0.35, 0.0, 0.0, 0.7)
+    assert np.abs(dark.light).max() < 1e-12
+    # The sun straight into a hole with a white floor and a black wall: its whole light leaves the
+    # floor, and the part that falls on the ring beside it is the view factor.
+    floor = compute_bounced_light(0.05, 0.35, 0.0, 1.0, 1.0)
+    np.testing.assert_allclose(floor.light[:-1, 1], factors[:-1, -1], atol=1e-12)
+
+
+def test_sunlight_on_the_wall_and_floor_of_a_hole_is_that_which_enters() -> None:
+    # Through a mouth of area pi r^2 enters pi r^2 cos: all of it falls on wall (of small rings)
+    # and floor, and bounces once where both are nearly black.
+    for rise in (0.3, 0.8, 0.99):
+        first = measure_sunlight(0.05, 0.2, (np.arange(400) + 0.5) * 0.2 / 400, rise)
+        fallen = first[:-1].mean() * 2 * np.pi * 0.05 * 0.2 + first[-1] * np.pi * 0.05**2
+        assert fallen == pytest.approx(np.pi * 0.05**2 * rise, rel=0.02)
+
+
+def test_a_floor_of_a_hole_is_brighter_with_bounced_light_and_walls_see_the_ground() -> None:
+    camera = Pinhole(65, 65, 400.0, np.zeros(3))
+    block = drilled(FACING, np.array([0.0, 0.0, 2.0]))
+    up = np.array([0.0, -1.0, 0.0])
+    direct = Light(np.array([0.0, 0.0, -1.0]), 0.0, 1.0)
+    bounced = replace(direct, ground=GroundBounce(up, 0.4))
+    plain, lit = (seen([block], camera, light).radiance[..., 0] for light in (direct, bounced))
+    # A wall that stands on the ground: half of its light is the sky's, half the ground's.
+    assert lit[32, 58] / plain[32, 58] == pytest.approx(0.5 * (1.0 + 0.4), rel=1e-4)
+    assert lit[32, 32] / lit[32, 58] > 1.3 * plain[32, 32] / plain[32, 58]
 
 
 @pytest.mark.parametrize("name", names("scene"))

@@ -124,6 +124,12 @@ def test_effects_of_valves_are_refused_by_servos_and_the_other_way_round(
         option("actuator", "servo").build(machine, 1, CPU)
 
 
+@pytest.mark.parametrize("name", ["ideal", "lag", "valve", "hydraulic", "load_sensing", "force"])
+def test_an_actuator_of_other_commands_is_refused(arm: Machine, name: str) -> None:
+    with pytest.raises(ConfigError, match=r"commanded by position; choose actuator=servo"):
+        option("actuator", name).build(arm, 1, CPU)
+
+
 def test_one_machine_is_commanded_by_one_quantity(arm: Machine) -> None:
     joints = (replace(arm.joints[0], command="torque", max_force=arm.joints[0].max_speed), *arm.joints[1:])  # fmt: skip
     with pytest.raises(ConfigError, match="commanded by different quantities"):

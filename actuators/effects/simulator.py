@@ -1,0 +1,117 @@
+"""Effects on numbers inside of a simulator that is given as an MJCF file: friction, damping, armature, gain.
+
+They exist around `actuators.models.own_simulator` only. The way back is a change of the file.
+"""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import Any, ClassVar
+
+import torch
+
+from actuators.effects.effect import ANY_INTERFACE, EffectChain, EffectSpec
+from actuators.effects.ranges import EffectNumber, Joints, Value
+from brokk_rl.contracts.actuator import ActuatorModel
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+
+
+class _InsideEffect(EffectSpec):
+    """An effect that writes one number of the plant."""
+
+    side: ClassVar[Any] = "simulator"
+    interfaces = ANY_INTERFACE
+    quantity: ClassVar[str]
+
+    def wrap(
+        self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
+    ) -> EffectChain:
+        """Return `model` whose plant has the number.
+
+        Raises:
+            ConfigError: The innermost model is no MJCF file.
+        """
+        chain = super().wrap(model, machine, num_envs, device)
+        inner: Any = model
+        while hasattr(inner, "inner"):
+            inner = inner.inner
+        if not hasattr(inner, "changes"):
+            raise ConfigError(
+                f"effect={self.name()} changes a number of an MJCF file; give the simulator as simulator=<file>.xml"
+            )
+        (number,) = self.numbers
+        inner.changes[self.quantity] = lambda: chain.parameters[number]
+        return chain
+
+
+@spec
+class JointFriction(_InsideEffect):
+    """Coulomb friction in the joint: `frictionloss`.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        part: Torque of the friction, over the torque of the drive at an error of 5 % of the travel
+            (position), at full speed (velocity) or at full command (torque).
+    """
+
+    joints: Joints
+    part: Value
+    quantity = "friction"
+    # Chosen by hand: the drive stops 0.75 % of the travel from its target.
+    numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.15, bounds=(0.0, 2.0))}
+
+
+@spec
+class JointDamping(_InsideEffect):
+    """Viscous friction in the joint: `damping`.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        part: Torque at full speed, over the same torque of the drive.
+    """
+
+    joints: Joints
+    part: Value
+    quantity = "damping"
+    # Chosen by hand: at full speed the drive lags by 1 % of the travel more.
+    numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.2, bounds=(0.0, 5.0))}
+
+
+@spec
+class JointArmature(_InsideEffect):
+    """Inertia of rotor and gear: `armature`.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        part: Added inertia over that of the joint in the file's own pose.
+    """
+
+    joints: Joints
+    part: Value
+    quantity = "armature"
+    # Chosen by hand: a rotor behind a gear of some hundreds doubles the inertia of a small arm.
+    numbers: ClassVar = {"part": EffectNumber("1", none=0.0, typical=0.5, bounds=(0.0, 20.0))}
+
+
+@spec
+class DriveGain(_InsideEffect):
+    """Stiffness of the drive: `kp`, `kv` or the gain of a motor.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        gain: Factor.
+    """
+
+    joints: Joints
+    gain: Value
+    quantity = "gain"
+    # Chosen by hand: a battery that sags takes a fifth of the voltage.
+    numbers: ClassVar = {"gain": EffectNumber("1", none=1.0, typical=0.8, bounds=(0.1, 5.0))}
+
+
+EFFECTS = MappingProxyType(
+    {kind.name(): kind for kind in (JointFriction, JointDamping, JointArmature, DriveGain)}
+)
+"""The effects by name."""

@@ -1,0 +1,414 @@
+"""A simulator from outside as an actuator: a function `step(state, command) -> state`, or an MJCF file.
+
+It is run on the recorded commands as it is. Effects act on the commands before it and on the motion
+after it; the motion after it does not come back into it. Roll-outs are kept, since effects on the motion
+ask for the same one again. Axes: `N` rows, `T` samples of a run, `J` joints, `S` numbers of a state.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Protocol
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+
+from actuators.effects.simulator import EFFECTS
+from brokk_rl.contracts.actuator import PlannedRun
+from brokk_rl.errors import BrokkError, ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.open_loop import WARM_UP_S
+from brokk_rl.spec import spec
+
+MAX_KEPT = 20_000
+"""Roll-outs that are kept: 60 MB at 250 samples of three joints."""
+TRIAL_TOLERANCE = 1e-9
+"""Largest difference between a function called for two states at once and one by one."""
+
+
+class Plant(Protocol):
+    """Motion of all joints under commands; rows are independent."""
+
+    has_memory: bool
+    """Whether a state holds more than positions and speeds."""
+
+    def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return states `(N, S)` at positions and speeds `(N, J)`."""
+        ...
+
+    def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return states moved to positions and speeds."""
+        ...
+
+    def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and speeds of states, each `(…, J)`."""
+        ...
+
+    def run(
+        self,
+        state: np.ndarray,
+        commands: np.ndarray,
+        changes: Mapping[str, np.ndarray] | None = None,
+    ) -> np.ndarray:
+        """Return the states after each period, `(N, T, S)`, of commands `(N, T, J)`."""
+        ...
+
+
+@spec
+class OwnSimulator:
+    """A simulator from outside, diagnosed as it is.
+
+    A function `step(state, command)` returns the state one control period later. A state is an array: the
+    positions of the joints, their speeds, then whatever the simulator keeps. A command is in the unit of
+    the machine's interface: a target (rad, m), a speed, or a torque. With more than positions and speeds in
+    the state, a function `start(position, speed)` of the same module returns the first one. Write
+    `state[..., 0]`, and many rows are simulated at once.
+
+    An MJCF file has joints with the names of the machine, and one actuator on each.
+
+    Attributes:
+        source: `module:function`, seen from the current folder, or the path of an MJCF file.
+    """
+
+    source: str
+
+    @property
+    def path(self) -> Path | None:
+        """The MJCF file; `None` for a function."""
+        return Path(self.source).expanduser() if self.source.endswith(".xml") else None
+
+    def check(self) -> None:
+        if self.path is not None and not self.path.is_file():
+            raise ConfigError(
+                f"simulator={self.source}: there is no such file (seen from {Path.cwd()})"
+            )
+        if self.path is None and len(self.source.split(":")) != 2:
+            raise ConfigError(
+                f"simulator={self.source}: expected module:function, such as my_sim:step, or an MJCF file, such as my.xml"
+            )
+
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> OwnSimulatorModel:
+        """Return a model for `num_envs` environments.
+
+        Raises:
+            ConfigError: The function or the file cannot be used with the machine.
+        """
+        return OwnSimulatorModel(self.load(machine), machine, num_envs, device)
+
+    def load(self, machine: Machine) -> Any:
+        """Return the plant, the same one until file or function changes.
+
+        Raises:
+            ConfigError: The function or the file cannot be used with the machine.
+        """
+        if self.path is not None:
+            path = self.path.resolve()
+            return _load_file(path, path.stat().st_mtime_ns, machine)
+        step, start = _import_function(self.source)
+        return _load_function(step, start, machine, self.source)
+
+    def list_effects(self) -> dict[str, Any]:
+        """Return effects on numbers inside of the simulator, by name; none for a function."""
+        return dict(EFFECTS) if self.path is not None else {}
+
+
+class OwnSimulatorModel:
+    """A plant as an actuator model.
+
+    Attributes:
+        plant: The plant.
+        changes: Parameters of effects on numbers of the plant, by quantity; see
+            `actuators.effects.simulator`.
+    """
+
+    def __init__(self, plant: Any, machine: Machine, num_envs: int, device: torch.device) -> None:
+        if device.type != "cpu":
+            raise ConfigError("a simulator of your own runs on the CPU; set session.device=cpu")
+        self.plant = plant
+        self.changes: dict[str, Callable[[], torch.Tensor]] = {}
+        self.delay_s = torch.zeros(num_envs, machine.num_joints)
+        self._machine, self._period_s = machine, machine.period_s
+        self._fresh = torch.ones(num_envs, dtype=torch.bool)
+        start = plant.start(np.zeros((1, machine.num_joints)), np.zeros((1, machine.num_joints)))
+        self._state = torch.zeros(num_envs, start.shape[1], dtype=torch.float64)
+        self._seen = torch.zeros(num_envs, machine.num_joints, dtype=torch.float64)
+
+    @property
+    def state(self) -> dict[str, torch.Tensor]:
+        """`plant`, the state of the simulator `(N, S)`; `seen`, its last positions; `fresh`."""
+        return {"plant": self._state, "seen": self._seen, "fresh": self._fresh}
+
+    def reset(self, mask: torch.Tensor) -> None:
+        """Let the environments of `mask`, `(N,)` bool, start from their history."""
+        self._fresh.logical_or_(mask)
+
+    def step(self, history: History) -> torch.Tensor:
+        """Return the joint positions one control period later, shape `(N, J)`.
+
+        Where the history says something else than the last step did, the joints are put there, with the
+        speed between the last two positions.
+        """
+        q = history.q[:, -2:].double().numpy()
+        speed = (q[:, 1] - q[:, 0]) / self._period_s
+        fresh = self._fresh.numpy()
+        state = self._state.numpy()
+        if fresh.any():
+            state = np.where(fresh[:, None], self.plant.start(q[:, 1], speed), state)
+        # Single precision of the history is no motion.
+        moved = np.abs(q[:, 1] - self._seen.numpy()).max(1) > 1e-6
+        placed = self.plant.place(state, q[:, 1], speed)
+        state = np.where((moved & ~fresh)[:, None], placed, state)
+        commands = read_commands(history.u[:, -1:].double().numpy(), self._machine)
+        state = self.plant.run(state, commands, self._read_changes())[:, 0]
+        found = torch.as_tensor(self.plant.read(state)[0].astype(np.float32))
+        self._state.copy_(torch.as_tensor(state))
+        self._seen.copy_(found.double())
+        self._fresh.fill_(False)
+        return found
+
+    def plan_run(
+        self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
+    ) -> PlannedRun | None:
+        """See `brokk_rl.contracts.actuator.PlannedModel`.
+
+        `q` holds the positions of the warm-up too. The run begins behind it, where it does in
+        `brokk_rl.open_loop`.
+        """
+        if q is None:
+            return None
+        begin = first + round(WARM_UP_S / self._period_s)
+        if begin > len(u):
+            return None
+        known = q[:begin].double().numpy()
+        commands = read_commands(u.double().numpy(), self._machine)
+        path = _roll_out(
+            self.plant, known, commands, first, self._period_s, self._read_changes() or {}
+        )
+        return _RolledRun(torch.as_tensor(path), begin)
+
+    def _read_changes(self) -> dict[str, np.ndarray] | None:
+        found = {}
+        for name, read in self.changes.items():
+            found[name] = read().detach().double().numpy()
+        return found or None
+
+
+class _RolledRun:
+    """A run whose positions are known: effects add to its increments."""
+
+    def __init__(self, path: torch.Tensor, begin: int) -> None:
+        self._path, self._begin = path, begin
+
+    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
+        """Return positions `k`, `(N, J)`; see `brokk_rl.contracts.actuator.PlannedRun`."""
+        if k < self._begin:
+            return self._path[k]
+        return q[k - 1] + (self._path[k] - self._path[k - 1])
+
+
+def read_commands(u: np.ndarray, machine: Machine) -> np.ndarray:
+    """Return commands `(…, J)` in [-1, 1] as targets (rad, m), speeds (rad/s, m/s) or torques (Nm, N)."""
+    if machine.interface == "position":
+        return 0.5 * (machine.lower + machine.upper) + 0.5 * (machine.upper - machine.lower) * u
+    return u * (machine.max_speed if machine.interface == "speed" else machine.max_force)
+
+
+_ROLL_OUTS: WeakKeyDictionary[Any, dict[bytes, np.ndarray]] = WeakKeyDictionary()
+"""Positions of runs by plant and by a hash of their commands."""
+
+
+def _roll_out(
+    plant: Plant,
+    known: np.ndarray,
+    commands: np.ndarray,
+    first: int,
+    period_s: float,
+    changes: Mapping[str, np.ndarray] = MappingProxyType({}),
+) -> np.ndarray:
+    """Return positions `(T + 1, N, J)` of runs under commands `(T, N, J)`, those in `known` first.
+
+    Equal rows are simulated once, those of earlier calls not again.
+    """
+    count = commands.shape[1]
+    kept = _ROLL_OUTS.setdefault(plant, {})
+    rows: dict[bytes, list[int]] = {}
+    for row in range(count):
+        key = hashlib.blake2b(str(first).encode(), digest_size=16)
+        key.update(np.ascontiguousarray(known[:, row]).tobytes())
+        key.update(np.ascontiguousarray(commands[:, row]).tobytes())
+        for name, values in changes.items():
+            key.update(name.encode() + values[row].tobytes())
+        rows.setdefault(key.digest(), []).append(row)
+    missing = [key for key in rows if key not in kept]
+    if missing:
+        if len(kept) + len(missing) > MAX_KEPT:
+            held = {key: kept[key] for key in rows if key in kept}
+            kept.clear()
+            kept.update(held)
+        chosen = [rows[key][0] for key in missing]
+        own = {name: values[chosen] for name, values in changes.items()}
+        paths = _simulate(plant, known[:, chosen], commands[:, chosen], first, period_s, own)
+        kept.update(zip(missing, paths.astype(np.float32), strict=True))
+    found = np.empty((len(commands) + 1, count, commands.shape[2]), dtype=np.float32)
+    for key, places in rows.items():
+        found[:, places] = kept[key][:, None]
+    return found
+
+
+def _simulate(
+    plant: Plant,
+    known: np.ndarray,
+    commands: np.ndarray,
+    first: int,
+    period_s: float,
+    changes: Mapping[str, np.ndarray],
+) -> np.ndarray:
+    """Return positions of runs, `(N, T + 1, J)`."""
+    begin = len(known)
+    speed = np.diff(known, axis=0, prepend=known[:1]) / period_s
+    at = first if plant.has_memory else begin
+    state = plant.start(known[at - 1], speed[at - 1])
+    for k in range(at, begin):  # what a simulator remembers of commands is filled by the warm-up
+        state = plant.run(state, commands[k - 1][:, None], changes)[:, 0]
+        state = plant.place(state, known[k], speed[k])
+    states = plant.run(state, commands[begin - 1 :].swapaxes(0, 1), changes)
+    paths = plant.read(states)[0]
+    if not np.isfinite(paths).all():
+        raise BrokkError(
+            "the simulator gave NaN or infinity on the recorded commands; run it on one recording by itself"
+        )
+    return np.concatenate([known.swapaxes(0, 1), paths], 1)
+
+
+class FunctionPlant:
+    """A function `step(state, command) -> state` as a plant.
+
+    Args:
+        step: The function.
+        start: First state at positions and speeds; `None`: the two in a row.
+        machine: The machine.
+        name: Name of the function in messages.
+
+    Raises:
+        ConfigError: The function cannot be called, or returns no such state.
+    """
+
+    def __init__(
+        self,
+        step: Callable[..., Any],
+        start: Callable[..., Any] | None,
+        machine: Machine,
+        name: str,
+    ) -> None:
+        self._step, self._start, self._name = step, start, name
+        self._num_joints = machine.num_joints
+        self.has_memory = start is not None
+        middle = 0.5 * (machine.lower + machine.upper)
+        q = np.stack([middle, middle + 0.1 * (machine.upper - machine.lower)])
+        state = self._begin_rows(q, np.zeros_like(q))
+        command = read_commands(np.full_like(q, 0.1), machine)
+        one_by_one = np.stack([self._call(*one) for one in zip(state, command, strict=True)])
+        if one_by_one.shape != state.shape:
+            raise ConfigError(
+                f"simulator={name}: a state has {state.shape[1]} numbers, but the function returned {one_by_one.shape[1:]}; "
+                "it must return a state of the same shape"
+            )
+        self._is_vectorised = self._agrees_in_rows(state, command, one_by_one)
+
+    def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """See `Plant`."""
+        return self._begin_rows(q, speed)
+
+    def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """See `Plant`."""
+        state, joints = state.copy(), self._num_joints
+        state[:, :joints], state[:, joints : 2 * joints] = q, speed
+        return state
+
+    def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See `Plant`."""
+        joints = self._num_joints
+        return state[..., :joints], state[..., joints : 2 * joints]
+
+    def run(
+        self,
+        state: np.ndarray,
+        commands: np.ndarray,
+        changes: Mapping[str, np.ndarray] | None = None,
+    ) -> np.ndarray:
+        """See `Plant`; a function has no numbers that could be changed."""
+        found = np.empty((*commands.shape[:2], state.shape[1]))
+        for k in range(commands.shape[1]):
+            command = commands[:, k]
+            if self._is_vectorised:
+                state = self._call(state, command)
+            else:
+                rows = [self._call(*one) for one in zip(state, command, strict=True)]
+                state = np.stack(rows) if rows else state
+            found[:, k] = state
+        return found
+
+    def _call(self, state: np.ndarray, command: np.ndarray) -> np.ndarray:
+        try:
+            return np.asarray(self._step(state.copy(), command.copy()), dtype=float)
+        except Exception as error:
+            raise ConfigError(
+                f"simulator={self._name}: step(state, command) failed with {type(error).__name__}: {error}; "
+                f"it got a state of shape {state.shape} and a command of shape {command.shape}"
+            ) from error
+
+    def _agrees_in_rows(self, state: np.ndarray, command: np.ndarray, rows: np.ndarray) -> bool:
+        try:
+            found = self._call(state, command)
+        except ConfigError:
+            return False
+        return found.shape == rows.shape and bool(
+            np.allclose(found, rows, rtol=0, atol=TRIAL_TOLERANCE)
+        )
+
+    def _begin_rows(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        if self._start is None:
+            return np.concatenate([q, speed], 1)
+        return np.stack([np.asarray(self._start(*one)) for one in zip(q, speed, strict=True)])
+
+
+@lru_cache(maxsize=8)
+def _load_file(path: Path, changed_ns: int, machine: Machine) -> Any:
+    from brokk_rl.sim.mjcf_plant import MjcfPlant  # MuJoCo is not in every installation
+
+    return MjcfPlant(path, machine)
+
+
+@lru_cache(maxsize=8)
+def _load_function(
+    step: Callable[..., Any], start: Callable[..., Any] | None, machine: Machine, name: str
+) -> FunctionPlant:
+    return FunctionPlant(step, start, machine, name)
+
+
+def _import_function(source: str) -> tuple[Callable[..., Any], Callable[..., Any] | None]:
+    """Return the function `module:function`, and `start` of the same module where it has one."""
+    module_name, _, function = source.partition(":")
+    if (here := str(Path.cwd())) not in sys.path:
+        sys.path.insert(0, here)
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(
+            f"simulator={source}: module '{module_name}' cannot be imported ({error}); "
+            f"run the command in the folder of {module_name}.py"
+        ) from error
+    step = getattr(module, function, None)
+    if not callable(step):
+        raise ConfigError(
+            f"simulator={source}: module '{module_name}' has no function '{function}'"
+        )
+    return step, getattr(module, "start", None)

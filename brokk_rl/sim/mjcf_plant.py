@@ -1,0 +1,221 @@
+"""An MJCF file as a plant: joint motion under commands, simulated by MuJoCo C.
+
+Numbers of joints and drives (friction, damping, armature, gain) can differ from row to row, so that
+candidates are simulated side by side. Axes: `N` rows, `T` control periods, `J` joints, `S` numbers of a
+state.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+
+STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+MAX_STATES = 4_000_000
+"""Numbers of states kept at once: 32 MB."""
+REFERENCE_TRAVEL = 0.05
+"""Error of position, over the travel, at which a position drive gives its reference torque. Chosen by
+hand: a drive that holds an arm errs by a few percent."""
+QUANTITIES = ("friction", "damping", "armature", "gain")
+"""Numbers that a row may change; see `MjcfPlant.read_references`."""
+
+
+class MjcfPlant:
+    """Joints and drives of an MJCF file, named as those of a machine.
+
+    Args:
+        path: MJCF file.
+        machine: The machine: its joint names are those of the file.
+
+    Raises:
+        ConfigError: The file cannot be compiled, a joint or its drive is missing, or the control period
+            is no multiple of the time step.
+    """
+
+    def __init__(self, path: Path, machine: Machine) -> None:
+        try:
+            self.model = mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            raise ConfigError(f"simulator={path}: MuJoCo cannot compile it: {error}") from error
+        self._machine = machine
+        names = machine.joint_names
+        joints = [_find_joint(self.model, path, name) for name in names]
+        self.drives = np.array(
+            [
+                _find_drive(self.model, path, name, joint)
+                for name, joint in zip(names, joints, strict=True)
+            ]
+        )
+        self.joints = np.array(joints)
+        self.dofs = self.model.jnt_dofadr[joints]
+        self.substeps = round(machine.period_s / self.model.opt.timestep)
+        if (
+            abs(self.substeps * self.model.opt.timestep - machine.period_s)
+            > 1e-6 * machine.period_s
+        ):
+            raise ConfigError(
+                f"simulator={path}: the control period {machine.period_s:g} s of machine '{machine.name}' is no multiple of the "
+                f"time step {self.model.opt.timestep:g} s; change <option timestep> or the machine's period_s"
+            )
+        self._data = mujoco.MjData(self.model)
+        # MuJoCo's order of a full state: time, qpos, qvel, act, …
+        self._q_at = 1 + self.model.jnt_qposadr[joints]
+        self._speed_at = 1 + self.model.nq + self.dofs
+        gear = self.model.actuator_gear[self.drives, 0]
+        self._per_command = 1.0 / gear if machine.interface == "torque" else gear
+        self._models: dict[bytes, mujoco.MjModel] = {}
+
+    @property
+    def has_memory(self) -> bool:
+        """True if a state holds more than positions and speeds, such as activations or delayed commands."""
+        beyond = mujoco.mj_stateSize(self.model, STATE) - 1 - self.model.nq - self.model.nv
+        return beyond > 0
+
+    def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return states at positions and speeds `(N, J)`, `(N, S)`; other joints are where the file has them."""
+        mujoco.mj_resetData(self.model, self._data)
+        state = np.empty(mujoco.mj_stateSize(self.model, STATE))
+        mujoco.mj_getState(self.model, self._data, state, STATE)
+        return self.place(np.repeat(state[None], len(q), 0), q, speed)
+
+    def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
+        """Return states moved to positions and speeds `(N, J)`."""
+        state = state.copy()
+        state[:, self._q_at] = q
+        state[:, self._speed_at] = speed
+        return state
+
+    def read(self, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and speeds of states, each `(…, J)`."""
+        return state[..., self._q_at], state[..., self._speed_at]
+
+    def run(
+        self,
+        state: np.ndarray,
+        commands: np.ndarray,
+        changes: Mapping[str, np.ndarray] | None = None,
+    ) -> np.ndarray:
+        """Return the states after each control period, `(N, T, S)`.
+
+        Args:
+            state: Where the rows begin, `(N, S)`.
+            commands: Targets (rad, m), speeds (rad/s, m/s) or torques (Nm, N), `(N, T, J)`.
+            changes: `QUANTITIES` by name, each `(N, J)`, in the units of `change_model`.
+        """
+        count, periods = commands.shape[:2]
+        models = self._list_models(count, changes)
+        found = np.empty((count, periods, state.shape[1]))
+        if not count or not periods:
+            return found
+        at_once = max(1, MAX_STATES // (periods * self.substeps * state.shape[1]))
+        for first in range(0, count, at_once):
+            rows = slice(first, first + at_once)
+            control = np.zeros((len(found[rows]), periods, self.model.nu))
+            control[..., self.drives] = commands[rows] * self._per_command
+            states, _ = rollout.rollout(
+                models[rows], self._data, state[rows], np.repeat(control, self.substeps, 1)
+            )
+            found[rows] = np.asarray(states)[:, self.substeps - 1 :: self.substeps]
+        return found
+
+    def read_references(self) -> dict[str, np.ndarray]:
+        """Return the unit of each of `QUANTITIES` on each joint, `(J,)`.
+
+        Friction is counted in the torque that a drive gives for an error of 5 % of the travel
+        (position), at full speed (velocity), or at full command (torque), Nm or N. Damping is counted
+        in that torque over the full speed, armature in the inertia of the joint, gain in itself.
+        """
+        model, machine = self.model, self._machine
+        gain = np.abs(model.actuator_gainprm[self.drives, 0] * model.actuator_gear[self.drives, 0])
+        gain = np.where(gain > 0.0, gain, 1.0)
+        full = {
+            "position": gain * REFERENCE_TRAVEL * (machine.upper - machine.lower),
+            "speed": gain * machine.max_speed,
+            "torque": machine.max_force,
+        }[machine.interface]
+        limited = model.actuator_forcelimited[self.drives].astype(bool)
+        limit = np.abs(model.actuator_forcerange[self.drives]).max(1)
+        full = np.where(limited, np.minimum(full, limit), full)
+        inertia = model.dof_M0[self.dofs]
+        ones = np.ones(machine.num_joints)
+        return {
+            "friction": full,
+            "damping": full / machine.max_speed,
+            "armature": inertia,
+            "gain": ones,
+        }
+
+    def change_model(self, changes: Mapping[str, np.ndarray]) -> mujoco.MjModel:
+        """Return the model with numbers of its joints changed, each `(J,)`.
+
+        Args:
+            changes: `friction`, `damping` and `armature` are added, in the units of `read_references`;
+                `gain` multiplies the drive's.
+        """
+        model, unit = copy.copy(self.model), self.read_references()
+        dofs, drives = self.dofs, self.drives
+        if "friction" in changes:
+            model.dof_frictionloss[dofs] += changes["friction"] * unit["friction"]
+        if "damping" in changes:
+            extra = changes["damping"] * unit["damping"]
+            if model.dof_damping.ndim > 1:  # MuJoCo 4: linear and higher orders
+                model.dof_damping[dofs, 0] += extra
+            else:
+                model.dof_damping[dofs] += extra
+        if "armature" in changes:
+            model.dof_armature[dofs] += changes["armature"] * unit["armature"]
+        if "gain" in changes:
+            # Both terms of a position drive: the force is gain (target - position) - damping speed.
+            model.actuator_gainprm[drives, 0] *= changes["gain"]
+            model.actuator_biasprm[drives, 1] *= changes["gain"]
+            if self._machine.interface == "speed":
+                model.actuator_biasprm[drives, 2] *= changes["gain"]
+        mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by
+        return model
+
+    def _list_models(
+        self, count: int, changes: Mapping[str, np.ndarray] | None
+    ) -> list[mujoco.MjModel]:
+        if not changes:
+            return [self.model] * count
+        names = sorted(changes)
+        rows = np.stack([changes[name] for name in names], 1).astype(np.float64)  # (N, Q, J)
+        models = []
+        for row in rows:
+            key = "".join(names).encode() + row.tobytes()
+            if key not in self._models:
+                if len(self._models) > 512:  # candidates of a search seldom come back so late
+                    self._models.clear()
+                self._models[key] = self.change_model(dict(zip(names, row, strict=True)))
+            models.append(self._models[key])
+        return models
+
+
+def _find_joint(model: mujoco.MjModel, path: Path, name: str) -> int:
+    found = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_JOINT, name)
+    if found < 0:
+        known = [model.joint(number).name for number in range(model.njnt)]
+        raise ConfigError(
+            f"simulator={path}: it has no joint '{name}'; it has {', '.join(known)}. Name the joints of the machine file as "
+            "those of the MJCF"
+        )
+    return found
+
+
+def _find_drive(model: mujoco.MjModel, path: Path, name: str, joint: int) -> int:
+    on_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+    found = np.flatnonzero(on_joint & (model.actuator_trnid[:, 0] == joint))
+    if len(found) != 1:
+        raise ConfigError(
+            f"simulator={path}: expected one actuator on joint '{name}', found {len(found)}; "
+            f'add <position joint="{name}" kp=…/>, <velocity …/> or <motor …/>'
+        )
+    return int(found[0])

@@ -1,0 +1,317 @@
+"""Simulators from outside: an MJCF file and a function, run on recorded commands."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from brokk_rl import open_loop
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Dimension, Joint, Machine
+from brokk_rl.record import Recording, make_motion
+from diagnosis import api, baseline, effect_library
+
+ARM = """
+<mujoco model="two_links">
+  <compiler angle="radian"/>
+  <option timestep="0.005" integrator="implicitfast"/>
+  <worldbody>
+    <body pos="0 0 0.3">
+      <joint name="shoulder" axis="0 1 0" range="-1.6 1.6" damping="0.2"/>
+      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1.0" contype="0"/>
+      <body pos="0.3 0 0">
+        <joint name="elbow" axis="0 1 0" range="-1.6 1.6" damping="0.1"/>
+        <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.5" contype="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position joint="shoulder" kp="60" kv="4"/>
+    <position joint="elbow" kp="30" kv="1.5"/>
+  </actuator>
+</mujoco>
+"""
+NOISE_RAD = 2e-4
+PENDULUM = """
+import numpy as np
+
+def step(state, command):
+    angle, speed = state[..., 0], state[..., 1]
+    for _ in range(4):  # 5 ms each: a servo of 30 Nm/rad holds 1 kg at 0.3 m
+        torque = 30.0 * (command[..., 0] - angle) - 2.0 * speed - 9.81 * 0.3 * np.sin(angle)
+        speed = speed + 0.005 * torque / 0.09
+        angle = angle + 0.005 * speed
+    return np.stack([angle, speed], axis=-1)
+"""
+
+
+def make_machine(*names: str) -> Machine:
+    """Returns a machine of position servos at 50 Hz, known by its joints."""
+
+    def number(value: float) -> Dimension:
+        return Dimension(value=value, source="test", confidence="high")
+
+    joints = tuple(
+        Joint(
+            name=name,
+            part=None,
+            kind="hinge",
+            lower=number(-1.5),
+            upper=number(1.5),
+            home=0.0,
+            max_speed=number(3.0),
+            body=None,
+            command="position",
+        )
+        for name in names
+    )
+    return Machine(
+        name="two_links",
+        title="two links",
+        mjcf=None,
+        period_s=0.02,
+        dead_time_s=0.0,
+        num_history=26,
+        joints=joints,
+        tool_m=None,
+        exclusive=(),
+        levers=(),
+    )
+
+
+def draw_targets(generator: np.random.Generator, count: int, joints: int) -> np.ndarray:
+    """Returns targets that step and ramp, `(T, J)`."""
+    found = np.zeros((count, joints))
+    for j in range(joints):
+        at, k = 0.0, 0
+        while k < count:
+            goal, speed = generator.uniform(-0.9, 0.9), generator.choice([0.6, 1.5, 1e3])
+            for _ in range(int(generator.integers(15, 80))):
+                at += float(np.clip(goal - at, -speed * 0.02, speed * 0.02))
+                if k < count:
+                    found[k, j] = at
+                k += 1
+    return found
+
+
+def record_arm(
+    machine: Machine, change: Callable[[Any], None], delay: int, seed: int, seconds: float = 16.0
+) -> Recording:
+    """Returns a recording of the arm with a fault, stepped by MuJoCo in a loop of its own."""
+    generator = np.random.default_rng(seed)
+    spec = mujoco.MjSpec.from_string(ARM)
+    change(spec)
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    count = round(seconds / machine.period_s)
+    targets, q = draw_targets(generator, count, 2), np.zeros((count, 2))
+    for k in range(count):
+        q[k] = data.qpos
+        data.ctrl[:] = targets[max(0, k - delay)]
+        for _ in range(4):
+            mujoco.mj_step(model, data)
+    t_s = np.arange(count) * machine.period_s
+    q += generator.normal(0.0, NOISE_RAD, q.shape)
+    return make_motion(machine, f"run {seed}", t_s, (targets / 1.5).astype(np.float32), q)
+
+
+def keep(spec: Any) -> None:
+    """The arm as in the file."""
+
+
+def rub(spec: Any) -> None:
+    """Adds friction at the elbow."""
+    spec.joint("elbow").frictionloss = 0.5
+
+
+def weaken(spec: Any) -> None:
+    """Takes 40 % of the stiffness of the shoulder's drive."""
+    drive = spec.actuators[0]
+    gain, bias = drive.gainprm.copy(), drive.biasprm.copy()
+    gain[0], bias[1] = 0.6 * gain[0], 0.6 * bias[1]
+    drive.gainprm, drive.biasprm = gain, bias
+
+
+@pytest.fixture
+def arm(tmp_path: Path) -> Path:
+    """The MJCF file of the arm."""
+    path = tmp_path / "arm.xml"
+    path.write_text(ARM)
+    return path
+
+
+@pytest.fixture
+def pendulum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """A function of ten lines in the current folder."""
+    (tmp_path / "my_pendulum.py").write_text(PENDULUM)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.delitem(sys.modules, "my_pendulum", raising=False)
+    return "my_pendulum:step"
+
+
+def measure_errors(
+    simulator: Any, machine: Machine, recording: Recording, effects: dict[str, dict[str, Any]]
+) -> np.ndarray:
+    """Returns the RMS error of free runs with effects, `(J,)` rad."""
+    kinds = {kind.name: kind for kind in effect_library.load_effects(machine, None, simulator)}
+    runs = baseline.compare_simulator(simulator, [(recording, 0.0)], machine, 0).residuals.simulator
+    chosen = [(kinds[name], values) for name, values in effects.items()]
+    error = runs.cut.measured - runs.simulate(chosen)[0]
+    return np.sqrt(np.square(error).mean((0, 1)))
+
+
+@pytest.mark.parametrize(
+    ("change", "delay", "effect"),
+    [
+        (keep, 0, {}),
+        (keep, 3, {"dead_time": {"dead_time_s": np.full((1, 2), 0.06)}}),
+        # 0.5 Nm over kp 30 Nm/rad times 5 % of a travel of 3 rad.
+        (rub, 0, {"joint_friction": {"part": np.array([[0.0, 0.5 / 4.5]])}}),
+        (weaken, 0, {"drive_gain": {"gain": np.array([[0.6, 1.0]])}}),
+    ],
+)
+def test_a_file_with_the_fault_as_effect_is_the_faulty_machine(
+    arm: Path, change: Callable[[Any], None], delay: int, effect: dict[str, Any]
+) -> None:
+    machine = make_machine("shoulder", "elbow")
+    recording = record_arm(machine, change, delay, seed=1)
+    simulator = api._load_simulator(arm)
+    # The speed at the start of a run is a difference of two noisy positions: a few times the noise.
+    assert measure_errors(simulator, machine, recording, effect).max() < 8 * NOISE_RAD
+    if effect:
+        assert measure_errors(simulator, machine, recording, {}).max() > 20 * NOISE_RAD
+
+
+def test_effects_behind_the_simulator_do_not_run_it_again(pendulum: str) -> None:
+    machine = make_machine("hinge")
+    targets = draw_targets(np.random.default_rng(0), 400, 1)
+    t_s = np.arange(400) * machine.period_s
+    recording = make_motion(machine, "run", t_s, (targets / 1.5).astype(np.float32), targets)
+    simulator = api._load_simulator(pendulum)
+    plant = simulator.load(machine)
+    plain = measure_errors(simulator, machine, recording, {})
+    calls, run = [], plant.run
+    plant.run = lambda *given: calls.append(1) or run(*given)
+    assert measure_errors(simulator, machine, recording, {}) == plain
+    assert not calls
+    dead_time = {"dead_time": {"dead_time_s": np.full((1, 1), 0.04)}}
+    assert measure_errors(simulator, machine, recording, dead_time) != plain
+    assert calls
+
+
+def test_a_function_for_one_state_is_that_for_many(
+    pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    single = PENDULUM.replace(
+        "np.stack([angle, speed], axis=-1)", "np.array([float(angle), speed])"
+    )
+    (tmp_path / "my_single.py").write_text(single)
+    machine = make_machine("hinge")
+    state, commands = np.array([[0.1, 0.0], [-0.4, 1.0]]), np.full((2, 5, 1), 0.3)
+    runs = [
+        api._load_simulator(name).load(machine).run(state, commands)
+        for name in (pendulum, "my_single:step")
+    ]
+    np.testing.assert_allclose(runs[0], runs[1], atol=1e-12)
+    module = sys.modules["my_pendulum"]
+    expected = state[0]
+    for _ in range(5):
+        expected = module.step(expected, np.array([0.3]))
+    np.testing.assert_allclose(runs[0][0, -1], expected, atol=1e-12)
+
+
+def test_a_pendulum_written_by_hand_explains_its_own_delay(pendulum: str) -> None:
+    machine = make_machine("hinge")
+    simulator = api._load_simulator(pendulum)
+    simulator.load(machine)
+    step = sys.modules["my_pendulum"].step
+    targets = draw_targets(np.random.default_rng(2), 800, 1)
+    state, q = np.zeros(2), np.zeros((800, 1))
+    for k in range(800):
+        q[k] = state[0]
+        state = step(state, targets[max(0, k - 2)])
+    t_s = np.arange(800) * machine.period_s
+    recording = make_motion(machine, "run", t_s, (targets / 1.5).astype(np.float32), q)
+    late = {"dead_time": {"dead_time_s": np.full((1, 1), 0.04)}}
+    before = measure_errors(simulator, machine, recording, {})[0]
+    after = measure_errors(simulator, machine, recording, late)[0]
+    assert after < 0.05 * before
+
+
+def test_steps_and_a_planned_run_agree(arm: Path) -> None:
+    machine = make_machine("shoulder", "elbow")
+    recording = record_arm(machine, keep, 0, seed=3, seconds=5.0)
+    simulator: Any = api._load_simulator(arm)
+    stepped = api.simulate(simulator, api.RecordingSet((recording,), machine))[0]
+    before = open_loop.count_samples_before(machine)
+    error = stepped[before:] - recording.q[before:]
+    assert np.sqrt(np.square(error).mean()) < 5 * NOISE_RAD
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"source": "my_sim.py"}, "expected module:function"),
+        ({"source": "nowhere.xml"}, "there is no such file"),
+    ],
+)
+def test_a_simulator_that_cannot_be_is_refused(change: dict[str, str], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        replace(api._load_option("actuator", "own"), **change)
+
+
+def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: Path) -> None:
+    simulator: Any = api._load_simulator(arm)
+    with pytest.raises(ConfigError, match="no joint 'wrist'; it has shoulder, elbow"):
+        simulator.load(make_machine("wrist"))
+    with pytest.raises(ConfigError, match="is no multiple of the time step"):
+        simulator.load(replace(make_machine("shoulder"), period_s=0.018))
+    arm.write_text(ARM.replace('<position joint="elbow" kp="30" kv="1.5"/>', ""))
+    other = arm.with_name("other.xml")
+    other.write_text(arm.read_text())
+    with pytest.raises(ConfigError, match="expected one actuator on joint 'elbow', found 0"):
+        api._load_simulator(other).load(make_machine("shoulder", "elbow"))
+
+
+def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
+    machine = make_machine("hinge")
+    inside = {"joint_friction", "joint_damping", "joint_armature", "drive_gain"}
+    for source, found in ((pendulum, set()), (arm, inside)):
+        kinds = effect_library.load_effects(machine, None, api._load_simulator(source))
+        assert {kind.name for kind in kinds} & inside == found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("change", "delay", "effect", "joints"),
+    [
+        (keep, 0, None, ()),
+        (keep, 3, "dead_time", ("shoulder", "elbow")),
+        (rub, 0, "joint_friction", ("elbow",)),
+        (weaken, 0, "drive_gain", ("shoulder",)),
+    ],
+)
+def test_a_withheld_fault_is_named_around_the_file(
+    arm: Path,
+    tmp_path: Path,
+    change: Callable[[Any], None],
+    delay: int,
+    effect: str | None,
+    joints: tuple[str, ...],
+) -> None:
+    machine = make_machine("shoulder", "elbow")
+    runs = tuple(record_arm(machine, change, delay, seed, 40.0) for seed in range(4))
+    field = api.RecordingSet(runs, machine)
+    answer = api.diagnose(field, tmp_path / "run", simulator=arm).answer
+    if effect is None:
+        assert answer.verdict == "none"
+        return
+    assert [(one.effect, one.joints) for one in answer.selected] == [(effect, joints)]
