@@ -459,19 +459,19 @@ class EffectChain:
 def change_drive(
     model: Any, effect: EffectSpec, value: Mapping[str, torch.Tensor], where: str
 ) -> None:
-    """Write the numbers of an effect into the `changes` of the drive within `model`.
+    """Write the numbers of an effect into the `drive_changes` of the drive within `model`.
 
     Raises:
         ConfigError: the model inside is no drive, so that it has no such number.
     """
     while hasattr(model, "inner"):
         model = model.inner
-    if not hasattr(model, "changes"):
+    if not hasattr(model, "drive_changes"):
         raise ConfigError(
             f"{where}: it changes mass or friction of a drive, and {type(model).__name__} has none; choose actuator=force"
         )
     for name, changed in effect.drives.items():
-        model.changes[changed] = value[name]
+        model.drive_changes[changed] = value[name]
 
 
 def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:

@@ -60,7 +60,7 @@ class ForceDriveModel:
     Attributes:
         parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
             candidates side by side.
-        changes: Changes of them by effects, `(N, J)` by name: a factor on the mass, force added to
+        drive_changes: Changes of them by effects, `(N, J)` by name: a factor on the mass, force added to
             the others.
     """
 
@@ -79,7 +79,7 @@ class ForceDriveModel:
             nominal, config.spread, num_envs, device, "actuator.spread"
         )
         self.parameters = self._parameters.value
-        self.changes: dict[str, torch.Tensor] = {}
+        self.drive_changes: dict[str, torch.Tensor] = {}
         self._period_s = machine.period_s
 
         def tensor(values: object) -> torch.Tensor:
@@ -132,7 +132,7 @@ class ForceDriveModel:
     def _change_numbers(self) -> dict[str, torch.Tensor]:
         """Return the numbers with the changes by effects, `(N, J)`."""
         value = dict(self.parameters)
-        for name, change in self.changes.items():
+        for name, change in self.drive_changes.items():
             own = value[name]
             value[name] = own * change if name == "mass_kg" else own + change
         return value
