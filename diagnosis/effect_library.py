@@ -226,11 +226,7 @@ def _check_simulable(kind: EffectType, machine: Machine) -> None:
 
 
 class StationaryModel:
-    """A machine that does not move.
-
-    Attributes:
-        drive_changes: Changes of the numbers of a drive, which do nothing here.
-    """
+    """A machine that does not move; changes of a drive do nothing to it."""
 
     def __init__(self) -> None:
         self.drive_changes: dict[str, torch.Tensor] = {}

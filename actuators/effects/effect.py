@@ -17,6 +17,7 @@ import torch
 from actuators.effects.planned_run import ChainRun
 from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
 from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
+from actuators.models.force_drive import change_drive
 from brokk_rl.contracts.actuator import ActuatorModel, PlannedRun
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -232,7 +233,7 @@ class EffectChain:
         self.motions: dict[str, Any] = {name: e for name, e in effects.items() if e.side in MOTION}
         self._drives = {name: e for name, e in effects.items() if e.side == "drive"}
         for name, effect in self._drives.items():
-            change_drive(inner, effect, self.get_values(name), where)
+            change_drive(inner, effect.drives, self.get_values(name), where)
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
         self.is_weighed = machine.has_bodies and any(e.weighed for e in self.motions.values())
@@ -266,7 +267,7 @@ class EffectChain:
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
         for name, effect in self._drives.items():
-            change_drive(self.inner, effect, self.get_values(name), name)
+            change_drive(self.inner, effect.drives, self.get_values(name), name)
         if not (self.commands or self.motions):
             return self.inner.step(history)
         fresh = self._fresh
@@ -454,24 +455,6 @@ class EffectChain:
         if counter is None or name not in self._salts:
             return None
         return counter + self._salts[name]
-
-
-def change_drive(
-    model: Any, effect: EffectSpec, value: Mapping[str, torch.Tensor], where: str
-) -> None:
-    """Write the numbers of an effect into the `drive_changes` of the drive within `model`.
-
-    Raises:
-        ConfigError: the model inside is no drive, so that it has no such number.
-    """
-    while hasattr(model, "inner"):
-        model = model.inner
-    if not hasattr(model, "drive_changes"):
-        raise ConfigError(
-            f"{where}: it changes mass or friction of a drive, and {type(model).__name__} has none; choose actuator=force"
-        )
-    for name, changed in effect.drives.items():
-        model.drive_changes[changed] = value[name]
 
 
 def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:

@@ -6,12 +6,14 @@ A command acts for a whole control period. The speed is solved implicitly over t
 friction of any size is stable and Coulomb friction brings a joint exactly to rest.
 """
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 
 from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import select_commands_in_force
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -141,3 +143,27 @@ class ForceDriveModel:
     def delay_s(self) -> torch.Tensor:
         """Dead time, `(N, J)`."""
         return self.parameters["dead_time_s"]
+
+
+def change_drive(
+    model: Any, drives: Mapping[str, str], value: Mapping[str, torch.Tensor], where: str
+) -> None:
+    """Write numbers of an effect into the `drive_changes` of the drive within `model`.
+
+    Args:
+        model: The drive, or effects around it.
+        drives: Number of the drive that each number of the effect changes.
+        value: Numbers of the effect, `(N, J)` by name.
+        where: Config node named in messages.
+
+    Raises:
+        ConfigError: the model inside is no drive, so that it has no such number.
+    """
+    while hasattr(model, "inner"):
+        model = model.inner
+    if not hasattr(model, "drive_changes"):
+        raise ConfigError(
+            f"{where}: it changes mass or friction of a drive, and {type(model).__name__} has none; choose actuator=force"
+        )
+    for name, changed in drives.items():
+        model.drive_changes[changed] = value[name]
