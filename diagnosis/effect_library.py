@@ -151,7 +151,7 @@ def load_effects(
     Args:
         machine: The machine.
         names: Names to choose; `None`: all.
-        simulator: Adds effects on its own numbers, if it has a method `list_effects`.
+        simulator: Adds effects on its own numbers, if it has methods `list_effects` and `list_left_out`.
 
     Raises:
         ConfigError: a name is unknown, or an effect cannot be imported.
@@ -176,7 +176,12 @@ def load_effects(
     inside = getattr(simulator, "list_effects", dict)()
     for name, target in inside.items():
         found[name] = EffectType(name, target, machine)
+    left_out = getattr(simulator, "list_left_out", dict)()
+    for name, reason in left_out.items():
+        log.info("%s is left out: %s", name, reason)
     for name in names or ():
+        if name in left_out:
+            raise ConfigError(f"diagnosis.effects: '{name}' cannot be simulated: {left_out[name]}")
         if name not in found:
             raise ConfigError(
                 f"diagnosis.effects: '{name}' is no effect; {list_choices(name, found)}"
