@@ -65,6 +65,9 @@ class Frame:
             perfect pair, `None` for one that was not calibrated.
         disparity_error_px: Known error of the disparity between the two pictures, px: a constant,
             and slopes per unit of x / z and y / z. `depth_m` is free of it, `right` still has it.
+        gamma: Exponent of the camera's tone curve: values are light to the power 1 / gamma. 1 for
+            linear pictures; real cameras have about 2.2.
+        depth_shrink: Pixels of the picture to one for which depth was measured, in each direction.
     """
 
     color: np.ndarray
@@ -79,3 +82,5 @@ class Frame:
     camera_cov: np.ndarray | None = None
     disparity_std_px: float | None = None
     disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    gamma: float = 1.0
+    depth_shrink: int = 1

@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 SIDE_ORDER = {
     "simulator": -1,
+    "drive": -1,
     "joints": 0,
     "speed": 1,
     "command": 2,
@@ -75,9 +76,10 @@ class EffectType:
         return self.target.stage
 
     @property
-    def order(self) -> tuple[int, int]:
+    def order(self) -> tuple[int, int, int]:
         """Place from the machine outwards."""
-        return SIDE_ORDER.get(self.target.side, 3), int(self.target.stage == "timing")
+        side = SIDE_ORDER.get(self.target.side, 3)
+        return side, int(self.target.stage == "timing"), getattr(self.target, "layer", 0)
 
     @property
     def running(self) -> str | None:
@@ -151,7 +153,7 @@ def load_effects(
     Args:
         machine: The machine.
         names: Names to choose; `None`: all.
-        simulator: Adds effects on its own numbers, if it has a method `list_effects`.
+        simulator: Adds effects on its own numbers, if it has methods `list_effects` and `list_left_out`.
 
     Raises:
         ConfigError: a name is unknown, or an effect cannot be imported.
@@ -173,10 +175,17 @@ def load_effects(
         target = getattr(target, "find_variant", lambda _, own=target: own)(machine)
         if target is not None:
             found[option.name] = EffectType(option.name, target, machine)
+    if hasattr(simulator, "list_effects"):  # it has such numbers of its own, not those of a drive
+        found = {name: kind for name, kind in found.items() if kind.target.side != "drive"}
     inside = getattr(simulator, "list_effects", dict)()
     for name, target in inside.items():
         found[name] = EffectType(name, target, machine)
+    left_out = getattr(simulator, "list_left_out", dict)()
+    for name, reason in left_out.items():
+        log.info("%s is left out: %s", name, reason)
     for name in names or ():
+        if name in left_out:
+            raise ConfigError(f"diagnosis.effects: '{name}' cannot be simulated: {left_out[name]}")
         if name not in found:
             raise ConfigError(
                 f"diagnosis.effects: '{name}' is no effect; {list_choices(name, found)}"
@@ -217,7 +226,10 @@ def _check_simulable(kind: EffectType, machine: Machine) -> None:
 
 
 class StationaryModel:
-    """A machine that does not move."""
+    """A machine that does not move; changes of a drive do nothing to it."""
+
+    def __init__(self) -> None:
+        self.drive_changes: dict[str, torch.Tensor] = {}
 
     @property
     def state(self) -> dict[str, torch.Tensor]:

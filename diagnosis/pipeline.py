@@ -1,19 +1,15 @@
-"""The whole way from a case to an outcome, and `effects.yaml` for a training on the machine as it is."""
+"""The whole way from a case to an outcome."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
 from brokk_rl.contracts.actuator import CurveFit, Excitation
-from brokk_rl.errors import StorageError
 from brokk_rl.inspection import InspectionThresholds
-from brokk_rl.session import write_text
 from diagnosis import (
     calibration,
     decision,
@@ -36,6 +32,7 @@ from diagnosis.effect_library import DetectedEffect, EffectSimulator, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
 from diagnosis.hypotheses import MAX_SAME, Choice, Hypothesis
+from diagnosis.motion_delay import measure_motion_delays
 from diagnosis.refine import FittedSet
 from diagnosis.request import Penalties, ProbabilityModel
 from diagnosis.residual_model import CLUES
@@ -50,7 +47,7 @@ by simulation."""
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
 CURVE_SEED = 0
-"""Seed for the bootstrap of the speed curves. Draws of later steps stay as they are."""
+"""Seed for the bootstraps of speed curves and delays. Draws of later steps stay as they are."""
 DECIDED_BY = {
     frozenset(
         {"flow_gain", "encoder_scale"}
@@ -158,6 +155,7 @@ class DiagnosisPipeline:
             | self._more(result, weighed, foretold)
             | {"curves": speed_curves.serialize_curves(curves)}
             | {"unknown_remainder": remainder, "reference_error": reach.measure_reference()}
+            | {"motion_delay_s": measure_motion_delays(before, after, machine, CURVE_SEED)}
             | self._unseen(result, seen.fitted),
         )
         return Outcome(answer, before, after, floor)
@@ -450,51 +448,3 @@ def _describe_remainder(result: DetectionResult, names: Sequence[str]) -> dict[s
             "scatter": float(result.scatter[j]),
         }
     return left
-
-
-EFFECTS_FILE = "effects.yaml"
-
-
-def write_effects(answer: Answer, kinds: Sequence[EffectType], path: Path) -> None:
-    """Write the selected effects, the one nearest to the machine first; a note alone where nothing was selected.
-
-    Raises:
-        StorageError: it could not be written.
-    """
-    by_name = {kind.name: kind for kind in kinds}
-    chosen = sorted(answer.selected, key=lambda one: by_name[one.effect].order)
-    lines = [
-        "# @package effect",
-        f"# {answer.verdict}: {answer.reason}",
-        "# taken by effect=@<this file>",
-    ]
-    text = (
-        yaml.safe_dump(
-            {one.effect: _build_node(one, by_name[one.effect]) for one in chosen}, sort_keys=False
-        )
-        if chosen
-        else ""
-    )
-    try:
-        write_text(path, "\n".join(lines) + "\n" + text)
-    except OSError as error:
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
-
-
-def _build_node(one: Selected, kind: EffectType) -> dict:
-    target = kind.target
-    node: dict = {"_target_": f"{target.__module__}.{target.__name__}"}
-    if "joints" in target.__annotations__:
-        node["joints"] = list(one.joints) or "all"
-    for name, number in kind.target.numbers.items():
-        values = {
-            joint: float(f"{value.mean:.6g}")
-            for joint, value in one.parameters.get(name, {}).items()
-        }
-        if not values:
-            node[name] = number.typical if number.none is None else number.none
-        elif number.per_joint:
-            node[name] = values | {"other": number.typical if number.none is None else number.none}
-        else:
-            node[name] = next(iter(values.values()))
-    return node

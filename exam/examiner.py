@@ -30,7 +30,7 @@ from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, read_answer
 from diagnosis.case import estimate_running_s
-from diagnosis.pipeline import EFFECTS_FILE
+from diagnosis.effects_file import EFFECTS_FILE
 from exam.dataset import CASES_FOLDER, WITHHELD_FOLDER
 from exam.generate import UNCHANGED_FOLDER
 

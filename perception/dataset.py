@@ -156,6 +156,7 @@ def write_camera(
     baseline_m: float | None,
     dist: Sequence[float] = (),
     disparity_std_px: float | None = None,
+    gamma: float | None = None,
 ) -> None:
     """Write `camera.yaml`; see `brokk_rl.signals.Frame`.
 
@@ -170,6 +171,8 @@ def write_camera(
         told["baseline_m"] = float(baseline_m)
     if disparity_std_px is not None:
         told["disparity_std_px"] = float(disparity_std_px)
+    if gamma is not None:
+        told["gamma"] = float(gamma)
     if base_from_camera is not None:
         told["T_base_cam"] = np.asarray(base_from_camera).tolist()
     _write(folder / CAMERA, yaml.safe_dump(told, sort_keys=False, default_flow_style=None).encode())

@@ -13,7 +13,6 @@ import torch
 from actuators.effects.effect import ANY_INTERFACE, EffectChain, EffectSpec
 from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.contracts.actuator import ActuatorModel
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -30,19 +29,16 @@ class _InsideEffect(EffectSpec):
     ) -> EffectChain:
         """Return `model` whose plant has the number.
 
-        Raises:
-            ConfigError: The innermost model is no MJCF file.
+        The flexible models that give a diagnosis its floor have no such number: around them the effect
+        does nothing.
         """
         chain = super().wrap(model, machine, num_envs, device)
         inner: Any = model
         while hasattr(inner, "inner"):
             inner = inner.inner
-        if not hasattr(inner, "changes"):
-            raise ConfigError(
-                f"effect={self.name()} changes a number of an MJCF file; give the simulator as simulator=<file>.xml"
-            )
         (number,) = self.numbers
-        inner.changes[self.quantity] = lambda: chain.parameters[number]
+        if hasattr(inner, "changes"):
+            inner.changes[self.quantity] = lambda: chain.parameters[number]
         return chain
 
 

@@ -1,11 +1,13 @@
 """Logs of a CAN bus (BLF or ASC), decoded by a DBC file.
 
-Each message of the DBC is a table with its signals and `time`, the time of the frame in s.
+Each message of the DBC is a table with its signals and `time`, the time of the frame in s. Frames are
+read and decoded by blocks: a BLF file of 1 GB holds tens of millions of them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,79 @@ from brokk_rl.errors import ConfigError, RecordingError
 TIME = "time"
 HEAD_FRAMES = 20000
 """Frames from the beginning in which messages are looked for: slow ones come once a second."""
+WORD_BYTES = 8
+"""Data of a classic frame."""
+BLF_FRAME = np.dtype(
+    [
+        ("signature", "S4"), ("header_size", "<u2"), ("version", "<u2"), ("size", "<u4"), ("kind", "<u4"),
+        ("time_unit", "<u4"), ("client", "<u2"), ("object_version", "<u2"), ("ticks", "<u8"),
+        ("channel", "<u2"), ("flags", "u1"), ("length", "u1"), ("frame_id", "<u4"), ("data", "u1", (WORD_BYTES,)),
+    ]
+)  # fmt: skip
+"""A classic frame in a BLF file, as `can.io.blf` unpacks it: object header, its version 1, CAN message."""
+CLASSIC_KIND, REMOTE_FLAG, ID_BITS = 1, 0x80, 0x1FFFFFFF
+TICKS_OF_10_US = 1
+"""Time unit of 10 µs; others are of 1 ns."""
+
+
+@dataclass(frozen=True)
+class FrameBlock:
+    """Frames that carry data, one after another, `N` of them.
+
+    Attributes:
+        time_s: Their times, `(N,)`.
+        frame_id: Their identifiers, `(N,)`.
+        length: Bytes of their data, `(N,)`.
+        data: The data, zero beyond its end, `(N, B)`.
+    """
+
+    time_s: np.ndarray
+    frame_id: np.ndarray
+    length: np.ndarray
+    data: np.ndarray
+
+
+class BlfBlockReader(can.BLFReader):
+    """A reader that parses a container of classic frames at once, and others frame by frame."""
+
+    def _parse_data(self, data: bytes) -> Iterator[Any]:
+        frames = np.frombuffer(data, BLF_FRAME, len(data) // BLF_FRAME.itemsize)
+        is_classic = (
+            (frames["signature"] == b"LOBJ")
+            & (frames["size"] == BLF_FRAME.itemsize)
+            & (frames["version"] == 1)
+            & (frames["kind"] == CLASSIC_KIND)
+        )
+        if not len(frames) or not is_classic.all():
+            yield from super()._parse_data(data)
+            return
+        self._pos = len(frames) * BLF_FRAME.itemsize
+        unit_s = np.where(frames["time_unit"] == TICKS_OF_10_US, 1e-5, 1e-9)
+        time_s = frames["ticks"] * unit_s + self.start_timestamp
+        chosen = frames["flags"] & REMOTE_FLAG == 0
+        length = np.minimum(frames["length"], WORD_BYTES)
+        inside = np.arange(WORD_BYTES) < length[:, None]
+        content = np.where(inside, frames["data"], 0).astype(np.uint8)
+        found = FrameBlock(time_s, frames["frame_id"] & ID_BITS, length, content)
+        yield select_frames(found, chosen)
+
+
+def select_frames(block: FrameBlock, chosen: np.ndarray) -> FrameBlock:
+    """Return some frames of a block."""
+    return FrameBlock(*(getattr(block, name)[chosen] for name in FrameBlock.__dataclass_fields__))
+
+
+def gather_frames(frames: list[can.Message]) -> FrameBlock:
+    """Return frames as a block."""
+    lengths = [len(frame.data) for frame in frames]
+    widest = max(WORD_BYTES, *lengths)
+    text = b"".join(bytes(frame.data).ljust(widest, b"\0") for frame in frames)
+    return FrameBlock(
+        np.array([frame.timestamp for frame in frames]),
+        np.array([frame.arbitration_id for frame in frames]),
+        np.array(lengths),
+        np.frombuffer(text, np.uint8).reshape(len(frames), widest),
+    )
 
 
 class CanLog(LogFile):
@@ -31,10 +106,12 @@ class CanLog(LogFile):
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the signals of the messages of the DBC that the beginning of the log has."""
-        seen = set()
-        for number, frame in enumerate(self._iterate()):
-            seen.add(frame.arbitration_id)
-            if number >= HEAD_FRAMES:
+        seen: set[int] = set()
+        count = 0
+        for block in self._iterate():
+            seen.update(np.unique(block.frame_id).tolist())
+            count += len(block.frame_id)
+            if count >= HEAD_FRAMES:
                 break
         tables = {}
         for frame_id, message in self._messages.items():
@@ -49,29 +126,46 @@ class CanLog(LogFile):
         chosen = {i: m for i, m in self._messages.items() if m.name in wanted}
         names = {i: [s.name for s in m.signals if s.name in wanted[m.name]] for i, m in chosen.items()}  # fmt: skip
         stores = {i: StoredColumns([TIME, *several]) for i, several in names.items()}
-        rows: dict[int, list[list[float]]] = {i: [] for i in chosen}
         counts = dict.fromkeys(chosen, 0)
-        for number, frame in enumerate(self._iterate()):
-            at = frame.arbitration_id
-            if at not in chosen or (max_rows is not None and counts[at] >= max_rows):
-                if max_rows is not None and all(count >= max_rows for count in counts.values()):
-                    break
-                continue
-            try:
-                values: Any = chosen[at].decode(frame.data, decode_choices=False)
-            except Exception as error:  # cantools and bitstruct raise what they stumble over
-                raise RecordingError(
-                    f"{self.path}: frame {number} at {frame.timestamp:.6f} s: is no message '{chosen[at].name}' of the DBC "
-                    f"({error})"
-                ) from error
-            rows[at].append([frame.timestamp, *(values.get(name, np.nan) for name in names[at])])
-            counts[at] += 1
-            if len(rows[at]) >= BLOCK_ROWS:
-                _store(stores[at], rows[at], names[at])
-        for at in chosen:
-            _store(stores[at], rows[at], names[at])
+        before = 0
+        for block in self._iterate():
+            for at, message in chosen.items():
+                rows = np.flatnonzero(block.frame_id == at)
+                rows = rows[: None if max_rows is None else max_rows - counts[at]]
+                if not len(rows):
+                    continue
+                part = select_frames(block, rows)
+                values = self._decode(message, names[at], part, before + rows)
+                stores[at].add(TIME, part.time_s)
+                for name, column in values.items():
+                    stores[at].add(name, column)
+                counts[at] += len(rows)
+            before += len(block.frame_id)
+            if max_rows is not None and all(count >= max_rows for count in counts.values()):
+                break
         tables = {chosen[at].name: Table(store) for at, store in stores.items()}
         yield LogRun(self.path.stem, str(self.path), tables)
+
+    def _decode(
+        self, message: Any, names: list[str], block: FrameBlock, numbers: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """Return the named signals of frames of one message; `numbers` are those of the frames."""
+        if is_plain(message) and (block.length >= message.length).all():
+            signals = {signal.name: signal for signal in message.signals}
+            return {name: extract_signal(signals[name], block.data) for name in names}
+        rows = []
+        for number, time_s, length, data in zip(
+            numbers, block.time_s, block.length, block.data, strict=True
+        ):
+            try:
+                values: Any = message.decode(data[:length].tobytes(), decode_choices=False)
+            except Exception as error:  # cantools and bitstruct raise what they stumble over
+                raise RecordingError(
+                    f"{self.path}: frame {number} at {time_s:.6f} s: is no message '{message.name}' of the DBC "
+                    f"({error})"
+                ) from error
+            rows.append([values.get(name, np.nan) for name in names])
+        return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
 
     def _check_size(self, reader: Any) -> None:
         """Refuse a BLF file that is shorter than its header says; python-can reads it without a word."""
@@ -79,22 +173,59 @@ class CanLog(LogFile):
         if there < stated:
             raise RecordingError(f"{self.path}: cut off at byte {there} of {stated}")
 
-    def _iterate(self) -> Iterator[can.Message]:
-        """Yield the frames that carry data."""
+    def _iterate(self) -> Iterator[FrameBlock]:
+        """Yield the frames that carry data, by blocks."""
         count, last_s = 0, 0.0
+        is_blf = self.path.suffix.lower() == ".blf"
+        waiting: list[can.Message] = []
         try:
-            with can.LogReader(self.path) as reader:
+            with BlfBlockReader(self.path) if is_blf else can.LogReader(self.path) as reader:
                 self._check_size(reader)
-                for frame in reader:
-                    count, last_s = count + 1, frame.timestamp
-                    if not (frame.is_error_frame or frame.is_remote_frame):
-                        yield frame
+                frames: Iterator[Any] = iter(reader)
+                for found in frames:
+                    is_block = isinstance(found, FrameBlock)
+                    if waiting and (is_block or len(waiting) >= BLOCK_ROWS):
+                        yield gather_frames(waiting)
+                        waiting = []
+                    if is_block:
+                        yield found
+                        count += len(found.time_s)
+                        last_s = float(found.time_s[-1]) if len(found.time_s) else last_s
+                        continue
+                    count, last_s = count + 1, found.timestamp
+                    if not (found.is_error_frame or found.is_remote_frame):
+                        waiting.append(found)
+            if waiting:
+                yield gather_frames(waiting)
         except Exception as error:  # python-can raises what its parsers stumble over
             if isinstance(error, RecordingError):
                 raise
             raise RecordingError(
                 f"{self.path}: damaged after frame {count} at {last_s:.6f} s ({type(error).__name__}: {error})"
             ) from error
+
+
+def is_plain(message: Any) -> bool:
+    """Return whether all signals of a message are whole numbers at fixed places of a classic frame."""
+    return (
+        message.length <= WORD_BYTES
+        and not message.is_multiplexed()
+        and not any(signal.is_float for signal in message.signals)
+    )
+
+
+def extract_signal(signal: Any, data: np.ndarray) -> np.ndarray:
+    """Return a signal of a plain message from the data of its frames, `(N, 8)`; see the DBC's bit numbers."""
+    is_big = signal.byte_order == "big_endian"
+    # of a big-endian signal `start` is the highest bit, bits of a byte count down
+    words = np.ascontiguousarray(data[:, :WORD_BYTES]).view(">u8" if is_big else "<u8")[:, 0]
+    low = signal.start
+    if is_big:
+        low = 64 - (signal.start // 8 * 8 + 7 - signal.start % 8) - signal.length
+    # the highest bit of the signal becomes that of the word, so that shifting back keeps the sign
+    raised = words.astype(np.uint64) << np.uint64(64 - low - signal.length)
+    kept = raised.view(np.int64) if signal.is_signed else raised
+    return (kept >> kept.dtype.type(64 - signal.length)) * signal.scale + float(signal.offset)
 
 
 def load_dbc(dbc: str) -> list[Any]:
@@ -109,11 +240,3 @@ def load_dbc(dbc: str) -> list[Any]:
     except Exception as error:  # cantools raises what its parser stumbles over
         raise ConfigError(f"dbc={dbc}: cannot be read ({error})") from error
     return list(database.messages)
-
-
-def _store(columns: StoredColumns, rows: list[list[float]], names: list[str]) -> None:
-    if rows:
-        block = np.array(rows, dtype=float)
-        for at, name in enumerate([TIME, *names]):
-            columns.add(name, block[:, at])
-        rows.clear()

@@ -353,6 +353,10 @@ def _scan(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
                 raise RecordingError(
                     f"{path}: line {reader.line_num}: not CSV ({error})"
                 ) from error
+            except UnicodeDecodeError as error:  # text is decoded some lines ahead
+                raise RecordingError(
+                    f"{path}: after line {reader.line_num}: not text in UTF-8 ({error.reason})"
+                ) from error
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: no such log") from error
     except (OSError, UnicodeDecodeError) as error:

@@ -4,7 +4,7 @@
 
 Every pair is matched with `stereo=sgbm`, refined and not. The error of a disparity is its difference
 from the truth; counted are errors within 1 px of their median, away from steps of the depth. Rendered:
-the block's face at 1, 2 and 3 m. Real: the motorcycle of Middlebury 2014 (Scharstein et al.), in the
+the block's face around a hole at 1, 2 and 3 m. Real: the motorcycle of Middlebury 2014 (Scharstein et al.), in the
 size that scikit-image ships, two photographs by single-lens reflex cameras.
 """
 
@@ -27,10 +27,13 @@ from hydra.utils import instantiate
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
+from perception.render.stereo_camera import place_rig
 from perception.stereo import Stereo
 
 SENSORS = ("linear", "mosaic")
 DISTANCES_M = (1.0, 2.0, 3.0)
+WINDOW_PX = (640, 480)
+"""Part of the picture that is rendered, columns and rows."""
 AWAY_PX = 10
 """Pixels as near to a step of the depth are left out: a window would mix two surfaces."""
 LARGEST_PX = 1.0
@@ -90,11 +93,19 @@ def measure_rendered(
     """Yield the matching and its errors on the block of a random scene, px, NaN where unknown."""
     assert isinstance(studio.scene, SceneRanges), "clean scenes are random ones"
     scene = compose_scene(studio.scene, studio.rig, generator)
-    shot = replace(studio, depth="exact").shot(scene, generator)
+    assert scene.block is not None, "clean scenes have a block"
+    middle = scene.block.pose.point(scene.block.holes[0].center_m)
+    place = np.round(studio.rig.left.project(middle) - np.array(WINDOW_PX) / 2)
+    corner = np.clip(place, 0, np.array([studio.rig.width, studio.rig.height]) - WINDOW_PX)
+    pose = studio.rig.base_from_camera
+    window = place_rig(studio.rig, pose, (int(corner[0]), int(corner[1])), WINDOW_PX)
+    shot = replace(studio, rig=window, depth="exact").shot(scene, generator)
     assert shot.right is not None, "a pair is rendered"
     shift_px = studio.rig.focal_px * studio.rig.baseline_m
     truth = shift_px / shot.exact_depth_m
     counted = shot.label.block & ~shot.label.arm & ~find_steps(truth)
+    # What the right picture does not show.
+    counted[:, : int(np.nanmax(truth)) + AWAY_PX] = False
     for name, stereo in list_matchings(studio.stereo):
         depth_m = stereo.depth_m(shot.color, shot.right, studio.rig.focal_px, studio.rig.baseline_m)
         yield name, (shift_px / depth_m - truth)[counted]
@@ -102,7 +113,8 @@ def measure_rendered(
 
 def measure_real(stereo: Stereo) -> Iterator[tuple[str, np.ndarray]]:
     """Yield the matching and its errors on the real pair, px, NaN where unknown."""
-    from skimage.data import stereo_motorcycle  # not a dependency: this script alone wants it
+    # Not a dependency: this script alone wants it.
+    from skimage.data import stereo_motorcycle  # pyright: ignore[reportMissingImports]
 
     left, right, truth = stereo_motorcycle()
     truth = np.where(np.isfinite(truth), truth, np.nan).astype(np.float32)

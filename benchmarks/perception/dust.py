@@ -26,7 +26,7 @@ from brokk_rl.contracts.vision import Rejection
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception.dataset import TrueCircle
-from perception.pose.plane_conic import IN_DUST
+from perception.pose.appearance import IN_DUST
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
 

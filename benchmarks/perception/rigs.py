@@ -65,8 +65,10 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long")
     given = parser.parse_args()
     until = time.monotonic() + 60 * given.minutes
-    studio: FrameRenderer = compose("studio", "mode=render")
-    drifted: FrameRenderer = compose("studio", "mode=render", "rig/error=drifted")
+    # Ideal pictures: the errors shown are those of the rig alone.
+    plain_pictures = ("mode=render", "rig/sensor=linear")
+    studio: FrameRenderer = compose("studio", *plain_pictures)
+    drifted: FrameRenderer = compose("studio", *plain_pictures, "rig/error=drifted")
     session: Session = compose("session", "mode=render", "session.seed=1", "session.out=.")
     after: StagedFinder = compose("perception", "mode=perceive").build()
     before = replace(after.settings, rectification=None).build()

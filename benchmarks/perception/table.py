@@ -7,7 +7,11 @@ Each scene is rendered, looked at and forgotten; what came of it is a line of `<
 Called again, it goes on where it stopped, with more scenes or more options too. Writes
 `table.json`, `table.csv`, `table.png`, the error model for `task.noise` into `noise.json`, and
 pictures of what went wrong, with the reasons, into `failures/`. A fixed seed: the same scenes
-everywhere. Rims as drills leave them, before and after:
+everywhere. An option with `stereo.` settings matches the same pictures again with them:
+
+    python benchmarks/perception/table.py <out> plane_conic 'plane_conic stereo.shrink=4' --count 6
+
+Rims as drills leave them, before and after:
 
     python benchmarks/perception/table.py <out> plane_conic
     'plane_conic perception.proposer=null perception.pose.broken=1'
@@ -24,7 +28,7 @@ import multiprocessing
 import signal
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +48,7 @@ from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
+from perception.sources.simulator import make_frame
 
 CONDITIONS = ("clean", "haze", "dark", "hidden", "decoy", "empty")
 VARIATIONS = {
@@ -57,6 +62,8 @@ SHOWN = (
     "along_inside_1_sigma", "across_inside_1_sigma", "normal_inside_1_sigma", "false", "ms_median",
 )  # fmt: skip
 BASELINE = "paper"
+ALL = "all"
+"""Condition of the rows over all conditions."""
 
 
 @dataclass(frozen=True)
@@ -172,15 +179,11 @@ def look(task: Task) -> list[dict[str, Any]]:
     generator = scenes(task.seed).generator(f"scene/{task.number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
-    frame = Frame(
-        color=shot.color, depth_m=shot.depth_m, camera_matrix=studio.rig.left.matrix, base_from_camera=studio.rig.base_from_camera,
-        t_s=0.0, right=shot.right, baseline_m=studio.rig.baseline_m,
-        disparity_std_px=0.0,  # the rig is perfect
-    )  # fmt: skip
+    frame = make_frame(shot, studio.rig, 0.0)
     lines = []
     for option in task.options:
         finder = build_finder(option)
-        tally, found = score_frame(finder, frame, shot.truth)
+        tally, found = score_frame(finder, match_again(option, frame), shot.truth)
         place = {
             "condition": task.condition,
             "distance_m": task.distance_m,
@@ -192,6 +195,18 @@ def look(task: Task) -> list[dict[str, Any]]:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
             show_failure(task, name, frame, found, finder)
     return lines
+
+
+def match_again(option: str, frame: Frame) -> Frame:
+    """Returns the frame with the depth that an option's own stereo settings give."""
+    overrides = [one for one in option.split() if one.startswith("stereo.")]
+    if not overrides:
+        return frame
+    assert frame.right is not None and frame.baseline_m is not None
+    stereo = composed("stereo", "mode=render", *overrides)
+    focal_px = float(frame.camera_matrix[0, 0])
+    depth_m = stereo.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
+    return replace(frame, depth_m=depth_m, depth_shrink=stereo.shrink)
 
 
 def show_failure(
@@ -224,7 +239,7 @@ def renderer(condition: str, distance_m: float, render: tuple[str, ...]) -> Fram
 
 @functools.cache
 def build_finder(option: str) -> StagedFinder:
-    name, *overrides = option.split()
+    name, *overrides = [one for one in option.split() if not one.startswith("stereo.")]
     return composed(
         "perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides
     ).build()
@@ -256,13 +271,13 @@ def read(path: Path) -> Iterator[dict[str, Any]]:
 
 
 def rows(path: Path, options: list[str]) -> list[dict[str, Any]]:
-    """Returns the rows of the table, each with how many times smaller its median error is than that of the baseline."""
+    """Returns the rows of each condition and of all, with the factor by which the median error is below the baseline's."""
     tallies: dict[tuple, FinderScore] = defaultdict(FinderScore)
     for line in read(path):
         if line["option"] in options:
-            tallies[line["option"], line["condition"], line["distance_m"]] += FinderScore(
-                **line["tally"]
-            )
+            for condition in (line["condition"], ALL):
+                key = line["option"], condition, line["distance_m"]
+                tallies[key] += FinderScore(**line["tally"])
     found_conditions = dict.fromkeys(key[1] for key in tallies)
     order = {name: number for number, name in enumerate((*options, *CONDITIONS, *found_conditions))}
     found = []

@@ -19,7 +19,7 @@ from brokk_rl.parallel import use_workers
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import answer, baseline, case, effect_library, pipeline, report, report_checks
+from diagnosis import answer, baseline, case, effect_library, effects_file, report, report_checks
 from diagnosis.answer import Answer, Outcome
 from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
@@ -132,7 +132,7 @@ class Diagnose:
         folder = self.session.folder
         kinds = self._load_effects()
         outcome.save(folder)
-        pipeline.write_effects(outcome.answer, kinds, folder / pipeline.EFFECTS_FILE)
+        effects_file.write_effects(outcome.answer, kinds, folder / effects_file.EFFECTS_FILE)
         with use_workers(self.diagnosis.workers):
             report.write_report(outcome, folder, self.machine)
 

@@ -14,6 +14,7 @@ import yaml
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
+from perception.pose.plane_conic import convert_to_gray, linearize
 
 MIN_CORNERS = 4
 """Corners that determine a pose."""
@@ -80,9 +81,16 @@ class BoardTracker:
         Raises:
             FrameError: too few are seen.
         """
-        found, numbers = self._detect(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))[:2]
-        # OpenCV gives one array for each marker, or one for all corners.
-        count = 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
+        gray = convert_to_gray(frame)
+        found, numbers = self._detect(gray)[:2]
+        count = _count_corners(found, numbers)
+        if frame.gamma != 1.0:
+            # A tone curve brightens blurred cells of small markers; dark boards have few levels of
+            # linear light. The picture in which more is seen counts.
+            light = np.rint(linearize(gray, frame.gamma)).astype(np.uint8)
+            other = self._detect(light)[:2]
+            if _count_corners(*other) > count:
+                (found, numbers), count = other, _count_corners(*other)
         if count < self._min_corners:
             raise FrameError(
                 f"{frame.name}: {count} corners of the board are seen, {self._min_corners} are "
@@ -118,6 +126,11 @@ class BoardTracker:
         # OpenCV gives the board in the camera; the inverse is wanted.
         pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ np.ravel(shift)
         return CameraPose(pose, error_px)
+
+
+def _count_corners(found: Sequence[np.ndarray], numbers: np.ndarray | None) -> int:
+    """Return the number of corners; OpenCV gives one array for each marker, or one for all."""
+    return 0 if numbers is None else sum(len(np.reshape(one, (-1, 2))) for one in found)
 
 
 class GivenPoseTracker:

@@ -65,6 +65,7 @@ class RecordCamera:
                     model.baseline_m,
                     distortion,
                     model.disparity_std_px,
+                    model.gamma,
                 )
             dataset.write_frame(folder / f"{kept:05d}", frame.color, frame.depth_m, frame.right)
             kept += 1

@@ -16,12 +16,16 @@ face. Chosen by hand."""
 WIDE = 8.0
 """Radii of the surroundings, in which something else is dark too unless there is dust. Chosen by
 hand."""
+FAINTEST = 0.1
+"""Least logarithm of the contrast, so that a hole in dense dust has no boundless slope."""
 CLEARLY_M = 0.03
 """Least distance behind the face at which depth belongs to the inside of a hole, whatever the
 noise. Chosen by hand."""
 FADE, BRINK_PX, OUTERMOST = 0.3, 1.5, 0.95
 """Depth at which the light on a wall has faded to 1 / e, in radii; px within the rim that its blur
 reaches, and largest radius without it. FADE was the best of 0.3, 0.5 and 1 on the same scenes."""
+IN_DUST = "log-likelihood ratio of a hole to a flat disc"
+"""Reason for a refusal in dust: it cannot be told, or it is a disc."""
 LEAST_INSIDE, LEAST_POWER, SMOOTH_PX = 60, 0.1, 1.5
 """Least pixels inside and on the face; least sum of squares of the expected light, in pixels that
 are fully lit; blur before the darkest quarter is taken, px. Chosen by hand."""
@@ -38,7 +42,8 @@ class Interior:
     Attributes:
         darkness: Brightness of its darkest quarter over that of the face around it.
         slope: Change of brightness over one radius, over the contrast between face and darkest
-            quarter, in the direction in which the hole goes on behind the face. The camera sees
+            quarter, in the direction in which the hole goes on behind the face; both of the
+            logarithm, so that the exponent of the camera's tone curve cancels. The camera sees
             the lit end of the wall near the far rim and the dark depth at the near rim: clearly
             negative in a hole, about zero on a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
@@ -103,14 +108,14 @@ def measure_interior(
         into = camera_matrix[:2, :2] @ (-plane.normal[:2] + plane.normal[2] * middle[:2])
         away = _list_pixels(inside, left, top) - (x, y)
         along = away @ (into / max(float(np.linalg.norm(into)), 1e-9)) / a
-        # Dust brightens hole and face by the same gradient: take the face's off.
-        drift = _fit_brightness_gradient(part[ring], _list_pixels(ring, left, top) - (x, y))
-        drift = drift * min(darkness, 1.0)
-        values = values - away @ drift
+        # Uneven light changes hole and face by the same factor: take the face's change off.
+        level = np.log(part[ring] + 1.0)
+        drift = _fit_brightness_gradient(level, _list_pixels(ring, left, top) - (x, y))
+        values = np.log(values + 1.0) - away @ drift
+        contrast = float(np.log((face + 1.0) / (face * darkness + 1.0)))
         apart = along - along.mean()
-        slope = float(apart @ values / max(float(apart @ apart), 1e-9)) / max(
-            face * (1.0 - darkness), 1.0
-        )
+        slope = float(apart @ values / max(float(apart @ apart), 1e-9))
+        slope /= max(contrast, FAINTEST)
     around = _measure_darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(
         darkness, slope, deeper, unknown, around, _measure_contrast(smooth[ring], face * darkness)
@@ -273,7 +278,7 @@ def _list_pixels(there: np.ndarray, left: int, top: int) -> np.ndarray:
 
 
 def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray:
-    """Fit the gradient of brightness `(P,)` over places `(P, 2)`, `(2,)` grey levels a pixel.
+    """Fit the gradient of values `(P,)` over places `(P, 2)`, `(2,)` a pixel.
 
     Robust: outliers count little (Cauchy weights).
     """
@@ -284,5 +289,18 @@ def _fit_brightness_gradient(values: np.ndarray, away: np.ndarray) -> np.ndarray
         heavy = away * weight[:, None]
         fitted = np.linalg.lstsq(heavy.T @ away, heavy.T @ values, rcond=None)[0]
         off = np.abs(values - away @ fitted)
-        weight = 1.0 / (1.0 + (off / max(1.5 * float(np.median(off)), 0.3)) ** 2)
+        # Not zero on a face without grain.
+        weight = 1.0 / (1.0 + (off / max(1.5 * float(np.median(off)), 1e-3)) ** 2)
     return fitted[:2]
+
+
+def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
+    """Return the mean of a picture within 0.8 of an ellipse."""
+    # The semi-major axis bounds the ellipse, however it is turned.
+    x, y, a = row[:3]
+    top, left = max(0, int(y - a)), max(0, int(x - a))
+    part = picture[top : int(y + a) + 2, left : int(x + a) + 2]
+    rows, columns = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
+    # 0.8 leaves out the blurred edge of the rim. Chosen by hand; not searched.
+    inside = conic.measure_radii(row, columns, rows) < 0.8
+    return float(part[inside].mean()) if inside.any() else 0.0

@@ -171,7 +171,7 @@ def fit_broken_rim(
     """Fit the circle of a rim with broken pieces; `None` without enough edges.
 
     Args:
-        gray: Picture, `(h, w)` uint8.
+        gray: Light, `(h, w)` float32; see `plane_conic.linearize`.
         chart: Coordinates on the face.
         both: Both pictures around the rim; `None` without a right one.
         start_m: First centre on it, `(2,)`.

@@ -9,7 +9,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.pose import appearance
-from perception.pose.plane_conic import as_row, convert_to_gray
+from perception.pose.plane_conic import as_row, convert_to_gray, linearize
 
 
 @spec
@@ -58,8 +58,9 @@ class MonoCircleEstimator:
             return Rejection(
                 "pose", "angle to the expected normal, rad", angle, s.normal_rad, ellipse
             )
+        light = linearize(convert_to_gray(frame), frame.gamma)
         dark = appearance.measure_interior(
-            convert_to_gray(frame), frame.depth_m, row, frame.camera_matrix, None
+            light, frame.depth_m, row, frame.camera_matrix, None
         ).darkness
         if not dark <= s.darkness:
             return Rejection("pose", "brightness inside over outside", dark, s.darkness, ellipse)

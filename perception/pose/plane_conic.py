@@ -34,8 +34,6 @@ FORGIVEN, AT_FIRST = 0.55, 1.4
 for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
 BROKEN_SEEN = 0.6
 """Least part of a broken rim with edges: its pieces may lie at any depth, so texture has some too."""
-IN_DUST = "log-likelihood ratio of a hole to a flat disc"
-"""Reason for a refusal in dust: it cannot be told, or it is a disc."""
 BESIDE = (1.15, 1.45)
 """Radii of an ellipse at which occluders of its rim are searched."""
 
@@ -159,12 +157,12 @@ class PlaneConicEstimator:
         self._without_depth: PoseEstimator | None = (
             settings.without_depth.build() if settings.without_depth else None
         )
-        self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray] | None = None
+        self._seen: tuple[Frame, Masks, np.ndarray, np.ndarray, np.ndarray] | None = None
 
     def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
         """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s, row = self.settings, as_row(ellipse)
-        gray, allowed = self._prepare(frame, masks)
+        gray, light, allowed = self._prepare(frame, masks)
         face = self._fit_face(frame, allowed, row, ellipse)
         if face is None:
             assert self._without_depth is not None
@@ -178,7 +176,14 @@ class PlaneConicEstimator:
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
             agreed = alignment.align_plane(
-                both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m
+                both,
+                face,
+                frame,
+                allowed,
+                row,
+                s.inner,
+                s.cell_px,
+                s.matcher_bias_per_m * frame.depth_shrink,
             )
             # `None` says that the pictures disagree: then parallax means nothing either.
             both, face = (None, face) if agreed is None else (both, agreed)
@@ -186,10 +191,10 @@ class PlaneConicEstimator:
             shape = self._check_shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
-        circle = self._fit_circle(gray, frame, face, both, ellipse, has_good_shape=shape)
+        circle = self._fit_circle(light, frame, face, both, ellipse, has_good_shape=shape)
         if isinstance(circle, Rejection):
             return circle
-        return self._describe_hole(gray, frame, masks, face, circle, both, ellipse)
+        return self._describe_hole(light, frame, masks, face, circle, both, ellipse)
 
     def _fit_face(
         self, frame: Frame, allowed: np.ndarray, row: np.ndarray, ellipse: Ellipse
@@ -217,11 +222,12 @@ class PlaneConicEstimator:
             return Rejection("pose", reason, face.sigma, s.noise_limit_per_m, ellipse)
         # Errors of neighbouring pixels are alike, so the count of pixels overstates the
         # precision.
-        return replace(face, cov=face.cov * s.matcher_alike)
+        # Those of a coarse match grow with its pixels.
+        return replace(face, cov=face.cov * s.matcher_alike * frame.depth_shrink**2)
 
     def _fit_circle(
         self,
-        gray: np.ndarray,
+        light: np.ndarray,
         frame: Frame,
         face: FacePlane,
         both: alignment.StereoPatch | None,
@@ -232,7 +238,7 @@ class PlaneConicEstimator:
         s = self.settings
         # On the plane a circle has only three unknowns.
         circle = rim.fit_rim_circle(
-            gray,
+            light,
             as_row(ellipse),
             frame.camera_matrix,
             face.m,
@@ -247,12 +253,16 @@ class PlaneConicEstimator:
         ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
         chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
         is_broken = 1.0 - seen - measure_hidden_part(face, row, frame) > s.broken
-        if s.broken < 1.0 and both is not None and broken_rim.is_below_face(gray, chart, both, row):
+        if (
+            s.broken < 1.0
+            and both is not None
+            and broken_rim.is_below_face(light, chart, both, row)
+        ):
             # The circle lies below the face: a refusal is better than its place.
             is_broken, circle, seen = True, None, 0.0
         if is_broken:
             broken = broken_rim.fit_broken_rim(
-                gray, chart, both, np.zeros(2), s.radius_m, s.center_px
+                light, chart, both, np.zeros(2), s.radius_m, s.center_px
             )
             # Its coverage counts the broken parts too.
             if broken is not None and broken.coverage >= max(seen, BROKEN_SEEN):
@@ -273,7 +283,7 @@ class PlaneConicEstimator:
 
     def _describe_hole(
         self,
-        gray: np.ndarray,
+        light: np.ndarray,
         frame: Frame,
         masks: Masks,
         face: FacePlane,
@@ -285,7 +295,7 @@ class PlaneConicEstimator:
         s, row = self.settings, circle.ellipse
         # Appearance is measured in the fitted circle: the first ellipse may follow the shade
         # within.
-        inside = appearance.measure_interior(gray, frame.depth_m, row, frame.camera_matrix, face)
+        inside = appearance.measure_interior(light, frame.depth_m, row, frame.camera_matrix, face)
         parallax, covered = float("nan"), 0.0
         if both is not None:
             parallax, covered = alignment.measure_parallax(
@@ -298,7 +308,7 @@ class PlaneConicEstimator:
         glow = None
         if inside.darkness > s.looks.veiled:
             place = (frame.camera_matrix, face, circle.center_m, circle.radius_m)
-            glow = appearance.measure_wall_glow(gray, frame.depth_m, row, *place)
+            glow = appearance.measure_wall_glow(light, frame.depth_m, row, *place)
         refused = self._check_appearance(inside, parallax, glow, masks, row, ellipse, undecided)
         if refused:
             return refused
@@ -339,14 +349,15 @@ class PlaneConicEstimator:
         along_m2 = center_m[2] ** 4 * float(ray @ shifted.cov @ ray)
         return along_m2 * np.outer(ray, ray), shifted.normal_cov_rad2()
 
-    def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray]:
-        """Return the grey picture and the pixels of the face, cached for all ellipses of a frame."""
+    def _prepare(self, frame: Frame, masks: Masks) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return grey picture, linear light and pixels of the face, cached for a frame's ellipses."""
         if self._seen is None or self._seen[0] is not frame or self._seen[1] is not masks:
             allowed = masks.block > 0.5
             # A mouth shows the inside of the hole, whose depth is not that of the face.
             if masks.hole_mask is not None:
                 allowed &= masks.hole_mask < 0.5
-            self._seen = frame, masks, convert_to_gray(frame), allowed
+            gray = convert_to_gray(frame)
+            self._seen = frame, masks, gray, linearize(gray, frame.gamma), allowed
         return self._seen[2:]
 
     def _check_shape(
@@ -386,10 +397,7 @@ class PlaneConicEstimator:
         ellipse: Ellipse,
         undecided: bool,
     ) -> Rejection | None:
-        """Return the gate of the appearance that a hole misses, `None` where it passes all.
-
-        `glow` is known where the inside is veiled, `None` elsewhere.
-        """
+        """Return the gate that a hole misses, `None` for none; `glow` is known for veiled ones."""
         looks = self.settings.looks
 
         def refuse(reason: str, value: float, limit: float) -> Rejection:
@@ -399,7 +407,7 @@ class PlaneConicEstimator:
         if not inside.darkness <= looks.darkness:
             return refuse("brightness inside over outside", inside.darkness, looks.darkness)
         has_mask = masks.hole_mask is not None
-        mouth = 0.0 if masks.hole_mask is None else average_inside(masks.hole_mask, row)
+        mouth = 0.0 if masks.hole_mask is None else appearance.average_inside(masks.hole_mask, row)
         if has_mask and mouth < looks.mouth:
             # A mouth probability of 0 with no mask means "not asked", not "no mouth".
             return refuse("mouth probability inside", mouth, looks.mouth)
@@ -426,7 +434,7 @@ class PlaneConicEstimator:
             if inside.contrast < looks.contrast:
                 return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
             if glow.log_ratio < looks.hole_log_ratio:
-                return refuse(IN_DUST, glow.log_ratio, looks.hole_log_ratio)
+                return refuse(appearance.IN_DUST, glow.log_ratio, looks.hole_log_ratio)
             return None
         # Nothing can be seen that would decide: the hole passes with a lower score.
         if undecided and not has_parallax and (is_sure or not has_mask):
@@ -480,13 +488,11 @@ def convert_to_gray(frame: Frame) -> np.ndarray:
     return cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
 
 
-def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
-    """Return the mean of a picture within 0.8 of an ellipse."""
-    # The semi-major axis bounds the ellipse, however it is turned.
-    x, y, a = row[:3]
-    top, left = max(0, int(y - a)), max(0, int(x - a))
-    part = picture[top : int(y + a) + 2, left : int(x + a) + 2]
-    rows, columns = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
-    # 0.8 leaves out the blurred edge of the rim. Chosen by hand; not searched.
-    inside = conic.measure_radii(row, columns, rows) < 0.8
-    return float(part[inside].mean()) if inside.any() else 0.0
+def linearize(gray: np.ndarray, gamma: float) -> np.ndarray:
+    """Return the light of a grey picture `(h, w)` uint8, `(h, w)` float32, 255 for white.
+
+    A tone curve moves the steepest place of a blurred edge towards the dark: a rim would become
+    smaller, and its centre would move where the hole is not equally dark all around.
+    """
+    levels = 255.0 * (np.arange(256) / 255.0) ** gamma
+    return np.asarray(cv2.LUT(gray, levels.astype(np.float32)))

@@ -138,7 +138,7 @@ def fit_rim_circle(
     Return `None` where no circle of a possible size has enough.
 
     Args:
-        gray: Picture, `(h, w)` uint8.
+        gray: Light, `(h, w)` float32; see `plane_conic.linearize`.
         ellipse: Start, `(5,)`.
         camera_matrix: Camera matrix, `(3, 3)`.
         m: Plane, `(3,)`.

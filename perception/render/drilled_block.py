@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from perception.render.hole_light import compute_bounced_light
 from perception.render.materials import Material
 from perception.render.solids import Box, Hits, SolidPose, Surface
 
@@ -195,6 +196,7 @@ class DrilledBlock:
         normal, uv, *_ = self.box.surface(point, flat, to_sun)
         normal = normal.copy()
         openness, sunlit = np.ones(len(part), np.float32), np.ones(len(part), bool)
+        opening, bounced = normal.copy(), np.zeros((len(part), 2), np.float32)
         local = (point - self.pose.center_m.astype(np.float32)) @ self.pose.rotation.astype(
             np.float32
         )
@@ -209,13 +211,22 @@ class DrilledBlock:
                 )
                 normal[rows] = inside.normal @ self.pose.rotation.T.astype(np.float32)
                 uv[rows], openness[rows], sunlit[rows] = inside.uv_m, inside.openness, inside.sunlit
+                # Light comes in through the mouth, whatever the direction of the wall.
+                opening[rows] = (self.pose.rotation @ hole.outward).astype(np.float32)
+                wall, floor = (
+                    float(np.mean(self.materials[min(at, len(self.materials) - 1)].color))
+                    for at in (NUM_FACES + 2 * number, NUM_FACES + 2 * number + 1)
+                )
+                rise = float(sun[hole.axis] * hole.sign)
+                rings = compute_bounced_light(hole.radius_m, hole.depth_m, wall, floor, rise)
+                bounced[rows] = rings.at(hole.across_m(local[rows])[2], part[rows] % 2 == 1)
         for chip in self.chips:
             away = chip.center_m.astype(np.float32) - local
             on = (part == self.break_part) & (
                 np.abs(np.einsum("ij,ij->i", away, away) - chip.radius_m**2) < 1e-4 * chip.radius_m
             )
             normal[on] = (away[on] / chip.radius_m) @ self.pose.rotation.T.astype(np.float32)
-        return Surface(normal, uv, openness, sunlit)
+        return Surface(normal, uv, openness, sunlit, opening, bounced)
 
 
 def _describe_inside(

@@ -96,6 +96,7 @@ class FrameRenderer:
             scenes.base_from_camera,
             rig.baseline_m,
             disparity_std_px=rig.disparity_std_px,
+            gamma=rig.sensor.usual_gamma,
         )
         scenes.write_records(folder.parent, count)
         return scenes

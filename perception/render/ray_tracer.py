@@ -70,6 +70,19 @@ class Pinhole:
 
 
 @dataclass(frozen=True)
+class GroundBounce:
+    """Light that the ground sends back.
+
+    Attributes:
+        up: Unit vector away from it, `(3,)`, camera coordinates.
+        brightness: Light that it sends into each direction, as `Light.ambient`.
+    """
+
+    up: np.ndarray
+    brightness: float
+
+
+@dataclass(frozen=True)
 class Light:
     """Sunlight, or a lamp far away, and light from everywhere.
 
@@ -78,12 +91,25 @@ class Light:
         sun: Its strength on a surface that faces it.
         ambient: Strength of the light from everywhere.
         shade: Solids that throw shadows though they are not seen.
+        ground: With it, light from below is that of the ground instead of the ambient one, and
+            light bounces within holes; `None`: each surface has direct light alone.
     """
 
     to_sun: np.ndarray
     sun: float
     ambient: float
     shade: tuple[Solid, ...] = ()
+    ground: GroundBounce | None = None
+
+    def compute_ambient(self, toward: np.ndarray) -> np.ndarray | float:
+        """Return the ambient light on unobstructed surfaces with normals `toward`, `(M, 3)`.
+
+        Half of sky and ground each for a wall, after the inclination (Moon and Spencer 1942).
+        """
+        if self.ground is None:
+            return self.ambient
+        below = 0.5 * (1.0 - toward @ self.ground.up.astype(np.float32))
+        return self.ambient * (1.0 - below) + self.ground.brightness * below
 
 
 @dataclass(frozen=True)
@@ -247,8 +273,12 @@ class Tracer:
             # A solid's own shadow is already in the slope of its surface.
             if lit.any() and caster.solid is not thing:
                 caster.darken(point, lit)
-        ambient = self.light.ambient * (1.0 if surface.openness is None else surface.openness)
-        bright = ambient + self.light.sun * np.where(lit, slope, 0.0)
+        toward = surface.normal * -away[:, None] if surface.opening is None else surface.opening
+        ambient = self.light.compute_ambient(toward)
+        bright = ambient * (1.0 if surface.openness is None else surface.openness)
+        bright = bright + self.light.sun * np.where(lit, slope, 0.0)
+        if surface.bounced is not None and self.light.ground is not None:
+            bright += ambient * surface.bounced[:, 0] + self.light.sun * surface.bounced[:, 1]
         albedo = np.empty((len(part), 3), np.float32)
         # Obliquely seen texture is filtered more, but not without bound.
         size_m = pixel_m / np.sqrt(np.maximum(facing, 0.1))

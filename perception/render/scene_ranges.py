@@ -143,6 +143,7 @@ class LightRanges:
         sun: Strength of the sun or a lamp.
         ambient: Strength of the light from everywhere.
         elevation_rad: Of the sun above the ground.
+        bounces: Light comes back from the ground, and bounces within holes.
         shadows: Things out of sight that throw a shadow on the block.
         level: Light there is, relative to the level that the exposure is set for; drawn evenly on a
             logarithmic scale.
@@ -160,6 +161,7 @@ class LightRanges:
     sun: Range
     ambient: Range
     elevation_rad: Range
+    bounces: bool
     shadows: Count
     level: Range
     exposure: Range
@@ -225,7 +227,10 @@ def view_from(scene: Scene, camera_from_reference: np.ndarray) -> Scene:
     block = None if scene.block is None else move(scene.block)
     solids = tuple(block if solid is scene.block else move(solid) for solid in scene.solids)
     shade = tuple(move(solid) for solid in scene.light.shade)
-    light = replace(scene.light, to_sun=turn @ scene.light.to_sun, shade=shade)
+    ground = scene.light.ground
+    if ground is not None:
+        ground = replace(ground, up=turn @ ground.up)
+    light = replace(scene.light, to_sun=turn @ scene.light.to_sun, shade=shade, ground=ground)
     return replace(scene, solids=solids, block=block, light=light)
 
 

@@ -11,7 +11,7 @@ from perception.render.block_sampler import build_frame, draw_bars, draw_block
 from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import Disc, DrilledBlock, DrilledHole
 from perception.render.materials import NUM_TEXTURES, TEXTURE_SIDE, Material
-from perception.render.ray_tracer import Light
+from perception.render.ray_tracer import GroundBounce, Light
 from perception.render.scene_ranges import (
     Scene,
     SceneRanges,
@@ -184,7 +184,7 @@ def add_surroundings(
         solids += [block, *draw_bars(kind.block, block, generator)]
     solids += arm
     solids += _draw_clutter(kind, rig, block, down, ground_m, generator)
-    light = _draw_light(kind, down, target, generator)
+    light = _draw_light(kind, down, target, float(np.mean(solids[0].materials[0].color)), generator)
     exposure, level = _draw_exposure(kind, light, normal, target, generator)
     # The sky is a little darker than its light on a surface. Chosen by hand; not searched.
     sky = (0.8 * light.ambient, 0.8 * light.ambient, 0.8 * light.ambient)
@@ -356,9 +356,13 @@ def _draw_clutter(
 
 
 def _draw_light(
-    kind: SceneRanges, down: np.ndarray, target: np.ndarray, generator: np.random.Generator
+    kind: SceneRanges,
+    down: np.ndarray,
+    target: np.ndarray,
+    ground_brightness: float,
+    generator: np.random.Generator,
 ) -> Light:
-    """Return sun and sky, and things out of sight that throw shadows on the face."""
+    """Return sun, sky and light from the ground, and unseen things that throw shadows on the face."""
     elevation, azimuth = (
         draw_uniform(kind.light.elevation_rad, generator),
         generator.uniform(-np.pi, np.pi),
@@ -380,12 +384,14 @@ def _draw_light(
         half = np.array([generator.uniform(0.03, 0.25), 1.5, 0.02])
         dark = draw_material(0.3, 0.1, 0.01, generator)
         shade.append(Box("clutter", SolidPose(beam, target + beside + 3.0 * to_sun), half, (dark,)))
-    return Light(
-        to_sun,
+    sun, ambient = (
         draw_uniform(kind.light.sun, generator),
         draw_uniform(kind.light.ambient, generator),
-        tuple(shade),
     )
+    # Open ground: shadows of block and machine are left out.
+    sent = ground_brightness * (ambient + sun * math.sin(elevation))
+    ground = GroundBounce(-down, sent) if kind.light.bounces else None
+    return Light(to_sun, sun, ambient, tuple(shade), ground)
 
 
 def _draw_exposure(

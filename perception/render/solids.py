@@ -42,12 +42,18 @@ class Surface(NamedTuple):
         openness: Part of the ambient light that arrives, `(M,)`; `None` for all of it.
         sunlit: The solid itself does not shade the point, `(M,)` bool; `None` where only the normal
             decides.
+        opening: Unit vectors towards the middle of the sky that lights the point, `(M, 3)`; `None`
+            for the normals.
+        bounced: Light that reaches the point over other places of the solid: for each unit of the
+            ambient light, and of the sun, `(M, 2)`; `None` for none.
     """
 
     normal: np.ndarray
     uv_m: np.ndarray
     openness: np.ndarray | None = None
     sunlit: np.ndarray | None = None
+    opening: np.ndarray | None = None
+    bounced: np.ndarray | None = None
 
 
 @dataclass(frozen=True)

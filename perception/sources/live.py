@@ -169,4 +169,5 @@ class LiveSource:
             distortion=lens.distortion,
             right=capture.right,
             baseline_m=lens.baseline_m,
+            gamma=validation.USUAL_GAMMA,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -28,6 +29,7 @@ def make_frame(shot: RenderedFrame, rig: StereoRig, t_s: float) -> Frame:
     return Frame(
         color=shot.color, depth_m=shot.depth_m, camera_matrix=rig.left.matrix, base_from_camera=rig.base_from_camera,
         t_s=t_s, right=shot.right, baseline_m=rig.baseline_m, disparity_std_px=rig.disparity_std_px,
+        gamma=rig.sensor.usual_gamma,
     )  # fmt: skip
 
 
@@ -131,7 +133,8 @@ class SimulatedSource:
         number, rig = self._count, self._settings.rig
         self._count += 1
         shot = self.shot(np.random.default_rng((self._settings.seed, number)))
-        return make_frame(shot, rig, number / self._settings.rate_hz)
+        frame = make_frame(shot, rig, number / self._settings.rate_hz)
+        return replace(frame, depth_shrink=self._settings.stereo.shrink)
 
     def shot(self, noise: np.random.Generator, rig: StereoRig | None = None) -> RenderedFrame:
         """Return the current frame, with its truth.

@@ -21,6 +21,9 @@ _RIGID = 1e-3
 
 _LARGEST_OFFSET_PX = 10.0
 """Uncertainty of a disparity from which a pair is not calibrated at all."""
+USUAL_GAMMA = 2.2
+"""Exponent of the tone curve of cameras and files that do not state it: that of sRGB, about."""
+_LARGEST_GAMMA = 4.0
 
 
 def check_matrix(value: Any, where: str) -> np.ndarray:
@@ -107,6 +110,17 @@ def check_disparity_std(value: Any, where: str) -> float:
     if not 0.0 <= found <= _LARGEST_OFFSET_PX:
         raise FrameError(
             f"{where}: disparity_std_px is {found:g}, expected 0 to {_LARGEST_OFFSET_PX:g} px"
+        )
+    return found
+
+
+def check_gamma(value: Any, where: str) -> float:
+    """Return the exponent of a tone curve, or raises a `FrameError`."""
+    found = float(_parse_numbers(value, (), f"{where}: gamma"))
+    if not 1.0 <= found <= _LARGEST_GAMMA:
+        raise FrameError(
+            f"{where}: gamma is {found:g}, expected 1 (linear) to {_LARGEST_GAMMA:g}; most cameras "
+            f"have {USUAL_GAMMA:g}"
         )
     return found
 

@@ -191,7 +191,7 @@ def test_a_log_with_decimal_commas_and_windows_line_ends_is_read(
 
 def test_what_is_no_text_is_refused(tmp_path: Path, excavator: Machine, reader: ColumnMap) -> None:
     (tmp_path / "dig.csv").write_bytes(b"\xff\xfe\x00\x81" * 40)
-    with pytest.raises(RecordingError, match=r"dig\.csv: not a text file"):
+    with pytest.raises(RecordingError, match=r"dig\.csv: after line 0: not text in UTF-8"):
         reader.read(tmp_path / "dig.csv", excavator)
 
 

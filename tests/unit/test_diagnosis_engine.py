@@ -21,7 +21,7 @@ from brokk_rl.contracts.actuator import Effect
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import answer, baseline, case, effect_library, pipeline
+from diagnosis import answer, baseline, case, effect_library, effects_file
 from diagnosis.answer import (
     Answer,
     Estimate,
@@ -218,8 +218,8 @@ def test_an_answer_is_written_in_the_fixed_format_and_read_again(tmp_path: Path)
 def test_training_takes_the_found_effects_as_they_are(
     tmp_path: Path, machine: Machine, brokk: Callable[..., Any]
 ) -> None:
-    path = tmp_path / pipeline.EFFECTS_FILE
-    pipeline.write_effects(said(), effect_library.load_effects(machine), path)
+    path = tmp_path / effects_file.EFFECTS_FILE
+    effects_file.write_effects(said(), effect_library.load_effects(machine), path)
     done = brokk("mode=train", f"effect=@{path}", "--cfg", "job")
     assert done.code == 0, done.err
     text = done.out[done.out.index("backlash:") :]

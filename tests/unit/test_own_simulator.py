@@ -2,141 +2,28 @@
 
 from __future__ import annotations
 
+import re
+import runpy
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
+from arm import ARM, NOISE_RAD, draw_targets, keep, make_machine, record_arm, rub, weaken
 
 from brokk_rl import open_loop
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Dimension, Joint, Machine
+from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 from diagnosis import api, baseline, effect_library
 
-ARM = """
-<mujoco model="two_links">
-  <compiler angle="radian"/>
-  <option timestep="0.005" integrator="implicitfast"/>
-  <worldbody>
-    <body pos="0 0 0.3">
-      <joint name="shoulder" axis="0 1 0" range="-1.6 1.6" damping="0.2"/>
-      <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.03" mass="1.0" contype="0"/>
-      <body pos="0.3 0 0">
-        <joint name="elbow" axis="0 1 0" range="-1.6 1.6" damping="0.1"/>
-        <geom type="capsule" fromto="0 0 0 0.25 0 0" size="0.025" mass="0.5" contype="0"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator>
-    <position joint="shoulder" kp="60" kv="4"/>
-    <position joint="elbow" kp="30" kv="1.5"/>
-  </actuator>
-</mujoco>
-"""
-NOISE_RAD = 2e-4
-PENDULUM = """
-import numpy as np
-
-def step(state, command):
-    angle, speed = state[..., 0], state[..., 1]
-    for _ in range(4):  # 5 ms each: a servo of 30 Nm/rad holds 1 kg at 0.3 m
-        torque = 30.0 * (command[..., 0] - angle) - 2.0 * speed - 9.81 * 0.3 * np.sin(angle)
-        speed = speed + 0.005 * torque / 0.09
-        angle = angle + 0.005 * speed
-    return np.stack([angle, speed], axis=-1)
-"""
-
-
-def make_machine(*names: str) -> Machine:
-    """Returns a machine of position servos at 50 Hz, known by its joints."""
-
-    def number(value: float) -> Dimension:
-        return Dimension(value=value, source="test", confidence="high")
-
-    joints = tuple(
-        Joint(
-            name=name,
-            part=None,
-            kind="hinge",
-            lower=number(-1.5),
-            upper=number(1.5),
-            home=0.0,
-            max_speed=number(3.0),
-            body=None,
-            command="position",
-        )
-        for name in names
-    )
-    return Machine(
-        name="two_links",
-        title="two links",
-        mjcf=None,
-        period_s=0.02,
-        dead_time_s=0.0,
-        num_history=26,
-        joints=joints,
-        tool_m=None,
-        exclusive=(),
-        levers=(),
-    )
-
-
-def draw_targets(generator: np.random.Generator, count: int, joints: int) -> np.ndarray:
-    """Returns targets that step and ramp, `(T, J)`."""
-    found = np.zeros((count, joints))
-    for j in range(joints):
-        at, k = 0.0, 0
-        while k < count:
-            goal, speed = generator.uniform(-0.9, 0.9), generator.choice([0.6, 1.5, 1e3])
-            for _ in range(int(generator.integers(15, 80))):
-                at += float(np.clip(goal - at, -speed * 0.02, speed * 0.02))
-                if k < count:
-                    found[k, j] = at
-                k += 1
-    return found
-
-
-def record_arm(
-    machine: Machine, change: Callable[[Any], None], delay: int, seed: int, seconds: float = 16.0
-) -> Recording:
-    """Returns a recording of the arm with a fault, stepped by MuJoCo in a loop of its own."""
-    generator = np.random.default_rng(seed)
-    spec = mujoco.MjSpec.from_string(ARM)
-    change(spec)
-    model = spec.compile()
-    data = mujoco.MjData(model)
-    count = round(seconds / machine.period_s)
-    targets, q = draw_targets(generator, count, 2), np.zeros((count, 2))
-    for k in range(count):
-        q[k] = data.qpos
-        data.ctrl[:] = targets[max(0, k - delay)]
-        for _ in range(4):
-            mujoco.mj_step(model, data)
-    t_s = np.arange(count) * machine.period_s
-    q += generator.normal(0.0, NOISE_RAD, q.shape)
-    return make_motion(machine, f"run {seed}", t_s, (targets / 1.5).astype(np.float32), q)
-
-
-def keep(spec: Any) -> None:
-    """The arm as in the file."""
-
-
-def rub(spec: Any) -> None:
-    """Adds friction at the elbow."""
-    spec.joint("elbow").frictionloss = 0.5
-
-
-def weaken(spec: Any) -> None:
-    """Takes 40 % of the stiffness of the shoulder's drive."""
-    drive = spec.actuators[0]
-    gain, bias = drive.gainprm.copy(), drive.biasprm.copy()
-    gain[0], bias[1] = 0.6 * gain[0], 0.6 * bias[1]
-    drive.gainprm, drive.biasprm = gain, bias
+PAGE = (Path(__file__).parents[2] / "docs/tutorials/your_simulator.md").read_text()
+PENDULUM, RECORDER = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)[:2]
+(PENDULUM_FILE,) = re.findall(r"^```xml\n(.*?)^```", PAGE, re.M | re.S)
+"""Examples of the tutorial."""
 
 
 @pytest.fixture
@@ -149,7 +36,7 @@ def arm(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def pendulum(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """A function of ten lines in the current folder."""
+    """The function of the tutorial in the current folder."""
     (tmp_path / "my_pendulum.py").write_text(PENDULUM)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
@@ -246,6 +133,24 @@ def test_a_pendulum_written_by_hand_explains_its_own_delay(pendulum: str) -> Non
     assert after < 0.05 * before
 
 
+def test_function_and_file_of_the_tutorial_are_the_same_pendulum(
+    pendulum: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pendulum.xml").write_text(PENDULUM_FILE)
+    (tmp_path / "record.py").write_text(RECORDER)
+    runpy.run_path(str(tmp_path / "record.py"))
+    log = np.genfromtxt(tmp_path / "raw/run_0.csv", delimiter=",", names=True)
+    targets, q = log["hinge_target_rad"][:, None], log["hinge_position_rad"]
+    machine = make_machine("hinge")
+    for source in (pendulum, "pendulum.xml"):
+        plant = api._load_simulator(source).load(machine)
+        state = plant.start(np.zeros((1, 1)), np.zeros((1, 1)))
+        path = plant.read(plant.run(state, targets[None]))[0][0, :, 0]
+        # The recorder is two periods late, and its noise has 0.5 mrad.
+        assert np.sqrt(np.mean(np.square(path[:-3] - q[3:]))) < 1.5e-3
+        assert np.sqrt(np.mean(np.square(path[:-1] - q[1:]))) > 2e-2
+
+
 def test_steps_and_a_planned_run_agree(arm: Path) -> None:
     machine = make_machine("shoulder", "elbow")
     recording = record_arm(machine, keep, 0, seed=3, seconds=5.0)
@@ -273,7 +178,7 @@ def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: 
     with pytest.raises(ConfigError, match="no joint 'wrist'; it has shoulder, elbow"):
         simulator.load(make_machine("wrist"))
     with pytest.raises(ConfigError, match="is no multiple of the time step"):
-        simulator.load(replace(make_machine("shoulder"), period_s=0.018))
+        simulator.load(replace(make_machine("shoulder"), period_s=0.019))
     arm.write_text(ARM.replace('<position joint="elbow" kp="30" kv="1.5"/>', ""))
     other = arm.with_name("other.xml")
     other.write_text(arm.read_text())
@@ -287,6 +192,10 @@ def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
     for source, found in ((pendulum, set()), (arm, inside)):
         kinds = effect_library.load_effects(machine, None, api._load_simulator(source))
         assert {kind.name for kind in kinds} & inside == found
+    with pytest.raises(
+        ConfigError, match="'joint_friction' cannot be simulated: my_pendulum:step has no numbers"
+    ):
+        effect_library.load_effects(machine, ["joint_friction"], api._load_simulator(pendulum))
 
 
 @pytest.mark.slow

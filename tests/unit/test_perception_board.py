@@ -15,6 +15,7 @@ import pytest
 from composed import option
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.signals import Frame
 from perception.modes.board import draw_board
 
 POINTS_PER_M = 72.0 / 0.0254
@@ -43,9 +44,39 @@ def test_opencv_finds_every_corner_at_its_place_on_the_page() -> None:
     )
     found, numbers, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(page)
     assert len(numbers) == (board.columns - 1) * (board.rows - 1)
-    corners_m = np.asarray(drawn.getChessboardCorners())[numbers[:, 0]][:, :2]
+    all_m: Any = np.asarray(drawn.getChessboardCorners())
+    corners_m = all_m[numbers[:, 0]][:, :2]
     # pixel centres lie half a pixel in; the detector refines to a tenth of a pixel
     np.testing.assert_allclose(found[:, 0], 2000 * (corners_m + 0.03) - 0.5, atol=0.6)
+
+
+def test_small_blurred_markers_are_read_in_linear_light() -> None:
+    charuco = option("perception/camera_pose", "charuco")
+    markers = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, charuco.dictionary))
+    board = cv2.aruco.CharucoBoard((8, 6), charuco.square_m, charuco.marker_m, markers)
+    picture = board.generateImage((8 * 112, 6 * 112)).astype(np.float32) / 255
+    picture = 0.05 + 0.85 * np.pad(picture, 80, constant_values=1.0)
+    turned = cv2.warpAffine(
+        picture,
+        np.array([[0.9925, 0.1219, 0], [-0.1219, 0.9925, 100]]),
+        (1160, 990),
+        borderValue=0.5,
+    )
+    # 28 px a square, of which one of a marker's cells has 3 px.
+    blurred = cv2.GaussianBlur(turned, (0, 0), 3.6)
+    light = cv2.resize(blurred, None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    coded = np.rint(255 * light ** (1 / 2.2)).astype(np.uint8)
+    frame = Frame(
+        color=np.repeat(coded[..., None], 3, 2),
+        depth_m=np.ones(coded.shape, np.float32),
+        camera_matrix=np.eye(3),
+        base_from_camera=None,
+        t_s=0.0,
+        gamma=2.2,
+    )
+    tracker = charuco.build()
+    assert len(tracker.find_corners(frame)[0]) == 35
+    assert len(tracker.find_corners(replace(frame, gamma=1.0))[0]) < 30
 
 
 def test_a_board_that_cannot_be_drawn_is_refused() -> None:

@@ -12,8 +12,9 @@ from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 from brokk_rl.contracts.vision import HolePose, Rejection
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, plane, rim
-from perception.pose.plane_conic import IN_DUST, convert_to_gray
+from perception.pose.appearance import IN_DUST
 from perception.pose.plane_conic import as_row as pose_row
+from perception.pose.plane_conic import convert_to_gray
 
 
 @pytest.fixture(scope="module")
@@ -43,6 +44,26 @@ def test_a_third_of_a_rim_that_is_hidden_is_not_missed(estimator) -> None:
     assert isinstance(pose, HolePose)
     assert pose.center_m == pytest.approx(CENTER, abs=1.5e-3)
     assert float(pose.axis @ AXIS) > np.cos(np.radians(0.2))
+
+
+def test_a_tone_curve_moves_no_rim_and_changes_no_evidence_once_it_is_known(estimator) -> None:
+    frame, masks, ellipse = drawn()
+    plain = estimator.estimate(frame, masks, ellipse)
+    coded = np.rint(255 * (frame.color / 255.0) ** (1 / 2.2)).astype(np.uint8)
+    curved = replace(frame, color=coded, gamma=2.2)
+    found = estimator.estimate(curved, masks, ellipse)
+    taken_for_linear = estimator.estimate(replace(curved, gamma=1.0), masks, ellipse)
+    assert found.center_m == pytest.approx(plain.center_m, abs=5e-5)
+    assert found.radius_m == pytest.approx(plain.radius_m, abs=5e-5)
+    assert taken_for_linear.radius_m < plain.radius_m - 2e-4, "edges move into the dark"
+    face = plane.FacePlane(AXIS / (AXIS @ CENTER), np.eye(3) * 1e-6, 1e-4, 1000, 7.0)
+    slopes = []
+    for one in (frame, curved):
+        gray = convert_to_gray(one)  # not linearised: the ratio of logarithms needs no exponent
+        slopes.append(
+            appearance.measure_interior(gray, one.depth_m, pose_row(ellipse), K, face).slope
+        )
+    assert slopes[0] < -0.17 and slopes[1] == pytest.approx(slopes[0], rel=0.2)
 
 
 def as_color(gray: np.ndarray) -> np.ndarray:

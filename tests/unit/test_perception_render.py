@@ -28,9 +28,14 @@ from perception.render.camera_sensor import (
 )
 from perception.render.drilled_block import Chip, Disc, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer
+from perception.render.hole_light import (
+    compute_bounced_light,
+    compute_view_factors,
+    measure_sunlight,
+)
 from perception.render.materials import Material
 from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
-from perception.render.ray_tracer import Light, Pinhole, Tracer
+from perception.render.ray_tracer import GroundBounce, Light, Pinhole, Tracer
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene, compute_hidden_share, sample_rim
 from perception.render.solids import Box, Cylinder, PlaneSolid, SolidPose
@@ -420,9 +425,46 @@ def test_a_sensor_draws_one_pair_for_a_seed_and_another_for_each_frame() -> None
     assert first == sensor.draw_pair(np.random.default_rng(3))
     one = replace(sensor, seed=5)
     first, second = one.draw_pair(chance), one.draw_pair(chance)
-    assert replace(first[1], motion_px=(0, 0)) == replace(second[1], motion_px=(0, 0))
+    still = {"motion_px": (0.0, 0.0), "gain": 1.0}  # these belong to the frame
+    assert replace(first[1], **still) == replace(second[1], **still)
+    assert first[0].gain / first[1].gain == pytest.approx(second[0].gain / second[1].gain)
     with pytest.raises(ConfigError, match="jpeg_quality"):
         replace(sensor, jpeg_quality=(0, 90))
+
+
+def test_light_in_a_white_hole_is_that_outside_and_a_dark_one_sends_none_on() -> None:
+    factors, mouth = compute_view_factors(0.05, 0.35)
+    np.testing.assert_allclose(factors.sum(1) + mouth, 1.0, atol=1e-12)
+    # Where nothing is lost, light is the same everywhere: an isothermal enclosure.
+    white = compute_bounced_light(0.05, 0.35, 1.0, 1.0, 1.0)
+    np.testing.assert_allclose(white.light[:, 0] + mouth, 1.0, atol=1e-9)
+    dark = compute_bounced_light(0.05, 0.35, 0.0, 0.0, 0.7)
+    assert np.abs(dark.light).max() < 1e-12
+    # The sun straight into a hole with a white floor and a black wall: its whole light leaves the
+    # floor, and the part that falls on the ring beside it is the view factor.
+    floor = compute_bounced_light(0.05, 0.35, 0.0, 1.0, 1.0)
+    np.testing.assert_allclose(floor.light[:-1, 1], factors[:-1, -1], atol=1e-12)
+
+
+def test_sunlight_on_the_wall_and_floor_of_a_hole_is_that_which_enters() -> None:
+    # Through a mouth of area pi r^2 enters pi r^2 cos: all of it falls on wall (of small rings)
+    # and floor, and bounces once where both are nearly black.
+    for rise in (0.3, 0.8, 0.99):
+        first = measure_sunlight(0.05, 0.2, (np.arange(400) + 0.5) * 0.2 / 400, rise)
+        fallen = first[:-1].mean() * 2 * np.pi * 0.05 * 0.2 + first[-1] * np.pi * 0.05**2
+        assert fallen == pytest.approx(np.pi * 0.05**2 * rise, rel=0.02)
+
+
+def test_a_floor_of_a_hole_is_brighter_with_bounced_light_and_walls_see_the_ground() -> None:
+    camera = Pinhole(65, 65, 400.0, np.zeros(3))
+    block = drilled(FACING, np.array([0.0, 0.0, 2.0]))
+    up = np.array([0.0, -1.0, 0.0])
+    direct = Light(np.array([0.0, 0.0, -1.0]), 0.0, 1.0)
+    bounced = replace(direct, ground=GroundBounce(up, 0.4))
+    plain, lit = (seen([block], camera, light).radiance[..., 0] for light in (direct, bounced))
+    # A wall that stands on the ground: half of its light is the sky's, half the ground's.
+    assert lit[32, 58] / plain[32, 58] == pytest.approx(0.5 * (1.0 + 0.4), rel=1e-4)
+    assert lit[32, 32] / lit[32, 58] > 1.3 * plain[32, 32] / plain[32, 58]
 
 
 @pytest.mark.parametrize("name", names("scene"))

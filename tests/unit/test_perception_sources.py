@@ -181,6 +181,7 @@ def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read
         ({"T_base_cam": (np.eye(4) * [[2], [1], [1], [1]]).tolist()}, "no rigid transform"),
         ({"T_base_cam": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, "no rigid transform"),
         ({"T_base_cam": np.eye(3).tolist()}, r"shape \(3, 3\)"),
+        ({"gamma": 0.45}, r"gamma is 0.45, expected 1 \(linear\) to 4"),
     ],
 )
 def test_a_camera_that_cannot_be_is_refused(

@@ -1,0 +1,201 @@
+"""Table of rivals: their answers to cases of an opened exam beside the published ones of the diagnosis.
+
+    python benchmarks/exam/rivals/table.py <exam> <opened> <work> <out.json> mujoco_sysid=<answers> pace=<answers>
+
+`<exam>` is what `remake.py` wrote from `<opened>`. Each rival has two rows: names by the rule of
+`rules.json`, and all fitted numbers taken as they are. Scores and the closed share are those of
+`mode=exam`; what was examined already stays in `<work>`.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import hydra
+import naming
+import numpy as np
+from case_data import read_changes
+from choose_rule import QUIET, THRESHOLDS, count_names
+from hydra.utils import instantiate
+from sit import RULES_FILE
+
+from brokk_rl.extensions import register_options
+from brokk_rl.session import write_json
+from diagnosis.answer import read_answer
+from exam import dataset, score
+from exam.answer_scoring import AnswerScoring
+from exam.generate import restrict_machine
+
+OURS = "diagnosis"
+COMMAND = (
+    "python benchmarks/exam/rivals/table.py <exam> benchmarks/exam/held_out/second <work> "
+    "benchmarks/exam/rivals/rivals.json mujoco_sysid=<answers> pace=<answers>"
+)
+ROWS = (
+    "top1",
+    "exact_set",
+    "set_f1",
+    "false_alarms",
+    "unknown_recall",
+    "joints",
+    "parameter_error",
+    "closed_examined",
+)
+"""Metrics of `exam.metrics` that the table has."""
+
+
+def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
+    """Write the published answers of the diagnosis as the exam left them, and their examinations."""
+    for line in (opened / f"answers_{OURS}.jsonl").read_text().splitlines():
+        row = json.loads(line)
+        if row["case"] in cases:
+            place = work / OURS / row["case"]
+            place.mkdir(parents=True, exist_ok=True)
+            write_json(place / "diagnosis.json", row["answer"])
+            write_json(place / "sitting.json", row["note"])
+    examined = json.loads((opened / "examined.json").read_text())[OURS]
+    known = {case: one for case, one in examined.items() if case in cases}
+    path = work / "examined.json"
+    if not path.is_file():
+        write_json(path, {OURS: known})
+
+
+def write_named(answers: Path, cases: list[str], rule: dict[str, Any], out: Path) -> None:
+    """Write the answers that a rule makes of the fitted changes."""
+    for case in cases:
+        place = answers / case
+        if not (place / "changes.json").is_file():
+            continue
+        naming.write_answer(read_changes(place / "changes.json"), rule, out / case)
+        if (place / "sitting.json").is_file():
+            (out / case / "sitting.json").write_text((place / "sitting.json").read_text())
+
+
+def measure_hindsight(
+    answers: Path, labels: list[dict[str, Any]], spreads: dict[str, float]
+) -> dict[str, Any]:
+    """Return the best F1 of names that any threshold has on these very cases."""
+    best: dict[str, Any] = {"f1": 0.0}
+    for threshold in THRESHOLDS:
+        total, alarms = np.zeros(3), 0
+        for label in labels:
+            path = answers / label["case"] / "changes.json"
+            if not path.is_file():
+                continue
+            named = list(naming.select_effects(read_changes(path), spreads, float(threshold)))
+            is_quiet = label["kind"] in QUIET
+            truth = set() if is_quiet else {one["effect"] for one in label["effects"]}
+            total += count_names(truth, named)
+            alarms += is_quiet and bool(named)
+        right, wrong, missed = total
+        f1 = float(2 * right / max(2 * right + wrong + missed, 1))
+        if f1 > best["f1"]:
+            best = {"f1": round(f1, 3), "threshold": float(threshold), "false_alarms": int(alarms)}
+    return best
+
+
+def summarise(
+    table: dict[str, Any],
+    folder: Path,
+    labels: list[dict[str, Any]],
+    examined: dict[str, Any],
+    scoring: AnswerScoring,
+) -> dict[str, Any]:
+    """Return the table's row of one candidate."""
+    row = {name: table[name] for name in ROWS}
+    hits, there, false = 0, 0, 0
+    for label in labels:
+        answer = read_answer(folder / label["case"] / "diagnosis.json")
+        one = score.score_answer(label, answer, scoring.classes, scoring.of_machine)
+        hits, there = hits + len(one.hits), there + len(one.truth)
+        false += len(one.named) - len(one.hits)
+    row["effects_named"] = {"value": hits, "of": there}
+    row["names_false"] = {"value": false, "of": len(labels)}
+    row["names_f1"] = round(2 * hits / max(there + hits + false, 1), 3)
+    closed = [one["closed"] for one in examined.values() if one["closed"] is not None]
+    # a repair that makes the error many times larger counts as one that doubles the gap
+    row["closed_mean"] = float(np.mean(np.clip(closed, -1.0, 1.0))) if closed else None
+    row["cases"], row["failed"] = table["sat"]["value"], table["failed"]
+    row["seconds"] = table["seconds"]
+    return row
+
+
+def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path]) -> None:
+    """Name, examine, score, write."""
+    labels = dataset.open_labels(exam)["cases"]
+    cases = [label["case"] for label in labels]
+    unpack_published(opened, cases, work)
+    rules = json.loads(RULES_FILE.read_text())
+    folders = {OURS: work / OURS}
+    for name, answers in rivals.items():
+        everything = {**rules[name], "threshold": 0.0}
+        for title, rule in ((name, rules[name]), (f"{name} as fitted", everything)):
+            folders[title] = work / title.replace(" ", "_")
+            write_named(answers, cases, rule, folders[title])
+    overrides = ["mode=exam", "exam_protocol=sealed", "session.seed=1000", f"session.out={work}"]
+    register_options(overrides)
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        mode = instantiate(hydra.compose("config", overrides), _convert_="all")
+    settings = mode.exam
+    # those that some rival has not answered are left out for all
+    sat = [
+        label
+        for label in labels
+        if all((folder / label["case"] / "diagnosis.json").is_file() for folder in folders.values())
+    ]
+    scoring = AnswerScoring(
+        exam=exam,
+        labels=sat,
+        machine=restrict_machine(
+            mode.machine, json.loads((exam / "exam.json").read_text())["known"]
+        ),
+        fit=settings.oracle,
+        classes=settings.mix.classes,
+        of_machine=[n for n, one in settings.mix.troubles.items() if one.joints == "all"],
+        oracle={},
+    )
+    # numbers taken as they are repair the rival's own simulator only: `own_gap.py`
+    repairs = {name: folder for name, folder in folders.items() if "as fitted" not in name}
+    examined = scoring.examine(repairs, work / "examined.json", 1)
+    rows, chosen = {}, {label["case"] for label in sat}
+    for name, folder in folders.items():
+        table = scoring.build_table(folder, examined.get(name, {}))
+        shares = {case: one for case, one in examined.get(name, {}).items() if case in chosen}
+        rows[name] = summarise(table, folder, sat, shares, scoring)
+    kinds: dict[str, int] = {}
+    for label in sat:
+        kinds[label["kind"]] = kinds.get(label["kind"], 0) + 1
+    result = {
+        "command": COMMAND,
+        "cases": kinds,
+        "candidates": rows,
+        "hindsight": {
+            name: measure_hindsight(answers, sat, rules[name]["spreads"])
+            for name, answers in rivals.items()
+        },
+        "rules": {
+            name: {key: rules[name][key] for key in ("threshold", "f1", "cases", "exam_seed")}
+            for name in rivals
+        },
+        "machine": f"{platform.machine()}, 2 shared cores, Python {platform.python_version()}",
+        "commit": subprocess.run(
+            ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
+        ).stdout.strip(),
+    }
+    write_json(out, result)
+
+
+if __name__ == "__main__":
+    exam, opened, work, out = map(Path, sys.argv[1:5])
+    main(
+        exam,
+        opened,
+        work,
+        out,
+        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[5:])},
+    )

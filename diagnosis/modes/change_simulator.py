@@ -1,0 +1,271 @@
+"""`brokk mode=change_simulator`: writes findings of a diagnosis as changes of the simulator that was diagnosed."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from brokk_rl import record
+from brokk_rl.contracts.actuator import Actuator
+from brokk_rl.errors import ConfigError
+from brokk_rl.machine import Machine
+from brokk_rl.open_loop import WARM_UP_S
+from brokk_rl.record import Recording
+from brokk_rl.session import Session, write_json
+from brokk_rl.spec import spec
+from diagnosis import answer, baseline, drive_networks, effect_library, simulator_changes
+from diagnosis.answer import Answer
+
+log = logging.getLogger(__name__)
+
+MJCF_FILE, SYSID_FILE = "changed.xml", "sysid_parameters.py"
+RANGES_FILE, TABLE_FILE, NETWORKS = "randomisation.yaml", "randomisation.json", "networks"
+CHANGES_FILE = "changes.json"
+NUM_TARGET_RUNS, TARGET_RUN_S = 3, 20.0
+"""Drawn motions that a network is fitted to beside the recorded ones. Chosen by hand."""
+
+
+@spec
+class ChangeRequest:
+    """Findings to write.
+
+    Attributes:
+        diagnosis: Run folder of `mode=diagnose`.
+        recordings: Glob or globs of recordings that the changed file is replayed on.
+        why: `why.json`, with the success that each effect costs.
+        networks: Fit networks of the drives.
+    """
+
+    diagnosis: str
+    recordings: str | tuple[str, ...] | None
+    why: str | None
+    networks: bool
+
+
+@spec
+class ChangeSimulator:
+    """Write what a diagnosis found as changes of the simulator.
+
+    Attributes:
+        session: Folder, seed, device.
+        machine: The machine.
+        simulator: The simulator that was diagnosed: an MJCF file, or `module:function`.
+        own: The actuator that runs it.
+        changes: Which findings, and what to write.
+    """
+
+    session: Session
+    machine: Machine
+    simulator: str
+    own: Actuator
+    changes: ChangeRequest
+
+    def check(self) -> None:
+        replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+    def run(self) -> None:
+        """Write the files.
+
+        Raises:
+            RecordingError: The diagnosis, the recordings or `why.json` cannot be read.
+            ConfigError: The MJCF file does not have the machine's joints, or nothing was found.
+            StorageError: A file could not be written.
+        """
+        self.session.seed_all()
+        torch.set_num_threads(1)  # small networks: threads would only wait for each other
+        folder = self.session.folder
+        given = answer.read_answer(Path(self.changes.diagnosis) / answer.ANSWER_FILE)
+        if not given.selected:
+            raise ConfigError(
+                f"changes.diagnosis={self.changes.diagnosis}: its verdict is '{given.verdict}', so there is nothing to change"
+            )
+        own: Any = replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        kinds = effect_library.load_effects(self.machine, None, own)
+        costs = {}
+        if self.changes.why is not None:
+            costs = simulator_changes.read_success_costs(Path(self.changes.why))
+        recordings = self._read_recordings()
+        folder.mkdir(parents=True, exist_ok=True)
+        ranges = simulator_changes.list_ranges(given, kinds, costs)
+        simulator_changes.write_randomisation(given, kinds, ranges, folder / RANGES_FILE)
+        write_json(folder / TABLE_FILE, [asdict(one) for one in ranges])
+        told: dict[str, Any] = {"changes": [], "not_in_the_file": {}, "replay": {}, "networks": []}
+        if own.path is not None:
+            told = self._change_file(own, given, recordings)
+        write_json(folder / CHANGES_FILE, told)
+        _print(told, ranges, folder)
+
+    def _read_recordings(self) -> list[Recording]:
+        if self.changes.recordings is None:
+            return []
+        return record.read_recordings(self.changes.recordings, self.machine)
+
+    def _change_file(
+        self, own: Any, given: Answer, recordings: Sequence[Recording]
+    ) -> dict[str, Any]:
+        """Write the changed MJCF, the priors and the networks; return what was done."""
+        from brokk_rl.sim import mjcf_changes  # MuJoCo is not in every installation
+
+        folder = self.session.folder
+        findings = []
+        for one in given.selected:
+            for joint in one.joints or self.machine.joint_names:
+                estimates = {name: row.get(joint) for name, row in one.parameters.items()}
+                values = {name: value for name, value in estimates.items() if value is not None}
+                findings.append(
+                    mjcf_changes.JointFinding(
+                        one.effect,
+                        joint,
+                        {name: value.mean for name, value in values.items()},
+                        {
+                            name: value.ci95 if value.has_interval else None
+                            for name, value in values.items()
+                        },
+                    )
+                )
+        changed = folder / MJCF_FILE
+        changes, left = mjcf_changes.write_changed_mjcf(own.path, self.machine, findings, changed)
+        simulator_changes.write_sysid_priors(changes, folder / SYSID_FILE)
+        told: dict[str, Any] = {
+            "changes": [asdict(one) for one in changes],
+            "not_in_the_file": left,
+            "replay": {},
+            "networks": [],
+        }
+        if recordings:
+            told["replay"] = {
+                "before": self._replay(own, recordings),
+                "after": self._replay(replace(own, source=str(changed)), recordings),
+            }
+        if self.changes.networks and self.machine.interface == "position":
+            told["networks"] = self._fit_networks(own.path, changed, given, recordings)
+        return told
+
+    def _replay(self, simulator: Actuator, recordings: Sequence[Recording]) -> dict[str, float]:
+        """Return the error of free runs on the recordings by joint, rad or m."""
+        begun = [(one, 0.0) for one in recordings]
+        runs = baseline.compare_simulator(simulator, begun, self.machine, 0).residuals.simulator
+        error = runs.cut.measured - runs.plain_runs
+        rmse = np.sqrt(np.square(error).mean((0, 1)))
+        return dict(zip(self.machine.joint_names, rmse.tolist(), strict=True))
+
+    def _fit_networks(
+        self, source: Path, changed: Path, given: Answer, recordings: Sequence[Recording]
+    ) -> list[dict[str, Any]]:
+        """Write the networks of all drives; return their contracts, with their errors in a roll-out."""
+        from brokk_rl.sim import drive_torques
+
+        machine, seed = self.machine, self.session.stream("networks")
+        generator = np.random.default_rng(seed)
+        targets = [draw_targets(machine, generator) for _ in range(NUM_TARGET_RUNS)]
+        middle = 0.5 * (machine.upper + machine.lower)
+        half = 0.5 * (machine.upper - machine.lower)
+        targets = [middle + half * one.u.astype(float) for one in recordings[:-1]] + targets
+        withheld = targets[-1]
+        if recordings:
+            withheld = middle + half * recordings[-1].u.astype(float)
+        samples = drive_torques.sample_drives(changed, machine, targets, seed)
+        delay_s = find_longest_delay_s(given)
+        history = drive_networks.choose_history(delay_s, samples.step_s)
+        drives = []
+        for place, name in enumerate(machine.joint_names):
+            drives.append(
+                drive_networks.fit_network(
+                    name,
+                    samples.error[:, place],
+                    samples.speed[:, place],
+                    samples.torque[:, place],
+                    samples.start,
+                    samples.step_s,
+                    history,
+                    seed,
+                )
+            )
+        for network, contract in drives:
+            drive_networks.write_network(network, contract, self.session.folder / NETWORKS)
+        begin = recordings[-1].q[0].astype(float) if recordings else withheld[0]
+        with_networks = drive_torques.roll_out_torques(
+            changed, machine, withheld, begin, drive_networks.DriveStack(drives)
+        )
+        expected = drive_torques.roll_out_targets(changed, machine, withheld, begin)
+        unchanged = drive_torques.roll_out_targets(source, machine, withheld, begin)
+        found = []
+        warm = round(WARM_UP_S / machine.period_s)  # histories are filled by then
+        for place, (_, contract) in enumerate(drives):
+            pairs = {"network": with_networks, "unchanged_file": unchanged}
+            errors = {}
+            for name, path in pairs.items():
+                error = path[warm:, place] - expected[warm:, place]
+                errors[name] = float(np.sqrt(np.square(error).mean()))
+            found.append(asdict(contract) | {"rmse_to_changed_file": errors})
+        return found
+
+
+def find_longest_delay_s(given: Answer) -> float:
+    """Return the longest time that a network has to look back, s: dead times and three time constants."""
+    longest_s = 0.0
+    for one in given.selected:
+        for name, scale in (("dead_time_s", 1.0), ("time_constant_s", 3.0)):
+            values = one.parameters.get(name, {}).values()
+            longest_s = max([longest_s, *(scale * value.mean for value in values)])
+    return longest_s
+
+
+def draw_targets(machine: Machine, generator: np.random.Generator) -> np.ndarray:
+    """Return targets that step and ramp over three fifths of the travel, `(T, J)`, rad or m."""
+    count = round(TARGET_RUN_S / machine.period_s)
+    found = np.empty((count, machine.num_joints))
+    middle, travel = 0.5 * (machine.lower + machine.upper), machine.upper - machine.lower
+    for j in range(machine.num_joints):
+        at, k = middle[j], 0
+        while k < count:
+            goal = middle[j] + 0.3 * travel[j] * generator.uniform(-1.0, 1.0)
+            way = machine.max_speed[j] * machine.period_s * generator.uniform(0.1, 2.0)
+            held = int(generator.uniform(0.3, 1.5) / machine.period_s)
+            end = min(count, k + max(1, held))
+            for row in range(k, end):
+                at += float(np.clip(goal - at, -way, way))
+                found[row, j] = at
+            k = end
+    return found
+
+
+def _print(
+    told: dict[str, Any], ranges: Sequence[simulator_changes.RandomisationRange], folder: Path
+) -> None:
+    console = Console()
+    if told["changes"]:
+        table = Table("finding", "joint", "attribute", "before", "after", box=None)
+        for one in told["changes"]:
+            table.add_row(
+                one["effect"],
+                one["joint"],
+                f"{one['element']} {one['attribute']}",
+                f"{one['before']:.4g}",
+                f"{one['after']:.4g}",
+            )
+        console.print(table)
+    for name, reason in told["not_in_the_file"].items():
+        console.print(f"not in {MJCF_FILE}: {name}: {reason}", highlight=False, markup=False)
+    for joint, before in told["replay"].get("before", {}).items():
+        after = told["replay"]["after"][joint]
+        console.print(f"{joint}: error {before:.4g}, with the changes {after:.4g}", highlight=False)
+    for one in told["networks"]:
+        errors = one["rmse_to_changed_file"]
+        console.print(
+            f"network of {one['joint']}: {errors['network']:.4g} off {MJCF_FILE}, "
+            f"the file as it was {errors['unchanged_file']:.4g}",
+            highlight=False,
+        )
+    for name in dict.fromkeys(one.effect for one in ranges):
+        first = next(one for one in ranges if one.effect == name)
+        console.print(f"{name}: {simulator_changes.describe_cost(first)}", highlight=False)
+    console.print(f"written: {folder}", highlight=False)

@@ -1,0 +1,198 @@
+"""Findings of a diagnosis as changes of an MJCF file, priors, networks and ranges."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+from arm import ARM, NOISE_RAD, make_machine, record_arm, rub
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.record import write_recording
+from brokk_rl.session import Session
+from diagnosis import api
+from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
+from diagnosis.closure import Estimate
+from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
+
+DELAY_S, FRICTION_NM = 0.06, 0.5
+
+
+def estimate(value: float, half: float) -> Estimate:
+    """Returns a number with its interval."""
+    return Estimate(value, (value - half, value + half))
+
+
+def name_effects() -> Answer:
+    """Returns a diagnosis that names a delay, friction at the elbow, and play at the shoulder."""
+    part = FRICTION_NM / (30 * 0.05 * 3.0)  # of kp times 5 % of the travel
+    parameters: dict[str, Any] = {
+        "dead_time": {
+            "dead_time_s": {name: estimate(DELAY_S, 0.004) for name in ("shoulder", "elbow")}
+        },
+        "joint_friction": {"part": {"elbow": estimate(part, 0.01)}},
+        "backlash": {"gap_rad": {"shoulder": estimate(0.03, 0.01)}},
+    }
+    closed = {"dead_time": 0.7, "joint_friction": 0.2, "backlash": 0.05}
+    selected = []
+    for name, numbers in parameters.items():
+        (values,) = numbers.values()
+        selected.append(
+            Selected(
+                effect=name,
+                joints=tuple(values),
+                probability=0.9,
+                parameters=numbers,
+                gap_closed=estimate(closed[name], 0.05),
+            )
+        )
+    return Answer(
+        verdict="effects",
+        selected=tuple(selected),
+        ranking=(Ranked("dead_time", (), 0.9),),
+        where=Where({}, (), None),
+        gap=None,
+        rivals={},
+        next_experiment=None,
+        reason="test",
+    )
+
+
+def change_arm(folder: Path, networks: bool) -> dict[str, Any]:
+    """Returns `changes.json` of the arm with delay and friction, replayed on two recordings."""
+    machine = make_machine("shoulder", "elbow")
+    for seed in range(2):
+        write_recording(
+            record_arm(machine, rub, round(DELAY_S / machine.period_s), seed),
+            folder / f"{seed}.parquet",
+        )
+    (folder / "arm.xml").write_text(ARM)
+    name_effects().write(folder / ANSWER_FILE)
+    why = {
+        "success": {
+            "as_trained": {"mean": 0.9},
+            "with_dead_time": {"mean": 0.7},
+            "with_joint_friction": {"mean": 0.3},
+        },
+        "effects": [{"effect": name} for name in ("dead_time", "joint_friction", "backlash")],
+    }
+    (folder / "why.json").write_text(json.dumps(why))
+    ChangeSimulator(
+        session=Session(out=str(folder / "out"), seed=0, device="cpu"),
+        machine=machine,
+        simulator=str(folder / "arm.xml"),
+        own=api._load_option("actuator", "own"),
+        changes=ChangeRequest(
+            diagnosis=str(folder),
+            recordings=str(folder / "*.parquet"),
+            why=str(folder / "why.json"),
+            networks=networks,
+        ),
+    ).run()
+    return json.loads((folder / "out" / "changes.json").read_text())
+
+
+def test_the_changed_file_is_the_faulty_machine(tmp_path: Path) -> None:
+    told = change_arm(tmp_path, networks=False)
+    text = (tmp_path / "out" / "changed.xml").read_text()
+    assert "<!-- joint_friction: frictionloss 0 to 0.5 [" in text
+    assert "Not in this file: backlash: MJCF has no play on a target" in text
+    model = mujoco.MjModel.from_xml_string(text)
+    assert model.dof_frictionloss.tolist() == [0.0, pytest.approx(FRICTION_NM)]
+    assert model.actuator_delay.tolist() == [DELAY_S, DELAY_S]
+    assert min(told["replay"]["before"].values()) > 100 * NOISE_RAD
+    # MuJoCo begins a run with an empty buffer of commands; the warm-up fills it.
+    assert max(told["replay"]["after"].values()) < 8 * NOISE_RAD
+    ranges = json.loads((tmp_path / "out" / "randomisation.json").read_text())
+    ranked = list(dict.fromkeys(one["effect"] for one in ranges))
+    assert ranked == ["joint_friction", "dead_time", "backlash"]  # by success, then by the gap
+    nodes = yaml.safe_load((tmp_path / "out" / "randomisation.yaml").read_text())
+    assert nodes["dead_time"]["dead_time_s"]["elbow"] == [0.048, 0.072]
+    assert "joint_friction" not in nodes
+    path = tmp_path / "alone.yaml"
+    path.write_text(yaml.safe_dump(nodes["dead_time"]))
+    assert api._load_option("effect", path).joints == ("shoulder", "elbow")
+
+
+def test_priors_write_themselves_into_a_spec(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sysid = pytest.importorskip("mujoco.sysid")
+    if not hasattr(sysid, "Parameter"):
+        pytest.skip("needs mujoco[sysid]")
+    change_arm(tmp_path, networks=False)
+    found = importlib.util.spec_from_file_location(
+        "sysid_parameters", tmp_path / "out" / "sysid_parameters.py"
+    )
+    assert found and found.loader
+    module = importlib.util.module_from_spec(found)
+    monkeypatch.setitem(sys.modules, "sysid_parameters", module)
+    found.loader.exec_module(module)
+    parameters = module.build_parameters()
+    spec = mujoco.MjSpec.from_string(ARM)
+    for one in parameters.parameters.values():
+        one.apply_modifier(spec)
+    model = spec.compile()
+    changed = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "changed.xml"))
+    assert model.dof_frictionloss.tolist() == pytest.approx(changed.dof_frictionloss.tolist())
+    assert model.actuator_delay.tolist() == pytest.approx(changed.actuator_delay.tolist())
+    lower, upper = parameters.get_bounds()
+    assert (np.asarray(lower) < np.asarray(upper)).all()
+
+
+@pytest.mark.slow
+def test_networks_drive_the_file_as_its_drives_do(tmp_path: Path) -> None:
+    told = change_arm(tmp_path, networks=True)
+    for one in told["networks"]:
+        errors = one["rmse_to_changed_file"]
+        assert errors["network"] < 0.05 * errors["unchanged_file"]
+    folder = tmp_path / "out" / "networks"
+    contract = json.loads((folder / "elbow.json").read_text())
+    files: dict[str, Any] = {"contract.json": ""}
+    network = torch.jit.load(str(folder / "elbow.pt"), _extra_files=files)
+    assert json.loads(files["contract.json"]) == contract
+    # A target 0.01 rad ahead for as long as the history reaches: kp 30 Nm/rad holds it.
+    length = contract["history_length"]
+    row = np.concatenate([np.full(length, 0.01 * contract["pos_scale"]), np.zeros(length)])
+    given = torch.as_tensor(row, dtype=torch.float32)[None]
+    torque_nm = float(network(given)) * contract["torque_scale"]
+    assert torque_nm == pytest.approx(0.3, abs=0.05)
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(str(folder / "elbow.onnx"))
+    (answer,) = session.run(None, {"input": given.numpy()})
+    assert float(answer[0, 0]) == pytest.approx(float(network(given)), abs=1e-5)
+    properties = session.get_modelmeta().custom_metadata_map
+    assert json.loads(properties["metadata"]) == contract
+
+
+def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
+    none = Answer(
+        verdict="none",
+        selected=(),
+        ranking=(),
+        where=Where({}, (), None),
+        gap=None,
+        rivals={},
+        next_experiment=None,
+        reason="test",
+    )
+    none.write(tmp_path / ANSWER_FILE)
+    (tmp_path / "arm.xml").write_text(ARM)
+    mode = ChangeSimulator(
+        session=Session(out=str(tmp_path / "out"), seed=0, device="cpu"),
+        machine=make_machine("shoulder", "elbow"),
+        simulator=str(tmp_path / "arm.xml"),
+        own=api._load_option("actuator", "own"),
+        changes=ChangeRequest(diagnosis=str(tmp_path), recordings=None, why=None, networks=False),
+    )
+    with pytest.raises(ConfigError, match="its verdict is 'none', so there is nothing to change"):
+        mode.run()
+    assert not (tmp_path / "out").exists()
