@@ -55,6 +55,7 @@ class MessageReader:
         self._label_keys: list[Keys] | None = None
         self._leaves: dict[tuple[Any, ...], dict[str, Keys]] = {}
         self._plans: dict[tuple[Any, ...], list[tuple[Keys, list[str | int]]]] = {}
+        self._stamps: list[int] = []
 
     def find_numbers(self, message: Any) -> dict[str, Keys]:
         """Return the numbers in a message by their names; known from an earlier one of its kind."""
@@ -68,6 +69,7 @@ class MessageReader:
         labels = self._read_labels(message)
         if labels not in self._plans:
             self._plans[labels] = _plan_reading(self.find_numbers(message), names)
+            self._stamps = [at for at, name in enumerate(names) if name.endswith("stamp")]
         values: list[float | None] = []
         for parent_keys, keys in self._plans[labels]:
             parent = _follow(message, parent_keys)
@@ -79,9 +81,8 @@ class MessageReader:
             except (KeyError, IndexError, TypeError, AttributeError):
                 several = [_follow(parent, (key,)) for key in keys]
             values += several
-        for at, name in enumerate(names):
-            if name.endswith("stamp"):
-                values[at] = _read_time(values[at])
+        for at in self._stamps:
+            values[at] = _read_time(values[at])
         return values
 
     def _read_labels(self, message: Any) -> tuple[Any, ...]:

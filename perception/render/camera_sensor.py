@@ -200,6 +200,7 @@ class MosaicSensor:
         bits: Of the converter.
         red_gain: White balance of red: green photosites see so much more.
         blue_gain: Likewise of blue.
+        exposure: Exposure of both cameras relative to the one that the scene asks for.
         gain_std: Standard deviation of each camera's exposure, relative.
         color_std: Standard deviation of each camera's gains of red and blue, relative.
         focus_px: Standard deviation of the defocus of each lens.
@@ -216,6 +217,7 @@ class MosaicSensor:
     bits: int
     red_gain: Range
     blue_gain: Range
+    exposure: Range
     gain_std: float
     color_std: float
     focus_px: Range
@@ -231,10 +233,12 @@ class MosaicSensor:
         return (self.gamma[0] + self.gamma[1]) / 2
 
     def check(self) -> None:
-        if min(self.full_well_e[0], self.gamma[0], self.red_gain[0], self.blue_gain[0]) <= 0:
-            raise ConfigError(
-                "rig.sensor: expected full_well_e, gamma, red_gain and blue_gain above 0"
-            )
+        for name in ("full_well_e", "gamma", "red_gain", "blue_gain", "exposure"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise ConfigError(
+                    f"rig.sensor.{name}: expected 0 < lowest <= highest, got {low} and {high}"
+                )
         if not 1 <= self.jpeg_quality[0] <= self.jpeg_quality[1] <= 100:
             raise ConfigError(
                 f"rig.sensor.jpeg_quality: expected 1 <= lowest <= highest <= 100, got "
@@ -266,12 +270,14 @@ class MosaicSensor:
             "sharpening": pair.uniform(*self.sharpening),
             "jpeg_quality": int(pair.integers(self.jpeg_quality[0], self.jpeg_quality[1] + 1)),
         }
+        # How bright a picture is depends on the scene, whichever camera takes it.
+        exposure = generator.uniform(*self.exposure)
         own = []
         for _ in range(2):
             error = np.exp(self.color_std * pair.standard_normal(2))
             own.append(
                 {
-                    "gain": float(np.exp(self.gain_std * pair.standard_normal())),
+                    "gain": exposure * float(np.exp(self.gain_std * pair.standard_normal())),
                     "color_error": (float(error[0]), 1.0, float(error[1])),
                     "focus_px": pair.uniform(*self.focus_px),
                     "pattern": int(pair.integers(1 << 31)),

@@ -44,7 +44,8 @@ def test_opencv_finds_every_corner_at_its_place_on_the_page() -> None:
     )
     found, numbers, _, _ = cv2.aruco.CharucoDetector(drawn).detectBoard(page)
     assert len(numbers) == (board.columns - 1) * (board.rows - 1)
-    corners_m = np.asarray(drawn.getChessboardCorners())[numbers[:, 0]][:, :2]
+    all_m: Any = np.asarray(drawn.getChessboardCorners())
+    corners_m = all_m[numbers[:, 0]][:, :2]
     # pixel centres lie half a pixel in; the detector refines to a tenth of a pixel
     np.testing.assert_allclose(found[:, 0], 2000 * (corners_m + 0.03) - 0.5, atol=0.6)
 

@@ -425,7 +425,9 @@ def test_a_sensor_draws_one_pair_for_a_seed_and_another_for_each_frame() -> None
     assert first == sensor.draw_pair(np.random.default_rng(3))
     one = replace(sensor, seed=5)
     first, second = one.draw_pair(chance), one.draw_pair(chance)
-    assert replace(first[1], motion_px=(0, 0)) == replace(second[1], motion_px=(0, 0))
+    still = {"motion_px": (0.0, 0.0), "gain": 1.0}  # these belong to the frame
+    assert replace(first[1], **still) == replace(second[1], **still)
+    assert first[0].gain / first[1].gain == pytest.approx(second[0].gain / second[1].gain)
     with pytest.raises(ConfigError, match="jpeg_quality"):
         replace(sensor, jpeg_quality=(0, 90))
 

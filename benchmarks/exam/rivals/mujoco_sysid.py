@@ -255,8 +255,8 @@ def fit_kinematics(arm: Arm, windows: Windows) -> tuple[ParameterDict, Errors]:
     return found, compute_errors(found, result.jac, residual)
 
 
-def find_changes(case: Path, arm: Arm) -> list[Change]:
-    """Return all numbers of the field beside those of the reference."""
+def find_changes(case: Path, arm: Arm) -> tuple[list[Change], dict[str, list[float]]]:
+    """Return the changes from reference to field, and both parameter vectors."""
     absl_logging.set_verbosity(absl_logging.ERROR)
     halves = {
         "reference": read_windows(case / "reference", arm, REFERENCE_STRIDE_S),
@@ -298,7 +298,24 @@ def find_changes(case: Path, arm: Arm) -> list[Change]:
         changes.append(Change("flow_sharing", "demand", joint, value, away, wide))
     if halves["field"].ee is not None and np.isfinite(halves["field"].ee).all():
         changes += find_kinematic_changes(arm, halves)
-    return changes
+    fitted = {"nominal": nominal.as_vector().tolist(), "present": present.as_vector().tolist()}
+    return changes, fitted
+
+
+def simulate(arm: Arm, windows: Windows, vector: list[float]) -> np.ndarray:
+    """Return the free runs of a parameter vector, `(W, K, J)`."""
+    parameters = list_parameters(arm)
+    parameters.update_from_vector(np.array(vector))
+    model = sysid.apply_param_modifiers(parameters, build_spec(arm))
+    value = {name: parameters[name].value for name in [*STARTS, "demand"]}
+    return WindowRollout(arm, windows).simulate(model, value)
+
+
+def simulate_halves(
+    arm: Arm, windows: Windows, fitted: dict[str, list[float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the free runs of the simulator as built, and as fitted to the field."""
+    return simulate(arm, windows, fitted["nominal"]), simulate(arm, windows, fitted["present"])
 
 
 def find_kinematic_changes(arm: Arm, halves: dict[str, Windows]) -> list[Change]:

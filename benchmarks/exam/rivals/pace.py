@@ -120,8 +120,8 @@ def simulate_vectors(drives: SpeedDrives, vectors: np.ndarray) -> np.ndarray:
     )
 
 
-def find_changes(case: Path, arm: Arm) -> list[Change]:
-    """Return the numbers of the field beside those of the reference."""
+def find_changes(case: Path, arm: Arm) -> tuple[list[Change], dict[str, list[float]]]:
+    """Return the changes from reference to field; the valve curve and the fitted vector."""
     absl_logging.set_verbosity(absl_logging.ERROR)
     reference = read_windows(case / "reference", arm, REFERENCE_STRIDE_S)
     field = read_windows(case / "field", arm, FIELD_STRIDE_S)
@@ -143,4 +143,16 @@ def find_changes(case: Path, arm: Arm) -> list[Change]:
         away = float(round(found[-1])) * arm.period_s / STEPS
         changes.append(Change("dead_time", "dead_time_s", joint, max(away, 0.0), away, 1.0))
         changes.append(Change("encoder_bias", "bias_rad", joint, bias[j], bias[j], 1.0))
-    return changes
+    return changes, {"nominal": fitted.as_vector().tolist(), "present": found.tolist()}
+
+
+def simulate_halves(
+    arm: Arm, windows: Windows, fitted: dict[str, list[float]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the free runs of the simulator as built, and as fitted to the field."""
+    parameters = mujoco_sysid.list_parameters(arm)
+    parameters.update_from_vector(np.array(fitted["nominal"]))
+    nominal = {name: parameters[name].value.copy() for name in [*mujoco_sysid.STARTS, "demand"]}
+    before = mujoco_sysid.simulate(arm, windows, fitted["nominal"])
+    drives = SpeedDrives(arm, windows, nominal)
+    return before, simulate_vectors(drives, np.array(fitted["present"])[None])[0]

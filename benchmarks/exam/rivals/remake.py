@@ -12,13 +12,15 @@ import sys
 from pathlib import Path
 
 import hydra
+import yaml
 from hydra.utils import instantiate
 
 from brokk_rl.extensions import register_options
 from brokk_rl.progress import ItemProgress
-from brokk_rl.session import write_json
+from brokk_rl.session import write_json, write_text
 from exam import dataset
-from exam.generate import CaseRecorder, restrict_machine
+from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
+from exam.run_cases import MACHINE_FILE, describe_spec
 
 
 def main(opened: Path, num_cases: int, folder: Path) -> None:
@@ -43,7 +45,8 @@ def main(opened: Path, num_cases: int, folder: Path) -> None:
         settings.approach,
         restrict_machine(mode.machine, published["known"]),
     )
-    halves = {name: getattr(settings, name) for name in ("reference", "field", "withheld")}
+    names: tuple[Half, ...] = ("reference", "field", "withheld")
+    halves: dict[Half, HalfPlan] = {name: getattr(settings, name) for name in names}
     questions = mode.questions(published["salt"])[:num_cases]
     cases = dataset.CaseSet(recorder, questions, halves, mode.machine, folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -57,6 +60,8 @@ def main(opened: Path, num_cases: int, folder: Path) -> None:
     facts["num_cases"] = num_cases
     sealed = dataset.seal_labels(folder, {**facts, "cases": labels}, published["salt"])
     write_json(folder / "exam.json", {**facts, "labels_sha256": sealed})
+    known = restrict_machine(mode.machine, published["known"])
+    write_text(folder / MACHINE_FILE, yaml.safe_dump(describe_spec(known), sort_keys=False))
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """A rival answers one case: `python sit.py <rival> <case> <out> <machine.yaml>`.
 
 The exam starts it as a candidate's program. It writes `changes.json`, every number that the rival
-fitted, and `diagnosis.json` and `effects.yaml` by the rule of `rules.json`.
+fitted, `fitted.json`, its parameter vectors, and by the rule of `rules.json` `diagnosis.json` and
+`effects.yaml`.
 """
 
 from __future__ import annotations
@@ -20,8 +21,9 @@ NO_RULE = {"spreads": {}, "threshold": float("inf")}
 
 def main(rival: str, case: Path, out: Path, machine: Path) -> None:
     """Fit, write all changes, name some of them."""
-    changes = importlib.import_module(rival).find_changes(case, read_arm(machine))
+    changes, fitted = importlib.import_module(rival).find_changes(case, read_arm(machine))
     write_changes(changes, out)
+    (out / "fitted.json").write_text(json.dumps(fitted) + "\n")
     rules = json.loads(RULES_FILE.read_text()) if RULES_FILE.is_file() else {}
     rule = rules.get(rival)
     if rule is None:  # before a rule is chosen

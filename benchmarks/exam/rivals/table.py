@@ -116,6 +116,7 @@ def summarise(
         false += len(one.named) - len(one.hits)
     row["effects_named"] = {"value": hits, "of": there}
     row["names_false"] = {"value": false, "of": len(labels)}
+    row["names_f1"] = round(2 * hits / max(there + hits + false, 1), 3)
     closed = [one["closed"] for one in examined.values() if one["closed"] is not None]
     # a repair that makes the error many times larger counts as one that doubles the gap
     row["closed_mean"] = float(np.mean(np.clip(closed, -1.0, 1.0))) if closed else None
@@ -158,11 +159,13 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
         of_machine=[n for n, one in settings.mix.troubles.items() if one.joints == "all"],
         oracle={},
     )
-    examined = scoring.examine(folders, work / "examined.json", 1)
+    # numbers taken as they are repair the rival's own simulator only: `own_gap.py`
+    repairs = {name: folder for name, folder in folders.items() if "as fitted" not in name}
+    examined = scoring.examine(repairs, work / "examined.json", 1)
     rows, chosen = {}, {label["case"] for label in sat}
     for name, folder in folders.items():
-        table = scoring.build_table(folder, examined[name])
-        shares = {case: one for case, one in examined[name].items() if case in chosen}
+        table = scoring.build_table(folder, examined.get(name, {}))
+        shares = {case: one for case, one in examined.get(name, {}).items() if case in chosen}
         rows[name] = summarise(table, folder, sat, shares, scoring)
     kinds: dict[str, int] = {}
     for label in sat:
@@ -188,7 +191,11 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
 
 
 if __name__ == "__main__":
+    exam, opened, work, out = map(Path, sys.argv[1:5])
     main(
-        *map(Path, sys.argv[1:5]),
+        exam,
+        opened,
+        work,
+        out,
         {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[5:])},
     )

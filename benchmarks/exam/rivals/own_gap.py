@@ -1,0 +1,64 @@
+"""Share of the gap that a rival closes in its own simulator, with everything it fitted.
+
+    python benchmarks/exam/rivals/own_gap.py <exam> <out.json> mujoco_sysid=<answers> pace=<answers>
+
+Free runs of 5 s over the withheld recordings, as the exam's examiner has them: before is the rival's
+simulator as fitted to the reference, after as fitted to the field, floor the first against the same
+machine without the cause. No name of an effect counts here. Runs in the rivals' environment.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+from case_data import Arm, Windows, read_arm, read_windows
+
+STRIDE_S = 2.5
+MIN_GAP_RATIO = 1.05
+"""As in `exam.examiner`: distance of windows, and error over floor from which there is a gap."""
+
+
+def measure_error(paths: np.ndarray, windows: Windows) -> float:
+    """Return the root mean square error over all joints, rad."""
+    return float(np.sqrt(np.square(paths - windows.q[:, 1:]).mean()))
+
+
+def close_gap(rival: str, exam: Path, case: str, answer: Path, arm: Arm) -> dict[str, float | None]:
+    """Return before, after, floor and closed share of one case."""
+    module = importlib.import_module(rival)
+    fitted = json.loads((answer / "fitted.json").read_text())
+    withheld = read_windows(exam / "withheld" / case, arm, STRIDE_S)
+    unchanged = read_windows(exam / "withheld" / case / "unchanged", arm, STRIDE_S)
+    before, after = (
+        measure_error(paths, withheld) for paths in module.simulate_halves(arm, withheld, fitted)
+    )
+    floor = measure_error(module.simulate_halves(arm, unchanged, fitted)[0], unchanged)
+    closed = None
+    if before >= MIN_GAP_RATIO * floor:
+        gap = max(before - floor, (1.0 - 1.0 / MIN_GAP_RATIO) * before)
+        closed = (before - after) / gap
+    return {"before": before, "after": after, "floor": floor, "closed": closed}
+
+
+def main(exam: Path, out: Path, rivals: dict[str, Path]) -> None:
+    """Write the shares of all cases with one or several effects."""
+    arm, found = read_arm(exam / "machine.yaml"), {}
+    for label in json.loads((exam / "labels.sealed.json").read_text())["cases"]:
+        for rival, answers in rivals.items():
+            place = answers / label["case"]
+            if label["kind"] in ("one", "several") and (place / "fitted.json").is_file():
+                found.setdefault(rival, {})[label["case"]] = close_gap(
+                    rival, exam, label["case"], place, arm
+                )
+    out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(
+        *map(Path, sys.argv[1:3]),
+        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[3:])},
+    )
