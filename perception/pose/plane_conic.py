@@ -172,7 +172,14 @@ class PlaneConicEstimator:
         both = alignment.crop_pair(frame, gray, face.m, row, face.extent)
         if both is not None:
             agreed = alignment.align_plane(
-                both, face, frame, allowed, row, s.inner, s.cell_px, s.matcher_bias_per_m
+                both,
+                face,
+                frame,
+                allowed,
+                row,
+                s.inner,
+                s.cell_px,
+                s.matcher_bias_per_m * frame.depth_shrink,
             )
             # `None` says that the pictures disagree: then parallax means nothing either.
             both, face = (None, face) if agreed is None else (both, agreed)
@@ -211,7 +218,8 @@ class PlaneConicEstimator:
             return Rejection("pose", reason, face.sigma, s.noise_limit_per_m, ellipse)
         # Errors of neighbouring pixels are alike, so the count of pixels overstates the
         # precision.
-        return replace(face, cov=face.cov * s.matcher_alike)
+        # Those of a coarse match grow with its pixels.
+        return replace(face, cov=face.cov * s.matcher_alike * frame.depth_shrink**2)
 
     def _fit_circle(
         self,
