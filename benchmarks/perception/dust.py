@@ -24,7 +24,7 @@ from table import build_finder, renderer, scenes
 
 from brokk_rl.contracts.vision import Rejection
 from brokk_rl.session import Session
-from brokk_rl.signals import Frame
+from perception.benchmark.scoring import make_frame
 from perception.dataset import TrueCircle
 from perception.pose.appearance import IN_DUST
 from perception.render.scene_ranges import SceneRanges
@@ -65,16 +65,7 @@ def judge_scene(
     studio, generator = renderer(condition, distance_m), session.generator(f"scene/{number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
-    frame = Frame(
-        color=shot.color,
-        depth_m=shot.depth_m,
-        camera_matrix=studio.rig.left.matrix,
-        base_from_camera=studio.rig.base_from_camera,
-        t_s=0.0,
-        right=shot.right,
-        baseline_m=studio.rig.baseline_m,
-        disparity_std_px=0.0,
-    )
+    frame = make_frame(shot, studio.rig, 0.0)
     found = build_finder(REFUSE_ALL).find(frame)
     kind = CONDITIONS[condition]
     rows = []
