@@ -2,9 +2,10 @@
 
     python benchmarks/exam/rivals/table.py <exam> <opened> <work> <out.json> mujoco_sysid=<answers> pace=<answers>
 
-What they fitted stands in `changes_<rival>.jsonl` beside it. `<exam>` is what `remake.py` wrote from `<opened>`. Each rival has two rows: names by the rule of
-`rules.json`, and all fitted numbers taken as they are. Scores and the closed share are those of
-`mode=exam`; what was examined already stays in `<work>`.
+What they fitted stands in `changes_<rival>.jsonl` beside it. `<exam>` is what `remake.py` wrote
+from `<opened>`. Each rival has two rows: names by the rule of `rules.json`, and all fitted numbers
+taken as they are. Scores and the closed share are those of `mode=exam`; what was examined already
+stays in `<work>`.
 """
 
 from __future__ import annotations
