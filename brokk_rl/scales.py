@@ -11,7 +11,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 
-Scale = Literal["", "travel", "speed", "time", "reach"]
+Scale = Literal["", "travel", "speed", "time", "reach", "force", "viscosity"]
 """Property of a joint or machine in proportion to which a number grows; empty for none."""
 
 # machine=brokk170: medians over its joints, and its own times and lengths.
@@ -38,6 +38,10 @@ def measure_scale(machine: Machine, scale: Scale) -> np.ndarray:
         return machine.max_speed / REFERENCE_SPEED
     if scale == "time":
         return np.array([measure_time_scale(machine)])
+    if scale == "force":  # of joints commanded by torque: the reference is a drive of 1 N …
+        return machine.max_force
+    if scale == "viscosity":  # … at 1 m/s
+        return machine.max_force / machine.max_speed
     if scale == "reach":
         return np.array([_measure_reach_m(machine) / REFERENCE_REACH_M])
     return np.ones(1)

@@ -67,6 +67,7 @@ class Frame:
             and slopes per unit of x / z and y / z. `depth_m` is free of it, `right` still has it.
         gamma: Exponent of the camera's tone curve: values are light to the power 1 / gamma. 1 for
             linear pictures; real cameras have about 2.2.
+        depth_shrink: Pixels of the picture to one for which depth was measured, in each direction.
     """
 
     color: np.ndarray
@@ -82,3 +83,4 @@ class Frame:
     disparity_std_px: float | None = None
     disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gamma: float = 1.0
+    depth_shrink: int = 1

@@ -35,7 +35,7 @@ from diagnosis.modes.diagnose import Diagnose, DiagnosisSubject
 
 EXCITATIONS = ("levels", "sine", "ramps", "holds", "reversals", "staircase")
 """Experiments that a diagnosis may propose, as in `conf/mode/diagnose.yaml`."""
-FITS = {"speed": "valve", "position": "servo"}
+FITS = {"speed": "valve", "position": "servo", "torque": "force"}
 """Fit of each command interface."""
 HELD_OUT = 4
 """One recording in so many stops a fit."""
@@ -81,7 +81,8 @@ def identify(
     Args:
         recordings: Two or more.
         folder: Where `<name>.yaml` or the weights go.
-        fit: Option of `fit`; `None`: `valve`, or `servo` for joints commanded by position.
+        fit: Option of `fit`; `None`: `valve`; `servo` or `force` for joints commanded
+            by position or torque.
         seed: Of all random numbers.
 
     Raises:

@@ -49,10 +49,6 @@ class GapCase:
     def doubts(self) -> list[str]:
         """Return reasons why these recordings cannot tell anything, in words for people; none where they can."""
         found = []
-        if self.machine.interface == "torque":
-            found.append(
-                "no effect of the library is one of joints commanded by torque; fit=force measures mass and friction"
-            )
         total_s = sum(recording.duration_s for recording in self.field)
         horizon_s = choose_horizon_s(self.machine)
         least_s = MIN_TOTAL_RUNS * horizon_s

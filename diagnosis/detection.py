@@ -24,6 +24,7 @@ from diagnosis import (
 )
 from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
+from diagnosis.drive_numbers import propose_drive_effects
 from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.refine import FittedSet, fit_set
 from diagnosis.request import Penalties
@@ -185,6 +186,8 @@ class EffectSearch:
         shown, proposed = [], []
         if self.curves is not None:
             proposed = shown_effects.propose_effects(self.curves, self.kinds, self.case.machine)
+            if self.case.machine.interface == "torque":
+                proposed = propose_drive_effects(self.base, self.kinds, self.case.machine)
             parts = (effects.rays, effects.shapes, search.fitted, price)
             shown = shown_effects.fit_shown_effects(residuals, proposed, *parts)
         if shown:

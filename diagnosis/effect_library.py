@@ -33,6 +33,7 @@ log = logging.getLogger(__name__)
 
 SIDE_ORDER = {
     "simulator": -1,
+    "drive": -1,
     "joints": 0,
     "speed": 1,
     "command": 2,
@@ -75,9 +76,10 @@ class EffectType:
         return self.target.stage
 
     @property
-    def order(self) -> tuple[int, int]:
+    def order(self) -> tuple[int, int, int]:
         """Place from the machine outwards."""
-        return SIDE_ORDER.get(self.target.side, 3), int(self.target.stage == "timing")
+        side = SIDE_ORDER.get(self.target.side, 3)
+        return side, int(self.target.stage == "timing"), getattr(self.target, "layer", 0)
 
     @property
     def running(self) -> str | None:
@@ -173,6 +175,8 @@ def load_effects(
         target = getattr(target, "find_variant", lambda _, own=target: own)(machine)
         if target is not None:
             found[option.name] = EffectType(option.name, target, machine)
+    if hasattr(simulator, "list_effects"):  # it has such numbers of its own, not those of a drive
+        found = {name: kind for name, kind in found.items() if kind.target.side != "drive"}
     inside = getattr(simulator, "list_effects", dict)()
     for name, target in inside.items():
         found[name] = EffectType(name, target, machine)
@@ -222,7 +226,10 @@ def _check_simulable(kind: EffectType, machine: Machine) -> None:
 
 
 class StationaryModel:
-    """A machine that does not move."""
+    """A machine that does not move; changes of a drive do nothing to it."""
+
+    def __init__(self) -> None:
+        self.drive_changes: dict[str, torch.Tensor] = {}
 
     @property
     def state(self) -> dict[str, torch.Tensor]:

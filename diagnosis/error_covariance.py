@@ -110,6 +110,34 @@ class LevelCovariance(ErrorCovariance):
         return level
 
 
+@dataclass(frozen=True)
+class ForceCovariance(ErrorCovariance):
+    """Covariance of increments where a command sets a force, so that errors of force add up twice.
+
+    An error of the speed at the beginning stays; one of the force adds to it in each step and
+    forgets over `memory` increments. Neither depends on the motion: friction is wrong at rest too.
+
+    Attributes:
+        start: Standard deviation of an increment through the speed at the beginning, rad or m.
+        push: That through the force of one step, rad or m.
+        window: Increments in a window; each window begins anew.
+    """
+
+    start: float = 0.0
+    push: float = 0.0
+    window: int = 1
+
+    def covariance(self, increments: np.ndarray) -> np.ndarray:
+        """Return the covariance of increments in a row, `(B, S, S)`; see `ErrorCovariance`."""
+        size = increments.shape[1]
+        number = np.arange(size) // self.window
+        same = number[:, None] == number
+        summed = np.tril(same).astype(float)
+        forced = self.push**2 * (summed @ (self.remember(size) * same) @ summed.T)
+        one = self.start**2 * same + forced + self.sensor**2 * np.eye(size)
+        return np.broadcast_to(one, (len(increments), size, size))
+
+
 def _count_between(size: int) -> np.ndarray:
     """Return how many increments lie between two of `size` in a row, `(S, S)`."""
     return np.abs(np.subtract.outer(np.arange(size), np.arange(size)))
@@ -176,7 +204,36 @@ def fit_joint_noise(
     error, moved = join_windows(errors), join_windows(motions)
     if machine.interface == "position":
         return fit_level_noise(error, moved, errors[0].shape[1])
+    if machine.interface == "torque":
+        return fit_force_noise(error, errors[0].shape[1])
     return fit_noise(error, moved)
+
+
+def fit_force_noise(error: np.ndarray, window: int) -> ForceCovariance:
+    """Return the noise of one joint that is commanded by a force; see `fit_noise`.
+
+    Args:
+        error: Increments of the error, windows in a row, `(W, I)`.
+        window: Increments in a window.
+    """
+    typical = max(1.4826 * np.median(np.abs(error)), MIN_TYPICAL_ERROR * np.sqrt(np.mean(error**2)))
+    typical += 1e-12
+    error = np.clip(error, -12.0 * typical, 12.0 * typical)
+
+    def build(x: np.ndarray) -> ForceCovariance:
+        sensor, start, push, memory = np.exp(x)
+        return ForceCovariance(sensor, 0.0, 0.0, memory, 0.0, start, push, window)
+
+    def minus_log(x: np.ndarray) -> float:
+        factor = np.linalg.cholesky(build(x).covariance(error[:1])[0])
+        z = np.linalg.solve(factor, error.T)
+        return float(compute_loss(z) + len(error) * np.log(np.diagonal(factor)).sum())
+
+    first = np.log([0.3 * typical, 0.5 * typical, typical / window, 5.0])
+    ends = [(typical / 100, 10 * typical)] * 2 + [(typical / 1e4, 10 * typical), (1.0, 200.0)]
+    bounds = [(np.log(low), np.log(high)) for low, high in ends]
+    found = minimize(minus_log, first, method="L-BFGS-B", bounds=bounds, options={"maxiter": 40})
+    return build(found.x)
 
 
 def fit_level_noise(error: np.ndarray, increments: np.ndarray, window: int) -> LevelCovariance:

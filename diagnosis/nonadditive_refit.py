@@ -69,8 +69,10 @@ def is_needed(residuals: Residuals, fitted: FittedSet, promised: float) -> bool:
     Sizes are then far beyond the typical ones, and an effect hides others or gains far less than
     `promised`.
     An effect on the command hides all others: nothing shows within a dead band. A large error of
-    speed hides nothing.
+    speed hides nothing. Mass and friction of a drive are in one differential equation.
     """
+    if any(ray.kind.target.side == "drive" for ray in fitted.rays):
+        return True
     far: list[ParameterRay] = []
     for ray, sizes in zip(fitted.rays, fitted.sizes, strict=True):
         if np.abs(sizes).max() > LARGE_SIZE:

@@ -32,6 +32,7 @@ from diagnosis.effect_library import DetectedEffect, EffectSimulator, EffectType
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.gap import GapClosure, evaluate_unseen
 from diagnosis.hypotheses import MAX_SAME, Choice, Hypothesis
+from diagnosis.motion_delay import measure_motion_delays
 from diagnosis.refine import FittedSet
 from diagnosis.request import Penalties, ProbabilityModel
 from diagnosis.residual_model import CLUES
@@ -46,7 +47,7 @@ by simulation."""
 RIVAL_SHARE = 0.6
 """A rival that earns so much of what a selected effect earns is worth an experiment."""
 CURVE_SEED = 0
-"""Seed for the bootstrap of the speed curves. Draws of later steps stay as they are."""
+"""Seed for the bootstraps of speed curves and delays. Draws of later steps stay as they are."""
 DECIDED_BY = {
     frozenset(
         {"flow_gain", "encoder_scale"}
@@ -154,6 +155,7 @@ class DiagnosisPipeline:
             | self._more(result, weighed, foretold)
             | {"curves": speed_curves.serialize_curves(curves)}
             | {"unknown_remainder": remainder, "reference_error": reach.measure_reference()}
+            | {"motion_delay_s": measure_motion_delays(before, after, machine, CURVE_SEED)}
             | self._unseen(result, seen.fitted),
         )
         return Outcome(answer, before, after, floor)

@@ -21,6 +21,9 @@ from diagnosis.search import MIN_SIZE, EffectSet, PenaltyFunction, Subset
 MAX_FIT_STEPS = 6
 """Steps of a fit at most. It was 4 before; no comparison is recorded."""
 
+DRIVE_FIT_STEPS = 30
+"""The same for mass and friction of a drive: they trade against each other, so the way is long."""
+
 REFIT_STEPS = 2
 """The same for the residuals without some effects, which needs no exact sizes."""
 
@@ -41,8 +44,7 @@ MIN_FIT_GAIN = 0.02
 """Gain in log likelihood below which a fit ends."""
 
 DRAWN, FOLLOWED, SPREAD = 40, 3, 0.5
-"""Starts of a search, those of a joint that are followed, and how far they scatter (of the
-logarithm)."""
+"""Starts of a search, those of a joint that are followed, and their scatter (of the logarithm)."""
 
 MAX_EXTRAPOLATION = 2.5
 """Sizes may grow to so many times the largest that was simulated before."""
@@ -125,9 +127,8 @@ def fit_set(
     """Fit a set of effects by simulation, all sizes of a joint at once.
 
     The fit to all entries begins at the best of several multiples of `start`; those to all but one
-    half begin where it ended, and
-    stay there where their half says nothing: a pump shows its limit only in those parts where many
-    joints move at once.
+    half begin where it ended, and stay there where their half says nothing: a pump shows its limit
+    only in those parts where many joints move at once.
 
     Args:
         residuals: Residuals of the simulator without them.
@@ -140,6 +141,7 @@ def fit_set(
     every = np.ones((1, len(residuals.fold)))
     halves = np.stack([residuals.fold != 0, residuals.fold != 1]).astype(float)
     fit = _Fit(residuals, found, mask)
+    steps = DRIVE_FIT_STEPS if any(r.kind.target.side == "drive" for r in found) else steps
     whole = fit.descended(fit.nearest(sizes)[None], every, steps)
     # Fits to a half begin and are centred at the whole: a half may say nothing about a size.
     apart = fit.descended(np.repeat(whole, 2, 0), halves, max(1, steps // 2), whole)

@@ -219,6 +219,7 @@ def write_report(outcome: Outcome, folder: Path, machine: Machine) -> None:
     _add_effects(page, answer)
     report_checks.add_gates(page, answer)
     _add_errors_by_joint(page, answer, units)
+    report_checks.add_motion_delays(page, answer)
     _add_residual_model(page, more)
     _add_where(page, outcome, machine, units)
     page.add_heading("Measured and simulated")

@@ -47,6 +47,28 @@ def add_gates(page: Report, answer: Answer) -> None:
     page.add_table(["", "finding", "value", "limit"], rows)
 
 
+def add_motion_delays(page: Report, answer: Answer) -> None:
+    """Add the delay from command to motion by cross-correlation, measured and simulated."""
+    told = answer.more.get("motion_delay_s") or {}
+    rows: list[list[str | Cell | None]] = []
+    for joint, one in told.items():
+        if one is None:
+            rows.append([joint, "not told", None, None])
+            continue
+        interval = f"95 %: {1e3 * one['ci95'][0]:.0f} to {1e3 * one['ci95'][1]:.0f}"
+        measured = Cell(f"{1e3 * one['measured']:.0f}", interval)
+        simulated = [one.get(name) for name in ("before", "after")]
+        ends = [None if value is None else f"{1e3 * value:.0f}" for value in simulated]
+        rows.append([joint, measured, *ends])
+    if rows:
+        page.add_table(
+            ["joint", "measured, ms", "simulator as it was, ms", "with the effects, ms"],
+            rows,
+            "Delay from command to motion: the shift at which the speed resembles its command most. Dead time, "
+            "lag, play and one control period add up to it.",
+        )
+
+
 def format_gate(gate: Gate) -> tuple[str | None, str | None]:
     """Return value and limit of a gate as texts."""
     value, limit = (

@@ -174,6 +174,7 @@ def _write(element, joint, attribute, index):
         value = float(parameter.value[0])
         if attribute == "delay":  # its buffer holds the longest delay of the bounds
             owner.nsample = math.ceil(float(parameter.max_value[0]) / spec.option.timestep) + 2
+            owner.interp = 1  # between time steps
         if index is None:
             setattr(owner, attribute, value)
         else:

@@ -26,6 +26,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import rectification, search
+from perception.face_depth import FaceDepth, FaceMatcher
+from perception.pose.appearance import IN_DUST
 from perception.pose.plane_conic import convert_to_gray
 from perception.rectification import RectificationCheck
 
@@ -86,6 +88,10 @@ EXPLANATIONS = {
         "it is hardly darker than the grain of the face",
         "A stain or a shadow.",
     ),
+    IN_DUST: (
+        "dust or haze lies over it, and no light on a wall tells it from a flat dark disc",
+        "Wait for the dust to settle, or look from a place farther aside.",
+    ),
     "mouth probability inside": (
         "the network does not take it for the mouth of a hole",
         "A flat dark disc looks like this.",
@@ -140,6 +146,7 @@ class StagedPerception:
         block_probability: Probability from which a pixel counts as block.
         roi: Search region: the `mask` of the block, or its bounding `box`.
         apart: Holes nearer to each other than this many radii are one; the outer rim wins.
+        faces: Matches candidates again where depth is coarse (`stereo.shrink`); `null` for never.
         rectification: Check of the pair before anything else; `null` for none.
     """
 
@@ -155,6 +162,7 @@ class StagedPerception:
     block_probability: float
     roi: str
     apart: float
+    faces: FaceDepth | None
     rectification: RectificationCheck | None
 
     def check(self) -> None:
@@ -220,6 +228,7 @@ class StagedFinder:
             rejection = Rejection("segment", reason, share, s.smallest_block)
             return FrameDetections([], [rejection], [], masks, ms)
         judged = _Judged([], [], [])
+        finer = s.faces.build(frame, on_block) if s.faces else None
         # Regions take a third of the time of arcs: searched first, they may make arcs needless.
         stages = ("regions", "ellipse") if s.regions_first else ("ellipse", "regions")
         for stage in stages:
@@ -232,7 +241,7 @@ class StagedFinder:
                 else:
                     candidates = self._proposer.propose(frame, masks) if self._proposer else []
             with _time_stage(ms, "pose"):
-                self._judge(frame, masks, candidates, judged)
+                self._judge(frame, masks, candidates, judged, finer)
         found, doubles = self._remove_inner_rims(judged.found)
         rejected = judged.rejected
         if not found and not rejected:
@@ -256,7 +265,12 @@ class StagedFinder:
         return explain_rejection(rejection)
 
     def _judge(
-        self, frame: Frame, masks: Masks, candidates: Sequence[Ellipse], judged: _Judged
+        self,
+        frame: Frame,
+        masks: Masks,
+        candidates: Sequence[Ellipse],
+        judged: _Judged,
+        finer: FaceMatcher | None,
     ) -> None:
         """Add the holes among some candidates, and why the others are none."""
         # The appearance of a place is judged in one stage; its shape may be wrong, and another right.
@@ -271,7 +285,8 @@ class StagedFinder:
                     Rejection("ellipse", reason, float(number), MOST_CANDIDATES, candidate)
                 )
                 continue
-            pose = self._pose.estimate(frame, masks, candidate)
+            seen = finer.match_around(candidate) if finer else frame
+            pose = self._pose.estimate(seen, masks, candidate)
             if isinstance(pose, Rejection):
                 judged.rejected.append(pose)
             else:

@@ -17,12 +17,13 @@ import torch
 from actuators.effects.planned_run import ChainRun
 from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
 from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
+from actuators.models.force_drive import change_drive
 from brokk_rl.contracts.actuator import ActuatorModel, PlannedRun
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
-Side = Literal["command", "speed", "joints", "measurement", "kinematics"]
+Side = Literal["command", "drive", "speed", "joints", "measurement", "kinematics"]
 MOTION: tuple[Side, ...] = ("speed", "joints")
 """Sides that change the increment which the inner model returns."""
 ANY_INTERFACE = frozenset({"speed", "position", "torque"})
@@ -49,6 +50,9 @@ class EffectSpec:
             all commands of a run can be given to it at once.
         recent: Number of newest commands that it looks at, where it changes the newest only and
             asks for no positions but in `begin`; `None`: any. See `EffectChain.plan_run`.
+        drives: Number of the drive that each of its numbers changes; drive side only.
+        layer: Place among the effects of its side, from the machine outwards; a command passes the
+            largest first.
         placed: Whether its `begin` asks for the positions of the joints.
         weighed: Whether it asks for the weight on the joints, where masses are known.
         shared: Whether it has one cause for all joints (frames, clocks), so that it is hardly ever
@@ -71,6 +75,8 @@ class EffectSpec:
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
+    drives: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    layer: ClassVar[int] = 0
     placed: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
     shared: ClassVar[bool] = False
@@ -225,6 +231,9 @@ class EffectChain:
         self._others = {n: e for n, e in reversed(commanding.items()) if not e.delays}
         self.commands: dict[str, Any] = self._others | self._delays
         self.motions: dict[str, Any] = {name: e for name, e in effects.items() if e.side in MOTION}
+        self._drives = {name: e for name, e in effects.items() if e.side == "drive"}
+        for name, effect in self._drives.items():
+            change_drive(inner, effect.drives, self.get_values(name), where)
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
         self.is_weighed = machine.has_bodies and any(e.weighed for e in self.motions.values())
@@ -257,6 +266,8 @@ class EffectChain:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
+        for name, effect in self._drives.items():
+            change_drive(self.inner, effect.drives, self.get_values(name), name)
         if not (self.commands or self.motions):
             return self.inner.step(history)
         fresh = self._fresh

@@ -71,6 +71,7 @@ class TargetLag(EffectSpec):
     time_constant_s: Value
     label: ClassVar = "lag"
     side = "command"
+    layer = 1
     recent = 2
     interfaces = frozenset({"position", "torque"})
     numbers: ClassVar = {
@@ -111,6 +112,7 @@ class Sag(EffectSpec):
     sag_rad: Value
     sag_slope: Value
     side = "command"
+    layer = 2  # of the target: play holds the joint about the target less the sag
     pointwise = True
     interfaces = frozenset({"position"})
     numbers: ClassVar = {

@@ -139,6 +139,8 @@ def log_undetermined(facts: dict[str, Any]) -> None:
         )
 
 
+REFIT_STEPS = 6
+"""Gauss-Newton steps of a refit at most: it begins near its end."""
 ACTIVE_SHARE = 0.1
 """A window says something about a joint that is commanded for so much of it."""
 
@@ -238,7 +240,8 @@ class GreyBoxFit:
             raise RecordingError(
                 f"too little data: joint {joint} is never commanded in the {len(train)} recordings to fit to"
             )
-        held = self._free_runs(machine, validation, self.validation_windows, random, device)
+        judged = validation or train  # a fit to all recordings has none left to choose a start by
+        held = self._free_runs(machine, judged, self.validation_windows, random, device)
         place = folder / f"{self.name}.progress.json"
         search = _Search(self, runs, place, _hash_fit(self, machine, runs, held, seed))
         x = search.choose(search.run(nominal, seed), held)
@@ -263,6 +266,23 @@ class GreyBoxFit:
             ) from failure
         log_undetermined(facts)
         return fitted
+
+    def refit(
+        self, fitted: Actuator, machine: Machine, recordings: Sequence[Recording]
+    ) -> Actuator:
+        """Return `fitted` with its free numbers fitted to other recordings, from where they are."""
+        device = torch.device("cpu")
+        beside = dataclasses.replace(self, actuator=fitted)
+        random = np.random.default_rng(
+            0
+        )  # which windows count, where there are more than `windows`
+        runs = beside._free_runs(machine, recordings, self.windows, random, device)
+        x = beside._nominal(machine, device)
+        for _ in range(REFIT_STEPS):
+            x, gain = take_step(runs, x, self.robust)
+            if gain < self.tolerance:
+                break
+        return dataclasses.replace(fitted, **self._rounded(machine, runs, x))  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def _describe(
         self,

@@ -6,12 +6,14 @@ A command acts for a whole control period. The speed is solved implicitly over t
 friction of any size is stable and Coulomb friction brings a joint exactly to rest.
 """
 
-from typing import ClassVar
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 
 from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import select_commands_in_force
+from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
@@ -60,6 +62,8 @@ class ForceDriveModel:
     Attributes:
         parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
             candidates side by side.
+        drive_changes: Changes of them by effects, `(N, J)` by name: a factor on the mass, force added to
+            the others.
     """
 
     def __init__(
@@ -77,6 +81,7 @@ class ForceDriveModel:
             nominal, config.spread, num_envs, device, "actuator.spread"
         )
         self.parameters = self._parameters.value
+        self.drive_changes: dict[str, torch.Tensor] = {}
         self._period_s = machine.period_s
 
         def tensor(values: object) -> torch.Tensor:
@@ -106,7 +111,7 @@ class ForceDriveModel:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        value, period_s = self.parameters, self._period_s
+        value, period_s = self._change_numbers(), self._period_s
         earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / period_s)
         force = torch.lerp(later, earlier, part) * self._max_force - value["offset_n"]
         q = history.q[:, -1]
@@ -126,7 +131,39 @@ class ForceDriveModel:
         self._fresh.fill_(False)
         return held
 
+    def _change_numbers(self) -> dict[str, torch.Tensor]:
+        """Return the numbers with the changes by effects, `(N, J)`."""
+        value = dict(self.parameters)
+        for name, change in self.drive_changes.items():
+            own = value[name]
+            value[name] = own * change if name == "mass_kg" else own + change
+        return value
+
     @property
     def delay_s(self) -> torch.Tensor:
         """Dead time, `(N, J)`."""
         return self.parameters["dead_time_s"]
+
+
+def change_drive(
+    model: Any, drives: Mapping[str, str], value: Mapping[str, torch.Tensor], where: str
+) -> None:
+    """Write numbers of an effect into the `drive_changes` of the drive within `model`.
+
+    Args:
+        model: The drive, or effects around it.
+        drives: Number of the drive that each number of the effect changes.
+        value: Numbers of the effect, `(N, J)` by name.
+        where: Config node named in messages.
+
+    Raises:
+        ConfigError: the model inside is no drive, so that it has no such number.
+    """
+    while hasattr(model, "inner"):
+        model = model.inner
+    if not hasattr(model, "drive_changes"):
+        raise ConfigError(
+            f"{where}: it changes mass or friction of a drive, and {type(model).__name__} has none; choose actuator=force"
+        )
+    for name, changed in drives.items():
+        model.drive_changes[changed] = value[name]

@@ -8,6 +8,7 @@ The logs are public and none is copied here; `exam/conf/real_machine` says where
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import platform
 import subprocess
@@ -17,6 +18,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow.parquet as pq
 import torch
 
 from brokk_rl import extensions
@@ -25,6 +28,17 @@ from diagnosis import api
 
 PUBLISHED = {"mass_kg": 95.11, "viscous_n_s_m": 203.5, "coulomb_n": 20.39, "offset_n": -3.16}
 """Janot, Gautier and Brunot (2019), from the same experiment."""
+DIAGNOSED = {
+    "mass_kg": ("inertia", "factor"),
+    "viscous_n_s_m": ("viscous_friction", "viscous_n_s_m"),
+    "coulomb_n": ("coulomb_friction", "coulomb_n"),
+    "offset_n": ("force_offset", "offset_n"),
+}
+"""Effect and number that tell each of the published numbers."""
+BASE_MASSES_KG = (100.0, 60.0)
+"""Masses without friction against which the diagnosis is asked: near the truth, and far off."""
+PARTS = 4
+"""Recordings that the log is cut into: a diagnosis needs some that nothing is fitted to."""
 EMPS_FILES = {"emps": ["emps.mat"], "emps_p": ["emps_p.mat"], "both": ["emps.mat", "emps_p.mat"]}
 
 
@@ -53,7 +67,44 @@ def measure_emps(folder: Path) -> dict[str, Any]:
             numbers[key] = {**one, "error": one["value"] / published - 1.0}
         worst = max(abs(one["error"]) for one in numbers.values())
         found[name] = {"numbers": numbers, "worst_error": worst}
-    return {"published": PUBLISHED, "logs": found}
+    field, apart = (read_set("emps", folder, [f"{name}.mat"]) for name in ("emps", "emps_p"))
+    diagnoses = {f"{mass:g} kg": diagnose_emps(mass, field, apart) for mass in BASE_MASSES_KG}
+    return {"published": PUBLISHED, "logs": found, "diagnosis": diagnoses}
+
+
+def diagnose_emps(
+    mass_kg: float, field: api.RecordingSet, apart: api.RecordingSet
+) -> dict[str, Any]:
+    """Return the answer against a mass without friction, and its errors against the published numbers."""
+    parts = []
+    for recording in field.recordings:
+        rows = recording.num_samples // PARTS
+        for part in range(PARTS):
+            mine = slice(part * rows, (part + 1) * rows)
+            t_s = recording.t_s[mine] - recording.t_s[mine][0]
+            named = {**recording.metadata, "run": str(part)}
+            u, q = recording.u[mine], recording.q[mine]
+            parts.append(dataclasses.replace(recording, t_s=t_s, u=u, q=q, metadata=named))
+    simulator = dataclasses.replace(extensions.load_option("actuator", "force"), mass_kg=mass_kg)
+    split = api.RecordingSet(tuple(parts), field.machine)
+    with tempfile.TemporaryDirectory() as out:
+        answer = api.diagnose(split, out, simulator=simulator, unseen=apart).answer
+    told = {one.effect: one for one in answer.selected}
+    numbers = {}
+    for key, (effect, name) in DIAGNOSED.items():
+        if effect not in told:
+            continue
+        value = told[effect].parameters[name]["carriage"].mean
+        value = value * mass_kg if name == "factor" else value
+        numbers[key] = {"value": value, "error": value / PUBLISHED[key] - 1.0}
+    return {
+        "verdict": answer.verdict,
+        "effects": sorted(told),
+        "phantoms": sorted(set(told) - {effect for effect, _ in DIAGNOSED.values()}),
+        "numbers": numbers,
+        "worst_error": max((abs(one["error"]) for one in numbers.values()), default=None),
+        "apart": answer.more["unseen"]["joints"]["carriage"],
+    }
 
 
 def measure_so101(folder: Path) -> dict[str, Any]:
@@ -64,8 +115,31 @@ def measure_so101(folder: Path) -> dict[str, Any]:
         outcome = api.diagnose(field, out, simulator="servo", unseen=apart)
         api.report(outcome, field, out)
         answer = json.loads((Path(out) / "diagnosis.json").read_text())
-    kept = ("verdict", "reason", "selected", "gap", "rivals", "unseen", "gates")
-    return {key: answer.get(key) for key in kept}
+    kept = ("verdict", "reason", "selected", "gap", "rivals", "unseen", "gates", "motion_delay_s")
+    return {key: answer.get(key) for key in kept} | {"row_shift_s": measure_row_shifts(folder)}
+
+
+def measure_row_shifts(folder: Path) -> dict[str, float]:
+    """Return the shift of each joint, s, at which speeds of targets and positions in the rows of the logs agree most.
+
+    The logs are compared as they are, without any part of this project: the delay as SAGE counts it.
+    """
+    shifts = np.arange(20)
+    total: dict[str, np.ndarray] = {}
+    for path in sorted(folder.glob("*.parquet")):
+        log = pq.read_table(path)
+        period_s = float(np.median(np.diff(log["t_state_s"].to_numpy())))
+        for joint in ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll"):
+            target, q = (np.diff(log[f"{name}_{joint}_rad"].to_numpy()) for name in ("target", "q"))
+            last = len(q) - len(shifts)
+            sums = [float(target[:last] @ q[shift : shift + last]) for shift in shifts]
+            total[joint] = total.get(joint, 0.0) + np.array(sums)
+    found = {}
+    for joint, sums in total.items():
+        best = int(np.argmax(sums))
+        low, top, high = sums[best - 1 : best + 2]
+        found[joint] = (best + 0.5 * (low - high) / (low - 2.0 * top + high)) * period_s
+    return found
 
 
 def main() -> None:

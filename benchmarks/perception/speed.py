@@ -60,7 +60,8 @@ def main() -> None:
             start, busy = time.perf_counter(), time.process_time()
             depth_m = match(stereo, frame)
             ms = {"stereo": 1000.0 * (time.perf_counter() - start)}
-            ms |= finder.find(replace(frame, depth_m=depth_m)).ms
+            seen = replace(frame, depth_m=depth_m, depth_shrink=stereo.shrink)
+            ms |= finder.find(seen).ms
             total, spent = time.perf_counter() - start, time.process_time() - busy
             looks.append(
                 [ms.get(stage, 0.0) for stage in STAGES[:-2]] + [1000.0 * total, 1000.0 * spent]

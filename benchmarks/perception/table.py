@@ -7,7 +7,11 @@ Each scene is rendered, looked at and forgotten; what came of it is a line of `<
 Called again, it goes on where it stopped, with more scenes or more options too. Writes
 `table.json`, `table.csv`, `table.png`, the error model for `task.noise` into `noise.json`, and
 pictures of what went wrong, with the reasons, into `failures/`. A fixed seed: the same scenes
-everywhere. Rims as drills leave them, before and after:
+everywhere. An option with `stereo.` settings matches the same pictures again with them:
+
+    python benchmarks/perception/table.py <out> plane_conic 'plane_conic stereo.shrink=4' --count 6
+
+Rims as drills leave them, before and after:
 
     python benchmarks/perception/table.py <out> plane_conic
     'plane_conic perception.proposer=null perception.pose.broken=1'
@@ -24,7 +28,7 @@ import multiprocessing
 import signal
 from collections import defaultdict
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -179,7 +183,7 @@ def look(task: Task) -> list[dict[str, Any]]:
     lines = []
     for option in task.options:
         finder = build_finder(option)
-        tally, found = score_frame(finder, frame, shot.truth)
+        tally, found = score_frame(finder, match_again(option, frame), shot.truth)
         place = {
             "condition": task.condition,
             "distance_m": task.distance_m,
@@ -191,6 +195,18 @@ def look(task: Task) -> list[dict[str, Any]]:
             name = f"{option.replace(' ', '_').replace('/', '-')}_{task.condition}_{task.distance_m:g}m"
             show_failure(task, name, frame, found, finder)
     return lines
+
+
+def match_again(option: str, frame: Frame) -> Frame:
+    """Returns the frame with the depth that an option's own stereo settings give."""
+    overrides = [one for one in option.split() if one.startswith("stereo.")]
+    if not overrides:
+        return frame
+    assert frame.right is not None and frame.baseline_m is not None
+    stereo = composed("stereo", "mode=render", *overrides)
+    focal_px = float(frame.camera_matrix[0, 0])
+    depth_m = stereo.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
+    return replace(frame, depth_m=depth_m, depth_shrink=stereo.shrink)
 
 
 def show_failure(
@@ -223,7 +239,7 @@ def renderer(condition: str, distance_m: float, render: tuple[str, ...]) -> Fram
 
 @functools.cache
 def build_finder(option: str) -> StagedFinder:
-    name, *overrides = option.split()
+    name, *overrides = [one for one in option.split() if not one.startswith("stereo.")]
     return composed(
         "perception", "mode=perceive", f"perception={name}", "perceive.input=.", *overrides
     ).build()

@@ -86,10 +86,15 @@ def check_actuator_model(model: ActuatorModel, machine: Machine, device: torch.d
 
 
 class _Proportional:
-    """The simplest actuator model: speed proportional to the command."""
+    """The simplest actuator model: speed proportional to the command.
+
+    Attributes:
+        drive_changes: Changes by effects on drives, which do nothing to it.
+    """
 
     def __init__(self, machine: Machine, device: torch.device) -> None:
         self.state: dict[str, torch.Tensor] = {}
+        self.drive_changes: dict[str, torch.Tensor] = {}
         self._step = torch.as_tensor(
             machine.max_speed * machine.period_s, dtype=torch.float32, device=device
         )

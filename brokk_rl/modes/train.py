@@ -143,7 +143,7 @@ class Train:
                 runner.run()
             if not group.rank.first:
                 return None
-            _log_success(logger)
+            _log_success(logger, group.rank.count * loop.num_envs * loop.max_episode_length)
             facts = {
                 "env_steps": logger.env_steps,
                 "seconds": logger.seconds,
@@ -297,10 +297,15 @@ class FaultLog:
         return statistics
 
 
-def _log_success(logger: TrainingLogger) -> None:
-    """Log how many seconds of training the levels of success took."""
+def _log_success(logger: TrainingLogger, first_episodes: int) -> None:
+    """Log how many seconds of training the levels of success took.
+
+    Args:
+        logger: Holds the rows of the training.
+        first_episodes: Control steps of the first episodes; see `find_passing`.
+    """
     for level in LEVELS:
-        passed = find_passing(logger.rows, level)
+        passed = find_passing(logger.rows, level, first_episodes)
         text = "not reached" if passed is None else f"after {float(passed['seconds']):.1f} s"
         log.info("strict success of %.2f while learning: %s", level, text)
 

@@ -213,7 +213,8 @@ def _add_delay(to: _Editor) -> str | None:
     if to.get("dead_time_s") < 0.0:
         return "the machine answers sooner than the file; lower its own delay"
     to.write("actuator", "delay", None, "dead_time_s", lambda old, new: old + max(0.0, new))
-    to.drive.nsample = max(to.drive.nsample, math.ceil(to.drive.delay / to.timestep_s) + 1)
+    to.drive.nsample = max(to.drive.nsample, math.ceil(to.drive.delay / to.timestep_s) + 2)
+    to.drive.interp = 1  # a delay that is no multiple of the time step would be rounded up
     return None
 
 
@@ -222,7 +223,15 @@ def _add_lag(to: _Editor) -> str | None:
         return "the drive has dynamics of its own; raise its time constant"
     to.drive.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
     to.drive.dynprm = np.zeros_like(to.drive.dynprm)
-    to.write("actuator", "dynprm", 0, "time_constant_s", lambda old, new: new)
+    # The effect holds each period's last value, half a period ahead of a continuous filter.
+    ahead_s = 0.5 * to.machine.period_s
+    to.write(
+        "actuator",
+        "dynprm",
+        0,
+        "time_constant_s",
+        lambda old, new: max(new - ahead_s, to.timestep_s),
+    )
     return None
 
 

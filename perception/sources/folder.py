@@ -195,7 +195,7 @@ class FolderSource:
                 read_picture(paths[dataset.RIGHT]), str(paths[dataset.RIGHT])
             )
             validation.check_same_size(color, right, str(paths[dataset.RIGHT]), "the right picture")
-        depth = self._depth(stem, color, right, camera)
+        depth, shrink = self._depth(stem, color, right, camera)
         error_px, baseline_m = camera.disparity_error_px, camera.baseline_m
         if any(error_px) and baseline_m is not None:
             depth = correct_depth(depth, camera.matrix, baseline_m, error_px)
@@ -203,13 +203,13 @@ class FolderSource:
             color=color, depth_m=depth, camera_matrix=camera.matrix, base_from_camera=camera.base_from_camera, t_s=t_s,
             distortion=camera.distortion, right=right, baseline_m=camera.baseline_m, name=str(stem), camera_cov=camera.cov,
             disparity_std_px=camera.disparity_std_px, disparity_error_px=error_px,
-            gamma=camera.gamma,
+            gamma=camera.gamma, depth_shrink=shrink,
         )  # fmt: skip
 
     def _depth(
         self, stem: Path, color: np.ndarray, right: np.ndarray | None, camera: CameraModel
-    ) -> np.ndarray:
-        """Return the stored depth of a frame, else that of its two pictures."""
+    ) -> tuple[np.ndarray, int]:
+        """Return the stored depth of a frame, else that of its pair, and its `depth_shrink`."""
         stored = stem.with_name(stem.name + dataset.DEPTH)
         millimetres = stem.with_name(stem.name + dataset.DEPTH_MM)
         least = self._settings.least_known
@@ -222,9 +222,9 @@ class FolderSource:
             )
             found = validation.check_depth(values, str(where), least)
             validation.check_same_size(color, found, str(where), "depth")
-            return found
+            return found, 1
         if self._settings.needs != "depth":
-            return np.full(color.shape[:2], np.nan, np.float32)
+            return np.full(color.shape[:2], np.nan, np.float32), 1
         if right is None:
             raise FrameError(
                 f"{stem}: no depth; expected {stored.name}, {millimetres.name}, or "
@@ -238,7 +238,8 @@ class FolderSource:
         matched = self._settings.stereo.depth_m(
             color, right, float(camera.matrix[0, 0]), camera.baseline_m
         )
-        return validation.check_depth(matched, f"{stem}: matching left and right", least)
+        checked = validation.check_depth(matched, f"{stem}: matching left and right", least)
+        return checked, self._settings.stereo.shrink
 
 
 def _load_array(path: Path) -> np.ndarray:

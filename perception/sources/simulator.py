@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -132,7 +133,8 @@ class SimulatedSource:
         number, rig = self._count, self._settings.rig
         self._count += 1
         shot = self.shot(np.random.default_rng((self._settings.seed, number)))
-        return make_frame(shot, rig, number / self._settings.rate_hz)
+        frame = make_frame(shot, rig, number / self._settings.rate_hz)
+        return replace(frame, depth_shrink=self._settings.stereo.shrink)
 
     def shot(self, noise: np.random.Generator, rig: StereoRig | None = None) -> RenderedFrame:
         """Return the current frame, with its truth.

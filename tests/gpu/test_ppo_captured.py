@@ -15,7 +15,11 @@ from tensordict import TensorDict
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.symmetry import Mirror
 
-pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")]
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:torch"),
+    pytest.mark.filterwarnings("ignore:TensorFloat32:UserWarning"),  # wanted: see rl.tf32
+]
 
 CUDA = torch.device("cuda")
 NUM = 64

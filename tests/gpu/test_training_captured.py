@@ -22,7 +22,11 @@ from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.sim.fault_recorder import load_fault
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
 
-pytestmark = [pytest.mark.gpu, pytest.mark.filterwarnings("ignore::DeprecationWarning:torch")]
+pytestmark = [
+    pytest.mark.gpu,
+    pytest.mark.filterwarnings("ignore::DeprecationWarning:torch"),
+    pytest.mark.filterwarnings("ignore:TensorFloat32:UserWarning"),  # wanted: see rl.tf32
+]
 
 CUDA = torch.device("cuda")
 NUM = 64

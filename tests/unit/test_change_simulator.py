@@ -18,7 +18,8 @@ from arm import ARM, NOISE_RAD, make_machine, record_arm, rub
 from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
 from brokk_rl.session import Session
-from diagnosis import api
+from brokk_rl.sim.mjcf_changes import JointFinding, write_changed_mjcf
+from diagnosis import api, baseline, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
 from diagnosis.closure import Estimate
 from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
@@ -120,6 +121,39 @@ def test_the_changed_file_is_the_faulty_machine(tmp_path: Path) -> None:
     path = tmp_path / "alone.yaml"
     path.write_text(yaml.safe_dump(nodes["dead_time"]))
     assert api._load_option("effect", path).joints == ("shoulder", "elbow")
+
+
+CHANGES: dict[str, dict[str, float]] = {
+    "dead_time": {"dead_time_s": 0.05},
+    "lag": {"time_constant_s": 0.08},
+    "sag": {"sag_rad": 0.05, "sag_slope": 0.04},
+    "drive_gain": {"gain": 0.7},
+    "joint_damping": {"part": 0.3},
+    "joint_armature": {"part": 0.8},
+}
+
+
+def test_a_changed_file_moves_as_the_file_with_the_effect(tmp_path: Path) -> None:
+    machine, source = make_machine("shoulder", "elbow"), tmp_path / "arm.xml"
+    source.write_text(ARM)
+    recording = record_arm(machine, rub, 0, seed=4, seconds=8.0)
+
+    def simulate(path: Path, effects: list[Any]) -> np.ndarray:
+        simulator = api._load_simulator(path)
+        compared = baseline.compare_simulator(simulator, [(recording, 0.0)], machine, 0)
+        return compared.residuals.simulator.simulate(effects)[0]
+
+    plain = simulate(source, [])
+    for kind in effect_library.load_effects(machine, list(CHANGES), api._load_simulator(source)):
+        numbers, findings = CHANGES[kind.name], []
+        for joint in machine.joint_names:
+            findings.append(JointFinding(kind.name, joint, numbers, dict.fromkeys(numbers)))
+        changed = tmp_path / f"{kind.name}.xml"
+        assert write_changed_mjcf(source, machine, findings, changed)[1] == {}
+        values = {name: np.full((1, 2), value) for name, value in numbers.items()}
+        with_effect = simulate(source, [(kind, values)])
+        left = with_effect - simulate(changed, [])
+        assert np.square(left).mean() < 0.01 * np.square(with_effect - plain).mean(), kind.name
 
 
 def test_priors_write_themselves_into_a_spec(

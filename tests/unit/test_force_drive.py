@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -18,7 +18,10 @@ from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
+from diagnosis import api
 from diagnosis.case import GapCase
+from diagnosis.effect_library import load_effects
+from diagnosis.error_covariance import ForceCovariance, fit_force_noise
 
 CPU = torch.device("cpu")
 TRUE = {"mass_kg": 60.0, "viscous_n_s_m": 120.0, "coulomb_n": 15.0, "offset_n": 5.0}
@@ -104,8 +107,70 @@ def test_mass_friction_and_offset_are_read_off_a_controllers_log(
         option("fit", "force").fit(drive, [still], [], tmp_path, 0, CPU)
     with pytest.raises(ConfigError, match="cannot be filtered at a period"):
         option("fit", "force", motion_hz=95.0).fit(drive, logs, [], tmp_path, 0, CPU)
-    # The diagnosis has no effect of such joints: it says so instead of naming one of a valve.
-    assert "commanded by torque" in GapCase(drive, [], logs).doubts()[0]
+    assert not GapCase(drive, [], logs).doubts()
+
+
+CHANGES = {
+    "coulomb_friction": {"coulomb_n": TRUE["coulomb_n"]},
+    "viscous_friction": {"viscous_n_s_m": TRUE["viscous_n_s_m"]},
+    "force_offset": {"offset_n": TRUE["offset_n"]},
+    "inertia": {"factor": TRUE["mass_kg"] / 80.0},
+}
+
+
+def test_effects_on_a_drive_are_its_mass_and_friction(drive: Machine) -> None:
+    u = 0.3 * np.sin(np.arange(300) / 25.0)
+    whole = run(option("actuator", "force", **TRUE).build(drive, 1, CPU), drive, u, 0.1)
+    model: Any = option("actuator", "force", mass_kg=80.0).build(drive, 1, CPU)
+    for kind in load_effects(drive, list(CHANGES)):
+        model = kind.wrap(model, drive, 1, CPU)
+        for name, value in CHANGES[kind.name].items():
+            model.parameters[name].fill_(value)
+    np.testing.assert_allclose(run(model, drive, u, 0.1), whole, atol=1e-6)
+
+
+def test_an_effect_on_a_drive_needs_one(drive: Machine) -> None:
+    with pytest.raises(ConfigError, match="mass or friction of a drive"):
+        option("effect", "inertia").wrap(Blind(), drive, 1, CPU)
+
+
+class Blind:
+    """A model without numbers of a drive."""
+
+    state: ClassVar = {}
+
+
+def test_errors_of_force_add_up_twice() -> None:
+    """Covariance of increments against 40,000 drawn errors of speed and force."""
+    noise = ForceCovariance(0.1, 0.0, 0.0, 3.0, start=0.5, push=0.2, window=6)
+    rng, kept = np.random.default_rng(0), float(np.exp(-1.0 / 3.0))
+    drawn = np.empty((40_000, 12))
+    for first in (0, 6):
+        speed, push = 0.5 * rng.standard_normal(40_000), 0.2 * rng.standard_normal(40_000)
+        for k in range(6):
+            speed = speed + push
+            drawn[:, first + k] = speed + 0.1 * rng.standard_normal(40_000)
+            push = kept * push + 0.2 * np.sqrt(1.0 - kept**2) * rng.standard_normal(40_000)
+    found = noise.covariance(np.zeros((1, 12)))[0]
+    np.testing.assert_allclose(found, np.cov(drawn.T), atol=0.12)
+    fitted = fit_force_noise(drawn[:400], 6)
+    assert fitted.start == pytest.approx(0.5, rel=0.2)
+    assert fitted.push == pytest.approx(0.2, rel=0.2)
+
+
+@pytest.mark.slow
+def test_a_diagnosis_names_mass_friction_and_offset_of_a_drive(
+    drive: Machine, tmp_path: Path
+) -> None:
+    """The log is of a mass solved at 1 ms; the simulator is a mass of 80 kg without friction."""
+    logs = api.RecordingSet(tuple(log_controller(drive, seed, 8.0) for seed in range(4)), drive)
+    simulator = option("actuator", "force", mass_kg=80.0)
+    answer = api.diagnose(logs, tmp_path, simulator=simulator).answer
+    assert {one.effect for one in answer.selected} == set(CHANGES)
+    for one in answer.selected:
+        for name, value in CHANGES[one.effect].items():
+            found = one.parameters[name]["carriage"].mean
+            assert found == pytest.approx(value, rel=0.05), one.effect
 
 
 def test_a_force_is_averaged_over_a_period() -> None:

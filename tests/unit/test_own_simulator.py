@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 import pytest
 from arm import ARM, NOISE_RAD, draw_targets, keep, make_machine, record_arm, rub, weaken
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from brokk_rl import open_loop
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
+from brokk_rl.session import Session
 from diagnosis import api, baseline, effect_library
+from diagnosis.modes import why
 
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/your_simulator.md").read_text()
 PENDULUM, RECORDER = re.findall(r"^```python\n(.*?)^```", PAGE, re.M | re.S)[:2]
@@ -196,6 +199,30 @@ def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
         ConfigError, match="'joint_friction' cannot be simulated: my_pendulum:step has no numbers"
     ):
         effect_library.load_effects(machine, ["joint_friction"], api._load_simulator(pendulum))
+
+
+@pytest.mark.parametrize("name", ["my_sim:step", "my files/arm.xml"])
+def test_the_whole_question_hands_on_the_simulator(name: str, tmp_path: Path) -> None:
+    asked = why.Why(
+        session=Session(out=str(tmp_path), seed=0, device="cpu"),
+        machine=make_machine("hinge"),
+        evaluation=api._load_option("evaluation", "default"),
+        log="log.parquet",
+        policy={"folder": "policy"},
+        simulator=name,
+        sent=True,
+        target_in_base_m=None,
+        resume=None,
+    )
+    parser = OverridesParser.create()
+    for stage in (asked._examine(), asked._diagnose(), asked._evaluate("all", "[library]")):
+        given = {
+            one.key_or_group: one.value() for one in parser.parse_overrides(list(stage.command))
+        }
+        assert given["actuator"] == "own"
+        assert str(given["actuator.source"]) == name
+    named = replace(asked, simulator="servo")
+    assert "actuator=servo" in named._diagnose().command
 
 
 @pytest.mark.slow

@@ -231,10 +231,19 @@ def data(tmp_path: Path) -> Path:
     return folder.parent
 
 
+KNOWN = "real_machine.emps.known"
+BEYOND = [
+    f"{KNOWN}.explainable=false",
+    f"~{KNOWN}.effects.coulomb_friction",
+    f"~{KNOWN}.effects.viscous_friction",
+]
+"""A machine whose causes the library lacks: an abstention is right."""
+
+
 def test_a_scorecard_skips_missing_folders_and_keeps_finished_cases(
     brokk: Callable[..., Done], stages: Stages, data: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    words = ["mode=scorecard", f"scorecard.data={data}", "session.out=card"]
+    words = ["mode=scorecard", f"scorecard.data={data}", "session.out=card", *BEYOND]
     done = brokk(*words)
     assert done.code == 0, done.err
     assert "so101 is skipped: there is no folder" in caplog.text
@@ -246,7 +255,7 @@ def test_a_scorecard_skips_missing_folders_and_keeps_finished_cases(
     assert "| emps | unknown |" in (data.parent / "card" / "scorecard.md").read_text()
     assert "Known:" in (data.parent / "card" / "scorecard.html").read_text()
     # the answer stands; knowledge that has changed meanwhile counts
-    again = brokk(*words, "resume=card", "real_machine.emps.known.plausible=[lag]")
+    again = brokk(*words, "resume=card", f"{KNOWN}.plausible=[lag]")
     assert again.code == 0, again.err
     assert len(stages.commands) == 1
     later = json.loads((data.parent / "card" / "scorecard.json").read_text())
@@ -256,7 +265,7 @@ def test_a_scorecard_skips_missing_folders_and_keeps_finished_cases(
 def test_a_refusal_is_an_abstention_and_a_failure_is_none(
     brokk: Callable[..., Done], stages: Stages, data: Path
 ) -> None:
-    words = ["mode=scorecard", f"scorecard.data={data}", "real_machine=[emps]"]
+    words = ["mode=scorecard", f"scorecard.data={data}", "real_machine=[emps]", *BEYOND]
     outcomes = {}
     for stages.code in (2, 1):
         assert brokk(*words, f"session.out=card{stages.code}").code == 0

@@ -12,6 +12,7 @@ from composed import option
 from scipy.integrate import solve_ivp
 
 from actuators.excite.player import NominalLink
+from brokk_rl import record
 from brokk_rl.checks.actuator import check_actuator_model
 from brokk_rl.commands import SpeedProgram, find_rest, read_targets, scale_targets, view_speeds
 from brokk_rl.errors import ConfigError
@@ -21,6 +22,8 @@ from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.signals import Command
 from diagnosis.effect_library import load_effects
 from diagnosis.error_covariance import LevelCovariance, fit_level_noise
+from diagnosis.free_runs import WindowedRuns
+from diagnosis.motion_delay import measure_motion_delays
 
 CPU = torch.device("cpu")
 
@@ -201,3 +204,58 @@ def test_a_policy_commands_speeds_and_the_servo_gets_targets(
     drive = option("machine", "emps")
     with pytest.raises(ConfigError, match="commanded by torque"):
         accept_speeds(option("actuator", "force").build(drive, 1, CPU), drive, 1, CPU)
+
+
+def test_play_holds_a_joint_about_its_target_less_the_sag(arm: Machine) -> None:
+    """The servo model itself has both: effects around the ideal one must give the same path."""
+    u = 0.4 * np.sin(np.arange(120)[:, None] / 9.0) * np.ones(arm.num_joints)
+    ideal = option("actuator", "servo")
+    whole = replace(ideal, play_rad=0.05, sag_rad=0.03).build(arm, 1, CPU)
+    numbers = {"sag": {"sag_rad": 0.03}, "backlash": {"gap_rad": 0.05}}
+    kinds = [kind for kind in load_effects(arm) if kind.name in numbers]
+    model = ideal.build(arm, 1, CPU)
+    for kind in sorted(kinds, key=lambda one: one.order):
+        model = kind.wrap(model, arm, 1, CPU)
+        for name, value in numbers[kind.name].items():
+            model.parameters[name].fill_(value)
+    np.testing.assert_allclose(run(model, arm, u)[20:], run(whole, arm, u)[20:], atol=1e-5)
+
+
+def test_a_servo_is_fitted_again_to_other_recordings(arm: Machine) -> None:
+    servo = replace(option("actuator", "servo"), play_rad=0.03, sag_rad=0.02)
+    generator = np.random.default_rng(1)
+    u = 0.5 * np.sin(np.cumsum(generator.uniform(0.02, 0.25, (500, arm.num_joints)), 0))
+    q = run(servo.build(arm, 1, CPU), arm, u)
+    # A command acts on the position of the row after it.
+    log = record.make_motion(arm, "log", arm.period_s * np.arange(499), u[1:], q[:-1])
+    fit = option("fit", "servo")
+    fit = replace(fit, free={name: fit.free[name] for name in ("play_rad", "sag_rad")})
+    found = fit.refit(replace(servo, play_rad=0.05, sag_rad=0.0), arm, [log])
+    assert list(found.play_rad.values()) == pytest.approx([0.03] * arm.num_joints, abs=0.001)
+    assert list(found.sag_rad.values()) == pytest.approx([0.02] * arm.num_joints, abs=0.001)
+
+
+def test_the_delay_of_a_motion_is_the_shift_of_its_speed(arm: Machine) -> None:
+    """Speeds of the recording are those of its targets, three and a half periods later."""
+    t = np.arange(600.0)[:, None] + np.array([0.0, 7.0, 3.0, 11.0, 5.0])
+
+    def swing(at: np.ndarray) -> np.ndarray:
+        return 0.3 * (np.sin(0.21 * at) + np.sin(0.093 * at + 1.0))
+
+    q = read_targets(swing(t - 3.5), arm)
+    q[:, 4] = q[0, 4]  # a joint that stands still
+    log = record.make_motion(
+        arm, "log", arm.period_s * np.arange(600), view_speeds(swing(t), arm), q
+    )
+    row = 40 + 100 * np.arange(5)
+    simulated = np.stack([read_targets(swing(t - 1.0), arm)[k : k + 100] for k in row])
+    runs = WindowedRuns([log], np.zeros(5, dtype=int), row, simulated)
+    found = measure_motion_delays(runs, None, arm, seed=0)
+    assert found is not None
+    for joint in arm.joint_names[:4]:
+        one = found[joint]
+        assert one is not None
+        assert one["measured"] == pytest.approx(3.5 * arm.period_s, abs=0.1 * arm.period_s)
+        assert one["before"] == pytest.approx(1.0 * arm.period_s, abs=0.1 * arm.period_s)
+        assert one["ci95"][0] <= one["measured"] <= one["ci95"][1]
+    assert found[arm.joint_names[4]] is None

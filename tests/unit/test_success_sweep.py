@@ -38,6 +38,12 @@ def test_a_level_is_passed_by_the_newest_episodes_and_not_by_few_of_them() -> No
     assert find_passing(found, 0.95, window=20)["seconds"] == 4.0
     assert find_passing(found[:4], 0.95, window=20) is None
     assert find_passing(rows((19, 1.0)), 0.95, window=20) is None
+    # the first episodes to end are the short ones, and those succeed
+    early = rows((20, 1.0), (10, 0.5), (10, 0.5), (20, 1.0))
+    for number, row in enumerate(early, 1):
+        row["env_steps"] = 100.0 * number
+    assert find_passing(early, 0.95, window=20)["seconds"] == 0.0
+    assert find_passing(early, 0.95, after=100, window=20)["seconds"] == 3.0
     # an iteration without an episode repeats older figures, which count for nothing
     assert find_passing(rows((10, 0.0), (0, 1.0), (10, 0.0)), 0.5, window=20) is None
 

@@ -1,0 +1,56 @@
+"""The effects that inverse dynamics shows on joints commanded by torque, from which a search begins.
+
+`fit=force` reads mass, friction and offset off the field by linear least squares. Free runs of a drive
+that lacks all of them err by so much that a search from nothing ends at a wrong mixture.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+
+from brokk_rl.machine import Machine
+from diagnosis.baseline import Baseline
+from diagnosis.effect_library import EffectType
+from diagnosis.shown_effects import EffectNumbers
+
+LEAST_SIZE = 0.05
+"""Smallest size, over the typical one, that is proposed; the search weighs what it adds."""
+
+
+def propose_drive_effects(
+    base: Baseline, kinds: Sequence[EffectType], machine: Machine
+) -> list[EffectNumbers]:
+    """Return the effects that lead from the simulator's numbers to the fitted ones, by joint and name.
+
+    None without a flexible model of the field, or where either model has no such numbers.
+    """
+    found: list[dict[str, dict[str, float]]] = [{} for _ in machine.joint_names]
+    if not base.is_flexible:
+        return list(found)
+    own, fitted = (
+        _read_numbers(actuator, machine)
+        for actuator in (base.actuator, base.left_out[0].residuals.simulator.base)
+    )
+    for kind in kinds:
+        for name, changed in getattr(kind.target, "drives", {}).items():
+            if changed not in own or changed not in fitted:
+                continue
+            none = kind.numbers[name].none
+            change = (
+                fitted[changed] - own[changed] if none == 0.0 else fitted[changed] / own[changed]
+            )
+            value = kind.clipped(name, change)
+            for j in np.flatnonzero(np.abs(value - none) > LEAST_SIZE * np.abs(kind.size(name))):
+                found[j].setdefault(kind.name, {})[name] = float(value[j])
+    return list(found)
+
+
+def _read_numbers(actuator: Any, machine: Machine) -> dict[str, np.ndarray]:
+    """Return the numbers of a model by name, each `(J,)`; empty for one without."""
+    model = actuator.build(machine, 1, torch.device("cpu"))
+    parameters = getattr(model, "parameters", {})
+    return {name: value[0].numpy().astype(float) for name, value in parameters.items()}

@@ -1,0 +1,113 @@
+"""Matching in parts and resolutions, on pairs whose disparity is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from hydra.utils import instantiate
+from omegaconf import OmegaConf
+
+from brokk_rl.contracts.vision import Ellipse
+from brokk_rl.signals import Frame
+from perception.face_depth import FaceDepth
+from perception.stereo import PicturePart, Stereo, predict_face_error
+
+FOCAL_PX, BASELINE_M = 1056.0, 0.12
+PULL_PX = FOCAL_PX * BASELINE_M
+HEIGHT, WIDTH = 240, 480
+SLANT = 30.0 + 0.02 * np.arange(WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT, 0)
+"""Disparity of a slanted face at about 4 m, px."""
+
+
+@pytest.fixture(scope="module")
+def stereo() -> Stereo:
+    return instantiate(OmegaConf.load("conf/stereo/sgbm.yaml"))
+
+
+def make_pair(disparity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a textured right picture and the left one that it makes by a disparity, grey."""
+    chance = np.random.default_rng(3)
+    texture = cv2.GaussianBlur(chance.normal(0.0, 1.0, disparity.shape), (0, 0), 1.2)
+    right = np.clip(128.0 + 40.0 * texture / texture.std(), 0, 255).astype(np.float32)
+    columns, rows = np.meshgrid(*[np.arange(n, dtype=np.float32) for n in disparity.shape[::-1]])
+    left = cv2.remap(right, columns - disparity, rows, cv2.INTER_CUBIC)
+    return np.clip(left, 0, 255).astype(np.uint8), right.astype(np.uint8)
+
+
+def make_frame(disparity: np.ndarray, coarse_px: np.ndarray, shrink: int) -> Frame:
+    left, right = (cv2.cvtColor(some, cv2.COLOR_GRAY2RGB) for some in make_pair(disparity))
+    matrix = np.array([[FOCAL_PX, 0.0, WIDTH / 2], [0.0, FOCAL_PX, HEIGHT / 2], [0.0, 0.0, 1.0]])
+    depth_m = (PULL_PX / coarse_px).astype(np.float32)
+    return Frame(
+        left, depth_m, matrix, None, 0.0,
+        right=right, baseline_m=BASELINE_M, depth_shrink=shrink,
+    )  # fmt: skip
+
+
+def hole_at(x: float, y: float, a: float = 13.0) -> Ellipse:
+    return Ellipse(x, y, a, a, 0.0, rms_px=0.0, coverage=1.0, score=1.0)
+
+
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_a_part_in_a_band_is_matched_as_exactly_as_the_picture(stereo: Stereo, shrink: int) -> None:
+    left, right = make_pair(SLANT)
+    part = PicturePart(200, 40, 161, 121)
+    found = replace(stereo, shrink=shrink).match_part(left, right, part, 25.0, 45.0)
+    assert found.shape == (121, 161)
+    error = (found - SLANT[40:161, 200:361])[:, :-8]
+    assert np.isfinite(error).mean() > 0.9
+    assert np.nanmedian(np.abs(error)) < 0.1 * shrink
+
+
+def test_a_far_place_is_matched_again_and_a_near_one_is_not(stereo: Stereo) -> None:
+    coarse_px = SLANT + 1.0
+    frame = make_frame(SLANT, coarse_px, 4)
+    finer = FaceDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(
+        frame, np.ones_like(SLANT, bool)
+    )
+    assert finer is not None
+    assert finer.match_around(hole_at(260, 120, a=53.0)) is frame
+    seen = finer.match_around(hole_at(260, 120))
+    assert seen.depth_shrink == 1
+    square = np.s_[60:180, 200:320]
+    assert np.nanmedian(np.abs(PULL_PX / seen.depth_m[square] - SLANT[square])) < 0.1
+    assert np.array_equal(seen.depth_m[:, :150], frame.depth_m[:, :150])
+    assert np.array_equal(frame.depth_m, (PULL_PX / coarse_px).astype(np.float32))
+    assert finer.match_around(hole_at(262, 121)) is seen
+
+
+def test_an_occluder_outside_the_band_keeps_its_coarse_depth(stereo: Stereo) -> None:
+    coarse_px = SLANT.copy()
+    coarse_px[:, 280:300] = 90.0
+    on_block = coarse_px < 60.0
+    frame = make_frame(SLANT, coarse_px, 4)
+    finer = FaceDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(frame, on_block)
+    assert finer is not None
+    seen = finer.match_around(hole_at(260, 120))
+    assert np.array_equal(seen.depth_m[:, 280:300], frame.depth_m[:, 280:300])
+
+
+def test_fine_depth_and_depth_without_a_pair_stay() -> None:
+    faces = FaceDepth(stereo=instantiate(OmegaConf.load("conf/stereo/sgbm.yaml")), radius_px=12.0, extent=6.0)  # fmt: skip
+    frame, on = make_frame(SLANT, SLANT, 4), np.ones_like(SLANT, bool)
+    assert faces.build(replace(frame, depth_shrink=1), on) is None
+    assert faces.build(replace(frame, right=None), on) is None
+
+
+@pytest.mark.parametrize(("amplitude_px", "noise_px"), [(0.15, 0.1), (0.02, 0.4)])
+def test_attraction_and_noise_predict_the_error_of_a_face(
+    amplitude_px: float, noise_px: float
+) -> None:
+    rows, columns = np.mgrid[:400, :600]
+    true = 20.0 + 0.02 * columns + 0.013 * rows
+    noise = np.random.default_rng(0).normal(0.0, noise_px, true.shape)
+    attracted = true - amplitude_px * np.sin(2 * np.pi * true)
+    found = predict_face_error((attracted + noise).astype(np.float32))
+    assert found == pytest.approx(np.hypot(amplitude_px / np.sqrt(2), noise_px / 5), rel=0.25)
+
+
+def test_a_face_at_one_disparity_predicts_nothing() -> None:
+    assert predict_face_error(np.full((300, 300), 20.3, np.float32)) is None
