@@ -244,7 +244,6 @@ class EffectSearch:
             fit_joint_faults(effects.residuals),
             effects.shapes,
             self.shared,
-            self.base.is_flexible,
         )
         return ReferencePenalty(known, self.penalties.joint, self.penalties.reference)
 

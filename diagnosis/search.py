@@ -349,7 +349,6 @@ class ReferenceScores:
         joints: Residuals of each joint in the field.
         shapes: Responses of each joint to each effect in the field.
         shared: Effects with one cause for all joints.
-        is_flexible: The parts are of the field, left out of a flexible model's fit.
         tables: Of each part and joint.
         known: Effects that were simulated on the reference.
     """
@@ -361,7 +360,6 @@ class ReferenceScores:
     joints: Sequence[JointResiduals]
     shapes: Sequence[Mapping[str, Sequence[Response]]]
     shared: frozenset[str]
-    is_flexible: bool
     tables: list[list[SubsetTable]] = field(default_factory=list)
     known: set[str] = field(default_factory=set)
 
@@ -399,13 +397,10 @@ class ReferenceScores:
         """Return the most that the subset earns on joint `j` in any part of the reference, at the length of the field.
 
         Of a cause that all joints share the mean: its price adds up over the joints, and the most
-        of each adds up to too much. The mean too of a flexible model: the part on which it errs most
-        is a motion unlike those of its fit, which says little about chance.
+        of each adds up to too much.
         """
         found = [max(0.0, scored.total * part) for scored, part in self._scored(j, subset)]
-        if not found:
-            return 0.0
-        return float(np.mean(found) if self.is_flexible or subset <= self.shared else max(found))
+        return float((np.mean if subset <= self.shared else max)(found)) if found else 0.0
 
     def repeated(self, j: int, subset: frozenset[str]) -> float:
         """Return the gain of the subset in the field at its sizes on the reference; 0 where it has none there."""

@@ -55,10 +55,15 @@ def typical(machine: Machine, name: str, number: str) -> np.ndarray:
     return kind.typical(number)
 
 
+IDEAL = {"speed": "ideal", "position": "servo", "torque": "force"}
+"""Actuator that does at once what a command says, for each command interface."""
+
+
 @pytest.mark.parametrize("name", MACHINES)
 def test_the_library_is_drawn_on_every_machine_with_sizes_that_fit_its_joints(name: str) -> None:
     machine, library = option("machine", name), replace(option("effect", "library"), share=1.0)
-    model = library.wrap(option("actuator", "ideal").build(machine, 500, CPU), machine, 500, CPU)
+    inner = option("actuator", IDEAL[machine.interface]).build(machine, 500, CPU)
+    model = library.wrap(inner, machine, 500, CPU)
     drawn = {key: value.abs().amax(0).numpy() for key, value in model.parameters.items()}
     assert {key.split(".")[0] for key in drawn} == set(library.effects) - ABSENT[machine.interface]
     travel, speed = machine.upper - machine.lower, machine.max_speed
