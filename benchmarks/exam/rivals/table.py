@@ -2,9 +2,10 @@
 
     python benchmarks/exam/rivals/table.py <exam> <opened> <work> <out.json> mujoco_sysid=<answers> pace=<answers>
 
-`<exam>` is what `remake.py` wrote from `<opened>`. Each rival has two rows: names by the rule of
-`rules.json`, and all fitted numbers taken as they are. Scores and the closed share are those of
-`mode=exam`; what was examined already stays in `<work>`.
+What they fitted stands in `changes_<rival>.jsonl` beside it. `<exam>` is what `remake.py` wrote
+from `<opened>`. Each rival has two rows: names by the rule of `rules.json`, and all fitted numbers
+taken as they are. Scores and the closed share are those of `mode=exam`; what was examined already
+stays in `<work>`.
 """
 
 from __future__ import annotations
@@ -74,6 +75,18 @@ def write_named(answers: Path, cases: list[str], rule: dict[str, Any], out: Path
         naming.write_answer(read_changes(place / "changes.json"), rule, out / case)
         if (place / "sitting.json").is_file():
             (out / case / "sitting.json").write_text((place / "sitting.json").read_text())
+
+
+def publish_changes(answers: Path, labels: list[dict[str, Any]], path: Path) -> None:
+    """Write what a rival fitted, a line a case: rows of effect, parameter, joint, value, change, error."""
+    lines = []
+    for label in labels:
+        rows = []
+        for one in read_changes(answers / label["case"] / "changes.json"):
+            numbers = [float(f"{value:.4g}") for value in (one.value, one.change, one.error)]
+            rows.append([one.effect, one.parameter, one.joint, *numbers])
+        lines.append(json.dumps({"case": label["case"], "changes": rows}) + "\n")
+    path.write_text("".join(lines))
 
 
 def measure_hindsight(
@@ -188,6 +201,8 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
         ).stdout.strip(),
     }
     write_json(out, result)
+    for name, answers in rivals.items():
+        publish_changes(answers, sat, out.with_name(f"changes_{name}.jsonl"))
 
 
 if __name__ == "__main__":
