@@ -33,7 +33,7 @@ def main() -> None:
     begun = time.process_time()
     from diagnosis import api
 
-    seconds = {"import": time.process_time() - begun}
+    seconds = {"import": round(time.process_time() - begun, 1)}
 
     def call(name: str, function: Callable[..., T], *arguments: Any, **options: Any) -> T:
         before = time.process_time()

@@ -66,7 +66,10 @@ def main() -> None:
         with zipfile.ZipFile(asked.torch) as wheel:
             light["torch"] = sum(file.file_size for file in wheel.infolist()) / 1e6
     found = {
-        "command": f"python benchmarks/install_size.py {asked.extra} {asked.module} {asked.out.name} --torch <CPU wheel>",
+        "command": "python benchmarks/install_size.py "
+        f"{asked.extra} {asked.module} {asked.out.name}"
+        + " --torch <CPU wheel>"
+        * (asked.torch is not None),
         "extra": asked.extra,
         "with_cuda_mb": sum(sizes.values()),
         "without_cuda_mb": sum(light.values()),

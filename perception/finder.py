@@ -27,6 +27,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import rectification, search
 from perception.face_depth import FaceDepth, FaceMatcher
+from perception.pose.appearance import IN_DUST
 from perception.pose.plane_conic import convert_to_gray
 from perception.rectification import RectificationCheck
 
@@ -86,6 +87,10 @@ EXPLANATIONS = {
     "contrast to the grain of the face": (
         "it is hardly darker than the grain of the face",
         "A stain or a shadow.",
+    ),
+    IN_DUST: (
+        "dust or haze lies over it, and no light on a wall tells it from a flat dark disc",
+        "Wait for the dust to settle, or look from a place farther aside.",
     ),
     "mouth probability inside": (
         "the network does not take it for the mouth of a hole",

@@ -21,6 +21,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.pose import plane, rim
 from perception.pose.plane_conic import convert_to_gray
+from perception.segment.depth_plane import scale_noise
 
 # Chosen by hand on rendered scenes (benchmarks/perception/rims.py).
 STEP = 8
@@ -102,7 +103,8 @@ class FaceRegionProposer:
         s = self.settings
         gray = convert_to_gray(frame)
         found: list[Ellipse] = []
-        for face in find_faces(frame, masks.block > 0.5, s.noise_per_m, s.radius_m, s.radius_px):
+        noise_per_m = scale_noise(s.noise_per_m, frame)
+        for face in find_faces(frame, masks.block > 0.5, noise_per_m, s.radius_m, s.radius_px):
             found += self._propose_on(face, frame, gray, masks)
         kept: list[Ellipse] = []
         # Two faces that meet show the same region twice.
@@ -123,7 +125,9 @@ class FaceRegionProposer:
         rows, columns = np.nonzero((border == highest) & (border >= s.weak_border))
         if not len(rows):
             return
-        on, void = face.measure_depth(frame, masks.block > 0.5, rows, columns, s.noise_per_m)
+        on, void = face.measure_depth(
+            frame, masks.block > 0.5, rows, columns, scale_noise(s.noise_per_m, frame)
+        )
         for number in np.flatnonzero(on >= ON_FACE).tolist():
             row, column = int(rows[number]), int(columns[number])
             share = min(float(border[row, column]), 1.0)

@@ -284,13 +284,19 @@ def main() -> None:
     parser.add_argument("size", type=float)
     parser.add_argument("out", type=Path)
     parser.add_argument("--read", type=Path)
+    parser.add_argument("--write", type=Path)
     given = parser.parse_args()
+    if given.write:
+        WRITERS[given.kind](given.write, int(given.size))
+        return
     if given.read:
         read_log(given.kind, given.read)
         return
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / ("log" if given.kind in ("bag", "lerobot") else f"log.{given.kind}")
-        WRITERS[given.kind](path, int(given.size))
+        # a process begins with the largest memory of its parent, so that a child has to write
+        made = [given.kind, str(given.size), "-", "--write", str(path)]
+        subprocess.run([sys.executable, __file__, *made], check=True)
         command = [sys.executable, __file__, given.kind, "0", "-", "--read", str(path)]
         results = []
         for is_damaged in (False, True):

@@ -20,7 +20,7 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, plane, rim
-from perception.pose.appearance import Interior
+from perception.pose.appearance import Interior, WallGlow
 from perception.pose.plane import FacePlane
 from perception.pose.rim import RimCircle
 
@@ -48,7 +48,10 @@ class AppearanceGates:
         darker: Surroundings darker by more than this, over the brightness of the face, exclude
             dust.
         contrast: Least contrast of a veiled hole in standard deviations of the face's grain; a
-            stain has less. Not asked where both cameras see that it is deep.
+            stain has less.
+        hole_log_ratio: Least log-likelihood ratio of a veiled hole to a flat disc, by the light on
+            its wall (`appearance.WallGlow`). Neither this nor `contrast` is asked where the
+            parallax alone is evidence enough.
         mouth: Least mean of the segmenter's hole mask inside, where there is one.
         sure_mouth: Mean of the hole mask from which it decides where depth cannot be seen.
         slope: Slope of brightness inside (`Interior`) that alone is evidence enough; evidence is
@@ -63,6 +66,7 @@ class AppearanceGates:
     veiled: float
     darker: float
     contrast: float
+    hole_log_ratio: float
     mouth: float
     sure_mouth: float
     slope: float
@@ -301,7 +305,11 @@ class PlaneConicEstimator:
         undecided = inside.darkness > s.looks.veiled or (
             covered > UNDECIDED and inside.unknown > UNDECIDED
         )
-        refused = self._check_appearance(inside, parallax, masks, row, ellipse, undecided)
+        glow = None
+        if inside.darkness > s.looks.veiled:
+            place = (frame.camera_matrix, face, circle.center_m, circle.radius_m)
+            glow = appearance.measure_wall_glow(light, frame.depth_m, row, *place)
+        refused = self._check_appearance(inside, parallax, glow, masks, row, ellipse, undecided)
         if refused:
             return refused
         # A network that marks mouths has decided already; without it the doubt stays.
@@ -383,12 +391,13 @@ class PlaneConicEstimator:
         self,
         inside: Interior,
         parallax: float,
+        glow: WallGlow | None,
         masks: Masks,
         row: np.ndarray,
         ellipse: Ellipse,
         undecided: bool,
     ) -> Rejection | None:
-        """Return the gate of the appearance that a hole misses, `None` where it passes all."""
+        """Return the gate that a hole misses, `None` for none; `glow` is known for veiled ones."""
         looks = self.settings.looks
 
         def refuse(reason: str, value: float, limit: float) -> Rejection:
@@ -398,7 +407,7 @@ class PlaneConicEstimator:
         if not inside.darkness <= looks.darkness:
             return refuse("brightness inside over outside", inside.darkness, looks.darkness)
         has_mask = masks.hole_mask is not None
-        mouth = 0.0 if masks.hole_mask is None else average_inside(masks.hole_mask, row)
+        mouth = 0.0 if masks.hole_mask is None else appearance.average_inside(masks.hole_mask, row)
         if has_mask and mouth < looks.mouth:
             # A mouth probability of 0 with no mask means "not asked", not "no mouth".
             return refuse("mouth probability inside", mouth, looks.mouth)
@@ -415,14 +424,18 @@ class PlaneConicEstimator:
         has_parallax = bool(np.isfinite(from_parallax))
         evidence += from_parallax if has_parallax else 0.0
         # Dust and haze brighten the inside; there darkness alone does not decide.
-        if inside.darkness > looks.veiled:
+        if glow is not None:
             if is_sure:
                 return None
             if inside.around < inside.darkness - looks.darker:
                 return refuse("brightness inside over outside", inside.darkness, looks.veiled)
-            if inside.contrast >= looks.contrast or (has_parallax and evidence >= 1.0):
+            if has_parallax and from_parallax >= 1.0:
                 return None
-            return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
+            if inside.contrast < looks.contrast:
+                return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
+            if glow.log_ratio < looks.hole_log_ratio:
+                return refuse(appearance.IN_DUST, glow.log_ratio, looks.hole_log_ratio)
+            return None
         # Nothing can be seen that would decide: the hole passes with a lower score.
         if undecided and not has_parallax and (is_sure or not has_mask):
             return None
@@ -483,15 +496,3 @@ def linearize(gray: np.ndarray, gamma: float) -> np.ndarray:
     """
     levels = 255.0 * (np.arange(256) / 255.0) ** gamma
     return np.asarray(cv2.LUT(gray, levels.astype(np.float32)))
-
-
-def average_inside(picture: np.ndarray, row: np.ndarray) -> float:
-    """Return the mean of a picture within 0.8 of an ellipse."""
-    # The semi-major axis bounds the ellipse, however it is turned.
-    x, y, a = row[:3]
-    top, left = max(0, int(y - a)), max(0, int(x - a))
-    part = picture[top : int(y + a) + 2, left : int(x + a) + 2]
-    rows, columns = np.mgrid[top : top + part.shape[0], left : left + part.shape[1]]
-    # 0.8 leaves out the blurred edge of the rim. Chosen by hand; not searched.
-    inside = conic.measure_radii(row, columns, rows) < 0.8
-    return float(part[inside].mean()) if inside.any() else 0.0

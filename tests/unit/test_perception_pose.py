@@ -12,6 +12,7 @@ from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 from brokk_rl.contracts.vision import HolePose, Rejection
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, plane, rim
+from perception.pose.appearance import IN_DUST
 from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
 
@@ -155,39 +156,67 @@ def test_an_ellipse_that_is_no_circle_on_the_face_is_refused(estimator) -> None:
     assert isinstance(refused, Rejection) and refused.reason == "axis ratio on the face"
 
 
-def test_in_dust_a_disc_may_be_a_hole_for_half_the_score_and_in_clear_air_a_pale_one_is_none(
-    estimator,
-) -> None:
-    frame, masks, ellipse = drawn(depth_m=0.0)  # a flat dark disc
-    pale = (0.3 * frame.color.astype(float) + 0.7 * 150).astype(
-        np.uint8
-    )  # three quarters as bright as the face
-    dusty = estimator.estimate(replace(frame, color=pale), masks, ellipse)
-    assert isinstance(dusty, HolePose) and dusty.score == pytest.approx(0.5 * ellipse.score)
-    shaded = pale.copy()
+def draw_dust(color: np.ndarray) -> np.ndarray:
+    """Return a picture with dust that leaves three tenths of the contrast, denser to the right."""
+    airlight = 150.0 + 6.0 * np.linspace(-1.0, 1.0, color.shape[1])[None, :, None]
+    return (0.3 * color.astype(float) + 0.7 * airlight).astype(np.uint8)
+
+
+def test_in_dust_the_light_on_its_wall_tells_a_hole_from_a_flat_disc(estimator) -> None:
+    hole, masks, ellipse = drawn()
+    found = estimator.estimate(replace(hole, color=draw_dust(hole.color)), masks, ellipse)
+    assert isinstance(found, HolePose) and found.score == pytest.approx(0.5 * ellipse.score)
+    disc, masks, ellipse = drawn(depth_m=0.0)
+    dusty = draw_dust(disc.color)
+    refused = estimator.estimate(replace(disc, color=dusty), masks, ellipse)
+    assert isinstance(refused, Rejection) and refused.reason == IN_DUST
+    shaded = dusty.copy()
     shaded[int(ellipse.y + 4 * ellipse.a) :] //= 4  # something dark nearby: nothing lies over it
-    stain = estimator.estimate(replace(frame, color=shaded), masks, ellipse)
+    stain = estimator.estimate(replace(disc, color=shaded), masks, ellipse)
     assert isinstance(stain, Rejection) and stain.reason == "brightness inside over outside"
 
 
-def test_in_dust_a_spot_no_darker_than_the_grain_is_a_hole_if_two_cameras_see_it_deep(
+def test_a_wall_is_lit_by_as_much_as_was_drawn_whatever_the_gradient_of_dust() -> None:
+    frame, _, ellipse = drawn(depth_m=0.0)
+    face = plane.FacePlane(AXIS / (AXIS @ CENTER), np.eye(3) * 1e-6, 1e-3, 1000, 7.0)
+    place = (pose_row(ellipse), K, face, CENTER, 0.05)
+    flat = np.full(frame.depth_m.shape, 180.0)
+    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    inside = conic.measure_radii(place[0], columns, rows) < 1
+    depth_m = appearance._find_wall_depths(RAYS[inside], face.normal, CENTER, 0.05)
+    # by hand: a point of the wall is where the ray leaves the cylinder about the axis
+    wall = RAYS[inside] * ((AXIS @ CENTER - depth_m) / (RAYS[inside] @ AXIS))[:, None] - CENTER
+    across = wall - np.outer(wall @ AXIS, AXIS)
+    np.testing.assert_allclose(np.linalg.norm(across, axis=1), 0.05, atol=2e-3)
+    for share in (0.0, 0.4):
+        lit = share * np.exp(-depth_m / (appearance.FADE * 0.05))
+        flat[inside] = 100.0 + 0.3 * (columns[inside] - ellipse.x) + 80.0 * lit
+        gray = np.clip(np.rint(flat), 0, 255).astype(np.uint8)
+        glow = appearance.measure_wall_glow(gray, frame.depth_m, *place)
+        assert glow.share == pytest.approx(share, abs=0.05)
+        assert (glow.log_ratio > 0) == (share > 0)
+    assert appearance.WallGlow(1.5, 0.01).log_ratio == 0.0
+
+
+def test_in_dust_a_spot_must_be_darker_than_the_grain_and_lit_on_its_wall_or_differ_by_camera(
     estimator,
 ) -> None:
     _, masks, ellipse = drawn()
-    faint = appearance.Interior(
-        darkness=0.9, slope=0.0, deeper=0.2, unknown=0.4, around=0.9, contrast=2.0
+    spot = appearance.Interior(
+        darkness=0.9, slope=0.0, deeper=0.2, unknown=0.4, around=0.9, contrast=3.0
     )
-    for inside, parallax, passes in (
-        (faint, 1.0, True),
-        (faint, float("nan"), False),  # depth by one camera's guess
-        (faint, 0.2, False),  # they see the same
-        (replace(faint, deeper=0.0), 1.0, False),
-        (replace(faint, deeper=0.0, contrast=3.0), 1.0, True),
+    lit, even = appearance.WallGlow(0.3, 0.02), appearance.WallGlow(0.0, 0.02)
+    for inside, parallax, glow, passes in (
+        (spot, 1.0, lit, True),
+        (spot, 1.0, even, False),
+        (spot, 3.0, even, True),
+        (spot, float("nan"), appearance.WallGlow(float("nan"), float("nan")), False),
+        (replace(spot, contrast=2.0), 1.0, lit, False),
     ):
-        assert (
-            estimator._check_appearance(inside, parallax, masks, pose_row(ellipse), ellipse, True)
-            is None
-        ) == passes
+        refused = estimator._check_appearance(
+            inside, parallax, glow, masks, pose_row(ellipse), ellipse, True
+        )
+        assert (refused is None) == passes
 
 
 @pytest.mark.parametrize("arm", [True, False])

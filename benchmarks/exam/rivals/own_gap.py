@@ -1,10 +1,11 @@
 """Share of the gap that a rival closes in its own simulator, with everything it fitted.
 
-    python benchmarks/exam/rivals/own_gap.py <exam> <out.json> mujoco_sysid=<answers> pace=<answers>
+    python benchmarks/exam/rivals/own_gap.py <exam> <opened> <out.json> mujoco_sysid=<answers> pace=<answers>
 
 Free runs of 5 s over the withheld recordings, as the exam's examiner has them: before is the rival's
 simulator as fitted to the reference, after as fitted to the field, floor the first against the same
-machine without the cause. No name of an effect counts here. Runs in the rivals' environment.
+machine without the cause. No name of an effect counts here. `paired` has the cases with a gap that all rivals answered, beside
+the diagnosis's published closing by its named effects. Runs in the rivals' environment.
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ from pathlib import Path
 import numpy as np
 from case_data import Arm, Windows, read_arm, read_windows
 
+COMMAND = (
+    "python benchmarks/exam/rivals/own_gap.py <exam> benchmarks/exam/held_out/second own_gap.json "
+    "mujoco_sysid=<answers> pace=<answers>"
+)
 STRIDE_S = 2.5
 MIN_GAP_RATIO = 1.05
 """As in `exam.examiner`: distance of windows, and error over floor from which there is a gap."""
@@ -44,7 +49,7 @@ def close_gap(rival: str, exam: Path, case: str, answer: Path, arm: Arm) -> dict
     return {"before": before, "after": after, "floor": floor, "closed": closed}
 
 
-def main(exam: Path, out: Path, rivals: dict[str, Path]) -> None:
+def main(exam: Path, opened: Path, out: Path, rivals: dict[str, Path]) -> None:
     """Write the shares of all cases with one or several effects."""
     arm, found = read_arm(exam / "machine.yaml"), {}
     for label in json.loads((exam / "labels.sealed.json").read_text())["cases"]:
@@ -54,11 +59,29 @@ def main(exam: Path, out: Path, rivals: dict[str, Path]) -> None:
                 found.setdefault(rival, {})[label["case"]] = close_gap(
                     rival, exam, label["case"], place, arm
                 )
-    out.write_text(json.dumps(found, indent=1) + "\n")
+    ours = json.loads((opened / "examined.json").read_text())["diagnosis"]
+    shares = {name: {case: one["closed"] for case, one in x.items()} for name, x in found.items()}
+    shares["diagnosis"] = {case: one["closed"] for case, one in ours.items()}
+    paired = []
+    for case in ours:
+        if all(one.get(case) is not None for one in shares.values()):
+            paired.append(case)
+    result = {
+        "command": COMMAND,
+        "paired": {
+            case: {name: one[case] for name, one in shares.items()} for case in sorted(paired)
+        },
+        "median": {
+            name: float(np.median([one[case] for case in paired])) for name, one in shares.items()
+        },
+        "of": len(paired),
+        "cases": found,
+    }
+    out.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":
     main(
-        *map(Path, sys.argv[1:3]),
-        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[3:])},
+        *map(Path, sys.argv[1:4]),
+        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[4:])},
     )

@@ -2,9 +2,10 @@
 
     python benchmarks/exam/rivals/table.py <exam> <opened> <work> <out.json> mujoco_sysid=<answers> pace=<answers>
 
-`<exam>` is what `remake.py` wrote from `<opened>`. Each rival has two rows: names by the rule of
-`rules.json`, and all fitted numbers taken as they are. Scores and the closed share are those of
-`mode=exam`; what was examined already stays in `<work>`.
+What they fitted stands in `changes_<rival>.jsonl` beside it. `<exam>` is what `remake.py` wrote
+from `<opened>`. Each rival has two rows: names by the rule of `rules.json`, and all fitted numbers
+taken as they are. Scores and the closed share are those of `mode=exam`; what was examined already
+stays in `<work>`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import hydra
 import naming
 import numpy as np
 from case_data import read_changes
-from choose_rule import QUIET, THRESHOLDS, count_names
+from choose_rule import CLASSES, QUIET, THRESHOLDS, count_names
 from hydra.utils import instantiate
 from sit import RULES_FILE
 
@@ -49,6 +50,17 @@ ROWS = (
 """Metrics of `exam.metrics` that the table has."""
 
 
+def count_expressible(answers: Path, labels: list[dict[str, Any]]) -> int:
+    """Return how many of the true effects a rival has a number for, in whatever case it fitted one."""
+    known: set[str] = set()
+    for label in labels:
+        known.update(one.effect for one in read_changes(answers / label["case"] / "changes.json"))
+    for group in [*CLASSES, *({name, *same} for name, same in naming.SAME_AS.items())]:
+        known |= group if known & group else set()
+    truth = [one["effect"] for x in labels if x["kind"] not in QUIET for one in x["effects"]]
+    return sum(effect in known for effect in truth)
+
+
 def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
     """Write the published answers of the diagnosis as the exam left them, and their examinations."""
     for line in (opened / f"answers_{OURS}.jsonl").read_text().splitlines():
@@ -74,6 +86,18 @@ def write_named(answers: Path, cases: list[str], rule: dict[str, Any], out: Path
         naming.write_answer(read_changes(place / "changes.json"), rule, out / case)
         if (place / "sitting.json").is_file():
             (out / case / "sitting.json").write_text((place / "sitting.json").read_text())
+
+
+def publish_changes(answers: Path, labels: list[dict[str, Any]], path: Path) -> None:
+    """Write what a rival fitted, a line a case: rows of effect, parameter, joint, value, change, error."""
+    lines = []
+    for label in labels:
+        rows = []
+        for one in read_changes(answers / label["case"] / "changes.json"):
+            numbers = [float(f"{value:.4g}") for value in (one.value, one.change, one.error)]
+            rows.append([one.effect, one.parameter, one.joint, *numbers])
+        lines.append(json.dumps({"case": label["case"], "changes": rows}) + "\n")
+    path.write_text("".join(lines))
 
 
 def measure_hindsight(
@@ -174,6 +198,7 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
         "command": COMMAND,
         "cases": kinds,
         "candidates": rows,
+        "expressible": {name: count_expressible(a, sat) for name, a in rivals.items()},
         "hindsight": {
             name: measure_hindsight(answers, sat, rules[name]["spreads"])
             for name, answers in rivals.items()
@@ -188,6 +213,8 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
         ).stdout.strip(),
     }
     write_json(out, result)
+    for name, answers in rivals.items():
+        publish_changes(answers, sat, out.with_name(f"changes_{name}.jsonl"))
 
 
 if __name__ == "__main__":
