@@ -33,6 +33,10 @@ NUM_TARGET_RUNS, TARGET_RUN_S = 3, 20.0
 """Drawn motions that a network is fitted to beside the recorded ones. Chosen by hand."""
 
 
+MAX_NETWORK_SHARE = 0.3
+"""Error of a network over that of the unchanged file from which a warning says so. Chosen by hand."""
+
+
 @spec
 class ChangeRequest:
     """Findings to write.
@@ -206,6 +210,12 @@ class ChangeSimulator:
                 error = path[warm:, place] - expected[warm:, place]
                 errors[name] = float(np.sqrt(np.square(error).mean()))
             found.append(asdict(contract) | {"rmse_to_changed_file": errors})
+            if errors["network"] > MAX_NETWORK_SHARE * errors["unchanged_file"]:
+                log.warning(
+                    "the network of %s errs nearly as much as the file without the findings; "
+                    "a smaller time step of the file, or an armature, makes an explicit torque stable",
+                    contract.joint,
+                )
         return found
 
 
