@@ -31,7 +31,7 @@ from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
 
 CONDITIONS = {"haze": "hole", "discs_in_haze": "disc"}
-LIMITS = (0.0, 1.0, 2.0, 3.0, 4.0)
+LIMITS = (0.0, 1.0, 1.5, 2.0, 3.0)
 REFUSE_ALL = "plane_conic perception.pose.looks.hole_log_ratio=1000"
 NEAR = 0.5
 """Largest distance of an ellipse from the true centre, in its semi-axes."""

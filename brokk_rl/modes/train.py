@@ -143,7 +143,7 @@ class Train:
                 runner.run()
             if not group.rank.first:
                 return None
-            _log_success(logger, group.rank.count * loop.num_envs * loop.max_episode_length)
+            _log_success(logger, group.rank.count * loop.num_envs * loop.task.max_episode_steps)
             facts = {
                 "env_steps": logger.env_steps,
                 "seconds": logger.seconds,

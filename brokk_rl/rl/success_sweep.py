@@ -106,7 +106,7 @@ def _train(
         budget.share_spent,
         quiet=not group.rank.first,
     )
-    first_episodes = group.rank.count * loop.num_envs * loop.max_episode_length
+    first_episodes = group.rank.count * loop.num_envs * loop.task.max_episode_steps
     with logger:
         runner = TrainingRunner(loop, training, folder, loop.device, logger, group)
         runner.run(until=lambda: find_passing(logger.rows, max(LEVELS), first_episodes) is not None)

@@ -230,12 +230,17 @@ def refine_cuboid(
 ) -> Cuboid:
     """Return the block that fits best.
 
+    The cameras of a pair that is not calibrated see all depth too near or too far, by the same in
+    inverse depth. That offset is fitted along: edges of many views know the distance, and the depth
+    would pull the block away from them.
+
     Args:
         cuboid: The block as placed.
-        views: Frames to fit to.
+        views: Frames to fit to, all of one camera.
         noise_per_m: Standard deviation of inverse depth, 1/m.
         reach_px: Distance from the outline within which edges are sought at first.
     """
+    offset_per_m = 0.0
     for number in range(NUM_ROUNDS):
         reach = _compute_reach_px(reach_px, number)
         edges, depths = [], []
@@ -250,19 +255,25 @@ def refine_cuboid(
             edges: list[_EdgeMatches] = edges,
             depths: list[_DepthSamples] = depths,
         ) -> np.ndarray:
-            block = now.moved(change)
-            parts = []
+            block, offset_per_m = now.moved(change[:8]), change[8]
+            # The offset is about as large as the noise.
+            parts = [np.array([offset_per_m / noise_per_m])]
             for view, edge, depth in zip(views, edges, depths, strict=True):
                 # a point of an edge stays on it when the face grows
                 points_m = edge.points_m * (block.size_m / now.size_m)
                 parts.append(_compute_edge_residuals(block, points_m, edge, view))
-                parts.append(_compute_depth_residuals(block, depth, view) / noise_per_m)
+                off = _compute_depth_residuals(block, depth, view) - offset_per_m
+                parts.append(off / noise_per_m)
             return np.concatenate(parts)
 
         fit = least_squares(
-            compute_residuals, np.zeros(8), loss="soft_l1", x_scale=[0.01] * 8, max_nfev=20
+            compute_residuals,
+            np.append(np.zeros(8), offset_per_m),
+            loss="soft_l1",
+            x_scale=[0.01] * 8 + [noise_per_m],
+            max_nfev=20,
         )
-        cuboid = cuboid.moved(fit.x)
+        cuboid, offset_per_m = cuboid.moved(fit.x[:8]), float(fit.x[8])
     return cuboid
 
 

@@ -21,7 +21,12 @@ from perception.label import cuboid as label_placing
 from perception.label.camera_pose import Charuco, GivenPoses, TagGrid
 from perception.label.cuboid import compute_pixel_rays, trace_rays
 from perception.label.outline_match import match_outline
-from perception.label.refinement import sample_block_outline, smooth_gray
+from perception.label.refinement import (
+    prepare_view,
+    refine_cuboid,
+    sample_block_outline,
+    smooth_gray,
+)
 
 SIZE_PX = (480, 270)
 EYES_M = ((-1.8, -0.9, 1.0), (-2.0, 0.3, 0.8), (-1.5, 0.9, 1.2), (-2.4, -0.3, 0.7))
@@ -107,6 +112,21 @@ def test_a_block_in_the_wrong_place_is_left_out_and_said(
     assert done.code == 2
     assert "no frame could be labelled: the outline fits the picture best" in done.err
     assert not list(out.glob("frames/*"))
+
+
+def test_depth_that_is_off_as_a_whole_does_not_pull_the_block_off_its_edges() -> None:
+    views = []
+    for number, eye in enumerate(EYES_M):
+        view = cuboid.seen(cuboid.looking(eye, (0.1, 0.0, 0.3)), SIZE_PX, 0.001, seed=number)
+        # 0.006 1/m are 24 mm at 2 m, eight sigmas of the smallest noise that is assumed
+        depth_m = (1.0 / (1.0 / view.frame.depth_m + 0.006)).astype(np.float32)
+        frame = replace(view.frame, depth_m=depth_m)
+        views.append(prepare_view(frame, view.world_from_camera))
+    shifted_m = CORNERS_M + np.array([-0.02, 0.01, 0.0])
+    block = label_placing.build_cuboid(shifted_m, 1.2, views[0].pose[:3, 3])
+    found = refine_cuboid(block, views, 0.003, 10.0)
+    # the drilled face is that of the corners, 0.8 m wide; without the offset it was 15 mm off
+    np.testing.assert_allclose(found.origin_m[0], 0.0, atol=0.002)
 
 
 @pytest.mark.parametrize("miss_px", [0.0, 6.0])

@@ -21,7 +21,7 @@ import hydra
 import naming
 import numpy as np
 from case_data import read_changes
-from choose_rule import QUIET, THRESHOLDS, count_names
+from choose_rule import CLASSES, QUIET, THRESHOLDS, count_names
 from hydra.utils import instantiate
 from sit import RULES_FILE
 
@@ -48,6 +48,17 @@ ROWS = (
     "closed_examined",
 )
 """Metrics of `exam.metrics` that the table has."""
+
+
+def count_expressible(answers: Path, labels: list[dict[str, Any]]) -> int:
+    """Return how many of the true effects a rival has a number for, in whatever case it fitted one."""
+    known: set[str] = set()
+    for label in labels:
+        known.update(one.effect for one in read_changes(answers / label["case"] / "changes.json"))
+    for group in [*CLASSES, *({name, *same} for name, same in naming.SAME_AS.items())]:
+        known |= group if known & group else set()
+    truth = [one["effect"] for x in labels if x["kind"] not in QUIET for one in x["effects"]]
+    return sum(effect in known for effect in truth)
 
 
 def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
@@ -187,6 +198,7 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
         "command": COMMAND,
         "cases": kinds,
         "candidates": rows,
+        "expressible": {name: count_expressible(a, sat) for name, a in rivals.items()},
         "hindsight": {
             name: measure_hindsight(answers, sat, rules[name]["spreads"])
             for name, answers in rivals.items()
