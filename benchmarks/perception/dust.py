@@ -24,11 +24,11 @@ from table import build_finder, renderer, scenes
 
 from brokk_rl.contracts.vision import Rejection
 from brokk_rl.session import Session
-from perception.benchmark.scoring import make_frame
 from perception.dataset import TrueCircle
 from perception.pose.appearance import IN_DUST
 from perception.render.scene_ranges import SceneRanges
 from perception.render.scene_sampler import compose_scene
+from perception.sources.simulator import make_frame
 
 CONDITIONS = {"haze": "hole", "discs_in_haze": "disc"}
 LIMITS = (0.0, 1.0, 1.5, 2.0, 3.0)
@@ -62,7 +62,7 @@ def judge_scene(
     session: Session, condition: str, distance_m: float, number: int
 ) -> list[dict[str, Any]]:
     """Return a row for each hole or disc in view: its log ratio, `None` where no gate of dust decided."""
-    studio, generator = renderer(condition, distance_m), session.generator(f"scene/{number}")
+    studio, generator = renderer(condition, distance_m, ()), session.generator(f"scene/{number}")
     assert isinstance(studio.scene, SceneRanges), "every condition is one of random scenes"
     shot = studio.shot(compose_scene(studio.scene, studio.rig, generator), generator)
     frame = make_frame(shot, studio.rig, 0.0)
@@ -87,7 +87,7 @@ def find_ratio(
         if one.reason == IN_DUST and one.ellipse is not None:
             away = np.hypot(one.ellipse.x - pixel[0], one.ellipse.y - pixel[1])
             if away < NEAR * one.ellipse.a:
-                ratios.append(one.value)
+                ratios.append(float(one.value))
     return max(ratios, default=None)
 
 
@@ -100,7 +100,7 @@ def write(path: Path, seed: int, count: int, rows: list[dict[str, Any]]) -> None
             for row in rows:
                 if row["kind"] == kind and distance_m in (None, row["distance_m"]):
                     ratios.append(-math.inf if row["log_ratio"] is None else row["log_ratio"])
-            passed = {f"{limit:g}": sum(one >= limit for one in ratios) for limit in LIMITS}
+            passed = {f"{limit:g}": int(sum(one >= limit for one in ratios)) for limit in LIMITS}
             table.append(
                 {"kind": kind, "distance_m": distance_m, "count": len(ratios), "passed": passed}
             )
