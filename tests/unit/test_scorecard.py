@@ -231,11 +231,11 @@ def data(tmp_path: Path) -> Path:
     return folder.parent
 
 
-KNOWN = "real_machine.emps.known"
+EMPS_KNOWN = "real_machine.emps.known"
 BEYOND = [
-    f"{KNOWN}.explainable=false",
-    f"~{KNOWN}.effects.coulomb_friction",
-    f"~{KNOWN}.effects.viscous_friction",
+    f"{EMPS_KNOWN}.explainable=false",
+    f"~{EMPS_KNOWN}.effects.coulomb_friction",
+    f"~{EMPS_KNOWN}.effects.viscous_friction",
 ]
 """A machine whose causes the library lacks: an abstention is right."""
 
@@ -255,7 +255,7 @@ def test_a_scorecard_skips_missing_folders_and_keeps_finished_cases(
     assert "| emps | unknown |" in (data.parent / "card" / "scorecard.md").read_text()
     assert "Known:" in (data.parent / "card" / "scorecard.html").read_text()
     # the answer stands; knowledge that has changed meanwhile counts
-    again = brokk(*words, "resume=card", f"{KNOWN}.plausible=[lag]")
+    again = brokk(*words, "resume=card", f"{EMPS_KNOWN}.plausible=[lag]")
     assert again.code == 0, again.err
     assert len(stages.commands) == 1
     later = json.loads((data.parent / "card" / "scorecard.json").read_text())
