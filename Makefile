@@ -9,14 +9,15 @@ TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH_VERSION ?= $(shell sed -n '/^name = "torch"$$/{n;s/.*"\(.*\)"/\1/p;}' uv.lock)
 GET_TORCH = $(UV) pip install --quiet --python $(BIN)/python --no-deps --default-index $(TORCH_INDEX) torch==$(TORCH_VERSION)
 NO_CUDA = $(shell sed -nE 's/^name = "(torch|triton|nvidia-.*|cuda-.*)"$$/--no-install-package \1/p' uv.lock)
+PRESET ?= $(shell nvidia-smi -L >/dev/null 2>&1 && echo preset=gpu || echo preset=laptop)
 
 .PHONY: help play train test test-all mutants figures docs check setup clean
 
 help:                   ## show these targets
 	@grep -hE '^[a-z.-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:[^#]*## /\t/' | expand -t 12
 
-train: setup            ## install, train the main task and leave a run folder
-	$(BIN)/brokk mode=train
+train: setup            ## install, train the main task and leave a run folder; PRESET= for the defaults, 13 minutes
+	$(BIN)/brokk mode=train $(PRESET)
 
 play: setup             ## install, and watch the shipped policy in a browser
 	$(BIN)/brokk mode=play
