@@ -79,7 +79,12 @@ def augment(env: Mirror, obs: TensorDict | None, actions: torch.Tensor | None) -
 @pytest.mark.parametrize("mirrored", [False, True], ids=["plain", "mirror"])
 @pytest.mark.parametrize("fuse", [False, True], ids=["eager", "fused"])
 def test_captured_ppo_learns_what_rsl_rls_own_learns(fuse: bool, mirrored: bool) -> None:
-    """In float32: storage is that of the captured rollout, returns and update are compared."""
+    """In float32: storage is that of the captured rollout, returns and update are compared.
+
+    The learning rate is fixed. rsl-rl raises it when the divergence is above 0 and small, and at the
+    first mini-batch of an update only rounding decides that. The adaptive rate is compared on a CPU,
+    in `tests/unit/test_rl_ppo.py`.
+    """
     precision = torch.get_float32_matmul_precision()
     torch.set_float32_matmul_precision("highest")
     mirror = Mirror(
@@ -87,8 +92,8 @@ def test_captured_ppo_learns_what_rsl_rls_own_learns(fuse: bool, mirrored: bool)
         torch.tensor([-1.0, 1.0, 1.0], device="cuda"),
     )
     settings = {"env": mirror, "data_augmentation_func": augment, "use_data_augmentation": True}
-    ours = make_learner(DevicePPO, fuse)
-    theirs = make_learner(PPO, symmetry_cfg=settings if mirrored else None)
+    ours = make_learner(DevicePPO, fuse, schedule="fixed")
+    theirs = make_learner(PPO, schedule="fixed", symmetry_cfg=settings if mirrored else None)
     if mirrored:
         ours.use_mirror(mirror)  # type: ignore[attr-defined]
     for seed in range(4):
@@ -101,7 +106,6 @@ def test_captured_ppo_learns_what_rsl_rls_own_learns(fuse: bool, mirrored: bool)
         torch.testing.assert_close(
             ours.storage.returns, theirs.storage.returns, rtol=1e-4, atol=1e-5
         )
-        assert ours.learning_rate == pytest.approx(theirs.learning_rate, rel=1e-5)
     assert ours._epoch is not None and len(ours._epoch) == 1  # type: ignore[attr-defined]
     torch.set_float32_matmul_precision(precision)
     for mine, other in zip(
