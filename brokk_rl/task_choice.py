@@ -96,9 +96,10 @@ def _read_policy_task(cfg: DictConfig) -> str | None:
         path = Path(str(checkpoint))
         return read_task_name(path.parent if path.suffix == ".pt" else path)
     if folder is not None:
+        path = registry.resolve_package_path(str(folder))
         if OmegaConf.select(cfg, "policy.folder", default=None) == folder:
-            require_policy(registry.resolve_package_path(str(folder)))
-        return read_task_name(registry.resolve_package_path(str(folder)))
+            require_policy(path)
+        return read_task_name(path)
     return None
 
 

@@ -163,7 +163,7 @@ def _solve_gain(network: DriveNetwork, x: torch.Tensor, y: torch.Tensor) -> None
         network.gain.bias.copy_(weight[-1])
 
 
-def write_network(network: DriveNetwork, contract: NetworkContract, folder: Path) -> list[Path]:
+def write_network(network: DriveNetwork, contract: NetworkContract, folder: Path) -> None:
     """Write `<joint>.pt` (TorchScript), `<joint>.onnx` and `<joint>.json`; both networks hold the contract.
 
     Raises:
@@ -180,7 +180,6 @@ def write_network(network: DriveNetwork, contract: NetworkContract, folder: Path
         torch.jit.save(script, str(paths[0]), _extra_files={"contract.json": text.encode()})
     _write_onnx(network, contract, paths[1])
     write_json(paths[2], asdict(contract))
-    return paths
 
 
 class DriveStack:

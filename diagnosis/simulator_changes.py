@@ -113,15 +113,17 @@ def _widen(kind: EffectType, number: str, joint: str, value: Any) -> tuple[float
 
 def write_randomisation(
     answer: Answer, kinds: Sequence[EffectType], ranges: Sequence[RandomisationRange], path: Path
-) -> list[str]:
-    """Write the ranges as effects for training, `effect=[library,@<file>]`; return those that it cannot hold.
+) -> None:
+    """Write the ranges as effects for training, `effect=[library,@<file>]`.
+
+    An effect inside of an MJCF file is a comment: training has no simulator around which it is.
 
     Raises:
         StorageError: The file could not be written.
     """
     by_name = {kind.name: kind for kind in kinds}
     order = list(dict.fromkeys(one.effect for one in ranges))
-    nodes, inside = {}, []
+    nodes = {}
     lines = [
         "# @package effect",
         "# Ranges for domain randomisation, the effect that costs most first.",
@@ -131,7 +133,6 @@ def write_randomisation(
         selected = next(one for one in answer.selected if one.effect == name)
         lines.append(f"# {name}: {describe_cost(own[0])}")
         if by_name[name].target.side == "simulator":
-            inside.append(name)
             lines.append("#   a number of the MJCF file: its range is in randomisation.json")
         else:
             values: dict[str, dict[str, list[float]]] = {}
@@ -140,7 +141,6 @@ def write_randomisation(
             nodes[name] = build_node(selected, by_name[name], values)
     text = yaml.safe_dump(nodes, sort_keys=False) if nodes else ""
     write_text(path, "\n".join(lines) + "\n" + text)
-    return inside
 
 
 def describe_cost(one: RandomisationRange) -> str:
@@ -157,7 +157,8 @@ SYSID_HEAD = '''"""Priors for mujoco.sysid from a diagnosis: nominal value and b
     from sysid_parameters import build_parameters
     parameters = build_parameters()
 
-It needs `pip install 'mujoco[sysid]'`. The nominal value is that of the diagnosis; {bounds}.
+It needs `pip install 'mujoco[sysid]'`. The nominal value is that of the diagnosis; bounds are twice its
+95 % interval, at least a fifth of the change.
 """
 
 import math
@@ -205,8 +206,7 @@ def write_sysid_priors(changes: Sequence[Any], path: Path) -> None:
     Raises:
         StorageError: The file could not be written.
     """
-    bounds = "bounds are twice its 95 % interval, at least a fifth of the change"
-    text = SYSID_HEAD.replace("{bounds}", bounds)
+    text = SYSID_HEAD
     for one in changes:
         attribute, _, index = one.attribute.rstrip("]").partition("[")
         ends = one.interval or (one.after, one.after)

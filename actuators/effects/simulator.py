@@ -20,7 +20,7 @@ from brokk_rl.spec import spec
 class _InsideEffect(EffectSpec):
     """An effect that writes one number of the plant."""
 
-    side: ClassVar[Any] = "simulator"
+    side = "simulator"
     interfaces = ANY_INTERFACE
     quantity: ClassVar[str]
 

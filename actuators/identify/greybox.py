@@ -273,9 +273,8 @@ class GreyBoxFit:
         """Return `fitted` with its free numbers fitted to other recordings, from where they are."""
         device = torch.device("cpu")
         beside = dataclasses.replace(self, actuator=fitted)
-        random = np.random.default_rng(
-            0
-        )  # which windows count, where there are more than `windows`
+        # It draws which windows count, where there are more than `windows`.
+        random = np.random.default_rng(0)
         runs = beside._free_runs(machine, recordings, self.windows, random, device)
         x = beside._nominal(machine, device)
         for _ in range(REFIT_STEPS):

@@ -334,7 +334,7 @@ class FunctionPlant:
         self.has_memory = start is not None
         middle = 0.5 * (machine.lower + machine.upper)
         q = np.stack([middle, middle + 0.1 * (machine.upper - machine.lower)])
-        state = self._begin_rows(q, np.zeros_like(q))
+        state = self.start(q, np.zeros_like(q))
         command = read_commands(np.full_like(q, 0.1), machine)
         one_by_one = np.stack([self._call(*one) for one in zip(state, command, strict=True)])
         if one_by_one.shape != state.shape:
@@ -346,7 +346,9 @@ class FunctionPlant:
 
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """See `Plant`."""
-        return self._begin_rows(q, speed)
+        if self._start is None:
+            return np.concatenate([q, speed], 1)
+        return np.stack([np.asarray(self._start(*one)) for one in zip(q, speed, strict=True)])
 
     def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """See `Plant`."""
@@ -394,11 +396,6 @@ class FunctionPlant:
         return found.shape == rows.shape and bool(
             np.allclose(found, rows, rtol=0, atol=TRIAL_TOLERANCE)
         )
-
-    def _begin_rows(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        if self._start is None:
-            return np.concatenate([q, speed], 1)
-        return np.stack([np.asarray(self._start(*one)) for one in zip(q, speed, strict=True)])
 
 
 @lru_cache(maxsize=8)

@@ -96,7 +96,7 @@ def read_parameters(
     found = {}
     for name in names:
         value = getattr(config, name)
-        if value is None and name == "dead_time_s":
+        if name == "dead_time_s" and value is None:
             value = machine.dead_time_s
         found[name] = expand_per_joint(value, machine, f"actuator.{name}")
         if name in positive and (found[name] <= 0).any():

@@ -76,7 +76,7 @@ def read_folder(folder: Path) -> dict[str, np.ndarray]:
     found = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in (".png", ".jpg", ".jpeg"):
-            found[path.name] = cv2.imread(str(path))[..., ::-1]
+            found[path.name] = read_rgb(path)
     return found
 
 
@@ -85,19 +85,30 @@ def read_judged(panoramas: Path) -> dict[str, np.ndarray]:
     found = {}
     for name, count in zip(WITHHELD, JUDGED_EACH, strict=True):
         chance = np.random.default_rng(100)
-        panorama = cv2.imread(str(panoramas / f"{name}_1k.jpg"))[..., ::-1]
+        panorama = read_rgb(panoramas / f"{name}_1k.jpg")
         for number in range(count):
             found[f"{name} {number}"] = cut_view(panorama, chance, 360.0 * number / count)
     from matplotlib import cbook
     from sklearn.datasets import load_sample_images
 
     photographs = [*load_sample_images().images]
-    with cbook.get_sample_data("grace_hopper.jpg") as file:
-        data = np.frombuffer(file.read(), np.uint8)
-        photographs.append(cv2.imdecode(data, cv2.IMREAD_COLOR)[..., ::-1])
+    path = cbook.get_sample_data("grace_hopper.jpg", asfileobj=False)
+    photographs.append(read_rgb(Path(str(path))))
     for name, picture in zip(("temple", "flower", "person"), photographs, strict=True):
         found[name] = np.ascontiguousarray(picture)
     return found
+
+
+def read_rgb(path: Path) -> np.ndarray:
+    """Return a picture, RGB.
+
+    Raises:
+        FileNotFoundError: it is missing or no picture.
+    """
+    picture = cv2.imread(str(path))
+    if picture is None:
+        raise FileNotFoundError(f"{path} is missing or no picture")
+    return picture[..., ::-1]
 
 
 def judge(network: str, gate: str | None, pictures: dict[str, np.ndarray]) -> dict[str, object]:
@@ -155,7 +166,8 @@ def draw_leaves(chance: np.random.Generator) -> np.ndarray:
         near = shading + (1 - shading) * number / count
         tone = base + chance.normal(0, 1, 3) * [12, 25, 25]
         tone[2] *= near
-        hsv = np.uint8([[[int(tone[0] / 2) % 180, *np.clip(tone[1:], 5, 250).astype(int)]]])
+        pixel = [int(tone[0] / 2) % 180, *np.clip(tone[1:], 5, 250).astype(int)]
+        hsv = np.array([[pixel]], np.uint8)
         colour = cv2.cvtColor(hsv, cv2.COLOR_HSV2RGB)[0, 0]
         place = (int(chance.uniform(0, width)), int(chance.uniform(0, height)))
         axes = (max(1, int(size)), max(1, int(size / slim)))
@@ -177,7 +189,7 @@ def write_training(folder: Path, panoramas: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name in LEARNED:
         chance = np.random.default_rng(7)
-        panorama = cv2.imread(str(panoramas / f"{name}_1k.jpg"))[..., ::-1]
+        panorama = read_rgb(panoramas / f"{name}_1k.jpg")
         for number in range(VIEWS_EACH):
             view = cut_view(panorama, chance, chance.uniform(0, 360))
             cv2.imwrite(str(folder / f"{name}_{number:03d}.jpg"), view[..., ::-1])

@@ -1,6 +1,6 @@
 """Holes and flat dark discs in dust: log-likelihood ratios by the light on the wall, and the trade.
 
-    python benchmarks/perception/dust.py benchmarks/perception/dust.json --count 10 --seed 2
+    python benchmarks/perception/dust.py <out.json> --count 40 --distances 2 3 --minutes 4
 
 Scenes are `scene=haze` with one hole, and the same with discs in its place. The gate is set so
 high that each candidate in dust is refused with its ratio. Seed 1001 served to choose the numbers
@@ -15,6 +15,7 @@ import json
 import math
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def main() -> None:
             for condition in CONDITIONS:
                 if time.monotonic() < until:
                     rows += judge_scene(scenes(given.seed), condition, distance_m, number)
-        write(given.out, given.seed, given.count, rows)
+        write(given, rows)
 
 
 def judge_scene(
@@ -77,7 +78,7 @@ def judge_scene(
 
 
 def find_ratio(
-    circle: TrueCircle, camera_matrix: np.ndarray, rejected: list[Rejection]
+    circle: TrueCircle, camera_matrix: np.ndarray, rejected: Sequence[Rejection]
 ) -> float | None:
     """Return the largest log ratio among the candidates refused in dust at a true circle."""
     pixel = camera_matrix @ np.array(circle.center_m)
@@ -91,7 +92,7 @@ def find_ratio(
     return max(ratios, default=None)
 
 
-def write(path: Path, seed: int, count: int, rows: list[dict[str, Any]]) -> None:
+def write(given: argparse.Namespace, rows: list[dict[str, Any]]) -> None:
     """Write the share of holes and discs that pass each limit, by distance and in all."""
     table = []
     for distance_m in [*sorted({row["distance_m"] for row in rows}), None]:
@@ -107,14 +108,16 @@ def write(path: Path, seed: int, count: int, rows: list[dict[str, Any]]) -> None
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
     ).stdout.strip()
+    distances = " ".join(f"{distance_m:g}" for distance_m in given.distances)
     content = {
-        "command": f"python benchmarks/perception/dust.py {path} --count {count} --seed {seed}",
+        "command": f"python benchmarks/perception/dust.py <out.json> --count {given.count} "
+        f"--distances {distances} --seed {given.seed} --minutes {given.minutes:g}",
         "machine": "two shared cores",
         "commit": commit,
         "table": table,
         "rows": rows,
     }
-    path.write_text(json.dumps(content, indent=1) + "\n")
+    given.out.write_text(json.dumps(content, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -31,8 +31,6 @@ RANGES_FILE, TABLE_FILE, NETWORKS = "randomisation.yaml", "randomisation.json", 
 CHANGES_FILE = "changes.json"
 NUM_TARGET_RUNS, TARGET_RUN_S = 3, 20.0
 """Drawn motions that a network is fitted to beside the recorded ones. Chosen by hand."""
-
-
 MAX_NETWORK_SHARE = 0.3
 """Error of a network over that of the unchanged file from which a warning says so. Chosen by hand."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -97,7 +98,6 @@ class Diagnose:
             RecordingError: there is too little data to fit a simulator to.
             ConfigError: an effect is unknown, or there is neither a reference nor an actuator.
         """
-        kinds = self._load_effects()
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
         with (
             ItemProgress("fitting the simulator", SHARE) as progress,
@@ -107,13 +107,13 @@ class Diagnose:
             def tell(doing: str, done: float) -> None:
                 progress.reach(done, doing)
 
-            base = self._base(given, kinds, tell)
+            base = self._base(given, self._kinds, tell)
             generator = self.session.generator("diagnosis")
             prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
             work = DiagnosisPipeline(
                 given,
                 base,
-                kinds,
+                self._kinds,
                 prices,
                 certainty,
                 self.thresholds,
@@ -130,13 +130,14 @@ class Diagnose:
             StorageError: something could not be written.
         """
         folder = self.session.folder
-        kinds = self._load_effects()
         outcome.save(folder)
-        effects_file.write_effects(outcome.answer, kinds, folder / effects_file.EFFECTS_FILE)
+        effects_file.write_effects(outcome.answer, self._kinds, folder / effects_file.EFFECTS_FILE)
         with use_workers(self.diagnosis.workers):
             report.write_report(outcome, folder, self.machine)
 
-    def _load_effects(self) -> list[EffectType]:
+    @cached_property
+    def _kinds(self) -> list[EffectType]:
+        """Effects that are asked about; loading them logs which ones are left out, so it happens once."""
         return effect_library.load_effects(self.machine, self.diagnosis.effects, self.base)
 
     def _case(self) -> GapCase:

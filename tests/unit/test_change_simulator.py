@@ -183,6 +183,8 @@ def test_priors_write_themselves_into_a_spec(
 
 
 @pytest.mark.slow
+# mjlab and Isaac Lab load TorchScript, which torch deprecates.
+@pytest.mark.filterwarnings("ignore:.torch.jit.load. is deprecated:FutureWarning")
 def test_networks_drive_the_file_as_its_drives_do(tmp_path: Path) -> None:
     told = change_arm(tmp_path, networks=True)
     for one in told["networks"]:
@@ -197,12 +199,12 @@ def test_networks_drive_the_file_as_its_drives_do(tmp_path: Path) -> None:
     length = contract["history_length"]
     row = np.concatenate([np.full(length, 0.01 * contract["pos_scale"]), np.zeros(length)])
     given = torch.as_tensor(row, dtype=torch.float32)[None]
-    torque_nm = float(network(given)) * contract["torque_scale"]
+    torque_nm = network(given).item() * contract["torque_scale"]
     assert torque_nm == pytest.approx(0.3, abs=0.05)
     onnxruntime = pytest.importorskip("onnxruntime")
     session = onnxruntime.InferenceSession(str(folder / "elbow.onnx"))
     (answer,) = session.run(None, {"input": given.numpy()})
-    assert float(answer[0, 0]) == pytest.approx(float(network(given)), abs=1e-5)
+    assert float(answer[0, 0]) == pytest.approx(network(given).item(), abs=1e-5)
     properties = session.get_modelmeta().custom_metadata_map
     assert json.loads(properties["metadata"]) == contract
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -75,7 +75,9 @@ def kind(name: str) -> SceneRanges:
     return option("scene", name)
 
 
-def studio(name: str, rig: StereoRig, depth: str = "exact") -> FrameRenderer:
+def studio(
+    name: str, rig: StereoRig, depth: Literal["matched", "exact", "none"] = "exact"
+) -> FrameRenderer:
     return FrameRenderer(
         rig=rig,
         scene=kind(name),
@@ -476,6 +478,7 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(
     for number in range(1 if name != "varied" else 3):
         view = scenes.view(number)
         shot = maker.shot(view.scene, view.generator, view.base_from_camera)
+        assert shot.right is not None
         assert shot.color.shape == shot.right.shape == (270, 480, 3)
         assert (
             not (shot.label.hole_mask & ~shot.label.block).any()
