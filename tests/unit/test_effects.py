@@ -25,6 +25,8 @@ link_length base_tilt clock_offset extrinsics
 """.split()  # noqa: SIM905
 OF_SERVOS = ["sag"]
 """Effects of joints that are commanded by position; see `test_servo.py`."""
+OF_FORCES = ["coulomb_friction", "force_offset", "inertia", "viscous_friction"]
+"""Effects of joints that are commanded by torque; see `test_force_drive.py`."""
 SMOOTH = [name for name in FIXED if name not in ("frame_loss", "stiction", "quantisation")]
 
 
@@ -92,7 +94,7 @@ def stack(machine: Machine, inner: Any, specs: list[Any], num: int) -> Any:
 
 
 def test_every_fixed_name_has_an_effect_and_beside_them_are_only_libraries() -> None:
-    assert sorted(names("effect")) == sorted([*FIXED, *OF_SERVOS, "library", "wide"])
+    assert sorted(names("effect")) == sorted([*FIXED, *OF_SERVOS, *OF_FORCES, "library", "wide"])
 
 
 @pytest.mark.parametrize("name", FIXED)
