@@ -1,0 +1,161 @@
+"""Parameters of one arm of position servos, drawn from a seed; effects as changes of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.machine import Machine
+from exam.plants.plant_parameters import PlantParameters
+
+MAKES = ("bristle", "dry")
+"""Friction of a make: bristles that bend before they slip (LuGre), or dry friction of MuJoCo with a
+Stribeck part."""
+
+RANGES = {
+    "stiffness": (24.0, 40.0),  # Nm/rad: the weight of the arm then bends it by 10 to 20 mrad
+    "firmware_damping": (0.5, 1.1),  # Nm s/rad
+    "stall_n_m": (2.6, 3.3),  # STS3215: 2.94 Nm at 12 V
+    "no_load_rad_s": (4.6, 5.6),  # the same servo: 4.7 rad/s
+    "coulomb_n_m": (0.04, 0.08),  # its published frictionloss: 0.052
+    "viscous": (0.1, 0.3),  # Nm s/rad
+    "static_ratio": (1.2, 1.7),  # friction at rest over that in motion
+    "stribeck_rad_s": (0.05, 0.15),
+    "presliding_rad": (0.002, 0.004),  # bend of the bristles before they slip
+    "noise_rad": (0.0002, 0.0004),
+}
+"""Range of each parameter, uniform and by joint; chosen by hand where no source stands."""
+
+NUISANCES = {
+    "load_friction": (0.02, 0.06),  # of the torque through the gear: BAM's load-dependent term
+    "cogging_n_m": (0.005, 0.015),  # torque ripple over the angle
+    "dead_zone_rad": (0.0005, 0.0015),  # width of the firmware's zone without torque
+    "wander": (0.05, 0.10),  # standard deviation of the slow change of friction, of itself
+    "supply_drop": (0.01, 0.03),  # loss of voltage at full duty of all joints
+}
+"""The same for nuisances that the library has no model of; all scale with the roughness."""
+COUNT_RAD = 2.0 * np.pi / 4096
+"""Step of the servos' encoder: twelve bits over a turn."""
+ZERO_WITHOUT_FAULT = (
+    "jitter_s", "loss", "filter_s", "stroke_s", "added_friction_n_m", "added_viscous", "added_armature", "pull_n_m",
+    "extra_noise_rad", "outside_severity",
+)  # fmt: skip
+"""Parameters that are 0 in an arm without faults."""
+
+
+def draw_servos(machine: Machine, seed: int, roughness: float) -> tuple[str, PlantParameters]:
+    """Return make and parameters of the arm with this seed; `roughness` scales its nuisances."""
+    generator = np.random.default_rng([seed, *b"servos"])
+    make, count = MAKES[int(generator.integers(len(MAKES)))], machine.num_joints
+    found = {name: generator.uniform(*span, count) for name, span in RANGES.items()}
+    for name, span in NUISANCES.items():
+        found[name] = roughness * generator.uniform(*span, count)
+    found["supply_drop"] = np.full(count, found["supply_drop"][0])  # one supply
+    found["cogging_phase"] = generator.uniform(0.0, 2.0 * np.pi, count)
+    found["transport_s"] = np.full(count, generator.uniform(0.03, 0.06))  # one bus
+    found["ticks"] = np.full(count, float(generator.integers(1, 4)))  # steps between two of the loop
+    found["step_rad"] = np.full(count, COUNT_RAD)
+    found |= {name: np.zeros(count) for name in ZERO_WITHOUT_FAULT}
+    return make, found
+
+
+FaultSizes = Mapping[str, np.ndarray]
+"""Parameters of an effect by name, `(J,)`, neutral where a joint lacks it."""
+
+
+def _add_dead_time(n: PlantParameters, size: FaultSizes) -> None:
+    n["transport_s"] = n["transport_s"] + size["dead_time_s"]
+
+
+def _add_delay_jitter(n: PlantParameters, size: FaultSizes) -> None:
+    n["jitter_s"] = n["jitter_s"] + size["jitter_s"]
+
+
+def _add_frame_loss(n: PlantParameters, size: FaultSizes) -> None:
+    n["loss"] = n["loss"] + size["probability"]
+
+
+def _add_lag(n: PlantParameters, size: FaultSizes) -> None:
+    """Add the firmware's smoothing of targets: two equal stages with the same mean delay."""
+    n["filter_s"] = n["filter_s"] + 0.5 * size["time_constant_s"]
+
+
+def _add_rate_limit(n: PlantParameters, size: FaultSizes) -> None:
+    n["stroke_s"] = n["stroke_s"] + size["stroke_s"]
+
+
+def _add_backlash(n: PlantParameters, size: FaultSizes) -> None:
+    """Add friction that the loop's stiffness does not overcome within half the gap.
+
+    The encoder sits behind the gear: play before it leaves no error at rest, friction does.
+    """
+    n["added_friction_n_m"] = n["added_friction_n_m"] + 0.5 * n["stiffness"] * size["gap_rad"]
+
+
+def _add_sag(n: PlantParameters, size: FaultSizes) -> None:
+    """Add the pull of a cable that bends the loop by the sag in the middle of the travel."""
+    n["pull_n_m"] = n["pull_n_m"] - n["stiffness"] * size["sag_rad"]
+
+
+def _add_quantisation(n: PlantParameters, size: FaultSizes) -> None:
+    n["step_rad"] = np.maximum(n["step_rad"], size["step_rad"])
+
+
+def _add_sensor_noise(n: PlantParameters, size: FaultSizes) -> None:
+    n["extra_noise_rad"] = n["extra_noise_rad"] + size["sigma_rad"]
+
+
+def _add_joint_friction(n: PlantParameters, size: FaultSizes) -> None:
+    n["added_friction_n_m"] = n["added_friction_n_m"] + size["part"] * n["full_n_m"]
+
+
+def _add_joint_damping(n: PlantParameters, size: FaultSizes) -> None:
+    n["added_viscous"] = n["added_viscous"] + size["part"] * n["full_n_m"] / n["full_rad_s"]
+
+
+def _add_joint_armature(n: PlantParameters, size: FaultSizes) -> None:
+    n["added_armature"] = n["added_armature"] + size["part"]
+
+
+def _add_drive_gain(n: PlantParameters, size: FaultSizes) -> None:
+    n["stiffness"] = n["stiffness"] * size["gain"]
+
+
+FAULTS: dict[str, Callable[[PlantParameters, FaultSizes], None]] = {
+    "dead_time": _add_dead_time,
+    "delay_jitter": _add_delay_jitter,
+    "frame_loss": _add_frame_loss,
+    "lag": _add_lag,
+    "rate_limit": _add_rate_limit,
+    "backlash": _add_backlash,
+    "sag": _add_sag,
+    "quantisation": _add_quantisation,
+    "sensor_noise": _add_sensor_noise,
+    "joint_friction": _add_joint_friction,
+    "joint_damping": _add_joint_damping,
+    "joint_armature": _add_joint_armature,
+    "drive_gain": _add_drive_gain,
+}
+"""Change of the parameters by effect, in place. The last four are effects on numbers of an MJCF
+file: only a candidate that diagnoses such a simulator can name them."""
+
+
+def change_servos(
+    numbers: PlantParameters, faults: Mapping[str, FaultSizes], machine: Machine
+) -> PlantParameters:
+    """Return the parameters of an arm with faults.
+
+    Raises:
+        ConfigError: a fault is unknown.
+    """
+    found = {name: value.copy() for name, value in numbers.items()}
+    # as `brokk_rl.sim.mjcf_plant` counts: an error of 5 % of the travel, and full speed
+    found["full_n_m"] = 0.05 * found["stiffness"] * (machine.upper - machine.lower)
+    found["full_rad_s"] = machine.max_speed.copy()
+    for name, size in faults.items():
+        if name not in FAULTS:
+            raise ConfigError(f"exam: no servo has '{name}'; {list_choices(name, FAULTS)}")
+        FAULTS[name](found, size)
+    return found
