@@ -1,0 +1,230 @@
+"""Arms of position servos, simulated by MuJoCo C: `N` runs side by side, and their plant family.
+
+The library's servo is a linear loop of second order behind play and sag. Here a firmware loop on a
+quantised reading drives motors with back EMF against friction, and weight comes from the arm's masses.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from scipy.signal import lfilter
+
+from brokk_rl.commands import find_rest
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.machine import Dimension, Machine
+from brokk_rl.signals import Command, JointState
+from brokk_rl.sim.mjcf_plant import MjcfPlant
+from brokk_rl.spec import spec
+from exam.case_distribution import PlantRun
+from exam.plants import servo_parameters
+from exam.plants.electronics import CommandBus
+from exam.plants.plant_parameters import PlantParameters
+from exam.plants.servo_causes import CAUSES, ServoCauses
+from exam.plants.servo_drive import FRICTIONS, STEP_S, Friction, PositionLoop, TargetFilter
+
+ARM = Path(__file__).parent / "so101_arm.xml"
+WANDER_S = 8.0
+"""Correlation time of the slow change of friction, s; chosen by hand."""
+COGS = 40.0
+"""Cycles of the torque ripple over a turn of the joint; chosen by hand."""
+
+
+def restrict_to_torques(machine: Machine) -> Machine:
+    """Return the machine with joints that take 1 Nm a command, once a time step."""
+    unit = Dimension(value=1.0, source="unit of the torque", confidence="high")
+    joints = []
+    for joint in machine.joints:
+        joints.append(dataclasses.replace(joint, command="torque", max_force=unit))  # pyright: ignore[reportArgumentType]
+    return dataclasses.replace(  # pyright: ignore[reportCallIssue]
+        machine,  # pyright: ignore[reportArgumentType]
+        period_s=STEP_S,
+        dead_time_s=0.0,
+        joints=tuple(joints),
+    )
+
+
+class ServoArm:
+    """A `Link` to simulated arms of one make.
+
+    Args:
+        machine: Limits, travel, period.
+        make: See `servo_parameters.MAKES`.
+        parameters: Of each run's arm.
+        runs: The runs.
+        steps: Control periods of the longest run.
+    """
+
+    def __init__(
+        self,
+        machine: Machine,
+        make: str,
+        parameters: Sequence[PlantParameters],
+        runs: Sequence[PlantRun],
+        steps: int,
+    ) -> None:
+        self._machine = machine
+        n = self._n = {name: np.stack([one[name] for one in parameters]) for name in parameters[0]}
+        self._plant = MjcfPlant(ARM, restrict_to_torques(machine))
+        chance = [_RunChance(run.chance, machine, steps) for run in runs]
+        self._noise = np.stack([one.noise for one in chance], 1)
+        self._wander = np.stack([one.wander for one in chance], 1)
+        self._luck = np.stack([one.luck for one in chance], 1)
+        self._elapsed_s = np.array([run.elapsed_s for run in runs])
+        kinds = [run.outside_fault.kind if run.outside_fault else None for run in runs]
+        self._causes = ServoCauses(machine, kinds, n["outside_severity"])
+        q = np.tile(machine.home, (len(runs), 1))
+        self._state = self._plant.start(q, np.zeros_like(q))
+        self._bus = CommandBus(n, machine.period_s)
+        # the servos held their pose before; a second is more than any delay
+        rest = find_rest(q, machine)
+        luck = np.ones((len(runs), 1))
+        self._bus.send(rest, -1.0 - float(n["jitter_s"].max()), luck, 0.0 * luck, 0.0 * rest)
+        self._bus.at(0.0)
+        self._targets = TargetFilter(n, machine, q.copy())
+        self._loop = PositionLoop(n)
+        self._friction: Friction = FRICTIONS[make](n)
+        self._changes = dict(self._friction.changes)
+        if n["added_armature"].any():
+            self._changes["armature"] = n["added_armature"]
+        self._sigma = np.hypot(n["noise_rad"], n["extra_noise_rad"])
+        self._middle = (machine.upper + machine.lower) / 2
+        self._duty, self._through = np.zeros_like(q), np.zeros_like(q)
+        self._k = 0
+
+    @property
+    def q(self) -> np.ndarray:
+        """True positions of the joints, `(N, J)`."""
+        return self._plant.read(self._state)[0]
+
+    def read(self) -> JointState:
+        """Return the present readings of the encoders."""
+        return JointState(self._k * self._machine.period_s, self._measure(self.q))
+
+    def extra(self) -> Mapping[str, np.ndarray]:
+        """Return nothing: no tool is tracked."""
+        return {}
+
+    def send(self, command: Command) -> Command:
+        """Move on by one control period with these commands, `(N, J)`."""
+        machine, k, causes = self._machine, self._k, self._causes
+        t_s = k * machine.period_s
+        u = causes.command(np.asarray(command.u, dtype=float))
+        luck = self._luck[k]
+        later_s = causes.delay_s(self._elapsed_s + t_s)
+        self._bus.send(u, t_s, luck[:, :1], luck[:, 1:], later_s)
+        for i in range(round(machine.period_s / STEP_S)):
+            self._step(t_s + i * STEP_S)
+        self._k += 1
+        return command
+
+    def _step(self, t_s: float) -> None:
+        n, causes, loop = self._n, self._causes, self._loop
+        q, speed = self._plant.read(self._state)
+        target = self._targets.step(self._bus.at(t_s))
+        self._duty = loop.step(target, self._measure(q), speed, causes.cap(self._duty))
+        motor = causes.weaken(loop.torque(self._duty, speed))
+        # the weight goes through the gear: the motor's torque of the step before stands for it
+        loaded = n["load_friction"] * np.abs(self._through)
+        self._through = motor
+        wander = n["coulomb_n_m"] * n["wander"] * self._wander[self._k]
+        extra_n_m = np.maximum(loaded + wander, 0.0) + causes.friction_n_m(q)
+        lost = self._friction.torque(speed, extra_n_m)
+        lost = lost + (n["viscous"] + n["added_viscous"]) * speed
+        cogging = n["cogging_n_m"] * np.sin(COGS * q + n["cogging_phase"])
+        pull = n["pull_n_m"] * np.cos(q - self._middle)
+        torque = motor - lost + cogging + pull + causes.push(q, speed)
+        self._state = self._plant.run(self._state, torque[:, None], self._changes or None)[:, 0]
+
+    def _measure(self, q: np.ndarray) -> np.ndarray:
+        step = self._n["step_rad"]
+        return np.round((q + self._sigma * self._noise[self._k]) / step) * step
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        pass
+
+
+class _RunChance:
+    """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours."""
+
+    def __init__(self, seed: int, machine: Machine, steps: int) -> None:
+        generator = np.random.default_rng([seed, 5])
+        shape = (steps + 1, machine.num_joints)
+        self.noise = generator.standard_normal(shape)
+        keep = float(np.exp(-machine.period_s / WANDER_S))
+        white = generator.standard_normal(shape) * np.sqrt(1.0 - keep * keep)
+        white[0] /= np.sqrt(1.0 - keep * keep)
+        self.wander = np.asarray(lfilter([1.0], [1.0, -keep], white, axis=0))
+        self.luck = generator.random((steps + 1, 2))
+
+
+@spec
+class ServoPlants:
+    """Tabletop arms of position servos in two makes of friction, each arm unique.
+
+    Attributes:
+        roughness: By name, size of the nuisances.
+        outside_not_on: Joints on which nothing of an outside cause would be seen.
+    """
+
+    roughness: dict[str, float]
+    outside_not_on: dict[str, tuple[str, ...]]
+
+    is_held_out = False
+
+    def check(self) -> None:
+        for name in self.outside_not_on:
+            if name not in CAUSES:
+                raise ConfigError(
+                    f"exam.plants.outside_not_on: no cause '{name}'; {list_choices(name, CAUSES)}"
+                )
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects that its plants can have."""
+        return tuple(servo_parameters.FAULTS)
+
+    @property
+    def outside_faults(self) -> tuple[str, ...]:
+        """Names of the causes outside the library that its plants can have."""
+        return CAUSES
+
+    def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
+        """Return the make of each run."""
+        return [servo_parameters.draw_servos(machine, run.seed, 1.0)[0] for run in runs]
+
+    def build(self, machine: Machine, runs: Sequence[PlantRun], run_s: float) -> ServoArm:
+        """Return runs of one make, side by side.
+
+        Raises:
+            ConfigError: the machine is not commanded by position, or an effect or a roughness is
+                unknown.
+        """
+        if machine.interface != "position":
+            raise ConfigError(
+                f"exam_plants=servos: machine '{machine.name}' is commanded by {machine.interface}; expected a machine of "
+                "position servos, e.g. machine=so101"
+            )
+        makes, parameters = set(), []
+        for run in runs:
+            if run.roughness not in self.roughness:
+                raise ConfigError(
+                    f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
+                    f"{list_choices(run.roughness, self.roughness)}"
+                )
+            size = self.roughness[run.roughness]
+            make, numbers = servo_parameters.draw_servos(machine, run.seed, size)
+            numbers = servo_parameters.change_servos(numbers, run.faults, machine)
+            if run.outside_fault is not None:
+                numbers["outside_severity"] = run.outside_fault.severity
+            makes.add(make)
+            parameters.append(numbers)
+        (make,) = makes
+        return ServoArm(machine, make, parameters, runs, round(run_s / machine.period_s))
