@@ -55,7 +55,8 @@ def draw_servos(machine: Machine, seed: int, roughness: float) -> tuple[str, Pla
     found["supply_drop"] = np.full(count, found["supply_drop"][0])  # one supply
     found["cogging_phase"] = generator.uniform(0.0, 2.0 * np.pi, count)
     found["transport_s"] = np.full(count, generator.uniform(0.03, 0.06))  # one bus
-    found["ticks"] = np.full(count, float(generator.integers(1, 4)))  # steps between two of the loop
+    # time steps between two of the firmware's loop
+    found["ticks"] = np.full(count, float(generator.integers(1, 4)))
     found["step_rad"] = np.full(count, COUNT_RAD)
     found |= {name: np.zeros(count) for name in ZERO_WITHOUT_FAULT}
     return make, found
