@@ -4,9 +4,9 @@ torque_limit    the firmware cuts the motor's torque
 heat            the motor's torque falls as it works, and recovers in pauses
 bad_tooth       a sector of the gear in which the joint goes hard
 overload_trip   after some tenths of a second at high duty the servo lets go for a while
-moved_stop      something stands in the travel
+weak_side       the motor pulls less one way than the other
 cross_talk      the joint follows a part of the next joint's target
-reversal_pause  after a reversal the target stands still for some tenths of a second
+feed_forward    the firmware adds the target's speed to the target: the joint overshoots
 warm_delay      commands come later and later as the machine runs
 """
 
@@ -18,7 +18,7 @@ from brokk_rl.machine import Machine
 from exam.plants.servo_drive import STEP_S
 
 CAUSES = (
-    "torque_limit", "heat", "bad_tooth", "overload_trip", "moved_stop", "cross_talk", "reversal_pause", "warm_delay",
+    "torque_limit", "heat", "bad_tooth", "overload_trip", "weak_side", "cross_talk", "feed_forward", "warm_delay",
 )  # fmt: skip
 
 # Sizes at severity 1, chosen by hand so that each shows plainly in the motion.
@@ -26,9 +26,9 @@ LIMIT_LOSS = 0.8
 HEAT_LOSS, HEAT_S, WORK = 0.7, 15.0, 0.15
 TOOTH_N_M, TOOTH_TRAVEL = 0.6, 0.12
 TRIP_DUTY, TRIP_S, AWAY_S = 0.35, 0.2, 0.8
-STOP_TRAVEL, STOP_STIFFNESS, STOP_DAMPING = 0.35, 150.0, 2.0
+SIDE_LOSS = 0.7
 LEAK = 0.25
-PAUSE_S = 0.4
+LEAD_S = 0.15
 WARM_S, WARMING_S = 0.12, 400.0
 
 
@@ -50,25 +50,14 @@ class ServoCauses:
             self._of[kind] = severity * has[:, None]
         none = np.zeros_like(severity)
         self._heat, self._strained_s, self._away_s = none.copy(), none.copy(), none.copy()
-        self._pause_s, self._way = none.copy(), none.copy()
         self._before: np.ndarray | None = None
-        self._held = none
 
     def command(self, u: np.ndarray) -> np.ndarray:
         """Return the commands that reach the servos, `(N, J)`, once a control period."""
         u = u + LEAK * self._of["cross_talk"] * (np.roll(u, -1, axis=1) - u)
-        size = self._of["reversal_pause"]
-        if not size.any():
-            return u
-        if self._before is None:
-            self._before = self._held = u
-        change = np.sign(u - self._before)
-        turned = (change * self._way < 0) & (size > 0) & (self._pause_s <= 0)
-        self._pause_s = np.where(turned, PAUSE_S * size, self._pause_s - self._period_s)
-        self._way = np.where(change != 0, change, self._way)
+        before = u if self._before is None else self._before
         self._before = u
-        self._held = np.where(self._pause_s > 0, self._held, u)
-        return self._held
+        return u + LEAD_S / self._period_s * self._of["feed_forward"] * (u - before)
 
     def delay_s(self, t_s: np.ndarray) -> np.ndarray:
         """Return the extra delay of a frame, `(N, J)`, after a running time of `t_s`, `(N,)`."""
@@ -88,19 +77,12 @@ class ServoCauses:
         return cap
 
     def weaken(self, torque: np.ndarray) -> np.ndarray:
-        """Return the torques of the motors, `(N, J)`, as hot as they are."""
-        return torque * (1.0 - HEAT_LOSS * self._of["heat"] * self._heat)
+        """Return the torques of the motors, `(N, J)`: hot ones, and those with a weak side."""
+        side = 1.0 - SIDE_LOSS * self._of["weak_side"] * (torque > 0)
+        return torque * side * (1.0 - HEAT_LOSS * self._of["heat"] * self._heat)
 
     def friction_n_m(self, q: np.ndarray) -> np.ndarray:
         """Return further Coulomb friction at `q`, `(N, J)`."""
         place = (q - self._lower) / self._travel
         sector = np.exp(-np.square((place - 0.5) / TOOTH_TRAVEL))
         return TOOTH_N_M * self._of["bad_tooth"] * sector
-
-    def push(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
-        """Return the torque of a stop in the travel, `(N, J)`."""
-        size = self._of["moved_stop"]
-        beyond = q - (self._lower + (1.0 - STOP_TRAVEL * size) * self._travel)
-        touches = (beyond > 0) & (size > 0)
-        pressed = np.maximum(STOP_STIFFNESS * beyond + STOP_DAMPING * speed, 0.0)
-        return np.where(touches, -pressed, 0.0)

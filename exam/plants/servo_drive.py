@@ -98,7 +98,7 @@ class Friction(Protocol):
 
     @property
     def changes(self) -> Mapping[str, np.ndarray]:
-        """What MuJoCo itself has of it, as `MjcfPlant.run` takes it."""
+        """Part of it that MuJoCo itself simulates, as `MjcfPlant.run` takes it."""
         ...
 
     def torque(self, speed: np.ndarray, extra_n_m: np.ndarray) -> np.ndarray:

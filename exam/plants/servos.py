@@ -137,7 +137,7 @@ class ServoArm:
         lost = lost + (n["viscous"] + n["added_viscous"]) * speed
         cogging = n["cogging_n_m"] * np.sin(COGS * q + n["cogging_phase"])
         pull = n["pull_n_m"] * np.cos(q - self._middle)
-        torque = motor - lost + cogging + pull + causes.push(q, speed)
+        torque = motor - lost + cogging + pull
         self._state = self._plant.run(self._state, torque[:, None], self._changes or None)[:, 0]
 
     def _measure(self, q: np.ndarray) -> np.ndarray:
