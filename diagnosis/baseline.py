@@ -110,7 +110,9 @@ def apply_changes(actuator: Actuator, by: dict[str, np.ndarray], machine: Machin
     model: Any = actuator.build(machine, 1, torch.device("cpu"))
     tables: Any = {}
     for name, row in by.items():
-        values = (model.parameters[name][0].numpy() + row).clip(0.0).tolist()
+        start = model.parameters[name][0].numpy()
+        # as `tune_parameters` bounds them: only a number that was negative, such as a sag, stays so
+        values = np.maximum(start + row, np.minimum(start, 0.0)).tolist()
         tables[name] = dict(zip(machine.joint_names, values, strict=True))
     return dataclasses.replace(actuator, **tables)  # pyright: ignore[reportArgumentType, reportCallIssue]
 

@@ -20,6 +20,7 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.signals import Command
+from diagnosis.baseline import apply_changes
 from diagnosis.effect_library import load_effects
 from diagnosis.error_covariance import LevelCovariance, fit_level_noise
 from diagnosis.free_runs import WindowedRuns
@@ -259,3 +260,12 @@ def test_the_delay_of_a_motion_is_the_shift_of_its_speed(arm: Machine) -> None:
         assert one["before"] == pytest.approx(1.0 * arm.period_s, abs=0.1 * arm.period_s)
         assert one["ci95"][0] <= one["measured"] <= one["ci95"][1]
     assert found[arm.joint_names[4]] is None
+
+
+def test_a_changed_servo_keeps_a_negative_sag(arm: Machine) -> None:
+    """Weight that pulls a joint in its positive direction is a negative sag."""
+    servo = replace(option("actuator", "servo"), sag_rad=-0.015, play_rad=0.004)
+    rows = {"sag_rad": np.full(5, 0.001), "play_rad": np.full(5, -0.01)}
+    changed: Any = apply_changes(servo, rows, arm)
+    assert list(changed.sag_rad.values()) == pytest.approx([-0.014] * 5)
+    assert list(changed.play_rad.values()) == [0.0] * 5
