@@ -44,7 +44,7 @@ class Plant(Protocol):
     """Motion of all joints under commands; rows are independent."""
 
     has_memory: bool
-    """Whether a state holds more than positions and speeds."""
+    """True if a state holds more than positions and speeds."""
 
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """Return states `(N, S)` at positions and speeds `(N, J)`."""

@@ -24,7 +24,7 @@ FIELD_STRIDE_S, REFERENCE_STRIDE_S = 5.0, 15.0
 
 @dataclass(frozen=True)
 class Arm:
-    """What a rival is told of the machine.
+    """The facts about the machine that a rival gets.
 
     Attributes:
         joints: Names.
