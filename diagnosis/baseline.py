@@ -106,12 +106,11 @@ def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
 
 
 def apply_changes(actuator: Actuator, by: dict[str, np.ndarray], machine: Machine) -> Actuator:
-    """Return `actuator` with its numbers changed."""
+    """Return `actuator` with its numbers changed, within the bounds of `tune_parameters`: only a negative one stays so."""
     model: Any = actuator.build(machine, 1, torch.device("cpu"))
     tables: Any = {}
     for name, row in by.items():
         start = model.parameters[name][0].numpy()
-        # as `tune_parameters` bounds them: only a number that was negative, such as a sag, stays so
         values = np.maximum(start + row, np.minimum(start, 0.0)).tolist()
         tables[name] = dict(zip(machine.joint_names, values, strict=True))
     return dataclasses.replace(actuator, **tables)  # pyright: ignore[reportArgumentType, reportCallIssue]
