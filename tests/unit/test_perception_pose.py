@@ -12,7 +12,7 @@ from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 from brokk_rl.contracts.vision import HolePose, Rejection
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, plane, rim
-from perception.pose.appearance import IN_DUST
+from perception.pose.wall_light import IN_DUST, WallLight
 from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
 
