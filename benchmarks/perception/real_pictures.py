@@ -226,15 +226,15 @@ def measure_board(frame: Frame, pose: PlaneConic) -> dict[str, Any]:
     assert corners is not None
     by_picture = locate_by_picture(corners, frame.camera_matrix)
     face = find_face(frame, pose, corners, by_picture)
-    middle_m = by_picture.m / (by_picture.m @ by_picture.m)
+    ray = np.linalg.solve(frame.camera_matrix, [*corners.mean(0), 1.0])
     row = {
-        "range_m": float(np.linalg.norm(middle_m)),
-        "picture": compare_planes(face, by_picture, frame, pose),
+        "range_m": float(np.linalg.norm(by_picture.point(ray))),
+        "picture": compare_planes(face, by_picture, ray, frame, pose),
     }
     if others is None or np.abs(corners - others)[:, 1].max() > LARGEST_PX:
         return row | {"triangulated": None}
     by_pair = triangulate(corners, others, frame)
-    return row | {"triangulated": compare_planes(face, by_pair, frame, None)}
+    return row | {"triangulated": compare_planes(face, by_pair, ray, frame, None)}
 
 
 def locate_by_picture(corners: np.ndarray, matrix: np.ndarray) -> FacePlane:
@@ -297,9 +297,9 @@ def find_face(frame: Frame, pose: PlaneConic, corners: np.ndarray, near: FacePla
 
 
 def compare_planes(
-    face: FacePlane, true: FacePlane, frame: Frame, pose: PlaneConic | None
+    face: FacePlane, true: FacePlane, ray: np.ndarray, frame: Frame, pose: PlaneConic | None
 ) -> dict[str, float]:
-    """Return errors of a plane where the optical axis meets it, in units and in their sigmas.
+    """Return errors of a plane where a ray meets it, in units and in their sigmas.
 
     The sigma of the truth counts; that of the rig does where `pose` is given.
     """
@@ -308,7 +308,7 @@ def compare_planes(
         assert frame.baseline_m is not None
         std_per_m = pose.rig_px / (float(frame.camera_matrix[0, 0]) * frame.baseline_m)
         cov = cov + np.eye(3) * std_per_m**2
-    ray = true.m / np.linalg.norm(true.m)
+    ray = ray / np.linalg.norm(ray)
     range_m = 1.0 / float(true.m @ ray)
     range_std_m = range_m**2 * float(np.sqrt(ray @ cov @ ray))
     off_m = 1.0 / float(face.m @ ray) - range_m
