@@ -5,6 +5,8 @@
 Each footage is ten frames of one block with a board beside it, and three clicks that are 2 px off
 (`scene=footage`). It is labelled once as it is. Then all clicks are moved 6 px to the right and the
 block is not refined, so that the outline lies beside the block: such frames should be left out.
+`corner_mm` is the largest error of a corner in a frame; the pose of the camera by the board is part
+of it.
 """
 
 from __future__ import annotations
@@ -37,7 +39,9 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--sensors", nargs="+", default=["linear", "mosaic"])
-    parser.add_argument("--runs", type=Path, help="keep the runs here, and reuse footage")
+    parser.add_argument(
+        "--runs", type=Path, help="keep the runs here, and use those that are there"
+    )
     given = parser.parse_args()
     commit = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=True
@@ -86,8 +90,8 @@ def judge_footage(footage: Path, rig: str) -> dict[str, Any]:
         "frames": kept["count"],
         "kept": len(kept["names"]),
         "left_out": kept["left_out"],
-        "corner_mm": 1000 * max(corners_m, default=np.nan),
-        "least_overlap": min(overlaps, default=np.nan),
+        "corner_mm": {"median": 1000 * float(np.median(corners_m)), "most": 1000 * max(corners_m)},
+        "least_overlap": min(overlaps),
         "moved_kept": len(moved["names"]),
     }
 
@@ -96,7 +100,7 @@ def label(footage: Path, rig: str, placing: Path, num_refined: int) -> dict[str,
     """Return the names of the frames that are kept, and why the others are not."""
     out = footage.parent / f"labels_{placing.stem}_{footage.name}"
     # All frames left out is an answer too, and ends with an error.
-    is_done = run(
+    is_done = (out / "labels.json").is_file() or run(
         "mode=label", f"label.source.folder={footage / 'frames'}", f"label.placing={placing}",
         f"label.num_refined={num_refined}", f"label.noise_per_m={NOISE_PER_M[rig]}",
         f"session.out={out}", may_fail=placing.stem == "moved",
