@@ -88,11 +88,6 @@ class PlayPage:
         """Port on which the page listens."""
         return self._server.get_port()
 
-    @property
-    def num_viewers(self) -> int:
-        """Number of browsers that are connected."""
-        return len(self._server.get_clients())
-
     def update(self) -> bool:
         """Do what browsers have asked for, and show the present state; true: pages never end it."""
         self._follow_requests()

@@ -16,13 +16,13 @@ from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.contracts.task import MirroredTask
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
-from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.learning_curve import find_plateau
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.policy import TrainedPolicy, scale_output
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
+from brokk_rl.rl.training_group import TrainingGroup
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.task_description import TaskDescription
 

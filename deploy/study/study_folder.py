@@ -34,8 +34,6 @@ TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS = (
     "participants",
 )
 CAPTURES = "captures"
-OUTCOMES = ("inserted", "time limit", "stopped", "aborted")
-"""Endings of a trial: task, time, participant, experimenter, fault."""
 TRIAL_FIELDS = {
     "participant": str,
     "period": int,
