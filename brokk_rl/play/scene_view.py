@@ -99,7 +99,7 @@ class SceneView:
                 self.handle.position = place
 
     def hold_handle(self, held: bool) -> None:
-        """Say whether somebody drags the handle; it is left alone meanwhile."""
+        """Set whether a person drags the handle; the program does not move it meanwhile."""
         self._dragging = held
 
     def read_handle(self, world: int) -> np.ndarray:

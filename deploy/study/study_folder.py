@@ -47,7 +47,7 @@ TRIAL_FIELDS = {
 
 @dataclass(frozen=True)
 class Remark:
-    """Something that a reader of the results must know.
+    """Remark on the data that the report shows, such as a missing trial.
 
     Attributes:
         where: Participant or file.
