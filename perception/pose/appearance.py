@@ -147,9 +147,8 @@ def _measure_darkest_around(
     near = gray[np.ix_(rows, columns)]
     if plane is not None:
         here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])
-        behind = (
-            here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
-        )  # false where depth is unknown
+        # False where depth is unknown.
+        behind = here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
         near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
     return float(np.percentile(near, 1.0)) if near.size else 0.0
 

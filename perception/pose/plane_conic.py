@@ -473,9 +473,8 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
             np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
         )
         # Four standard deviations: of 72 points none is nearer by chance.
-        nearer |= on & (
-            1.0 / depth - rays @ face.m > 4 * face.sigma
-        )  # false where depth is unknown
+        # False where depth is unknown.
+        nearer |= on & (1.0 / depth - rays @ face.m > 4 * face.sigma)
     return float(nearer.mean())
 
 
