@@ -149,15 +149,10 @@ def _estimate_effects(found: Analysis) -> None:
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
         p = []
         for name in family:
-            deciding = get_deciding_p(found.effects[name])
+            deciding = found.effects[name].p
             p.append(math.nan if deciding is None else deciding)
         adjusted = permutation_tests.adjust_by_holm(np.array(p))
         found.holm |= dict(zip(family, adjusted.tolist(), strict=True))
-
-
-def get_deciding_p(found: GuidanceEffect) -> float | None:
-    """Return the p that counts: of the test with the period in the model; `None` where sequences do not allow it."""
-    return found.p
 
 
 def _measure_trial(

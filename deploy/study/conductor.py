@@ -78,9 +78,8 @@ class Conductor:
             times,
         )
         self._facts, self._seed, self._operators, self._clock = facts, seed, operators or {}, clock
-        for path in sorted(
-            (folder / folders.TRIALS).glob("*.json")
-        ):  # what an interruption left half saved
+        # Trials that an interruption left half saved.
+        for path in sorted((folder / folders.TRIALS).glob("*.json")):
             with suppress(ValueError):  # a file that cannot be read is said in the report
                 keep(folder, path, machine, stage)
         # Read after the repair above, so that the repaired trials count.
