@@ -198,7 +198,7 @@ def test_the_sensor_clock_of_a_topic_replaces_a_late_recorder(
     assert errors[1] < 0.1 * errors[0]
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 0.98])
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.7, 0.98])
 def test_a_cut_off_mcap_is_refused_by_its_place(
     tmp_path: Path, carriage: Machine, share: float
 ) -> None:
@@ -233,7 +233,7 @@ def test_a_message_that_cannot_be_decoded_is_told_by_its_number(
             data = b'{"u": 1.0, "q"' if number == 120 else json.dumps({"u": u, "q": q}).encode()
             writer.add_message(channel, time_ns, data, time_ns)
         writer.finish()
-    place = r"message 120, 1\.200 s from the first one, topic /state: cannot be decoded"
+    place = r"topic /state, message 120, 1\.200 s from the first one, in the chunk at byte \d+: cannot be decoded"
     with pytest.raises(RecordingError, match=place):
         make_map("/state:u", "/state:q", "log_time").read(path, carriage)
 
