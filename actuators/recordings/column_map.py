@@ -26,7 +26,7 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from actuators.recordings.expression import Expression
-from actuators.recordings.log_files import open_log
+from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import (
     Piece,
     Places,
@@ -207,6 +207,7 @@ class ColumnMap:
         overrun: Command beyond full that is taken for rounding and cut to full; more is refused.
         longest_gap_s: A longer time between two rows splits the log.
         shortest_s: Shorter pieces are left out.
+        damaged: `refuse` a log with damage, or `skip` its damaged messages, chunks and frames.
     """
 
     delimiter: Literal[",", ";", "\t", " "]
@@ -217,6 +218,7 @@ class ColumnMap:
     overrun: float
     longest_gap_s: float
     shortest_s: float
+    damaged: Damaged = "refuse"  # maps from before this field have none
 
     def check(self) -> None:
         if self.delimiter == self.decimal:
@@ -238,7 +240,8 @@ class ColumnMap:
             ConfigError: the map is not for this machine.
             RecordingError: the log cannot be used; names file, line, row and column.
         """
-        return self.read_log(open_log(path, CsvLayout(self.delimiter, self.decimal)), machine)
+        layout = CsvLayout(self.delimiter, self.decimal)
+        return self.read_log(open_log(path, layout, damaged=self.damaged), machine)
 
     def read_log(self, opened: LogFile, machine: Machine) -> list[Recording]:
         """Return the pieces of an opened log; see `read`."""
@@ -397,11 +400,11 @@ class CanColumnMap:
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
         """Return the pieces of the log at `path`; see `ColumnMap.read`."""
-        from actuators.recordings.can_log import (
-            CanLog,
-        )  # here: a desk without CAN has no python-can
+        from actuators.recordings.can_log import CanLog  # a desk without CAN has no python-can
 
-        return self.columns.read_log(CanLog(path, self.dbc), machine)
+        opened = CanLog(path, self.dbc)
+        opened.keep_whole = self.columns.damaged == "skip"
+        return self.columns.read_log(opened, machine)
 
 
 def _scale(signals: RunSignals, column: Column, empty: bool = False) -> Signal:

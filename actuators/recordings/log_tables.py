@@ -78,7 +78,7 @@ class LogFile(ABC):
         """
         if not self.keep_whole:
             raise RecordingError(
-                f"{self.path}: {text}; damaged=skip reads what is whole"
+                f"{self.path}: {text}; log.damaged=skip, or damaged: skip in the column map, reads what is whole"
             ) from error
         log.warning("%s: %s: left out", self.path, text)
 
