@@ -17,8 +17,8 @@ depend on the piston's position (at 20 Hz only the first mode of the joint is vi
 machine's YAML knows one stiffness); inertia is constant, `stiffness / (2 pi mode_hz)^2` (coupling
 through the arm's inertia is small against the 5 to 10 Hz of the oil column); pressure compensation
 is imperfect in one number, `load_sensitivity`; supply pressure is constant and the pump is limited
-by flow. Contact reaches the plant
-through the measured position only: a blocked joint keeps pushing, and the simulator's drive yields.
+by flow. Contact reaches the plant through the measured position only: a blocked joint keeps
+pushing, and the simulator's drive yields.
 """
 
 import math
@@ -205,9 +205,8 @@ class HydraulicModel:
         excess = p["breakaway"] - p["coulomb"]
         knee = p["stribeck_speed"] * self._full_speed
         viscous = p["viscous"] / self._full_speed
-        still = (
-            0.01 * self._full_speed
-        )  # below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step
+        # Below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step.
+        still = 0.01 * self._full_speed
         rub = dt * supply / inertia
 
         def rubbing(speed: torch.Tensor) -> torch.Tensor:
@@ -235,9 +234,8 @@ class HydraulicModel:
         )
         demand = torch.zeros_like(q)
         for i in range(self._num_substeps):
-            u = torch.lerp(
-                later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0)
-            )  # smooth in the delay
+            # Smooth in the delay.
+            u = torch.lerp(later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0))
             pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
             spool_rate = spool_rate + pull[0] * (pilot - spool) - pull[1] * spool_rate
             spool = (spool + dt * spool_rate).clamp(-1.0, 1.0)

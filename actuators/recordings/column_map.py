@@ -400,7 +400,8 @@ class CanColumnMap:
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
         """Return the pieces of the log at `path`; see `ColumnMap.read`."""
-        from actuators.recordings.can_log import CanLog  # a desk without CAN has no python-can
+        # Imported here, since a desk without CAN has no python-can.
+        from actuators.recordings.can_log import CanLog
 
         opened = CanLog(path, self.dbc)
         opened.keep_whole = self.columns.damaged == "skip"

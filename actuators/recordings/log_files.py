@@ -91,7 +91,8 @@ def _open_folder(path: Path) -> LogFile:
     if kind == "lerobot":
         return LeRobotLog(path)
     if kind == "bag":
-        from actuators.recordings.bag_log import BagLog  # a desk without logs has no rosbags
+        # Imported here, since a desk without logs has no rosbags.
+        from actuators.recordings.bag_log import BagLog
 
         return BagLog(path)
     raise RecordingError(
@@ -112,7 +113,8 @@ def _open_file(path: Path, layout: CsvLayout | None, dbc: str | None) -> LogFile
     if ending == ".mat":
         return MatlabLog(path)
     if ending == ".mcap":
-        from actuators.recordings.mcap_log import McapLog  # a desk without logs has no mcap
+        # Imported here, since a desk without logs has no mcap.
+        from actuators.recordings.mcap_log import McapLog
 
         return McapLog(path)
     if ending in BAG_ENDINGS:
@@ -120,7 +122,8 @@ def _open_file(path: Path, layout: CsvLayout | None, dbc: str | None) -> LogFile
 
         return BagLog(path)
     if ending in CAN_ENDINGS:
-        from actuators.recordings.can_log import CanLog  # a desk without CAN has no python-can
+        # Imported here, since a desk without CAN has no python-can.
+        from actuators.recordings.can_log import CanLog
 
         if dbc is None:
             raise ConfigError(

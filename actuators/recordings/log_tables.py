@@ -61,7 +61,7 @@ class LogRun:
 
 
 class LogFile(ABC):
-    """A log that is read as far as it is needed."""
+    """A log of which only the needed columns are read."""
 
     keep_whole = False
     """Whether damaged parts are left out with a warning; a log with damage is refused otherwise."""

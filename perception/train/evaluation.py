@@ -71,11 +71,9 @@ def compute_metrics(
     """Return figures for each condition, and for all frames under `all`.
 
     `block`: intersection over union of the block, seen as a whole. `mouth`: that of mouths, in the
-    closer view; both over all
-    pixels of all frames, `None` where there is nothing to find. `found`: part of the mouths that
-    one piece of the prediction covers
-    with an overlap above one half. `false`: predicted pieces per frame that touch no mouth.
-    `frames`: how many.
+    closer view; both over all pixels of all frames, `None` where there is nothing to find. `found`:
+    part of the mouths that one piece of the prediction covers with an overlap above one half.
+    `false`: predicted pieces per frame that touch no mouth. `frames`: how many.
     """
     said = probabilities > THRESHOLD
     block, mouth = (said[:, 0, 0], known[:, 0, 0]), (said[:, 1, 1], known[:, 1, 1])
@@ -159,9 +157,8 @@ def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    fitted = [
-        entry for entry in curve if entry["loss"] is not None
-    ]  # the network that it began with was not fitted yet
+    # The network that it began with was not fitted yet.
+    fitted = [entry for entry in curve if entry["loss"] is not None]
     left.plot(
         [entry["update"] for entry in fitted], [entry["loss"] for entry in fitted], color="black"
     )
