@@ -81,8 +81,7 @@ class JointWeight:
     """Gravity load over the yield force of each joint.
 
     The weight on the joints of a planar arm is linear in the sines and cosines of the sums of its
-    angles, which costs a tenth of the whole mechanics. Where that is exact it is used, else the
-    mechanics are.
+    angles. This form takes a tenth of the time of the full mechanics, and is used where it is exact.
 
     Args:
         machine: A machine with known masses.

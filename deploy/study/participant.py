@@ -1,8 +1,8 @@
 """A simulated participant at the twin, in real time: a browser's connections, a remote on the bus, a person's hands between them.
 
-The participant sees only the messages to the page, presses the buttons of a person, and
-moves the remote's levers as the simulated operators of `conf/operator` do. Everything that comes of
-it is marked as simulated.
+The participant gets only the messages to the page, presses the same buttons as a person, and
+moves the remote's levers as the simulated operators of `conf/operator` do. All its results are
+marked as simulated.
 """
 
 from __future__ import annotations
