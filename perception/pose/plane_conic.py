@@ -154,7 +154,7 @@ class PlaneConic:
 
 
 class PlaneConicEstimator:
-    """See `PlaneConic`."""
+    """Estimator of the face's plane and the rim on it, with the settings `PlaneConic`."""
 
     def __init__(self, settings: PlaneConic) -> None:
         self.settings = settings
