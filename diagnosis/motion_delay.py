@@ -28,7 +28,8 @@ def measure_motion_delays(
     """Return the delay of each joint, s: measured with its interval, and simulated before and after the effects.
 
     `None` for a joint whose motion does not resemble its command, or resembles it most at the longest
-    shift that is tried, or whose interval is wider than the delay itself; `None` in all for joints commanded by torque, to which no speed belongs.
+    shift that is tried, or whose interval is wider than the delay itself; `None` in all for joints
+    commanded by torque, to which no speed belongs.
     """
     if machine.interface == "torque":
         return None
