@@ -19,7 +19,7 @@ from scipy import stats
 
 from diagnosis.answer import Estimate
 from diagnosis.effect_library import DetectedEffect, EffectType, EffectValues, estimate_interval
-from diagnosis.residuals import Residuals, to_increments
+from diagnosis.residuals import INCREMENT_SAMPLES, Residuals, to_increments
 from diagnosis.responses import fit_sizes
 from diagnosis.search import find_weighted_median
 
@@ -114,22 +114,36 @@ class CommandChanges:
     residuals: Residuals
 
     @cached_property
+    def _frame_samples(self) -> int:
+        """Samples that count as one frame.
+
+        Targets of position servos move a little with each frame, so that an increment shows only the
+        mean delay of its frames. Other commands change in jumps.
+        """
+        machine = self.residuals.simulator.machine
+        return INCREMENT_SAMPLES if machine.interface == "position" else 1
+
+    @cached_property
     def _ranks(self) -> np.ndarray:
-        """Which of a joint's changes in a window a sample is, from 1 on; 0 where its command stays, `(W, L, J)`."""
-        cut = self.residuals.simulator.cut
-        jump = np.abs(np.diff(cut.u, axis=1)) > MIN_COMMAND_CHANGE
-        jump[:, : cut.num_before - cut.num_history] = False  # over when the free run begins
+        """Which of a joint's changes in a window a frame is, from 1 on; 0 where its command stays, `(W, F, J)`."""
+        cut, size = self.residuals.simulator.cut, self._frame_samples
+        first = cut.num_before - cut.num_history  # changes before are over when the free run begins
+        change = np.abs(np.diff(cut.u, axis=1))
+        change[:, :first] = 0.0
+        frames = np.add.reduceat(change, np.arange(0, change.shape[1], size), axis=1)
+        jump = frames > MIN_COMMAND_CHANGE
         return np.cumsum(jump, 1) * jump
 
     @cached_property
     def responses(self) -> np.ndarray:
         """Increments that change where the n-th change of each joint's command in a window comes late, `(C, W, I, J)`."""
-        cut, rank = self.residuals.simulator.cut, self._ranks
-        count, windows = int(rank.max(initial=0)), len(cut.u)
+        cut, windows = self.residuals.simulator.cut, len(self.residuals.simulator.cut.u)
+        count = int(self._ranks.max(initial=0))
         if not count:
             return np.zeros((0, *self.residuals.increments.shape))
         # One simulation shifts the n-th change of all joints; each joint is read for its own.
         number = np.arange(1, count + 1)[:, None, None, None]
+        rank = np.repeat(self._ranks, self._frame_samples, 1)[:, : cut.u.shape[1] - 1]
         late = np.where(rank == number, cut.u[:, :-1], cut.u[:, 1:])
         u = np.concatenate([np.repeat(cut.u[None, :, :1], count, 0), late], 2)
         rows = np.tile(np.arange(windows), count)
