@@ -35,7 +35,7 @@ JUMP = 1.5
 
 @spec
 class InspectionThresholds:
-    """When a stretch of a recording is worth telling.
+    """Thresholds from which on a stretch of a recording is reported.
 
     Attributes:
         commanded: A smaller command counts as none.
@@ -361,5 +361,5 @@ def estimate_step(q: np.ndarray) -> float:
 
 
 def _to_json_number(value: Any) -> float | None:
-    """Return a number as JSON knows it, `None` for NaN."""
+    """Return a number, `None` for NaN, which JSON cannot hold."""
     return float(value) if np.isfinite(value) else None

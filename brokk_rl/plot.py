@@ -47,22 +47,3 @@ def add_legend(figure: Figure, axis: Axes) -> None:
 def remove_frame(axis: Axes) -> None:
     """Remove the frame at the top and at the right."""
     axis.spines[["top", "right"]].set_visible(False)
-
-
-def annotate_point(
-    axis: Axes,
-    text: str,
-    at: tuple[float, float],
-    shift: tuple[float, float] = (0, 3),
-    **style: object,
-) -> None:
-    """Write a text beside a point of the data.
-
-    Args:
-        axis: Where to write.
-        text: The text.
-        at: The point, in data coordinates.
-        shift: Distance of the text from it, typographic points.
-        **style: Further text properties of matplotlib.
-    """
-    axis.annotate(text, at, shift, textcoords="offset points", **style)  # type: ignore[arg-type]

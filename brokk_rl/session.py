@@ -121,12 +121,6 @@ class Session:
         """Return a numpy generator for the stream `name`, independent of all other streams."""
         return np.random.default_rng(self.stream(name))
 
-    def torch_generator(self, name: str, device: torch.device | str = "cpu") -> torch.Generator:
-        """Return a torch generator on `device` for the stream `name`."""
-        import torch
-
-        return torch.Generator(device=device).manual_seed(self.stream(name))
-
     def seed_all(self) -> None:
         """Seed the global generators of Python, numpy and torch (all devices)."""
         random.seed(self.stream("python"))

@@ -26,24 +26,6 @@ class Command:
 
 
 @dataclass(frozen=True)
-class LeverPose:
-    """Angles of one lever in rad: `theta` fore and aft, `psi` sideways."""
-
-    theta_rad: float
-    psi_rad: float
-
-
-@dataclass(frozen=True)
-class Borehole:
-    """Estimated borehole: centre of the rim, unit axis out of the hole, radius, covariance."""
-
-    center_in_base_m: np.ndarray
-    axis_in_base: np.ndarray
-    radius_m: float
-    cov_m2: np.ndarray
-
-
-@dataclass(frozen=True)
 class Frame:
     """One RGB-D frame of a camera in the optical convention: x right, y down, z forward.
 

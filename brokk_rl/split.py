@@ -50,15 +50,14 @@ def split_runs(
     """Distribute runs over sets so that each joint's commanded time follows the shares.
 
     The joint that is commanded in the fewest runs comes first; its longest run goes to the set that
-    lacks it, or else to the one
-    that, over all joints of the run, is furthest from its share. Where names alone could decide, a
-    hash of them does: the last runs of a collection are often the warmest, and must not all be in
-    the same set. The same names always give the same split.
+    lacks it, or else to the one that, over all joints of the run, is furthest from its share. Where
+    names alone could decide, a hash of them does: the last runs of a collection are often the
+    warmest, and must not all be in the same set. The same names always give the same split.
 
     Source: iterative stratification, Sechidis et al. 2011, with seconds in place of labels.
 
     Args:
-        runs: Recordings by run, as `by_run` returns them.
+        runs: Recordings by run, as `group_by_run` returns them.
         shares: Share of each set; their sum is 1.
 
     Returns:

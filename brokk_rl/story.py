@@ -125,7 +125,7 @@ def run_story(
 
 
 def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) -> None:
-    """Run one stage in a process of its own, as a person would, and wait for it."""
+    """Run one stage as a separate command, and wait for its end."""
     place = folder / name
     for link, target in stage.links.items():
         path = folder / link

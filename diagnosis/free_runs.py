@@ -12,12 +12,7 @@ from datetime import datetime
 from functools import cached_property
 
 import numpy as np
-import torch
 
-from brokk_rl import open_loop
-from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.errors import RecordingError
-from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
 
@@ -74,32 +69,3 @@ class WindowedRuns:
         return np.array(
             [offset_s[s] + self.recordings[s].t_s[r] for s, r in zip(self.source, self.row, strict=True)]
         )  # fmt: skip
-
-
-def simulate_free_runs(
-    actuator: Actuator,
-    recordings: Sequence[Recording],
-    machine: Machine,
-    horizon_s: float,
-    device: torch.device,
-) -> WindowedRuns:
-    """Run a simulator through recordings from one end to the other, begun anew every `horizon_s`; the last may be shorter.
-
-    Raises:
-        RecordingError: no recording is long enough.
-    """
-    before, steps = open_loop.count_samples_before(machine), round(horizon_s / machine.period_s)
-    cuts, source, row = [], [], []
-    for number, recording in enumerate(recordings):
-        if recording.num_samples <= before:
-            continue
-        cut = open_loop.cut_windows([recording], machine, horizon_s, horizon_s, machine.period_s)
-        cuts.append(cut)
-        source += [number] * len(cut.q)
-        row += [before + steps * window for window in range(len(cut.q))]
-    if not cuts:
-        raise RecordingError(
-            f"too little data: a free run needs recordings of more than {before * machine.period_s:g} s"
-        )
-    simulated = open_loop.roll_out(actuator, machine, open_loop.join_windows(cuts), device)
-    return WindowedRuns(recordings, np.array(source), np.array(row), simulated.astype(float))

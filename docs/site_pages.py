@@ -26,6 +26,12 @@ CODE = {".py": "python", ".yaml": "yaml", ".toml": "toml", ".service": "ini", ".
 """Files that are shown as pages, and the language of their code block."""
 OWN_PAGES = {"README.md": "index.md"}
 """Pages of the site whose source stands outside `docs`."""
+COMMANDS = re.compile(r"^```\n(.*?)^```", re.MULTILINE | re.DOTALL)
+"""A block of commands: it names no language."""
+COMMENT = re.compile(r"^(\S.*?) {2,}# (.+)$", re.MULTILINE)
+"""A command and the comment behind it."""
+COLUMNS = 84
+"""Characters of a line of code that a window of 1,280 px shows; longer lines break."""
 
 
 def on_config(config: MkDocsConfig) -> MkDocsConfig:
@@ -55,9 +61,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Return the page with links that lead to places in the site."""
+    """Return the page with links that lead to places in the site, and comments that can be seen."""
+    markdown = COMMANDS.sub(lambda block: move_comments(block[0]), markdown)
     source = read_source_path(page.file)
     return markdown if source is None else move_links(markdown, source, page.file.src_uri)
+
+
+def move_comments(block: str) -> str:
+    """Return a block of commands, each comment above its command where a line is too long."""
+    if all(len(line) <= COLUMNS for line in block.splitlines()):
+        return block
+    return COMMENT.sub(r"# \2\n\1", block)
 
 
 def list_groups() -> dict[str, list[registry.Option]]:

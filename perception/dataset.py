@@ -8,8 +8,8 @@ NaN unknown) or `<stem>.depth.png` (16 bits, mm, 0 unknown), and where there is 
   `axis_in_base`, `radius_m`, `depth_m`, `hidden`: the part of the rim that cannot be seen,
   `in_view`), `decoys` (likewise), `block` (`center_m`, `rotation`, `half_m`). Axes point out of the
   hole; coordinates without a frame in their name are the left camera's.
-* `<stem>.mask.png`: bits of `BLOCK` (its mouths too), `MOUTH` (all that is seen through the rim of a
-  hole), `ARM`.
+* `<stem>.mask.png`: bits of `BLOCK` (with its holes), `HOLE_MASK` (all that is seen through the rim
+  of a hole), `ARM`.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def read_label(stem: Path) -> FrameLabel:
 
 
 def encode_mask(label: FrameLabel) -> np.ndarray:
-    """Return masks as they stand in the file, `(h, w)` uint8."""
+    """Return the bits of the masks for the file, `(h, w)` uint8."""
     return (BLOCK * label.block + HOLE_MASK * label.hole_mask + ARM * label.arm).astype(np.uint8)
 
 
@@ -230,7 +230,7 @@ def _build_path(stem: Path, ending: str) -> Path:
 
 
 def _write(path: Path, value: bytes | np.ndarray) -> None:
-    """Write a file in one step: readers see all of it or none."""
+    """Write a file in one step, so that a reader finds the whole file or none."""
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,7 @@ from brokk_rl.spec import spec
 
 @spec
 class TruthPerception:
-    """Return the configured borehole for every frame; stands in for a camera in rehearsals.
+    """Finder that returns the configured borehole for every frame; replaces a camera in rehearsals.
 
     Attributes:
         center_in_base_m: Centre of the rim.

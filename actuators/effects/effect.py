@@ -360,7 +360,7 @@ class EffectChain:
     def _change_commands(
         self, history: History, fresh: torch.Tensor, counter: torch.Tensor | None
     ) -> torch.Tensor:
-        """Return the commands as the inner model sees them, `(N, H, J)`."""
+        """Return the commands that the inner model gets, `(N, H, J)`."""
         still = torch.zeros_like(history.q[:, -1])
         recent = slice(-(self._num_recent or history.u.shape[1]), None)
         u = history.u[:, recent]

@@ -35,9 +35,8 @@ class CommandGuards:
     Attributes:
         max_command: Largest command.
         max_tool_speed_m_s: Largest speed of the tool point, predicted from the machine's nominal
-            speeds; commands that would
-            exceed it are scaled down together. `null`: no bound. Needs a machine whose geometry is
-                known.
+            speeds; commands that would exceed it are scaled down together. `null`: no bound. Needs
+            a machine whose geometry is known.
     """
 
     max_command: float

@@ -1,4 +1,4 @@
-"""Identical repeats: the only honest noise floor."""
+"""Repeats of the same commands: their scatter is the noise floor of the machine."""
 
 from collections.abc import Sequence
 from dataclasses import replace

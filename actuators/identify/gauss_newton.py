@@ -14,7 +14,6 @@ Axes: `C` candidates, `P` parameters, `J` joints, `W` windows, `K` steps, `D` co
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -36,13 +35,6 @@ SECANT = 0.04
 hundredth of a second it does not."""
 DAMPINGS = (0.0, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Levenberg-Marquardt dampings tried side by side, relative to the diagonal."""
-
-
-class ParametricModel(ActuatorModel, Protocol):
-    """An actuator model whose numbers can be set environment by environment."""
-
-    parameters: dict[str, torch.Tensor]
-    """Numbers by name, each `(N, J)`, after a field of the spec; read in every step."""
 
 
 @dataclass(frozen=True)

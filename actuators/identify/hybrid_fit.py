@@ -1,8 +1,8 @@
 """Fit of `actuators.models.hybrid`: the valve curve first, then trees on what it leaves.
 
-The residual has to win twice on recordings apart: on some like those fitted to, and on the runs
-whose commands and positions are least like the others. A joint on which it does not is left to the
-curve.
+The residual has to reduce the error on two kinds of withheld recordings: some like those fitted to,
+and the runs whose commands and positions are least like the others. A joint on which it does not
+keeps the curve alone.
 """
 
 from __future__ import annotations

@@ -18,8 +18,7 @@ class Identification:
         test: Glob or globs of unseen recordings to judge by, best of another excitation; `null`
             sets a part of `recordings` aside.
         folds: Cross-validation: each run is judged once, by a model fitted to the other folds; then
-            one model is fitted to all runs
-            and kept. For few recordings. `null`: one split.
+            one model is fitted to all runs and kept. For few recordings. `null`: one split.
         hold_out: One part in so many is kept from the fit to stop it by, and another one to judge
             by (without `test`).
         stride_s: Distance between the beginnings of two free runs.

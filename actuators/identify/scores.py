@@ -1,7 +1,7 @@
-"""Errors of free runs with intervals, and whether one model is really better than another.
+"""Errors of free runs with intervals, and whether one model is significantly better than another.
 
-Everything is sums over the windows of each run, so that resampling whole runs is one matrix
-product. All models are resampled alike, which makes differences between them paired.
+Errors are kept as sums over the windows of each run, so that resampling whole runs is one matrix
+product. All models get the same resamples, so differences between them are paired.
 Axes: `W` windows, `R` runs, `B` resamples, `K` steps, `J` joints.
 """
 

@@ -17,8 +17,8 @@ depend on the piston's position (at 20 Hz only the first mode of the joint is vi
 machine's YAML knows one stiffness); inertia is constant, `stiffness / (2 pi mode_hz)^2` (coupling
 through the arm's inertia is small against the 5 to 10 Hz of the oil column); pressure compensation
 is imperfect in one number, `load_sensitivity`; supply pressure is constant and the pump is limited
-by flow. Contact reaches the plant
-through the measured position only: a blocked joint keeps pushing, and the simulator's drive yields.
+by flow. Contact reaches the plant through the measured position only: a blocked joint keeps
+pushing, and the simulator's drive yields.
 """
 
 import math

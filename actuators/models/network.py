@@ -1,10 +1,9 @@
 """Actuator networks: one perceptron per joint, all joints computed in one batch.
 
 The paper feeds 13 commands and 13 positions. Here the 13 positions of a joint enter as its newest
-position and the 12 increments
-between them: the same information in another basis, so that the network sees speeds at full
-resolution instead of small differences of large numbers, and a relation learned in one place holds
-in another unless the data say otherwise.
+position and the 12 increments between them: the same information in another basis, so that the
+network sees speeds at full resolution instead of small differences of large numbers, and a relation
+learned in one place holds in another unless the data say otherwise.
 
 Axes: `J` joints, `B` batch, `H` history, `K` steps.
 """

@@ -70,7 +70,7 @@ class Plant(Protocol):
 
 @spec
 class OwnSimulator:
-    """A simulator from outside, diagnosed as it is.
+    """A simulator of the user: a function or an MJCF file, run unchanged.
 
     A function `step(state, command)` returns the state one control period later. A state is an array: the
     positions of the joints, their speeds, then whatever the simulator keeps. A command is in the unit of

@@ -112,9 +112,8 @@ class SpreadParameters:
     """Parameters for all environments: tensors `(N, J)` at fixed addresses, in `value` by name.
 
     With a `spread` a number is `nominal * (1 + spread * U(-1, 1))`, drawn per environment and joint
-    at each reset. The draws come
-    from a counter in `state` and not from a generator: no host is involved, a CUDA graph may hold
-    them, and a resumed run goes on exactly.
+    at each reset. The draws come from a counter in `state` and not from a generator: no host is
+    involved, a CUDA graph may hold them, and a resumed run goes on exactly.
 
     Args:
         nominal: Nominal values by name, each `(J,)`.

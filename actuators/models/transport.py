@@ -22,9 +22,8 @@ def select_commands_in_force(
     """Split the coming control period at the moment when the delayed command changes.
 
     A command is held for one period, so with a dead time of `n + f` periods the valve sees the
-    command of `n + 1` periods ago for
-    the first part `f` of the period and that of `n` periods ago for the rest. Nothing is
-    interpolated: this is exact.
+    command of `n + 1` periods ago for the first part `f` of the period and that of `n` periods ago
+    for the rest. Nothing is interpolated: this is exact.
 
     Args:
         u: Command history, shape `(N, H, J)`, newest last.

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -37,8 +37,6 @@ LONGEST_LAG_S = 1.5
 """Longest lag from command to motion that is tried: more than twice the 0.55 s of the slowest machine known."""
 CLEAR_CORRELATION = 0.8
 """From here on the numbers confirm a pair: two thirds of the variance are explained."""
-WEAK_CORRELATION = 0.3
-"""Below it the numbers say nothing about a pair."""
 MARGIN = 0.1
 """A partner that correlates better by so much contradicts a pair."""
 TARGET_SLOPE = (0.5, 1.5)
@@ -422,8 +420,3 @@ def read_times(table: Table, time: TimeGuess) -> np.ndarray:
     return np.asarray(table.columns[time.anchor or time.column]) * (
         1.0 if time.anchor else time.scale
     )
-
-
-def list_unsure(guesses: Sequence[Guess]) -> list[Guess]:
-    """Return the guesses that must be confirmed by a person."""
-    return [guess for guess in guesses if guess.sureness == "unsure"]

@@ -56,7 +56,7 @@ class LogRun:
 
 
 class LogFile(ABC):
-    """A log that is read as far as it is needed."""
+    """A log of which only the needed columns are read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

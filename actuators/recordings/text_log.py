@@ -259,7 +259,7 @@ class CsvLog(LogFile):
 
 
 def detect_layout(path: Path) -> CsvLayout:
-    """Return delimiter and decimal sign, told from the beginning of a file.
+    """Return delimiter and decimal sign, found from the beginning of a file.
 
     The delimiter is the sign that cuts all lines into the same number of cells, the most if several
     do.

@@ -1,11 +1,9 @@
 """Insertion on the twin, guided and alone: python benchmarks/deploy/guided.py <folder> <trials> <at once>.
 
 Each trial is `preset=bench` with real processes, in real time. `guided`: the default mode, nothing
-is sent, a simulated person
-moves the levers as the policy trained behind a person shows them. `alone`: the other shipped policy
-commands the valves itself.
-Success is the strict one, from the captured positions. `latched`: why the guard stopped a trial
-until the operator pressed again.
+is sent, a simulated person moves the levers as the policy trained behind a person shows them.
+`alone`: the other shipped policy commands the valves itself. Success is the strict one, from the
+captured positions. `latched`: why the guard stopped a trial until the operator pressed again.
 """
 
 from __future__ import annotations

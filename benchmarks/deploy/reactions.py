@@ -1,9 +1,9 @@
 """Reaction times with real processes: python benchmarks/deploy/reactions.py <json> [trials].
 
 Twin, bus process and a commander on a multicast bus, all with real-time priority where it is
-granted, the listener too. After each
-kill, stop or fault: the time until the valves get nothing any more, and until the guard commands
-zero, as the listener hears it. A fault counts from the cycle of the twin that begins with it.
+granted, the listener too. After each kill, stop or fault: the time until the valves get nothing any
+more, and until the guard commands zero, as the listener hears it. A fault counts from the cycle of
+the twin that begins with it.
 """
 
 from __future__ import annotations

@@ -2,10 +2,9 @@
 
 Advice at 20 Hz and levers at 50 Hz as from the loop, frames of 640 x 360 px at 3 and at 10 Hz, the
 3D scene beside them. Latency is from the moment an advice stands in the feed to the moment its
-frame is through layout and paint, by the browser's clock, translated
-to ours to half the round trip. Of it: on the way from the server to the page, and in the browser
-until drawn; the rest it waited for the server to look. Frame rate and bytes are what the browser
-has drawn and received.
+frame is through layout and paint, by the browser's clock, translated to ours to half the round
+trip. Of it: on the way from the server to the page, and in the browser until drawn; the rest it
+waited for the server to look. Frame rate and bytes are what the browser has drawn and received.
 """
 
 from __future__ import annotations

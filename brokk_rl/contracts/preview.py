@@ -18,7 +18,7 @@ PreviewCallback = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class EffectLimit:
-    """Smallest size of an effect that the motions would tell.
+    """Smallest size of an effect that would show in the motions.
 
     Sizes are distances from the value at which the effect does nothing.
 
@@ -52,7 +52,7 @@ class EffectLimit:
 
 @dataclass(frozen=True)
 class LookalikePair:
-    """Two effects that the motions cannot tell from each other.
+    """Two effects that cannot be told apart in the motions.
 
     Attributes:
         effects: Their names.

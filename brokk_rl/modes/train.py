@@ -18,7 +18,6 @@ from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import CheckpointError, SimulationError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
-from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.learning_curve import find_passing
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves
@@ -35,6 +34,7 @@ from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.success_sweep import LEVELS
 from brokk_rl.rl.tracking import NoTracking, Tracker, Tracking
+from brokk_rl.rl.training_group import TrainingGroup
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session, read_record
 from brokk_rl.sim.events import Event

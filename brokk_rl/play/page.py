@@ -88,13 +88,11 @@ class PlayPage:
         """Port on which the page listens."""
         return self._server.get_port()
 
-    @property
-    def num_viewers(self) -> int:
-        """Number of browsers that are connected."""
-        return len(self._server.get_clients())
-
     def update(self) -> bool:
-        """Do what browsers have asked for, and show the present state; true: pages never end it."""
+        """Carry out the requests of browsers and show the present state; return true.
+
+        A browser cannot end the session.
+        """
         self._follow_requests()
         if self._gamepad is not None and (levers := self._gamepad.read()) is not None:
             self._session.set_levers(levers)

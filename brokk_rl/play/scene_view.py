@@ -16,14 +16,8 @@ from brokk_rl.sim.shapes import MachineMesh, build_drilled_block
 
 SPACING_M = (9.0, 6.5)
 """Distance of neighbouring worlds along x and y. Chosen by hand: arms of two do not meet."""
-CONCRETE, HOLE, TRUE, SEEN, PUSHED = (
-    (186, 184, 178),
-    (52, 50, 48),
-    (230, 90, 40),
-    (40, 120, 220),
-    (220, 40, 40),
-)
-"""Colours of the block, its hole's bottom, the true target, the policy's estimate, and a pushed tip."""
+CONCRETE, HOLE, TRUE, SEEN = ((186, 184, 178), (52, 50, 48), (230, 90, 40), (40, 120, 220))
+"""Colours of the block, its hole's bottom, the true target, and the policy's estimate."""
 CAMERA_M, LOOK_AT_M = (4.9, -5.4, 3.3), (1.3, 0.0, 0.8)
 """Place of the camera and what it looks at, for one world. Chosen by hand for the eye."""
 MARK_M = 0.025
@@ -105,7 +99,7 @@ class SceneView:
                 self.handle.position = place
 
     def hold_handle(self, held: bool) -> None:
-        """Say whether somebody drags the handle; it is left alone meanwhile."""
+        """Set whether a person drags the handle; the program does not move it meanwhile."""
         self._dragging = held
 
     def read_handle(self, world: int) -> np.ndarray:

@@ -257,7 +257,7 @@ class PlaySession:
         self._push_n[self.selected] = force, round(PUSH_S / self.machine.period_s)
 
     def pull_joints(self, load: np.ndarray | None) -> None:
-        """Load the joints of the selected machine until told otherwise.
+        """Load the joints of the selected machine until the next call.
 
         Args:
             load: Torque or force on each joint, `(J,)`, N m or N; `None` for none.

@@ -79,5 +79,3 @@ class BenchmarkSizes:
             raise ConfigError(
                 f"bench.num_envs: expected one or more positive numbers, got {list(self.num_envs)}"
             )
-        if self.measure not in ("rates", "success"):
-            raise ConfigError(f"bench.measure: expected rates or success, got '{self.measure}'")

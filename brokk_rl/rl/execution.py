@@ -60,11 +60,11 @@ def report_compile_errors() -> Iterator[None]:
 
 @contextlib.contextmanager
 def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
-    """Keep torch to one thread meanwhile; nothing changes where `device` is a GPU.
+    """Limit torch to one thread inside of this context; nothing changes where `device` is a GPU.
 
-    The tensors of a control step are too small to share. Torch's other threads would only wait for
-    the next one, and they wait spinning, on the cores on which the physics runs; where the computer
-    has other work too, all stand still for the slowest.
+    The tensors of a control step are too small to be shared by threads. Torch's other threads would
+    wait for the next tensor in a busy loop, on the cores on which the physics runs. On a computer
+    with other work, every step would then wait for the slowest thread.
     """
     before = torch.get_num_threads()
     if torch.device(device).type != "cpu" or before == 1:

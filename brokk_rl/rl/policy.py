@@ -221,7 +221,7 @@ class NetworkPolicy:
 
 
 class PlainActor(torch.nn.Module):
-    """A copy of an actor that takes a dictionary of groups: ONNX knows no TensorDict."""
+    """Copy of an actor that takes a plain dictionary of groups, since ONNX cannot export a TensorDict."""
 
     def __init__(self, actor: MLPModel) -> None:
         super().__init__()

@@ -16,13 +16,13 @@ from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl.contracts.task import MirroredTask
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
-from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.learning_curve import find_plateau
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.policy import TrainedPolicy, scale_output
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
+from brokk_rl.rl.training_group import TrainingGroup
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.task_description import TaskDescription
 
@@ -272,7 +272,7 @@ class TrainingRunner(OnPolicyRunner):
         return self.env.record_answers(self.alg.get_policy(), NUM_ANSWERS)
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Do nothing: rsl-rl would save amid an iteration; `checkpoint` follows every `learn`."""
+        """Do nothing: rsl-rl would save within an iteration; `checkpoint` follows every `learn`."""
 
     def load(
         self,
@@ -332,7 +332,7 @@ class TrainingRunner(OnPolicyRunner):
 
 @contextlib.contextmanager
 def allow_tensor_cores(allowed: bool) -> Iterator[None]:
-    """Let matrix products use TF32 meanwhile.
+    """Let matrix products use TF32 inside of this context.
 
     Only where the control step is a captured graph, whose kernels were chosen before: ten bits of
     mantissa are enough for a network, but would put the tool of a 5 m arm millimetres off.

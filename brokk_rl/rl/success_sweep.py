@@ -22,12 +22,12 @@ from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
 from brokk_rl.plot import BLUE, ORANGE, make_figure, remove_frame
 from brokk_rl.rl.benchmark_sizes import KEYS, SuccessSweep
-from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.learning_curve import WINDOW, find_passing
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
 from brokk_rl.rl.tracking import NoTracking
+from brokk_rl.rl.training_group import TrainingGroup
 from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import Session, write_json
 

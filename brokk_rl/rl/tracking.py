@@ -169,5 +169,5 @@ class _WandbTracker:
 
 
 def _find_sweep(folder: Path) -> str | None:
-    """Return the name of the sweep whose job runs in `folder`, `None` for a run by itself."""
+    """Return the name of the sweep whose job runs in `folder`, `None` for a single run."""
     return folder.parent.name if (folder.parent / "multirun.yaml").is_file() else None

@@ -76,7 +76,7 @@ class SlabObject:
             require_number("size_m of a SlabObject", length_m, above=0)
 
     def list_boxes(self) -> Boxes:
-        """Return one box; see `SceneObject`."""
+        """Return the only box; see `SceneObject`."""
         x, y, z = self.size_m
         return [((x / 2, y / 2, z / 2), (0.0, 0.0, 0.0), NO_TURN)]
 

@@ -25,7 +25,7 @@ class BodyShape:
     """Triangles of one colour on one body.
 
     Attributes:
-        body: Index of the body in `BodyPoses`.
+        body: Index of the body in the rows of its machine's poses.
         color: Red, green and blue, 0 to 1.
         vertices: Corners in the frame of the body, `(V, 3)`, m.
         faces: Rows of `vertices`, `(F, 3)`.

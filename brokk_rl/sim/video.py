@@ -163,7 +163,7 @@ def render_video(
 
 
 def _render_in_subprocess(job: RenderJob) -> bool:
-    """Run MuJoCo's renderer in a process of its own; return whether it drew everything."""
+    """Run MuJoCo's renderer in a separate process; return whether it drew everything."""
     library = find_renderer()
     if library is None:
         log.warning(

@@ -16,9 +16,8 @@ cone divides their space into three zones (`_cone`). Newton's method with a line
 step finds the minimum in a few iterations.
 
 An arm has a handful of joints and contacts, so that the solver of `mujoco_warp`, made for any size,
-spends its time on launching a
-dozen kernels an iteration. Here a warp of 32 threads solves a world: each thread takes a constraint
-and all share the sums.
+spends its time on launching a dozen kernels an iteration. Here a warp of 32 threads solves a world:
+each thread takes a constraint and all share the sums.
 """
 
 # (sizes of vectors and matrices are known only at run time, so that their types are values)

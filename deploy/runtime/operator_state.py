@@ -183,7 +183,7 @@ class OperatorControls:
 
 @dataclass(frozen=True)
 class StopRequest:
-    """The operator's stop. It reaches the bus process by itself, whatever the supervisor does.
+    """The operator's stop. It reaches the bus process directly, without the supervisor.
 
     Attributes:
         t_s: When it was pressed.

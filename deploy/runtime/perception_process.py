@@ -196,7 +196,7 @@ def _publish_frame(slot: Slot, frame: Frame, num_px: int, t_s: float) -> None:
 
 
 def read_frame(record: Any) -> Frame:
-    """Return the frame that a record of `frame_fields` holds."""
+    """Return the frame that a record of `shm_layout.build_frame_fields` holds."""
     width, height = int(record["width"]), int(record["height"])
     pose = np.array(record["base_from_camera"])
     return Frame(

@@ -110,7 +110,7 @@ class Slot:
 
     @property
     def number(self) -> int:
-        """Number of records written so far; tells whether there is a new one without reading it."""
+        """Number of records written so far; shows without reading whether there is a new one."""
         return HEAD.unpack(self.memory.bytes[: HEAD.size])[0]
 
     def peek(self, field: str) -> Any | None:
@@ -258,7 +258,7 @@ class Pipe:
         return True
 
     def take(self) -> Iterator[bytes]:
-        """Yield the entries that nobody has taken yet, oldest first."""
+        """Yield and remove the waiting entries, oldest first."""
         written, read = self._get(0), self._get(1)
         while read < written:
             length = int.from_bytes(self._copy_out(read, LENGTH_BYTES), "little")
@@ -274,7 +274,7 @@ class Pipe:
 
     @property
     def waiting(self) -> int:
-        """Bytes that nobody has taken yet."""
+        """Number of bytes that wait to be taken."""
         return self._get(0) - self._get(1)
 
     def _get(self, index: int) -> int:

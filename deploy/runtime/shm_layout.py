@@ -83,7 +83,7 @@ def build_frame_fields(num_px: int) -> np.dtype:
 
 @dataclass
 class LoopMemory:
-    """All memory that the processes share; each of them gets it as it is.
+    """All memory that the processes share; each process gets the same object.
 
     Attributes:
         state: From the bus process.

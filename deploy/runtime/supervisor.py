@@ -228,7 +228,7 @@ class CompanionProcess:
 
 
 class BenchSpec(Protocol):
-    """A spec in `conf/bench`: stands in for machine and operator on a desk."""
+    """A spec in `conf/bench`: replaces machine and operator at a desk."""
 
     def companions(self, machine: Machine, session: Session) -> Sequence[CompanionProcess]:
         """Return the processes to run beside the loop."""

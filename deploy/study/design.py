@@ -2,9 +2,8 @@
 
 A participant does a few trials in each of two periods, one with guidance and one without. Which
 comes first is drawn, in pairs of participants, so that at no time one sequence is two ahead. Within
-a period every hole and every start occurs once, and over
-participants each stands at every place of the period equally often: neither a hard hole nor
-practice favours a condition.
+a period every hole and every start occurs once, and over participants each stands at every place of
+the period equally often: neither a hard hole nor practice favours a condition.
 """
 
 from __future__ import annotations
@@ -137,7 +136,7 @@ class Trial:
 
 
 def make_pseudonyms(count: int) -> list[str]:
-    """Return `P01`, `P02`, …: the only names that a study knows."""
+    """Return `P01`, `P02`, …, by which all files name the participants."""
     width = max(2, len(str(count)))
     return [f"P{number:0{width}d}" for number in range(1, count + 1)]
 
@@ -214,7 +213,7 @@ def plan_trials(design: Design, generator: np.random.Generator) -> list[Trial]:
 def format_plan(
     design: Design, machine: Machine, seed: int, planned: list[Trial]
 ) -> dict[str, Any]:
-    """Return the plan as it stands in `plan.json`."""
+    """Return the plan as plain data for `plan.json`."""
     # The order of participants is that of the plan.
     conditions = {trial.participant: {} for trial in planned}
     for trial in planned:

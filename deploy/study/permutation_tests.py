@@ -4,8 +4,8 @@ No distribution is assumed. Two kinds of assignment are possible: exchange of a 
 conditions (`flips`, the paired test), and the draw of the sequences as `deploy.study.design` makes
 it: one coin for each pair of persons, whose second gets the other sequence. A person whose partner
 dropped out keeps the coin. The second test keeps the effect of practice, which stays with the
-period. scipy's permutation test
-handles one study at a time; here thousands of simulated studies share one table of assignments.
+period. scipy's permutation test handles one study at a time; here thousands of simulated studies
+share one table of assignments.
 Axes: `S` studies at once, `P` persons, `M` assignments.
 """
 

@@ -360,7 +360,7 @@ def _format_csv(head: Sequence[str], rows: Sequence[Sequence]) -> str:
 
 
 def _convert_plain(value: Any) -> Any:
-    """Return the same with `None` for NaN, which JSON does not know."""
+    """Return plain data with `None` in place of NaN, which JSON cannot hold."""
     if isinstance(value, dict):
         return {key: _convert_plain(part) for key, part in value.items()}
     if isinstance(value, (list, tuple)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 
@@ -11,6 +10,7 @@ import numpy as np
 from deploy.study import permutation_tests
 
 SIZES = (5, 6, 8, 10, 12, 14, 16, 20, 24)
+"""Numbers of participants in the table of a plan."""
 EFFECTS_DZ = (0.5, 0.8, 1.2)
 """A medium, a large and a very large effect, in standard deviations of a person's difference."""
 STUDIES, MOST_COUNTED = 1000, 60_000_000
@@ -33,12 +33,6 @@ class SampleSize:
     smallest_paired_p: float
     smallest_p: float
     power: tuple[float, ...]
-
-
-@cache
-def tabulate_sizes(alpha: float, sizes: Sequence[int] = SIZES) -> list[SampleSize]:
-    """Return the power of each size, by simulated studies with normal differences."""
-    return [evaluate_size(num, alpha) for num in sizes]
 
 
 @cache

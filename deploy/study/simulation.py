@@ -35,7 +35,7 @@ class Nowhere:
     def run(
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
     ) -> list[Recording]:
-        """Is never asked: the study refuses before it begins; see `brokk_rl.contracts.operator.TrialGround`."""
+        """Is never called, since the study refuses before; see `brokk_rl.contracts.operator.TrialGround`."""
         raise NotImplementedError
 
 

@@ -34,8 +34,6 @@ TRIALS, RECORDINGS, QUESTIONNAIRES, PARTICIPANTS = (
     "participants",
 )
 CAPTURES = "captures"
-OUTCOMES = ("inserted", "time limit", "stopped", "aborted")
-"""Endings of a trial: task, time, participant, experimenter, fault."""
 TRIAL_FIELDS = {
     "participant": str,
     "period": int,
@@ -49,7 +47,7 @@ TRIAL_FIELDS = {
 
 @dataclass(frozen=True)
 class Remark:
-    """Something that a reader of the results must know.
+    """Remark on the data that the report shows, such as a missing trial.
 
     Attributes:
         where: Participant or file.

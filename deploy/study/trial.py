@@ -48,7 +48,7 @@ class Times:
 
 
 class Attempt:
-    """A trial that somebody does now; see the module.
+    """The trial that runs now; see the module.
 
     Args:
         folder: The study's.
@@ -134,7 +134,7 @@ class Attempt:
         return ""
 
     def stop(self) -> str:
-        """End it for the participant; one that has not begun is left as it is."""
+        """End the trial at the participant's wish; a trial that has not begun stays as it is."""
         return (
             self._end("stopped", "")
             if self._phase == "running"

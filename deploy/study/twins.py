@@ -1,11 +1,10 @@
 """Where simulated operators do trials on the twin: the real time's own parts, one process, and a clock that runs as fast as it can.
 
 Each trial has a twin (`deploy.twin`: plant, gateway, its messages), a remote, and of the loop the
-receiver and the adviser with
-policy and lever display. Frames go through the bus description both ways: coded, counted, checked.
-Not simulated are a bus with latencies, processes and their scheduling, guard and page. A simulated
-person sees an advice in the control period in which it is made, a real one some tens of
-milliseconds later.
+receiver and the adviser with policy and lever display. Frames go through the bus description both
+ways: coded, counted, checked. Not simulated are a bus with latencies, processes and their
+scheduling, guard and page. A simulated person sees an advice in the control period in which it is
+made, a real one some tens of milliseconds later.
 Axes: `N` trials, `J` joints.
 """
 
@@ -297,7 +296,7 @@ class _Desk:
         self._shown = self._display.command(advice.lever_rad, advice.button_right)
 
     def end(self) -> Recording:
-        """Return the recording, and lets go of the twin: its memory is wanted for nothing any more."""
+        """Return the recording and release the twin's memory."""
         found = self.recording()
         # Hundreds of twins would fill the memory until the last trial ends.
         del self._twin, self._link

@@ -78,7 +78,7 @@ class ActiveFaults:
     _place: tuple[list[float], list[float]] | None = None
 
     def request(self, text: bytes, now_s: float) -> None:
-        """Take a request; see the module.
+        """Begin the fault that a request asks for; the module lists the requests.
 
         Raises:
             ConfigError: it is none.

@@ -165,7 +165,7 @@ def _convert_to_frame(color: np.ndarray) -> Any:
 
 
 class CameraReader:
-    """Reads one camera in a thread of its own and keeps the newest picture.
+    """Thread that reads one camera and keeps its newest picture.
 
     Args:
         name: Of the camera.

@@ -85,7 +85,7 @@ def judge_fit(
     missing: Sequence[str],
     least_used: int = MIN_VIEWS_JUDGED,
 ) -> Verdict:
-    """Return the verdict on a fit by itself.
+    """Return the verdict on a fit, without a comparison with other models.
 
     Args:
         num_used: Views or points that agree.

@@ -114,7 +114,7 @@ class Cuboid:
 
 @dataclass(frozen=True)
 class CuboidView:
-    """A cuboid as a camera sees it; all `(h, w)`.
+    """Projection of a cuboid into a picture; all `(h, w)`.
 
     Attributes:
         depth_m: Depth along z of its visible part, infinite beside it.

@@ -280,7 +280,7 @@ def refine_cuboid(
 def refine_mouths(
     cuboid: Cuboid, views: Sequence[RefinementView], noise_per_m: float, reach_px: float
 ) -> Cuboid:
-    """Return the block with its mouths moved to the edges of the pictures; see `refine_cuboid`."""
+    """Return the block with its holes moved to the edges of the pictures; see `refine_cuboid`."""
     for number in range(len(cuboid.mouths)):
         cuboid = _refine_mouth(cuboid, number, views, noise_per_m, reach_px)
     return cuboid

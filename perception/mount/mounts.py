@@ -289,7 +289,7 @@ class PlacesMountModel:
         return np.broadcast_to(poses, (*np.broadcast_shapes(poses.shape[:-2], q.shape[:-1]), 4, 4))
 
     def compute_travel_s(self, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the time until it stands in each of `goals`."""
+        """Return the time until the mount stands in each of `goals`."""
         return np.where((goals == start).all(-1), 0.0, self._settings.move_s)
 
     def describe(self, position: np.ndarray) -> str:

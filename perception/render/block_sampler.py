@@ -1,4 +1,4 @@
-"""The block: its faces, holes and chips, the discs that are none, and the marks of its life."""
+"""Random blocks: faces, holes, chips, painted discs that look like holes, and stains."""
 
 from __future__ import annotations
 

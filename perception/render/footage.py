@@ -91,7 +91,7 @@ class FootageScenes:
         self._ground_m = float((block.corners_m @ rig.down_in_camera).max())
 
     def view(self, number: int) -> StagedScene:
-        """Return the scene as frame `number` sees it.
+        """Return the scene in the camera coordinates of frame `number`.
 
         Raises:
             ConfigError: no place of the camera shows block and board.

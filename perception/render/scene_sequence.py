@@ -16,7 +16,7 @@ from perception.render.stereo_camera import StereoRig
 
 @dataclass(frozen=True)
 class StagedScene:
-    """A scene as one frame sees it.
+    """Scene of one frame, in its camera coordinates.
 
     Attributes:
         scene: In the left camera's coordinates.

@@ -72,7 +72,7 @@ class UNet(nn.Module):
 
 
 class Probabilities(nn.Module):
-    """A network as it is used: probabilities instead of logits."""
+    """Network that returns probabilities instead of logits."""
 
     def __init__(self, network: UNet) -> None:
         super().__init__()

@@ -43,7 +43,7 @@ class RealSense:
 
 
 class RealSenseDevice:
-    """The library behind `Device`; see `perception.sources.live`."""
+    """The camera's library as a `perception.sources.live.CameraDevice`."""
 
     has_ended = False
 

@@ -25,7 +25,7 @@ from perception.stereo import Stereo
 
 
 def make_frame(shot: RenderedFrame, rig: StereoRig, t_s: float) -> Frame:
-    """Return what a camera tells of a rendered frame: pictures, depth and its own pose."""
+    """Return the frame of a camera for a rendered one: pictures, depth and the camera's pose."""
     return Frame(
         color=shot.color, depth_m=shot.depth_m, camera_matrix=rig.left.matrix, base_from_camera=rig.base_from_camera,
         t_s=t_s, right=shot.right, baseline_m=rig.baseline_m, disparity_std_px=rig.disparity_std_px,

@@ -70,7 +70,7 @@ class Zed:
 
 
 class ZedDevice:
-    """The SDK behind `Device`; see `perception.sources.live`."""
+    """The camera's SDK as a `perception.sources.live.CameraDevice`."""
 
     def __init__(self, settings: Zed) -> None:
         self._settings = settings

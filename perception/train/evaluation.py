@@ -71,11 +71,9 @@ def compute_metrics(
     """Return figures for each condition, and for all frames under `all`.
 
     `block`: intersection over union of the block, seen as a whole. `mouth`: that of mouths, in the
-    closer view; both over all
-    pixels of all frames, `None` where there is nothing to find. `found`: part of the mouths that
-    one piece of the prediction covers
-    with an overlap above one half. `false`: predicted pieces per frame that touch no mouth.
-    `frames`: how many.
+    closer view; both over all pixels of all frames, `None` where there is nothing to find. `found`:
+    part of the mouths that one piece of the prediction covers with an overlap above one half.
+    `false`: predicted pieces per frame that touch no mouth. `frames`: how many.
     """
     said = probabilities > THRESHOLD
     block, mouth = (said[:, 0, 0], known[:, 0, 0]), (said[:, 1, 1], known[:, 1, 1])

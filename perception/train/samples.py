@@ -1,9 +1,8 @@
 """Training samples: each frame as the segmenter's two views, with room to crop.
 
 A batch is a function of the seed and its number alone, so a training goes on exactly where it
-stopped. All of it is made by torch
-where the network is: a processor's cores took five times as long to make a batch as a graphics card
-takes to learn from it.
+stopped. All of it is made by torch where the network is: a processor's cores took five times as
+long to make a batch as a graphics card takes to learn from it.
 """
 
 from __future__ import annotations

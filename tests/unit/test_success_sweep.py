@@ -13,10 +13,10 @@ import training as runs
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.benchmark_sizes import SuccessSweep
-from brokk_rl.rl.distributed import TrainingGroup
 from brokk_rl.rl.learning_curve import find_passing, find_plateau
 from brokk_rl.rl.settings import Plateau
 from brokk_rl.rl.success_sweep import TABLE, report_sweep, run_sweep, summarise
+from brokk_rl.rl.training_group import TrainingGroup
 from brokk_rl.session import Session
 
 SWEEP = SuccessSweep(

@@ -29,13 +29,17 @@ class Arm:
     Attributes:
         joints: Names.
         period_s: Control period, s.
+        middle: Middle of the travel, `(J,)` rad.
+        half_travel: Half of the travel, `(J,)` rad.
         max_speed: Nominal speed at full command, `(J,)` rad/s.
-        yield_force: Torque that the drives hold, `(J,)` N m.
-        tip_m: Tool point in the frame of the last body, `(3,)` m.
+        yield_force: Torque that the drives hold, `(J,)` N m; NaN where it is not known.
+        tip_m: Tool point in the frame of the last body, `(3,)` m; NaN where it is not known.
     """
 
     joints: tuple[str, ...]
     period_s: float
+    middle: np.ndarray
+    half_travel: np.ndarray
     max_speed: np.ndarray
     yield_force: np.ndarray
     tip_m: np.ndarray
@@ -59,13 +63,19 @@ class Windows:
 def read_arm(path: Path) -> Arm:
     """Return the machine from the file that the exam hands to a program."""
     node = yaml.safe_load(path.read_text())
-    joints = node["joints"]
+    joints, tool = node["joints"], node["tool_m"] or [{"value": np.nan}] * 3
+    lower, upper = (
+        np.array([joint[side]["value"] for joint in joints]) for side in ("lower", "upper")
+    )
+    held = [joint["body"]["yield_force"]["value"] if joint["body"] else np.nan for joint in joints]
     return Arm(
         joints=tuple(joint["name"] for joint in joints),
         period_s=node["period_s"],
+        middle=(lower + upper) / 2,
+        half_travel=(upper - lower) / 2,
         max_speed=np.array([joint["max_speed"]["value"] for joint in joints]),
-        yield_force=np.array([joint["body"]["yield_force"]["value"] for joint in joints]),
-        tip_m=np.array([dimension["value"] for dimension in node["tool_m"]]),
+        yield_force=np.array(held),
+        tip_m=np.array([dimension["value"] for dimension in tool]),
     )
 
 

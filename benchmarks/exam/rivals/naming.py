@@ -22,6 +22,8 @@ ONE_WAY = {
     "creep": 1,
     "flow_sharing": 1,
     "saturation": -1,
+    "rate_limit": 1,
+    "backlash": 1,
 }
 """Effects that exist in one direction only, and the sign of their numbers' change."""
 ALL_JOINTS = ("flow_sharing", "base_tilt")
@@ -35,6 +37,9 @@ TARGETS = {
     "saturation": "command.Saturation",
     "lag": "speed.Lag",
     "dead_time": "timing.DeadTime",
+    "rate_limit": "command.RateLimit",
+    "backlash": "speed.Backlash",
+    "sag": "targets.Sag",
     "creep": "load.Creep",
     "flow_sharing": "load.FlowSharing",
     "encoder_bias": "measurement.EncoderBias",
@@ -45,6 +50,8 @@ TARGETS = {
 """Effects of the library by name, nearest to the machine last."""
 NOTHING = {"gain": 1.0, "extend_gain": 1.0, "retract_gain": 1.0, "level": 1.0, "scale": 1.0}
 """Values that change nothing; 0 for all others."""
+FIXED = {"sag": {"load_rad": 0.0, "sag_slope": 0.0}}
+"""Numbers of an effect that no rival fits, at the value that changes nothing."""
 PROBABILITY = 0.9
 """Stated for each name: none of the rivals gives a probability."""
 
@@ -118,7 +125,10 @@ def build_node(
     effect: str, joints: list[str], parameters: dict[str, dict[str, Any]]
 ) -> dict[str, Any]:
     """Return the option of an effect for the examiner's simulation."""
-    node: dict[str, Any] = {"_target_": f"actuators.effects.{TARGETS[effect]}"}
+    node: dict[str, Any] = {
+        "_target_": f"actuators.effects.{TARGETS[effect]}",
+        **FIXED.get(effect, {}),
+    }
     if effect != "base_tilt":
         node["joints"] = joints
     for name, values in parameters.items():

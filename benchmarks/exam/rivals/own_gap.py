@@ -1,6 +1,6 @@
 """Share of the gap that a rival closes in its own simulator, with everything it fitted.
 
-    python benchmarks/exam/rivals/own_gap.py <exam> <opened> <out.json> mujoco_sysid=<answers> pace=<answers>
+    python benchmarks/exam/rivals/own_gap.py <sitting> <exam> <opened> <out.json> <rival>=<answers> ...
 
 Free runs of 5 s over the withheld recordings, as the exam's examiner has them: before is the rival's
 simulator as fitted to the reference, after as fitted to the field, floor the first against the same
@@ -17,11 +17,8 @@ from pathlib import Path
 
 import numpy as np
 from case_data import Arm, Windows, read_arm, read_windows
+from sittings import describe_command
 
-COMMAND = (
-    "python benchmarks/exam/rivals/own_gap.py <exam> benchmarks/exam/held_out/second own_gap.json "
-    "mujoco_sysid=<answers> pace=<answers>"
-)
 STRIDE_S = 2.5
 MIN_GAP_RATIO = 1.05
 """As in `exam.examiner`: distance of windows, and error over floor from which there is a gap."""
@@ -49,7 +46,7 @@ def close_gap(rival: str, exam: Path, case: str, answer: Path, arm: Arm) -> dict
     return {"before": before, "after": after, "floor": floor, "closed": closed}
 
 
-def main(exam: Path, opened: Path, out: Path, rivals: dict[str, Path]) -> None:
+def main(sitting: str, exam: Path, opened: Path, out: Path, rivals: dict[str, Path]) -> None:
     """Write the shares of all cases with one or several effects."""
     arm, found = read_arm(exam / "machine.yaml"), {}
     for label in json.loads((exam / "labels.sealed.json").read_text())["cases"]:
@@ -67,7 +64,7 @@ def main(exam: Path, opened: Path, out: Path, rivals: dict[str, Path]) -> None:
         if all(one.get(case) is not None for one in shares.values()):
             paired.append(case)
     result = {
-        "command": COMMAND,
+        "command": describe_command(sitting),
         "paired": {
             case: {name: one[case] for name, one in shares.items()} for case in sorted(paired)
         },
@@ -82,6 +79,7 @@ def main(exam: Path, opened: Path, out: Path, rivals: dict[str, Path]) -> None:
 
 if __name__ == "__main__":
     main(
-        *map(Path, sys.argv[1:4]),
-        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[4:])},
+        sys.argv[1],
+        *map(Path, sys.argv[2:5]),
+        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[5:])},
     )

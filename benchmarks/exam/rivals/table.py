@@ -1,19 +1,20 @@
 """Table of rivals: their answers to cases of an opened exam beside the published ones of the diagnosis.
 
-    python benchmarks/exam/rivals/table.py <exam> <opened> <work> <out.json> mujoco_sysid=<answers> pace=<answers>
+    python benchmarks/exam/rivals/table.py <sitting> <exam> <opened> <work> <out.json> <rival>=<answers> ...
 
-What they fitted stands in `changes_<rival>.jsonl` beside it. `<exam>` is what `remake.py` wrote
-from `<opened>`. Each rival has two rows: names by the rule of `rules.json`, and all fitted numbers
+What they fitted stands in `changes_<rival>.jsonl` beside it. `<opened>` holds published answers and marks
+of the diagnosis, as `exam.do=score` leaves them. Each rival has two rows: names by the rule of `rules.json`, and all fitted numbers
 taken as they are. Scores and the closed share are those of `mode=exam`; what was examined already
 stays in `<work>`.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
+import os
 import platform
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from case_data import read_changes
 from choose_rule import CLASSES, QUIET, THRESHOLDS, count_names
 from hydra.utils import instantiate
 from sit import RULES_FILE
+from sittings import SITTINGS, describe_command
 
 from brokk_rl.extensions import register_options
 from brokk_rl.session import write_json
@@ -31,12 +33,9 @@ from diagnosis.answer import read_answer
 from exam import dataset, score
 from exam.answer_scoring import AnswerScoring
 from exam.generate import restrict_machine
+from exam.metrics import compute_rate
 
 OURS = "diagnosis"
-COMMAND = (
-    "python benchmarks/exam/rivals/table.py <exam> benchmarks/exam/held_out/second <work> "
-    "benchmarks/exam/rivals/rivals.json mujoco_sysid=<answers> pace=<answers>"
-)
 ROWS = (
     "top1",
     "exact_set",
@@ -50,15 +49,35 @@ ROWS = (
 """Metrics of `exam.metrics` that the table has."""
 
 
-def count_expressible(answers: Path, labels: list[dict[str, Any]]) -> int:
-    """Return how many of the true effects a rival has a number for, in whatever case it fitted one."""
+def list_vocabulary(answers: Path, labels: list[dict[str, Any]]) -> set[str]:
+    """Return the effects that a rival has a number for, in whatever case it fitted one."""
     known: set[str] = set()
     for label in labels:
         known.update(one.effect for one in read_changes(answers / label["case"] / "changes.json"))
     for group in [*CLASSES, *({name, *same} for name, same in naming.SAME_AS.items())]:
         known |= group if known & group else set()
+    return known
+
+
+def count_expressible(labels: list[dict[str, Any]], vocabulary: set[str]) -> int:
+    """Return how many of the true effects are in a vocabulary."""
     truth = [one["effect"] for x in labels if x["kind"] not in QUIET for one in x["effects"]]
-    return sum(effect in known for effect in truth)
+    return sum(effect in vocabulary for effect in truth)
+
+
+def measure_within(
+    folder: Path, labels: list[dict[str, Any]], vocabulary: set[str], scoring: AnswerScoring
+) -> dict[str, Any]:
+    """Return how many effects of a vocabulary are named: first where alone, and at all."""
+    firsts, named, there = [], 0, 0
+    for label in labels:
+        answer = read_answer(folder / label["case"] / "diagnosis.json")
+        one = score.score_answer(label, answer, scoring.classes, scoring.of_machine)
+        there += sum(effect in vocabulary for effect in one.truth)
+        named += sum(effect in vocabulary for effect, _ in one.hits)
+        if label["kind"] == "one" and set(one.truth) <= vocabulary:
+            firsts.append(one.first)
+    return {"top1": compute_rate(firsts), "effects_named": {"value": named, "of": there}}
 
 
 def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
@@ -149,7 +168,15 @@ def summarise(
     return row
 
 
-def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path]) -> None:
+def main(
+    sitting: str,
+    exam: Path,
+    opened: Path,
+    work: Path,
+    out: Path,
+    rivals: dict[str, Path],
+    workers: int,
+) -> None:
     """Name, examine, score, write."""
     labels = dataset.open_labels(exam)["cases"]
     cases = [label["case"] for label in labels]
@@ -161,7 +188,7 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
         for title, rule in ((name, rules[name]), (f"{name} as fitted", everything)):
             folders[title] = work / title.replace(" ", "_")
             write_named(answers, cases, rule, folders[title])
-    overrides = ["mode=exam", "exam_protocol=sealed", "session.seed=1000", f"session.out={work}"]
+    overrides = ["mode=exam", *SITTINGS[sitting].options, f"session.out={work}"]
     register_options(overrides)
     with hydra.initialize_config_module("conf", version_base="1.3"):
         mode = instantiate(hydra.compose("config", overrides), _convert_="all")
@@ -185,7 +212,7 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
     )
     # numbers taken as they are repair the rival's own simulator only: `own_gap.py`
     repairs = {name: folder for name, folder in folders.items() if "as fitted" not in name}
-    examined = scoring.examine(repairs, work / "examined.json", 1)
+    examined = scoring.examine(repairs, work / "examined.json", workers)
     rows, chosen = {}, {label["case"] for label in sat}
     for name, folder in folders.items():
         table = scoring.build_table(folder, examined.get(name, {}))
@@ -194,11 +221,19 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
     kinds: dict[str, int] = {}
     for label in sat:
         kinds[label["kind"]] = kinds.get(label["kind"], 0) + 1
+    words = {name: list_vocabulary(answers, sat) for name, answers in rivals.items()}
     result = {
-        "command": COMMAND,
+        "command": describe_command(sitting),
         "cases": kinds,
         "candidates": rows,
-        "expressible": {name: count_expressible(a, sat) for name, a in rivals.items()},
+        "expressible": {name: count_expressible(sat, one) for name, one in words.items()},
+        "within": {
+            name: {
+                "vocabulary": sorted(one),
+                **{who: measure_within(folders[who], sat, one, scoring) for who in (name, OURS)},
+            }
+            for name, one in words.items()
+        },
         "hindsight": {
             name: measure_hindsight(answers, sat, rules[name]["spreads"])
             for name, answers in rivals.items()
@@ -207,7 +242,7 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
             name: {key: rules[name][key] for key in ("threshold", "f1", "cases", "exam_seed")}
             for name in rivals
         },
-        "machine": f"{platform.machine()}, 2 shared cores, Python {platform.python_version()}",
+        "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}",
         "commit": subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True
         ).stdout.strip(),
@@ -218,11 +253,12 @@ def main(exam: Path, opened: Path, work: Path, out: Path, rivals: dict[str, Path
 
 
 if __name__ == "__main__":
-    exam, opened, work, out = map(Path, sys.argv[1:5])
-    main(
-        exam,
-        opened,
-        work,
-        out,
-        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[5:])},
-    )
+    parser = argparse.ArgumentParser(description="Table of rivals on one exam.")
+    parser.add_argument("sitting", choices=SITTINGS)
+    for folder in ("exam", "opened", "work", "out"):
+        parser.add_argument(folder, type=Path)
+    parser.add_argument("rivals", nargs="+", help="<rival>=<folder of its answers>")
+    parser.add_argument("--workers", type=int, default=1)
+    given = vars(parser.parse_args())
+    pairs = [one.partition("=") for one in given.pop("rivals")]
+    main(**given, rivals={name: Path(folder) for name, _, folder in pairs})

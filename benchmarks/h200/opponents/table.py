@@ -2,11 +2,11 @@
 
     python benchmarks/h200/opponents/table.py <folder> [<plants> [<numbers before>]]
 
-1,024 episodes each of 60 s (20 s for the predictive controller, which takes long), under the default
-randomisation; success within 20, 40 and 60 s is read off
-the time of each success. Differences from the trained policy and from the classical
-controller are paired: the mean over episodes with its 95 % interval. `<numbers before>` is a JSON table
-of `task.classical` numbers, evaluated as `classical before`.
+1,024 episodes each of 60 s (20 s for the predictive controller, which takes long), under the
+default randomisation; success within 20, 40 and 60 s is read off the time of each success.
+Differences from the trained policy and from the classical controller are paired: the mean over
+episodes with its 95 % interval. `<numbers before>` is a JSON table of `task.classical` numbers,
+evaluated as `classical before`.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Training of one policy by several processes, one a GPU (or several on a CPU, to try it).
+"""Process group of a training: several processes, one for each GPU, that train one policy.
 
-rsl-rl averages gradients and normalisers over them. This module adds the process group, decisions
-of the first process for all, figures over all environments, and the proof that all processes still
-hold the same policy.
-
+rsl-rl averages gradients and normalisers over the processes. This module adds the group itself,
+decisions that the first process makes for all, statistics over all environments, and a check that
+all processes still hold the same policy. Several processes on one CPU work too, as in the tests.
 """
 
 from __future__ import annotations
@@ -52,28 +51,25 @@ class TrainingGroup:
             dist.barrier()
             dist.destroy_process_group()
             return
-        if (
-            self.device.type == "cpu"
-        ):  # gloo's threads must end before the interpreter does, or it aborts
+        # gloo's threads must end before the interpreter does, or it aborts. Between GPUs nothing is
+        # destroyed after an error: NCCL would wait for processes that have ended.
+        if self.device.type == "cpu":
             dist.destroy_process_group()
         if isinstance(error, dist.DistError) or (
             isinstance(error, RuntimeError) and _is_lost_connection(str(error))
         ):
-            # between GPUs nothing is destroyed after an error: NCCL would wait for those that are
-            # gone
             raise DistributedError(
                 f"rank {self.rank.index}: another process of this training has ended; its own "
-                "message says why "
-                f"({str(error).splitlines()[0]})"
+                f"message says why ({str(error).splitlines()[0]})"
             ) from error
 
     def wait(self) -> None:
-        """Wait until all have come here."""
+        """Wait until all processes have called this."""
         if self.together:
             dist.barrier()
 
     def broadcast_first(self, value: Any) -> Any:
-        """Return the first process's `value`: a decision by the clock must be the same for all."""
+        """Return the `value` of the first process, so that all act by the same clock."""
         if not self.together:
             return value
         box = [value]
@@ -116,10 +112,10 @@ class TrainingGroup:
         }
 
     def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Prove that all processes hold the same numbers, bit for bit.
+        """Compare the numbers of all processes, bit for bit.
 
         Raises:
-            DistributedError: They do not; the message says which ranks differ from the first.
+            DistributedError: They differ; the message names the ranks that differ from the first.
         """
         if not self.together:
             return
