@@ -113,9 +113,8 @@ class HumanFollowerModel:
         self._levers = person.levers(machine.num_joints)
         fields = {name: getattr(person, name) for name in person.numbers}
         low, high = self._levers
-        if (
-            low < high
-        ):  # the whole numbers are equally likely: each is the middle of an interval of its own
+        # The whole numbers are equally likely: each is the middle of an interval of its own.
+        if low < high:
             fields["joints_at_once"] = (low - 0.5, high + 0.5)
         else:
             fields["joints_at_once"] = float(low)

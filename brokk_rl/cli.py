@@ -277,9 +277,8 @@ def set_up_logging() -> None:
     )
     # Hydra logs a target that cannot be loaded before it raises the error, which `main` explains.
     logging.getLogger("hydra.utils").setLevel(logging.CRITICAL)
-    logging.getLogger("matplotlib").setLevel(
-        logging.WARNING
-    )  # It reports its font cache otherwise.
+    # It reports its font cache otherwise.
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 
 def explain(error: BaseException) -> str | None:
@@ -340,9 +339,10 @@ def _explain_missing_option(error: MissingConfigException) -> str:
         return str(error).split("\nConfig search path")[0]
     if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
+    # Hydra lists none where a list of options was given.
     offered = error.options or [
         option.name for option in registry.list_options() if option.group == group
-    ]  # Hydra lists none where a list of options was given.
+    ]
     if not offered:
         return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
     return f"there is no {group}={name}; {list_choices(name, offered)}"

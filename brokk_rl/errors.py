@@ -4,7 +4,7 @@ Each message names the expected value, the given value, and the place to change 
 exception is a defect of this package and keeps its traceback.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
 
 
@@ -54,3 +54,11 @@ def list_choices(name: str, known: Iterable[str]) -> str:
     near = get_close_matches(name, names, n=1)
     hint = f"did you mean '{near[0]}'? " if near else ""
     return f"{hint}choices: {', '.join(names) or 'none'}"
+
+
+def group_by_reason(reasons: Mapping[str, str]) -> str:
+    """Return names and their reasons in one line: `a, b (reason); c (another)`."""
+    names: dict[str, list[str]] = {}
+    for name, reason in reasons.items():
+        names.setdefault(reason, []).append(name)
+    return "; ".join(f"{', '.join(group)} ({reason})" for reason, group in names.items())

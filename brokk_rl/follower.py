@@ -17,7 +17,7 @@ from brokk_rl.spec import spec
 
 @spec
 class NoFollower:
-    """Nobody: the policy's command is given as it is, at once."""
+    """No person in between: the policy's command is given unchanged and at once."""
 
     label: ClassVar = "nobody"
 
@@ -43,9 +43,9 @@ class NoFollowerModel:
 def select_levers(priority: torch.Tensor, most: torch.Tensor | int) -> torch.Tensor:
     """Return the levers that are moved, `(N, J)` bool: the `most` of highest `priority`.
 
-    `priority` is `(N, J)`, `most` a number or `(N, 1)`.
-
-    Of equals the first.
+    Args:
+        priority: Priority of each lever, `(N, J)`; of equal ones the first counts.
+        most: Number of levers, one for all environments or `(N, 1)`.
     """
     mine, others = priority[:, :, None], priority[:, None, :]
     order = torch.arange(priority.shape[1], device=priority.device)

@@ -1,9 +1,9 @@
 """GPU pool for the jobs of a sweep that run at the same time on one computer.
 
-submitit starts all jobs of a local sweep at once and gives them no GPU, or all the same ones. The
+submitit starts all jobs of a local sweep at once, and either gives them no GPU or the same ones. The
 launching process therefore lists places, one for each GPU, and a job waits for a free place. A
-place is a locked file: the system unlocks it when its process ends, however it ends. Two sweeps on
-one computer thus share the GPUs.
+place is a locked file, which the system unlocks when the process ends for any reason. So two sweeps
+on one computer share the GPUs.
 """
 
 from __future__ import annotations

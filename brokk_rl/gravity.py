@@ -40,9 +40,8 @@ class Gravity:
         """Return the gravity load in the positive direction at `q`, `(N, J)`, Nm or N."""
         axis, origin_m, moments = self._place(q)
         carried = moments.flip(1).cumsum(1).flip(1) - self._carried_kg[:, None] * origin_m
-        turning = (
-            axis[..., 0] * carried[..., 1] - axis[..., 1] * carried[..., 0]
-        )  # z of axis x lever arm, times mass
+        # z component of axis x lever arm, times mass.
+        turning = axis[..., 0] * carried[..., 1] - axis[..., 1] * carried[..., 0]
         lifting = self._carried_kg * axis[..., 2]
         return -GRAVITY_M_S2 * (self._hinge * turning + (1.0 - self._hinge) * lifting)
 
@@ -58,9 +57,8 @@ class Gravity:
         Each `(N, J, 3)`, in the base frame.
         """
         angle = (q * self._hinge)[..., None, None]
-        turn = (
-            self._eye + angle.sin() * self._cross + (1.0 - angle.cos()) * self._cross_twice
-        )  # Rodrigues
+        # Rodrigues' rotation formula.
+        turn = self._eye + angle.sin() * self._cross + (1.0 - angle.cos()) * self._cross_twice
         slide = (q * (1.0 - self._hinge))[..., None] * self._axis
         rotation, at_m = self._eye.expand(q.shape[0], 3, 3), q.new_zeros(q.shape[0], 3)
         origins, axes, moments = [], [], []
@@ -83,8 +81,7 @@ class JointWeight:
     """Gravity load over the yield force of each joint.
 
     The weight on the joints of a planar arm is linear in the sines and cosines of the sums of its
-    angles, which costs a tenth of the whole mechanics. Where that is exact it is used, else the
-    mechanics are.
+    angles. This form takes a tenth of the time of the full mechanics, and is used where it is exact.
 
     Args:
         machine: A machine with known masses.

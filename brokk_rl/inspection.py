@@ -29,6 +29,9 @@ CODE_REPEATS = 5
 STEP_QUANTILE = 0.05
 """Neighbouring values of a coarse sensor lie one step apart or, where those between were not
 visited often, several."""
+HELD_TARGET = 1e-4
+"""Speed of a target, as a part of full speed, below which it is held: above the rounding of float32. A
+servo follows a slow target, where a valve stays closed under a small command."""
 JUMP = 1.5
 """A sensor that has missed a sample jumps by two periods' worth of motion."""
 
@@ -38,7 +41,7 @@ class InspectionThresholds:
     """Thresholds from which on a stretch of a recording is reported.
 
     Attributes:
-        commanded: A smaller command counts as none.
+        commanded: A smaller command counts as none. A target counts as held where it stays the same.
         driving: A larger command should move any joint: beyond the dead band.
         still: A smaller speed counts as rest, as a part of the joint's full speed.
         settle_s: Time beyond the dead time that a joint takes to start or to stop.
@@ -149,9 +152,8 @@ class _RecordingScan:
         )
         self._is_moving = np.abs(self._v) > thresholds.still * machine.max_speed
         self._lead = round((machine.dead_time_s + thresholds.settle_s) / self._period_s)
-        self._idle = np.stack(
-            [_find_held(np.abs(u) < thresholds.commanded, self._lead) for u in self._u.T], 1
-        )
+        least = HELD_TARGET if machine.interface == "position" else thresholds.commanded
+        self._idle = np.stack([_find_held(np.abs(u) < least, self._lead) for u in self._u.T], 1)
         self._noise = np.array([self._noise_of(j) for j in range(machine.num_joints)])
         self._step = np.array([estimate_step(q) for q in self._q.T])
         self._visible = thresholds.steps * np.fmax(

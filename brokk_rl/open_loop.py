@@ -122,9 +122,8 @@ def roll_out(
     model = actuator.build(machine, count, device)
     u = torch.as_tensor(cut.u, dtype=torch.float32, device=device)
     q = torch.as_tensor(cut.q[:, :before], dtype=torch.float32, device=device)
-    history = History(
-        q=q[:, :size].clone(), u=u[:, :size].roll(1, 1)
-    )  # before the first push_u the newest command is one back
+    # Before the first push_u the newest command is one back.
+    history = History(q=q[:, :size].clone(), u=u[:, :size].roll(1, 1))
     path = []
     with torch.inference_mode():
         model.reset(torch.ones(count, dtype=torch.bool, device=device))

@@ -1,8 +1,8 @@
 """Independent work on several processor cores, by forked processes.
 
-A forked process sees the memory of its parent, so that nothing is sent to it; results come back
-through a pipe. Where a system has no safe fork (Windows, macOS) the work is done one after the
-other. The results do not depend on the number of processes.
+A forked process shares the memory of its parent, so nothing is sent to it; results come back through
+a pipe. On systems without a safe fork (Windows, macOS) one process does all the work. The results do
+not depend on the number of processes.
 """
 
 from __future__ import annotations

@@ -16,13 +16,14 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
+from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, Template
 
@@ -113,6 +114,13 @@ class Report:
     def add_list(self, texts: Sequence[str]) -> None:
         """Add a list of short texts."""
         self._blocks.append({"kind": "list", "texts": list(texts)})
+
+    def add_links(self, files: Mapping[str, str]) -> None:
+        """Add links to files beside the page: text and path, relative to the page's folder."""
+        links = []
+        for text, path in files.items():
+            links.append({"text": text, "address": quote(path)})
+        self._blocks.append({"kind": "links", "links": links})
 
     def add_code(self, text: str) -> None:
         """Add commands or a file unchanged."""
@@ -224,6 +232,21 @@ class Report:
             raise StorageError(
                 f"cannot write {path}: {error.strerror or error}; nothing was left behind"
             ) from error
+
+
+def write_picture(figure: Figure, path: Path) -> None:
+    """Write a figure as a PNG file.
+
+    Raises:
+        StorageError: it could not be written; nothing was left behind.
+    """
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        temporary.write_bytes(_draw_png(figure)[1])
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
 
 
 @cache

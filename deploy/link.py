@@ -75,7 +75,7 @@ class CanConnection:
 
 
 class CanLink:
-    """The link at work; see `brokk_rl.contracts.link.Link`."""
+    """Open link to the machine through the bus process and its guard; see `brokk_rl.contracts.link.Link`."""
 
     def __init__(self, can: CanConnection, machine: Machine) -> None:
         self._can, self._machine = can, machine

@@ -45,6 +45,7 @@ class AlarmCounts:
     """Alarms of an observer in recordings.
 
     Attributes:
+        num_joints: Number of joints, `J`.
         seconds: Length of all recordings.
         faults: Alarms by joint and fault.
         misfits: Alarms of the drift watch, one a run at most, by joint and effect.

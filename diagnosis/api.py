@@ -32,11 +32,10 @@ from diagnosis import report as diagnosis_report
 from diagnosis.answer import Outcome
 from diagnosis.case import GapCase
 from diagnosis.modes.diagnose import Diagnose, DiagnosisSubject
+from diagnosis.request import FITS
 
 EXCITATIONS = ("levels", "sine", "ramps", "holds", "reversals", "staircase")
 """Experiments that a diagnosis may propose, as in `conf/mode/diagnose.yaml`."""
-FITS = {"speed": "valve", "position": "servo", "torque": "force"}
-"""Fit of each command interface."""
 HELD_OUT = 4
 """One recording in so many stops a fit."""
 

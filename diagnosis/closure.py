@@ -60,7 +60,8 @@ class Gap:
         floor: Error that the unchanged machine would show under the field's own motion; without a
             reference that of a flexible model on field recordings that it was not fitted to;
             `None` where neither is known.
-        closed: `(before - after) / (before - floor)`; `None` together with `closed_reason`.
+        closed: `(before - after) / (before - floor)`; above 1 where `after` is below the floor, which
+            is an estimate and no bound; `None` together with `closed_reason`.
         unit: `rad` or `m`; `travel` on a machine with joints of both kinds, whose errors are taken
             over their travel.
         floor_of: `reference`, `flexible model`, or empty.

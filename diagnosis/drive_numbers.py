@@ -36,16 +36,19 @@ def propose_drive_effects(
         for actuator in (base.actuator, base.left_out[0].residuals.simulator.base)
     )
     for kind in kinds:
-        for name, changed in getattr(kind.target, "drives", {}).items():
-            if changed not in own or changed not in fitted:
-                continue
+        drives = getattr(kind.target, "drives", {})
+        if not drives or not own.keys() & fitted.keys() >= set(drives.values()):
+            continue
+        values, large = {}, np.zeros(len(found), dtype=bool)
+        for name, changed in drives.items():
             none = kind.numbers[name].none
             change = (
                 fitted[changed] - own[changed] if none == 0.0 else fitted[changed] / own[changed]
             )
-            value = kind.clipped(name, change)
-            for j in np.flatnonzero(np.abs(value - none) > LEAST_SIZE * np.abs(kind.size(name))):
-                found[j].setdefault(kind.name, {})[name] = float(value[j])
+            values[name] = kind.clipped(name, change)
+            large |= np.abs(values[name] - none) > LEAST_SIZE * np.abs(kind.size(name))
+        for j in np.flatnonzero(large):
+            found[j][kind.name] = {name: float(value[j]) for name, value in values.items()}
     return list(found)
 
 

@@ -21,7 +21,7 @@ import yaml
 
 from brokk_rl import registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, PlannedRun
-from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl.errors import BrokkError, ConfigError, group_by_reason, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import FreeRunWindows
@@ -181,8 +181,7 @@ def load_effects(
     for name, target in inside.items():
         found[name] = EffectType(name, target, machine)
     left_out = getattr(simulator, "list_left_out", dict)()
-    for name, reason in left_out.items():
-        log.info("%s is left out: %s", name, reason)
+    reasons = {} if names else dict(left_out)
     for name in names or ():
         if name in left_out:
             raise ConfigError(f"diagnosis.effects: '{name}' cannot be simulated: {left_out[name]}")
@@ -199,7 +198,9 @@ def load_effects(
             _check_simulable(kind, machine)
             usable.append(kind)
         except ConfigError as error:
-            log.info("%s is left out: %s", kind.name, error)
+            reasons[kind.name] = str(error).partition(";")[0]
+    if reasons:
+        log.info("not asked about: %s", group_by_reason(reasons))
     return usable
 
 

@@ -56,7 +56,8 @@ def write_headline(answer: Answer) -> tuple[str, Tone]:
         why = f" No share of the gap is told: {gap.closed_reason}." if gap else ""
         return f"The simulator lacks {names}.{fewer}{why}{told}{rest}", tone
     share = f"{_format_share(closed, ' of the gap')}"
-    return f"The simulator lacks {names}; adding {it} closes {share}.{told}{rest}", tone
+    below = " The error is then below its floor." if closed.mean > 1.0 else ""
+    return f"The simulator lacks {names}; adding {it} closes {share}.{below}{told}{rest}", tone
 
 
 def _describe_tool(answer: Answer) -> str:

@@ -18,6 +18,8 @@ CHOICE_SIGNS = {
     "stakes": ("effects", "none", "unknown"),
 }
 """Signs of the hypotheses of each verdict, and the verdicts that have a stake; see `hypotheses`."""
+FITS = {"speed": "valve", "position": "servo", "torque": "force"}
+"""Fit of each command interface."""
 STAGES = ("timing", "actuation", "sensing", "kinematics", "perception")
 
 

@@ -27,8 +27,8 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import rectification, search
 from perception.face_depth import FaceDepth, FaceMatcher
-from perception.pose.appearance import IN_DUST
 from perception.pose.plane_conic import convert_to_gray
+from perception.pose.wall_light import IN_DUST
 from perception.rectification import RectificationCheck
 
 SAME_ELLIPSE = 0.15

@@ -88,3 +88,74 @@ class ForceOffset(EffectSpec):
     numbers: ClassVar = {
         "offset_n": EffectNumber("N", none=0.0, typical=0.02, bounds=(-0.5, 0.5), scale="force")
     }
+
+
+@spec
+class StribeckFriction(EffectSpec):
+    """Dry friction of a drive that is larger at rest than in motion: it starts with a jerk and creeps in steps.
+
+    It falls with the speed as `stribeck_m_s` of the simulated drive says.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        stribeck_n: Friction at rest beyond that of the simulator (Nm of a hinge).
+    """
+
+    joints: Joints
+    stribeck_n: Value
+    side = "drive"
+    interfaces = frozenset({"torque"})
+    drives = MappingProxyType({"stribeck_n": "stribeck_n"})
+    numbers: ClassVar = {
+        # At rest 1.2 to 2 times the friction in motion, which is 5 % of the largest force.
+        "stribeck_n": EffectNumber("N", none=0.0, typical=0.03, bounds=(0.0, 0.5), scale="force")
+    }
+
+
+@spec
+class LoadFriction(EffectSpec):
+    """Dry friction of a gear that grows with the force through it.
+
+    Duclusaud, Passault, Padois and Ly, ICRA 2025, models M3 and M5; see `actuators.models.friction`.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        motor_load: Friction over the force of the motor, beyond that of the simulator.
+        outside_load: The same over the weight on the joint.
+    """
+
+    joints: Joints
+    motor_load: Value
+    outside_load: Value
+    side = "drive"
+    interfaces = frozenset({"torque"})
+    drives = MappingProxyType({"motor_load": "motor_load", "outside_load": "outside_load"})
+    numbers: ClassVar = {
+        # Gears of servos lose 2 to 20 % of the torque; from 1 on the motor moves nothing.
+        "motor_load": EffectNumber("1", none=0.0, typical=0.1, bounds=(0.0, 0.9)),
+        "outside_load": EffectNumber("1", none=0.0, typical=0.1, bounds=(0.0, 0.9)),
+    }
+
+
+@spec
+class PoseForce(EffectSpec):
+    """Weight on a drive that changes with the position of its joint.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        pose_sin_n: Force against the positive direction that follows the sine of the angle from
+            mid-travel (Nm), or the place in the travel of a sliding joint.
+        pose_cos_n: The same with the cosine of the angle less 1; nothing on a sliding joint.
+    """
+
+    joints: Joints
+    pose_sin_n: Value
+    pose_cos_n: Value
+    side = "drive"
+    interfaces = frozenset({"torque"})
+    drives = MappingProxyType({"pose_sin_n": "pose_sin_n", "pose_cos_n": "pose_cos_n"})
+    numbers: ClassVar = {
+        # A servo that bears a tenth of its largest torque in the outermost pose.
+        "pose_sin_n": EffectNumber("N", none=0.0, typical=0.1, bounds=(-1.0, 1.0), scale="force"),
+        "pose_cos_n": EffectNumber("N", none=0.0, typical=0.1, bounds=(-1.0, 1.0), scale="force"),
+    }

@@ -155,9 +155,8 @@ class Compliance(EffectSpec):
         The inner speed `v` changes at the beginning of each period.
         """
         period_s, damping = now.plant.period_s, now.value["damping"]
-        w = (
-            2.0 * math.pi / now.value["ringing_s"].clamp(min=1e-5)
-        )  # beyond 100 kHz nothing is left after a period, to the last bit
+        # Beyond 100 kHz nothing is left after a period, to the last bit.
+        w = 2.0 * math.pi / now.value["ringing_s"].clamp(min=1e-5)
         ringing, fade = w * torch.sqrt(1.0 - damping.square()), damping * w
         speed = now.moved / period_s
         d, rate = now.memory["deflection"], now.memory["rate"] + now.memory["speed"] - speed

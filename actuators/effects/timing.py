@@ -71,9 +71,8 @@ class ClockOffset(_Delayed):
     joints: Joints
     offset_s: Value
     shared = True
-    interfaces = frozenset(
-        {"speed", "torque"}
-    )  # a loop that holds a target shows it as a dead time
+    # A loop that holds a target shows it as a dead time.
+    interfaces = frozenset({"speed", "torque"})
     numbers: ClassVar = {
         "offset_s": EffectNumber("s", none=0.0, typical=0.05, bounds=(-0.3, 0.3), scale="time")
     }

@@ -160,9 +160,8 @@ class PlanPlayer:
         )
         program = program * (self.phase == PLAY)[:, None]
         low, high = self._low[self._rows, self.segment], self._high[self._rows, self.segment]
-        self._turned = np.where(
-            program * before > 0, self._turned, 1.0
-        )  # until the program passes zero
+        # Kept until the program passes zero.
+        self._turned = np.where(program * before > 0, self._turned, 1.0)
         outward = np.minimum(slow, fast) < low, np.maximum(slow, fast) > high
         demand = program * self._turned
         leaving = ((demand < 0) & outward[0]) | ((demand > 0) & outward[1])

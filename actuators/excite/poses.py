@@ -86,9 +86,10 @@ def _compute_potential_j(machine: Machine, q: np.ndarray) -> np.ndarray:
             x, y, z = axis
             cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
             angle = q[:, j, None, None]
+            # Rodrigues' rotation formula.
             rotation = rotation @ (
                 np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross
-            )  # Rodrigues
+            )
         height_m = (origin_m + rotation @ np.array(body.com_m))[:, 2]
         energy_j = energy_j + body.mass_kg.value * GRAVITY_M_S2 * height_m
     return energy_j

@@ -77,9 +77,10 @@ class Sine:
         shortest = max(2, round(1.0 / self.highest_hz / period_s))
         while steps - at >= shortest:
             hz = np.exp(generator.uniform(np.log(self.lowest_hz), np.log(self.highest_hz)))
+            # A sine may begin in either direction.
             amplitude = generator.uniform(self.smallest, self.largest) * generator.choice(
                 [-1.0, 1.0]
-            )  # may start either way
+            )
             count = min(max(round(1.0 / hz / period_s), shortest), steps - at)
             u[at : at + count] = amplitude * np.sin(2.0 * np.pi * np.arange(count) / count)
             at += count

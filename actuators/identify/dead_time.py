@@ -91,12 +91,13 @@ def _estimate_dead_time(
     ):
         return None
     runs = group_by_run(moving).values()
+    # (R, D, F + 1, F + 1)
     moments = np.stack(
         [
             np.sum([_compute_moments(part, joint, grid_s, machine) for part in parts], 0)
             for parts in runs
         ]
-    )  # (R, D, F + 1, F + 1)
+    )
     value = _find_best_delay(moments.sum(0))
     picks = (generator.integers(len(moments), size=len(moments)) for _ in range(RESAMPLED))
     again = grid_s[[_find_best_delay(moments[pick].sum(0)) for pick in picks]]
@@ -129,17 +130,15 @@ def _compute_moments(
     moved = np.convolve(np.diff(q), SMOOTHING, mode="valid")
     margin = AT_STOP * (machine.upper[joint] - machine.lower[joint])
     stopped = (q[:-1] < machine.lower[joint] + margin) | (q[:-1] > machine.upper[joint] - margin)
-    free = (
-        np.convolve(stopped, np.ones(len(SMOOTHING)), mode="valid") < 0.5
-    )  # a stop ends the motion before the command does
+    # A stop ends the motion before the command does.
+    free = np.convolve(stopped, np.ones(len(SMOOTHING)), mode="valid") < 0.5
     now = np.flatnonzero(free[reach:]) + reach
     found = []
     for delay_s in grid_s:
         whole, part = divmod(delay_s / machine.period_s + 1e-9, 1.0)
         back = int(whole)
-        delayed = (
-            part * curve[now - back - 1] + (1.0 - part) * curve[now - back]
-        )  # the command changes inside the period
+        # The command changes inside the period.
+        delayed = part * curve[now - back - 1] + (1.0 - part) * curve[now - back]
         features = np.concatenate([delayed, moved[now, None]], 1)
         found.append(features.T @ features)
     return np.stack(found)

@@ -395,9 +395,8 @@ class _Search:
         score, fallback = (
             _average_rmse(runs.squares(stacked), runs.active) for runs in (held, self.runs)
         )
-        score = np.where(
-            np.isfinite(score), score, fallback
-        )  # a joint that the validation never moves
+        # The fallback is for a joint that the validation never moves.
+        score = np.where(np.isfinite(score), score, fallback)
         if self.config.coupled:
             score = np.repeat((score / score.min(0)).sum(1, keepdims=True), score.shape[1], 1)
         return np.stack([stacked[best][:, j] for j, best in enumerate(score.argmin(0))], 1)

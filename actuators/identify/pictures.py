@@ -34,9 +34,8 @@ def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
     cut, machine = scores.cut, scores.machine
     steps = cut.measured.shape[1]
     t_s = machine.period_s * np.arange(1, steps + 1)
-    height = (
-        2.75 * machine.num_joints + 0.5
-    )  # inches; laid out by hand, which is much faster than any layout engine with so many axes
+    # Inches. Laid out by hand, which is much faster than any layout engine with so many axes.
+    height = 2.75 * machine.num_joints + 0.5
     figure = Figure(figsize=(12.0, height))
     rows = figure.add_gridspec(
         machine.num_joints,

@@ -1,9 +1,12 @@
 """Mass behind a motor that is commanded by force or torque, joint by joint.
 
-    mass q'' = max_force u(t - dead_time) - viscous q' - coulomb sign(q') - offset
+    mass q'' = max_force u(t - dead_time) - viscous q' - dry sign(q') - weight(q)
+    weight   = offset + pose_sin sin(angle) + pose_cos (cos(angle) - 1)
 
+`angle` counts from the middle of the travel; a sliding joint has its place in the travel, from -1 to 1,
+for the sine and 0 for the last term. `dry` is Coulomb friction, and what `actuators.models.friction` adds.
 A command acts for a whole control period. The speed is solved implicitly over the period, so that viscous
-friction of any size is stable and Coulomb friction brings a joint exactly to rest.
+friction of any size is stable and dry friction brings a joint exactly to rest.
 """
 
 from collections.abc import Mapping
@@ -11,6 +14,7 @@ from typing import Any, ClassVar
 
 import torch
 
+from actuators.models.friction import LOADS, STRIBECK_SPEED, compute_dry_friction
 from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import select_commands_in_force
 from brokk_rl.errors import ConfigError
@@ -18,7 +22,10 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
-NUMBERS = ("dead_time_s", "mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n")
+NUMBERS = (
+    "dead_time_s", "mass_kg", "viscous_n_s_m", "coulomb_n", "offset_n", "pose_sin_n", "pose_cos_n", "stribeck_n",
+    "stribeck_m_s", "stribeck_power", *LOADS,
+)  # fmt: skip
 SPEED_SAMPLES = 5
 """Positions from which a free run takes the speed that it begins with, by a parabola. Fewer take up the
 noise of the encoder, more its acceleration; on the linear drive EMPS 4 to 7 differ by 2 % of the mass."""
@@ -26,14 +33,28 @@ noise of the encoder, more its acceleration; on the linear drive EMPS 4 to 7 dif
 
 @spec
 class ForceDrive:
-    """Mass with viscous and Coulomb friction and a constant force, driven by the command.
+    """Mass with friction and weight, driven by the command.
 
     Attributes:
         dead_time_s: Time until a command acts; `null` takes the machine's.
         mass_kg: Mass, or inertia in kg m² of a hinge, motor and gear included.
         viscous_n_s_m: Viscous friction (Nm s/rad of a hinge).
         coulomb_n: Coulomb friction (Nm of a hinge).
-        offset_n: Constant force against the positive direction: weight, or an offset of the motor.
+        offset_n: Constant force against the positive direction: weight in the middle of the travel, or an
+            offset of the motor.
+        pose_sin_n: Weight that follows the sine of the angle from there (the place in the travel of a
+            sliding joint).
+        pose_cos_n: Weight that follows its cosine, less 1.
+        stribeck_n: Dry friction at rest beyond Coulomb friction.
+        stribeck_m_s: Speed at which a third of it is left (rad/s of a hinge); `null` takes a twentieth of
+            the machine's `max_speed`.
+        stribeck_power: Power of the speed in the exponential by which it falls.
+        motor_load: Dry friction over the force of the motor, see `actuators.models.friction`.
+        outside_load: Dry friction over the weight.
+        motor_load_at_rest: The same at rest, beyond that in motion.
+        outside_load_at_rest: The same of the weight.
+        motor_load_square: Friction at rest over the square of the motor's force, 1/N.
+        outside_load_square: The same of the weight.
         spread: Relative half width, by field name, of draws per environment and joint at reset.
     """
 
@@ -46,6 +67,18 @@ class ForceDrive:
     coulomb_n: PerJoint
     offset_n: PerJoint
     spread: dict[str, float]
+    # Files from before these numbers lack them; neutral.
+    pose_sin_n: PerJoint = 0.0
+    pose_cos_n: PerJoint = 0.0
+    stribeck_n: PerJoint = 0.0
+    stribeck_m_s: PerJoint | None = None
+    stribeck_power: PerJoint = 1.0
+    motor_load: PerJoint = 0.0
+    outside_load: PerJoint = 0.0
+    motor_load_at_rest: PerJoint = 0.0
+    outside_load_at_rest: PerJoint = 0.0
+    motor_load_square: PerJoint = 0.0
+    outside_load_square: PerJoint = 0.0
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ForceDriveModel":
         """Return a model for `num_envs` environments on `device`.
@@ -74,8 +107,9 @@ class ForceDriveModel:
             config,
             NUMBERS,
             machine,
-            positive=("mass_kg",),
-            not_negative=("viscous_n_s_m", "coulomb_n"),
+            positive=("mass_kg", "stribeck_m_s", "stribeck_power"),
+            not_negative=("viscous_n_s_m", "coulomb_n", "stribeck_n", *LOADS),
+            absent={"stribeck_m_s": STRIBECK_SPEED * machine.max_speed},
         )
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"
@@ -88,6 +122,8 @@ class ForceDriveModel:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
         self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
+        self._middle, self._half = (self._lower + self._upper) / 2, (self._upper - self._lower) / 2
+        self._slides = torch.tensor([j.kind == "slide" for j in machine.joints], device=device)
         self._max_force = tensor(machine.max_force)
         count = min(SPEED_SAMPLES, machine.num_history)
         times_s = self._period_s * torch.arange(1 - count, 1, dtype=torch.float64)
@@ -113,16 +149,17 @@ class ForceDriveModel:
         """Return the joint positions one control period later, shape `(N, J)`."""
         value, period_s = self._change_numbers(), self._period_s
         earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / period_s)
-        force = torch.lerp(later, earlier, part) * self._max_force - value["offset_n"]
+        motor = torch.lerp(later, earlier, part) * self._max_force
         q = history.q[:, -1]
+        weight = self._weigh(value, q)
         recent = history.q[:, -len(self._slope) :]
         begun = torch.einsum("h,nhj->nj", self._slope, recent)
         before = torch.where(self._fresh[:, None], begun, self._speed)
         mass = value["mass_kg"]
-        speed = (before + period_s * force / mass) / (
+        speed = (before + period_s * (motor - weight) / mass) / (
             1.0 + period_s * value["viscous_n_s_m"] / mass
         )
-        friction = period_s * value["coulomb_n"] / mass
+        friction = period_s * compute_dry_friction(value, before, motor, weight) / mass
         speed = speed.sign() * (speed.abs() - friction).clamp(min=0.0)
         moved = q + 0.5 * period_s * (before + speed)
         low, high = torch.minimum(self._lower, q), torch.maximum(self._upper, q)
@@ -130,6 +167,11 @@ class ForceDriveModel:
         self._speed.copy_(speed.masked_fill(held != moved, 0.0))
         self._fresh.fill_(False)
         return held
+
+    def _weigh(self, value: dict[str, torch.Tensor], q: torch.Tensor) -> torch.Tensor:
+        """Return the force from outside against the positive direction, `(N, J)`."""
+        sin, cos = read_pose(q, self._middle, self._half, self._slides)
+        return value["offset_n"] + value["pose_sin_n"] * sin + value["pose_cos_n"] * cos
 
     def _change_numbers(self) -> dict[str, torch.Tensor]:
         """Return the numbers with the changes by effects, `(N, J)`."""
@@ -143,6 +185,15 @@ class ForceDriveModel:
     def delay_s(self) -> torch.Tensor:
         """Dead time, `(N, J)`."""
         return self.parameters["dead_time_s"]
+
+
+def read_pose(
+    q: torch.Tensor, middle: torch.Tensor, half: torch.Tensor, slides: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return what `pose_sin_n` and `pose_cos_n` are multiplied by at positions `q`, each like `q`."""
+    away = q - middle
+    sin = torch.where(slides, away / half, torch.sin(away))
+    return sin, torch.where(slides, torch.zeros_like(q), torch.cos(away) - 1.0)
 
 
 def change_drive(

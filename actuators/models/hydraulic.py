@@ -205,9 +205,8 @@ class HydraulicModel:
         excess = p["breakaway"] - p["coulomb"]
         knee = p["stribeck_speed"] * self._full_speed
         viscous = p["viscous"] / self._full_speed
-        still = (
-            0.01 * self._full_speed
-        )  # below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step
+        # Below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step.
+        still = 0.01 * self._full_speed
         rub = dt * supply / inertia
 
         def rubbing(speed: torch.Tensor) -> torch.Tensor:
@@ -235,9 +234,8 @@ class HydraulicModel:
         )
         demand = torch.zeros_like(q)
         for i in range(self._num_substeps):
-            u = torch.lerp(
-                later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0)
-            )  # smooth in the delay
+            # Smooth in the delay.
+            u = torch.lerp(later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0))
             pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
             spool_rate = spool_rate + pull[0] * (pilot - spool) - pull[1] * spool_rate
             spool = (spool + dt * spool_rate).clamp(-1.0, 1.0)

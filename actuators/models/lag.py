@@ -167,16 +167,14 @@ class FirstOrderLagModel:
                 * value["gain"]
                 * self._max_speed
             )
-            time_constant_s = value["time_constant_s"].clamp(
-                min=1e-6
-            )  # 0 would divide by zero; a microsecond is as good
+            # A time constant of 0 would divide by zero; a microsecond is as good.
+            time_constant_s = value["time_constant_s"].clamp(min=1e-6)
             decay = torch.exp(-duration_s / time_constant_s)
             q = q + target * duration_s + (speed - target) * time_constant_s * (1.0 - decay)
             speed = target + (speed - target) * decay
         held = q.clamp(self._lower, self._upper)
-        self._speed.copy_(
-            speed.masked_fill(held != q, 0.0)
-        )  # a joint at its stop has no speed left
+        # A joint at its stop has no speed left.
+        self._speed.copy_(speed.masked_fill(held != q, 0.0))
         self._fresh.fill_(False)
         return held
 

@@ -164,10 +164,11 @@ class ArxFit:
             if recording.num_samples <= size:
                 continue
             u, q = recording.u.astype(np.float64), recording.q.astype(np.float64)
+            # (T - H, J, H)
             views = [
                 np.lib.stride_tricks.sliding_window_view(x, size, 0)[:-1]
                 for x in (u, np.abs(u) * u)
-            ]  # (T - H, J, H)
+            ]
             increments = np.lib.stride_tricks.sliding_window_view(np.diff(q, axis=0), size - 1, 0)[
                 :-1
             ]

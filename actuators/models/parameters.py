@@ -1,6 +1,7 @@
 """Parameters of an actuator: one value or one per joint, and drawn per episode if asked for."""
 
 from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,7 @@ def read_parameters(
     *,
     positive: Collection[str] = (),
     not_negative: Collection[str] = (),
+    absent: Mapping[str, np.ndarray] = MappingProxyType({}),
 ) -> dict[str, np.ndarray]:
     """Return the numbers of an actuator's spec for every joint, `(J,)` each, checked.
 
@@ -88,6 +90,7 @@ def read_parameters(
         machine: The machine.
         positive: Fields that must be above 0.
         not_negative: Fields that must be 0 or more.
+        absent: Values `(J,)` of other fields that are `None`.
 
     Raises:
         ConfigError: a number is out of its range, a joint is missing or unknown, or the machine's
@@ -98,7 +101,10 @@ def read_parameters(
         value = getattr(config, name)
         if name == "dead_time_s" and value is None:
             value = machine.dead_time_s
-        found[name] = expand_per_joint(value, machine, f"actuator.{name}")
+        if value is None:
+            found[name] = absent[name]
+        else:
+            found[name] = expand_per_joint(value, machine, f"actuator.{name}")
         if name in positive and (found[name] <= 0).any():
             raise ConfigError(f"actuator.{name}: expected > 0, got {found[name].tolist()}")
         if name in not_negative and (found[name] < 0).any():

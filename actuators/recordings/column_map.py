@@ -395,9 +395,8 @@ class CanColumnMap:
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
         """Return the pieces of the log at `path`; see `ColumnMap.read`."""
-        from actuators.recordings.can_log import (
-            CanLog,
-        )  # here: a desk without CAN has no python-can
+        # Imported here, since a desk without CAN has no python-can.
+        from actuators.recordings.can_log import CanLog
 
         return self.columns.read_log(CanLog(path, self.dbc), machine)
 

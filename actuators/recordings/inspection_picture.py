@@ -103,9 +103,8 @@ def draw_overview(path: Path, lines: Mapping[str, OverviewRow]) -> None:
     longest_s = max((line.duration_s for line in lines.values()), default=0.0) or 1.0
     for place, line in enumerate(lines.values()):
         axis.barh(place, line.duration_s, height=0.7, color="0.9")
-        for finding in sorted(
-            line.findings, key=lambda finding: -finding.duration_s
-        ):  # none hides a shorter one
+        # Longest first, so that none hides a shorter one.
+        for finding in sorted(line.findings, key=lambda finding: -finding.duration_s):
             width_s = max(finding.duration_s, THINNEST * longest_s)
             axis.barh(place, width_s, left=finding.t_s, height=0.7, color=COLOURS[finding.kind])
         if line.num_breaches:

@@ -57,9 +57,8 @@ def check_world(
     require(bool((first[-1] != home).any()), "step: the arm does not move")
     seen = {"q": world.q, "contact_force_n": world.contact_force_n, "faults": world.faults}
     require(is_in_place(seen, place), "step: a tensor moved; refresh it in place")
-    tolerance = (
-        0.0 if device.type == "cpu" else 1e-5
-    )  # the order of additions on a GPU is not fixed
+    # The order of additions on a GPU is not fixed.
+    tolerance = 0.0 if device.type == "cpu" else 1e-5
     world.load_state_dict(stored)
     require(
         is_same(_push_joints(world, steps), first, tolerance),

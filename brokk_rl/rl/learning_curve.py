@@ -1,4 +1,4 @@
-"""When a training passes a level of success, and when it no longer learns."""
+"""Learning curves: when a training reaches a level of success, and when it stops improving."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ training that succeeds in 0.98 of its episodes passed 0.99 by chance (benchmarks
 def find_passing(
     rows: Sequence[Mapping[str, Any]], level: float, after: int = 0, window: int = WINDOW
 ) -> Mapping[str, Any] | None:
-    """Return the first row of `progress.csv` at which the newest episodes succeed so often.
+    """Return the first row of `progress.csv` at which the newest episodes reach a level of success.
 
     Args:
         rows: One an iteration, with `episodes` and `episode/success_strict`.

@@ -149,9 +149,8 @@ class CapturedRollout:
     @torch.no_grad()
     def _keep(self) -> None:
         storage = self._algorithm.storage
-        reward = (
-            self._reward + self._algorithm.gamma * self._values * self._timed_out
-        )  # the end of time is not the end
+        # A time limit is no end of the task: the value of the next state counts on.
+        reward = self._reward + self._algorithm.gamma * self._values * self._timed_out
         rows = [
             (storage.actions, self._actions),
             (storage.rewards, reward),

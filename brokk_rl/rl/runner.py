@@ -293,9 +293,8 @@ class TrainingRunner(OnPolicyRunner):
         try:
             self.alg.load(content, None, strict=True)
             own = [content, *content.get("others", [])][self.group.rank.index :][:1]
-            for part in (
-                own
-            ):  # none where more processes go on than were stopped: the new ones start afresh
+            # Empty where more processes continue than were stopped: the new ones start afresh.
+            for part in own:
                 self.env.load_state_dict(part["env"])
                 set_random_state(part["random"], self.device)
             self.alg.learning_rate = content["learning_rate"]

@@ -53,9 +53,8 @@ class SimulatedTrials:
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel
     ) -> list[Recording]:
         """Run all trials; see `brokk_rl.contracts.operator.TrialGround`."""
-        device = torch.device(
-            "cpu"
-        )  # a few hundred trials are as fast on a CPU, and operators are numpy
+        # A few hundred trials are as fast on a CPU, and operators are numpy.
+        device = torch.device("cpu")
         torch.manual_seed(session.stream("ground"))
         num = len(trials.q)
         world = self.sim.build(machine, device, num)

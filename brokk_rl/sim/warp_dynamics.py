@@ -139,10 +139,8 @@ def _compile_kernels(num_dofs: int) -> tuple[wp.Kernel, wp.Kernel]:
     ):
         world = wp.tid()
         inertia, bias = Matrix(), Vector()
-        turns, moves = (
-            Columns(),
-            Columns(),
-        )  # of each joint at unit speed: its turn, and the velocity of a point at `origin`
+        # For each joint at unit speed: its turn, and the velocity of a point at `origin`.
+        turns, moves = Columns(), Columns()
         origin = pose.anchor[world, 0]
         omega, alpha, acceleration, point = wp.vec3(), wp.vec3(), wp.vec3(), wp.vec3(origin)
         for k in range(n):

@@ -39,9 +39,8 @@ _SLOPE_LEFT = wp.constant(0.01)
 
 _FRICTIONLESS = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS))
 _ELLIPTIC = wp.constant(int(mujoco.mjtConstraint.mjCNSTR_CONTACT_ELLIPTIC))
-_FRICTION = wp.types.vector(
-    5, wp.float32
-)  # what MuJoCo keeps of a contact: tangential (2), torsional, rolling (2)
+# Friction that MuJoCo keeps of a contact: tangential (2), torsional, rolling (2).
+_FRICTION = wp.types.vector(5, wp.float32)
 
 
 @wp.struct
@@ -221,11 +220,8 @@ def _compile_solver(num_dofs: int) -> wp.Kernel:
 
         Without constraints the slope is `start` + length `bend`; with them it begins at -`descent`.
         """
-        low, high, alpha = (
-            wp.float32(0.0),
-            wp.float32(wp.inf),
-            wp.float32(1.0),
-        )  # plain literals would be constants to Warp
+        # Plain literals would be constants to Warp.
+        low, high, alpha = wp.float32(0.0), wp.float32(wp.inf), wp.float32(1.0)
         for _ in range(num_searches):
             part = slope(constraints, world, lane, num_rows, cone_width, x, step, alpha)
             sums = wp.tile_reduce(wp.add, wp.tile(part, preserve_type=True))[0]

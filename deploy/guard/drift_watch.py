@@ -84,7 +84,7 @@ class ConformalMartingale:
 
 
 class DriftWatch:
-    """See the module.
+    """Conformal test martingale of each joint, fed with one score every `BLOCK_S` of its motion.
 
     Args:
         scores: Of the recordings that the model was not fitted to, of each joint; a joint without

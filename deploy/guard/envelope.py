@@ -31,7 +31,7 @@ WIDE_M = 1e3
 
 
 class Envelope:
-    """See the module.
+    """Commands limited by the distance of the arm to obstacles and to the work surface.
 
     Args:
         limits: Distances and speeds.

@@ -155,7 +155,7 @@ class GuardDecision:
 
 
 class Guard:
-    """See the module.
+    """State machine that passes, limits or withholds each requested command.
 
     Args:
         limits: Limits on commands, ages and positions.

@@ -83,7 +83,7 @@ class ObservedWindow:
 
 
 class Observer:
-    """See the module.
+    """Comparison of predicted and measured motion of each joint over the last `window_s`.
 
     Args:
         limits: Of the drift watch.

@@ -151,7 +151,7 @@ def write_link(session: Session, address: str) -> None:
 
 
 class PageServer:
-    """See the module.
+    """HTTP server of the operator's page, with its three WebSockets.
 
     Args:
         page: Settings.

@@ -26,7 +26,7 @@ TRY_AGAIN_LATER = 1013
 
 
 class VideoRelay:
-    """See the module; it is a `deploy.page.server.PageExtension`.
+    """WebSocket by which pages and video process exchange their offers; a `PageExtension`.
 
     Args:
         folder: Holds the socket of the video process.

@@ -136,7 +136,7 @@ def run(stop: Stop, config: PolicyProcessConfig, memory: LoopMemory) -> None:
 
 
 class PolicyAdviser:
-    """See the module.
+    """Advice of the policy, one control period after the other.
 
     Args:
         config: Settings.

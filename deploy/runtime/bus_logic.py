@@ -64,7 +64,7 @@ class BusInputs:
 
 
 class BusLogic:
-    """See the module.
+    """Decisions of one bus cycle: frames to send and the state to publish.
 
     Args:
         description: The bus.

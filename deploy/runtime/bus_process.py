@@ -72,7 +72,7 @@ def run(stop: Stop, config: BusProcessConfig, memory: LoopMemory) -> None:
 
 
 class BusProcess:
-    """See the module."""
+    """The bus process at work: bus, clock and shared memory around a `BusLogic`."""
 
     def __init__(self, config: BusProcessConfig, memory: LoopMemory) -> None:
         self._wire, self._memory = config.wire, memory

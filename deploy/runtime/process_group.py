@@ -91,7 +91,7 @@ class ProcessGroup:
 
 @spec
 class BusAndPolicySettings:
-    """Settings of a run that listens to a machine and lets a policy run along.
+    """Settings of a run that listens to a machine and runs a policy beside it.
 
     Attributes:
         wire: The bus.

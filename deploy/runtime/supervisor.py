@@ -1,8 +1,7 @@
 """The parent of the loop: starts its processes, watches over them, and reports on timing.
 
-A child that dies is not started again in secret: bus or policy end the run with an error, a dead
-log is an alarm beside which guidance goes on. Whoever dies, the gateway goes to zero flow by
-itself.
+A process that dies is never restarted. If it is the bus or the policy, the run ends with an error.
+If it is the log, guidance goes on with an alarm. In any case the gateway sets zero flow by itself.
 """
 
 from __future__ import annotations

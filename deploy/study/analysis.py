@@ -149,15 +149,10 @@ def _estimate_effects(found: Analysis) -> None:
     for family in (secondary, [f"tlx_{scale}" for scale in tlx.SCALES]):
         p = []
         for name in family:
-            deciding = get_deciding_p(found.effects[name])
+            deciding = found.effects[name].p
             p.append(math.nan if deciding is None else deciding)
         adjusted = permutation_tests.adjust_by_holm(np.array(p))
         found.holm |= dict(zip(family, adjusted.tolist(), strict=True))
-
-
-def get_deciding_p(found: GuidanceEffect) -> float | None:
-    """Return the p that counts: of the test with the period in the model; `None` where sequences do not allow it."""
-    return found.p
 
 
 def _measure_trial(
@@ -209,7 +204,7 @@ def _measure_trial(
 
 
 def _keep_outcome(trial: MeasuredTrial) -> MeasuredTrial:
-    """Return a trial without a recording as its outcome tells: inserted or not; not inserted counts with the limit."""
+    """Return a trial without a recording by its noted outcome; not inserted counts with the time limit."""
     outcome = trial.facts.get("outcome")
     if outcome not in ("inserted", "time limit", "stopped"):
         return trial
@@ -220,15 +215,15 @@ def _keep_outcome(trial: MeasuredTrial) -> MeasuredTrial:
 
 
 def _average_participants(found: Analysis, measure_name: str, condition: str) -> np.ndarray:
-    """Return each participant's mean over the trials that tell, `(P,)`."""
+    """Return each participant's mean over the trials with a value, `(P,)`."""
     means = np.full(len(found.participants), np.nan)
     for index, name in enumerate(found.participants):
-        told = []
+        own = []
         for trial in found.trials:
             if _is_of(trial, name, condition):
-                told.append(trial.values[measure_name])
-        values = np.array(told)
-        # A trial that does not tell is left out of the mean.
+                own.append(trial.values[measure_name])
+        values = np.array(own)
+        # NaN: the recording does not show this measure.
         values = values[~np.isnan(values)]
         means[index] = values.mean() if len(values) else math.nan
     return means

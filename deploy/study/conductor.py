@@ -1,8 +1,8 @@
-"""Leads a participant through a sitting: takes the page's messages, watches the machine, writes everything down at once.
+"""Conductor of a sitting: takes the messages of the page, watches the machine, and writes the files.
 
-Each finished step stands in the study's folder (`deploy.study.study_folder`) before the next thing
-begins, so that an interruption at any time costs at most the trial that was under way; that one is
-kept as aborted, and done again.
+Each finished step is written into the study's folder (`deploy.study.study_folder`) before the next
+one begins. So an interruption at any time costs at most the running trial, which is kept as aborted
+and repeated.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Words:
 
 
 class Conductor:
-    """See the module.
+    """One sitting after the other, each step chosen from the files of the study's folder.
 
     Args:
         folder: The study's.
@@ -78,9 +78,8 @@ class Conductor:
             times,
         )
         self._facts, self._seed, self._operators, self._clock = facts, seed, operators or {}, clock
-        for path in sorted(
-            (folder / folders.TRIALS).glob("*.json")
-        ):  # what an interruption left half saved
+        # Trials that an interruption left half saved.
+        for path in sorted((folder / folders.TRIALS).glob("*.json")):
             with suppress(ValueError):  # a file that cannot be read is said in the report
                 keep(folder, path, machine, stage)
         # Read after the repair above, so that the repaired trials count.

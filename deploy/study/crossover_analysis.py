@@ -186,10 +186,8 @@ def compute_dz_interval(dz: float, scale: float, free: int) -> Interval:
         return share if math.isfinite(share) else float(shift < t)  # far out scipy gives NaN
 
     def bound(level: float) -> float:
-        low, high = (
-            t - 10.0 - 4.0 * abs(t),
-            t + 10.0 + 4.0 * abs(t),
-        )  # with 1 degree of freedom it reaches to 2.24 t
+        # With 1 degree of freedom it reaches to 2.24 t.
+        low, high = t - 10.0 - 4.0 * abs(t), t + 10.0 + 4.0 * abs(t)
         return float(optimize.brentq(lambda shift: below(shift) - level, low, high)) / scale  # type: ignore[arg-type]
 
     return bound(0.5 + CONFIDENCE / 2), bound(0.5 - CONFIDENCE / 2)
@@ -209,8 +207,7 @@ def estimate_hodges_lehmann(difference: np.ndarray) -> tuple[float, Interval | N
         # The convolution adds each rank with both signs.
         ways = np.concatenate((ways, np.zeros(rank))) + np.concatenate((np.zeros(rank), ways))
     below = np.cumsum(ways) / 2.0**num
-    cut = int(
-        np.searchsorted(below, (1 - CONFIDENCE) / 2 + 1e-12, side="right")
-    )  # sums so small occur in less than 2.5 %
+    # Sums so small occur in less than 2.5 %.
+    cut = int(np.searchsorted(below, (1 - CONFIDENCE) / 2 + 1e-12, side="right"))
     interval = (float(means[cut - 1]), float(means[len(means) - cut])) if cut else None
     return float(np.median(means)), interval

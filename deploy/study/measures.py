@@ -37,8 +37,8 @@ class Measure:
     """One measure.
 
     Attributes:
-        name: In tables.
-        title: For people.
+        name: Key in files.
+        title: Words in tables and pictures.
         unit: Its unit, '' for a plain number.
         better: +1 where more is better, -1 where less is, 0 where neither.
     """
@@ -166,12 +166,12 @@ def detect_motion(q: np.ndarray, machine: Machine, period_s: float) -> np.ndarra
 def detect_lever_movements(u: np.ndarray) -> np.ndarray:
     """Return when and which lever axis began to move, `(M, 2)` of sample and joint, in order; commands `u`, `(T, J)`."""
     on, off = np.abs(u) >= LEVER_ON, np.abs(u) < LEVER_OFF
-    # the state after the newest sample that says anything: on, off, or at the start off
-    told = np.where(on, 1, np.where(off, 0, -1))
-    rows = np.where(told >= 0, np.arange(len(u))[:, None], -1)
-    # The newest sample that says on or off; in between the state is kept (hysteresis).
+    # 1 and 0 are beyond a threshold; -1 lies between both and keeps the state (hysteresis).
+    crossed = np.where(on, 1, np.where(off, 0, -1))
+    rows = np.where(crossed >= 0, np.arange(len(u))[:, None], -1)
+    # Row of the newest sample beyond a threshold; a recording begins with levers released.
     newest = np.maximum.accumulate(rows, axis=0)
-    held = np.where(newest >= 0, np.take_along_axis(told, np.maximum(newest, 0), 0), 0)
+    held = np.where(newest >= 0, np.take_along_axis(crossed, np.maximum(newest, 0), 0), 0)
     return np.argwhere(np.diff(held.astype(int), axis=0, prepend=0) > 0)
 
 

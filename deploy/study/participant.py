@@ -1,8 +1,8 @@
 """A simulated participant at the twin, in real time: a browser's connections, a remote on the bus, a person's hands between them.
 
-The participant sees only the messages to the page, presses the buttons of a person, and
-moves the remote's levers as the simulated operators of `conf/operator` do. Everything that comes of
-it is marked as simulated.
+The participant gets only the messages to the page, presses the same buttons as a person, and
+moves the remote's levers as the simulated operators of `conf/operator` do. All its results are
+marked as simulated.
 """
 
 from __future__ import annotations
@@ -110,22 +110,18 @@ class Person:
 
 def take_part(stop: Stop, person: Person, memory: LoopMemory) -> None:
     """Take part until it is asked to stop; asks its parent to stop once all sittings are done."""
-    asyncio.run(_Taking(person).run(stop))
+    asyncio.run(_SimulatedSittings(person).run(stop))
 
 
-class _Taking:
+class _SimulatedSittings:
+    """Connections, hands and eyes of a simulated participant; `run` ends with the last sitting."""
+
     def __init__(self, person: Person) -> None:
         bench, machine = person.bench, person.machine
         self._person, self._bench, self._machine = person, bench, machine
         levers = bench.guidance.levers or machine.levers
         self._shown_map, self._own = LeverMap(levers, machine), LeverMap(machine.levers, machine)
-        self._shown_full = []
-        for axis in AXES:
-            angles_rad = []
-            for one in levers:
-                if (one.side, one.axis) == axis:
-                    angles_rad.append(one.max_angle_rad)
-            self._shown_full.append(max(angles_rad, default=1.0))
+        self._shown_full_rad = find_full_angles_rad(levers)
         self._shown: dict[str, Any] = {}
         self._study: dict[str, Any] = {}
         self._model: OperatorModel | None = None
@@ -190,9 +186,8 @@ class _Taking:
             if shown.get("phase") == "ready" and not self._ready(shown):
                 continue
             screen = list(map(shown.get, SCREEN_FIELDS))
-            if (
-                screen != pressed or time.monotonic() - pressed_s > AGAIN_S
-            ):  # each screen is answered once, or once more if need be
+            # Each screen is answered once, and again if nothing happens.
+            if screen != pressed or time.monotonic() - pressed_s > AGAIN_S:
                 pressed, pressed_s = screen, time.monotonic()
                 for one in self._presses(shown):
                     await study.send(json.dumps(one))
@@ -299,7 +294,7 @@ class _Taking:
             return np.full(self._machine.num_joints, np.nan)
         parts = np.array([advice["levers"][f"{side}_{axis}"] for side, axis in AXES])
         return self._shown_map.command(
-            parts * np.array(self._shown_full), advice["levers"]["button_right"]
+            parts * self._shown_full_rad, advice["levers"]["button_right"]
         )
 
     def _end(self) -> None:

@@ -78,9 +78,8 @@ class Practice:
         skill = self.skill_sd * generator.standard_normal(persons)
         learning = self.learning + self.learning_sd * generator.standard_normal(persons)
         gain = effect + self.guidance_sd * generator.standard_normal(persons)
-        hole = self.hole_sd * generator.standard_normal(
-            (studies, 1, 1, num_trials)
-        )  # each occurs once in each period
+        # Each hole occurs once in each period.
+        hole = self.hole_sd * generator.standard_normal((studies, 1, 1, num_trials))
         chance = self.chance_sd * generator.standard_normal((*persons[:2], 2, num_trials))
         number = practised + 1 + np.arange(2 * num_trials).reshape(2, num_trials)
         guided = np.stack((guided_first, ~guided_first), 1)[None, :, :, None]

@@ -1,4 +1,4 @@
-"""One trial of a sitting as it happens: ready, recorded, counted down, under way, saved."""
+"""The running trial of a sitting, with its phases: ready, recording, countdown, running, saving."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ STARTING_S = 10.0
 
 @spec
 class Times:
-    """Times of a trial.
+    """Times and tolerance of a trial.
 
     Attributes:
-        countdown_s: From the press on the page to the beginning.
-        settle_s: For which a recording goes on after the end.
-        start_tolerance: How far each joint may be from the start, rad or m, so that the page calls
-            it there.
+        countdown_s: Time from the press on the page to the beginning.
+        settle_s: Time for which a recording goes on after the end.
+        start_tolerance: Distance from the start, rad or m, up to which the page shows a joint as
+            being there.
     """
 
     countdown_s: float
@@ -122,7 +122,7 @@ class Attempt:
             "limit_s": self._limit_s,
             **self._facts,
         }
-        # until it is over it stands there as what it would be if everything ended now
+        # Until the trial is over, its file describes it as interrupted.
         unfinished = {
             "outcome": "aborted",
             "reason": "interrupted: the sitting ended during the trial",
@@ -142,13 +142,13 @@ class Attempt:
         )
 
     def abort(self, reason: str) -> str:
-        """End it for a fault: it is kept, does not count, and is done again."""
+        """End the trial for a fault: it is kept, does not count, and is repeated."""
         if self._phase in ("starting", "countdown", "running"):
             return self._end("aborted", reason)
         return "not now"
 
     def tick(self) -> None:
-        """Let it go on."""
+        """Advance to the next phase where time, positions or recording allow it."""
         now_s, sight = self._clock(), self._stage.sight()
         in_phase_s = now_s - self._since_s
         # The time at which positions were last known.
@@ -209,7 +209,7 @@ class Attempt:
         self._worker.shutdown(wait=True)
 
     def leave(self) -> None:
-        """End it now; the recording, if missing, is made of the capture the next time."""
+        """End the trial now; a missing recording is made from the capture at the next start."""
         self.abort("the program ended")
         self._worker.shutdown(wait=False, cancel_futures=True)
 

@@ -55,7 +55,7 @@ class GatewayState(Enum):
 
 
 class Gateway:
-    """See the module; pure, the caller brings frames and time.
+    """Gateway between bus and valves. Pure: the caller brings frames and time.
 
     Args:
         description: The bus.

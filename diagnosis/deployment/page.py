@@ -17,6 +17,8 @@ from diagnosis.deployment.fault_search import StageResult
 from diagnosis.deployment.motion_check import MotionEvidence
 
 PAGE_FILE = "doctor.html"
+EVIDENCE_FILE = "evidence.png"
+"""Picture of the verdict: the departing command, or the motion of the joints."""
 TITLES = {
     "code": "The deployed code does something else than the contract says",
     "actuator": "The machine moves otherwise than those of the training",
@@ -73,6 +75,18 @@ def write_page(answer: DoctorAnswer, folder: Path) -> None:
         _add_task(page, run)
     _add_motion(page, answer.motion)
     page.write(folder / PAGE_FILE)
+
+
+def draw_evidence(answer: DoctorAnswer) -> Figure | None:
+    """Draw what the verdict rests on: a departing command, the joints' motion, or the best replay."""
+    stages = [(stage, run) for run in answer.runs for stage in run.stages]
+    departing = [one for one in stages if one[0].departs]
+    if not departing and answer.motion.joints:
+        return _draw_motion(answer.motion)
+    replayed = [one for one in stages if one[0].stage in ("policy", "network")]
+    for stage, run in (*departing, *replayed):
+        return _draw_departure(stage, run.log.t_s)
+    return None
 
 
 def describe_remedies(findings: Sequence[Finding]) -> list[str]:

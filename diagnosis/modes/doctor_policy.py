@@ -13,6 +13,7 @@ from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator, Effect
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.report import write_picture
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis.deployment import doctor, page
@@ -61,7 +62,7 @@ class DoctorPolicy:
     doctor: DoctorRequest
 
     def run(self) -> None:
-        """Write `doctor.json` and `doctor.html`.
+        """Write `doctor.json`, `doctor.html` and `evidence.png`.
 
         Raises:
             RecordingError: A log cannot be used.
@@ -72,6 +73,8 @@ class DoctorPolicy:
         folder = self.session.folder
         found.write(folder)
         page.write_page(found, folder)
+        if (picture := page.draw_evidence(found)) is not None:
+            write_picture(picture, folder / page.EVIDENCE_FILE)
         print_answer(found, folder)
 
     def examine(self) -> DoctorAnswer:

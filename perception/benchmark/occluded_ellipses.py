@@ -113,9 +113,8 @@ def _build_shape(generator: np.random.Generator, kind: str) -> np.ndarray:
     if kind == "polygons":
         turn = np.arange(number := int(generator.integers(5, 10))) * 2 * np.pi / number
         return np.column_stack([np.cos(turn), generator.uniform(0.7, 1.0) * np.sin(turn)])
-    if (
-        kind == "hearts of arcs"
-    ):  # two half circles and the lines from them to the tip, which they touch
+    # Two half circles and the lines from them to the tip, which they touch.
+    if kind == "hearts of arcs":
         tip = generator.uniform(1.0, 1.4)
         touch = np.arctan2(tip, -0.5) - np.arccos(0.5 / np.hypot(0.5, tip))
         turn = np.linspace(-np.pi, touch, 60)
@@ -127,9 +126,10 @@ def _build_shape(generator: np.random.Generator, kind: str) -> np.ndarray:
             generator.uniform(0.8, 1.2),
             1,
         )
+        # A cubic of Bézier.
         side = sum(
             one * (1 - part) ** (3 - k) * part**k * (1, 3, 3, 1)[k] for k, one in enumerate(knots)
-        )  # a cubic of Bézier
+        )
     return np.vstack([side, (np.asarray(side) * (-1, 1))[::-1]])
 
 

@@ -23,6 +23,7 @@ from brokk_rl.report import Report, Tone
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.spec import spec
 from perception import dataset
+from perception.benchmark.label_score import compare_corners, compute_overlap
 from perception.benchmark.session_score import SessionScore, score_session
 from perception.modes.calibrate import FILE as CALIBRATION
 from perception.render.board_on_arm import TRUTH
@@ -195,11 +196,11 @@ def _add_labels(page: Report, folder: Path) -> None:
     for name in kept:
         label = dataset.read_label(folder / LABELS / "frames" / name)
         true = dataset.read_label(folder / FOOTAGE / "frames" / name)
-        overlaps.append(_compute_overlap(label.block, true.block))
+        overlaps.append(compute_overlap(label.block, true.block))
         if true.hole_mask.any():
-            holes.append(_compute_overlap(label.hole_mask, true.hole_mask))
+            holes.append(compute_overlap(label.hole_mask, true.hole_mask))
         corners_m.append(
-            _compare_corners(folder / LABELS / "frames" / name, folder / FOOTAGE / "frames" / name)
+            compare_corners(folder / LABELS / "frames" / name, folder / FOOTAGE / "frames" / name)
         )
     _add_picture(
         page,
@@ -285,24 +286,6 @@ def _draw_errors(scores: Mapping[str, SessionScore]) -> Any:
     axis.spines[["top", "right"]].set_visible(False)
     axis.legend(frameon=False, loc="upper left")
     return figure
-
-
-def _compare_corners(labelled: Path, true: Path) -> float:
-    """Return the largest distance of a labelled block's corner from the nearest true one, m."""
-    found, expected = (_list_corners(dataset.read_truth(stem).block) for stem in (labelled, true))
-    away = np.linalg.norm(found[:, None] - expected[None], axis=-1)
-    return float(away.min(1).max())
-
-
-def _list_corners(block: Mapping[str, Any]) -> np.ndarray:
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, -1).T
-    local = signs * np.array(block["half_m"])
-    return local @ np.array(block["rotation"]).T + np.array(block["center_m"])
-
-
-def _compute_overlap(one: np.ndarray, other: np.ndarray) -> float:
-    """Return the intersection over the union of two masks."""
-    return float((one & other).sum() / max((one | other).sum(), 1))
 
 
 def _format_pair(values: list[float]) -> str | None:

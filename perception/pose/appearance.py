@@ -21,18 +21,6 @@ FAINTEST = 0.1
 CLEARLY_M = 0.03
 """Least distance behind the face at which depth belongs to the inside of a hole, whatever the
 noise. Chosen by hand."""
-FADE, BRINK_PX, OUTERMOST = 0.3, 1.5, 0.95
-"""Depth at which the light on a wall has faded to 1 / e, in radii; px within the rim that its blur
-reaches, and largest radius without it. FADE was the best of 0.3, 0.5 and 1 on the same scenes."""
-IN_DUST = "log-likelihood ratio of a hole to a flat disc"
-"""Reason for a refusal in dust: it cannot be told, or it is a disc."""
-LEAST_INSIDE, LEAST_POWER, SMOOTH_PX = 60, 0.1, 1.5
-"""Least pixels inside and on the face; least sum of squares of the expected light, in pixels that
-are fully lit; blur before the darkest quarter is taken, px. Chosen by hand."""
-WALL_GLOW, DISC_GLOW = (0.27, 0.13), (0.0, 0.035)
-"""Mean and standard deviation of the glow of holes and of flat discs in dust, for 120 holes and 232
-discs at 1 to 4 m of seed 1001 of benchmarks/perception/dust.py; half of them give the same within
-0.02."""
 
 
 @dataclass(frozen=True)
@@ -122,111 +110,6 @@ def measure_interior(
     )
 
 
-@dataclass(frozen=True)
-class WallGlow:
-    """Light on the wall of a hole, below the far part of its rim.
-
-    Attributes:
-        share: Brightness of the wall at the rim over that of the depth of the hole, in parts of the
-            contrast between face and darkest quarter of the inside.
-        std: Its standard deviation by the noise of the picture.
-    """
-
-    share: float
-    std: float
-
-    @property
-    def log_ratio(self) -> float:
-        """Log-likelihood ratio of a hole to a flat disc; 0 where the share is not possible.
-
-        Both are normal distributions. No wall is brighter than the face, and none is darker than the
-        depth below it.
-        """
-        if not abs(self.share) <= 1.0:
-            return 0.0
-        log_density = []
-        for mean, spread in (WALL_GLOW, DISC_GLOW):
-            std = float(np.hypot(spread, self.std))
-            log_density.append(-0.5 * ((self.share - mean) / std) ** 2 - np.log(std))
-        return log_density[0] - log_density[1]
-
-
-def measure_wall_glow(
-    gray: np.ndarray,
-    depth_m: np.ndarray,
-    ellipse: np.ndarray,
-    camera_matrix: np.ndarray,
-    plane: FacePlane,
-    center_m: np.ndarray,
-    radius_m: float,
-) -> WallGlow:
-    """Measure the light on the wall that a hole would have behind its rim, NaN for too few pixels.
-
-    Daylight fades with depth, so a wall is bright below the far part of its rim. Dust adds light,
-    and that changes slowly: offset and gradient of the inside are fitted along and count nothing.
-    The gradient on the face does not tell that inside, since dust about as bright as the face
-    hardly changes the face.
-
-    Args:
-        gray: Picture, `(h, w)` uint8.
-        depth_m: Depth, `(h, w)`; occluders are left out.
-        ellipse: Rim, `(5,)`.
-        camera_matrix: Camera matrix, `(3, 3)`.
-        plane: Plane of the face.
-        center_m: Centre of the rim in camera coordinates, `(3,)`.
-        radius_m: Its radius.
-    """
-    x, y, a, b = ellipse[:4]
-    reach = a * RING[1] + 2
-    top, left = max(0, int(y - reach)), max(0, int(x - reach))
-    bottom, right = min(len(gray), int(y + reach) + 2), min(len(gray[0]), int(x + reach) + 2)
-    part = gray[top:bottom, left:right].astype(np.float32)
-    rows, columns = np.mgrid[top:bottom, left:right]
-    radii = conic.measure_radii(ellipse, columns, rows)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        nearer = 1.0 / depth_m[top:bottom, left:right] - plane.inverse_depth(
-            camera_matrix, columns, rows
-        )
-    before = (nearer > 4 * plane.sigma).astype(np.uint8)
-    free = cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
-    inside = free & (radii < min(OUTERMOST, 1.0 - BRINK_PX / b))
-    ring = free & (radii > RING[0]) & (radii < RING[1])
-    if inside.sum() < LEAST_INSIDE or ring.sum() < LEAST_INSIDE:
-        return WallGlow(np.nan, np.nan)
-    pixels = np.column_stack([columns[inside], rows[inside], np.ones(int(inside.sum()))])
-    rays = pixels @ np.linalg.inv(camera_matrix).T
-    lit = np.exp(-_find_wall_depths(rays, plane.normal, center_m, radius_m) / (FADE * radius_m))
-    away = (pixels[:, :2] - (x, y)) / a
-    dust = np.column_stack([np.ones(len(away)), away])
-    # What a gradient explains of both is left out (Frisch and Waugh 1933).
-    values, lit = (
-        one - dust @ np.linalg.lstsq(dust, one, rcond=None)[0]
-        for one in (part[inside].astype(float), lit)
-    )
-    # Seen along its axis a hole shows no wall.
-    power = float(lit @ lit)
-    if power < LEAST_POWER:
-        return WallGlow(np.nan, np.nan)
-    glow = float(lit @ values) / power
-    noise = float(np.std(values - glow * lit))
-    smooth = cv2.GaussianBlur(part, (0, 0), SMOOTH_PX)
-    contrast = max(float(np.median(part[ring]) - np.percentile(smooth[inside], 25.0)), 1.0)
-    return WallGlow(glow / contrast, noise / float(np.sqrt(power)) / contrast)
-
-
-def _find_wall_depths(
-    rays: np.ndarray, normal: np.ndarray, center_m: np.ndarray, radius_m: float
-) -> np.ndarray:
-    """Return the depth behind the face, m, `(P,)`, at which rays `(P, 3)` meet the wall of a hole."""
-    across = rays - np.outer(rays @ normal, normal)
-    middle = center_m - (center_m @ normal) * normal
-    square, mixed = (across**2).sum(1), across @ middle
-    # A ray enters through the mouth, so it meets the cylinder at the farther of two places.
-    root = np.sqrt(np.maximum(mixed**2 - square * (middle @ middle - radius_m**2), 0.0))
-    reach_m = (mixed + root) / np.maximum(square, 1e-12)
-    return np.maximum((center_m - reach_m[:, None] * rays) @ normal, 0.0)
-
-
 def _measure_contrast(ring: np.ndarray, dark: float) -> float:
     """Return the difference between a ring and `dark`, in standard deviations of its grain.
 
@@ -264,9 +147,8 @@ def _measure_darkest_around(
     near = gray[np.ix_(rows, columns)]
     if plane is not None:
         here = plane.inverse_depth(camera_matrix, columns[None, :], rows[:, None])
-        behind = (
-            here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
-        )  # false where depth is unknown
+        # False where depth is unknown.
+        behind = here - 1.0 / depth_m[np.ix_(rows, columns)] > -4 * plane.sigma
         near = near[cv2.erode(behind.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0]
     return float(np.percentile(near, 1.0)) if near.size else 0.0
 

@@ -20,9 +20,10 @@ from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, plane, rim
-from perception.pose.appearance import Interior, WallGlow
+from perception.pose.appearance import Interior
 from perception.pose.plane import FacePlane
 from perception.pose.rim import RimCircle
+from perception.pose.wall_light import IN_DUST, WallLight, measure_wall_light
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py).
 UNDECIDED, UNDECIDED_SCORE = 0.8, 0.5
@@ -50,7 +51,7 @@ class AppearanceGates:
         contrast: Least contrast of a veiled hole in standard deviations of the face's grain; a
             stain has less.
         hole_log_ratio: Least log-likelihood ratio of a veiled hole to a flat disc, by the light on
-            its wall (`appearance.WallGlow`). Neither this nor `contrast` is asked where the
+            its wall (`WallLight`). Neither this nor `contrast` is asked where the
             parallax alone is evidence enough.
         mouth: Least mean of the segmenter's hole mask inside, where there is one.
         sure_mouth: Mean of the hole mask from which it decides where depth cannot be seen.
@@ -305,11 +306,11 @@ class PlaneConicEstimator:
         undecided = inside.darkness > s.looks.veiled or (
             covered > UNDECIDED and inside.unknown > UNDECIDED
         )
-        glow = None
+        wall = None
         if inside.darkness > s.looks.veiled:
             place = (frame.camera_matrix, face, circle.center_m, circle.radius_m)
-            glow = appearance.measure_wall_glow(light, frame.depth_m, row, *place)
-        refused = self._check_appearance(inside, parallax, glow, masks, row, ellipse, undecided)
+            wall = measure_wall_light(light, frame.depth_m, row, *place)
+        refused = self._check_appearance(inside, parallax, wall, masks, row, ellipse, undecided)
         if refused:
             return refused
         # A network that marks mouths has decided already; without it the doubt stays.
@@ -391,13 +392,13 @@ class PlaneConicEstimator:
         self,
         inside: Interior,
         parallax: float,
-        glow: WallGlow | None,
+        wall: WallLight | None,
         masks: Masks,
         row: np.ndarray,
         ellipse: Ellipse,
         undecided: bool,
     ) -> Rejection | None:
-        """Return the gate that a hole misses, `None` for none; `glow` is known for veiled ones."""
+        """Return the gate that a hole misses, `None` for none; `wall` is known for veiled ones."""
         looks = self.settings.looks
 
         def refuse(reason: str, value: float, limit: float) -> Rejection:
@@ -424,7 +425,7 @@ class PlaneConicEstimator:
         has_parallax = bool(np.isfinite(from_parallax))
         evidence += from_parallax if has_parallax else 0.0
         # Dust and haze brighten the inside; there darkness alone does not decide.
-        if glow is not None:
+        if wall is not None:
             if is_sure:
                 return None
             if inside.around < inside.darkness - looks.darker:
@@ -433,8 +434,8 @@ class PlaneConicEstimator:
                 return None
             if inside.contrast < looks.contrast:
                 return refuse("contrast to the grain of the face", inside.contrast, looks.contrast)
-            if glow.log_ratio < looks.hole_log_ratio:
-                return refuse(appearance.IN_DUST, glow.log_ratio, looks.hole_log_ratio)
+            if wall.log_ratio < looks.hole_log_ratio:
+                return refuse(IN_DUST, wall.log_ratio, looks.hole_log_ratio)
             return None
         # Nothing can be seen that would decide: the hole passes with a lower score.
         if undecided and not has_parallax and (is_sure or not has_mask):
@@ -472,9 +473,8 @@ def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float
             np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
         )
         # Four standard deviations: of 72 points none is nearer by chance.
-        nearer |= on & (
-            1.0 / depth - rays @ face.m > 4 * face.sigma
-        )  # false where depth is unknown
+        # False where depth is unknown.
+        nearer |= on & (1.0 / depth - rays @ face.m > 4 * face.sigma)
     return float(nearer.mean())
 
 

@@ -114,9 +114,8 @@ def _build_pyramid(number: int) -> tuple[np.ndarray, ...]:
     colours they appear.
     """
     generator = np.random.default_rng(9000 + number)
-    rise = (0.9, 1.0, 1.15, 1.3)[
-        number
-    ]  # strength of each octave relative to the one twice as coarse: from cloudy to speckled
+    # Strength of each octave relative to the one twice as coarse: from cloudy to speckled.
+    rise = (0.9, 1.0, 1.15, 1.3)[number]
     total = np.zeros((TEXTURE_SIDE, TEXTURE_SIDE), np.float32)
     for octave in range(_COARSEST_OCTAVE, _FINEST_OCTAVE + 1):
         coarse = generator.standard_normal((1 << octave, 1 << octave)).astype(np.float32)

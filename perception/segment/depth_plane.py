@@ -181,9 +181,8 @@ class PlaneSegmenter:
             rim = 3 * self._settings.edge_px + 1  # beyond, its edges move nothing
             right, bottom = min(left + wide + rim, len(face[0])), min(top + high + rim, len(face))
             left, top = max(0, left - rim), max(0, top - rim)
-            part = np.s_[
-                top * step : bottom * step, left * step : right * step
-            ]  # the last cells may be smaller ones
+            # The last cells may be smaller ones.
+            part = np.s_[top * step : bottom * step, left * step : right * step]
             size = (min(right * step, width) - left * step, min(bottom * step, height) - top * step)
             color = cv2.resize(
                 frame.color[part], (size[0] // 2, size[1] // 2), interpolation=cv2.INTER_AREA
@@ -237,11 +236,12 @@ class PlaneSegmenter:
         shift = np.rint(generator.uniform(-1.0, 1.0, (2, 2, count)) * reach).astype(int)
         corner_rows = np.stack([row, *np.clip(row + shift[0], 0, height - 1)])
         corner_columns = np.stack([column, *np.clip(column + shift[1], 0, width - 1)])
+        # (3 pixels, trials)
         x, y, value = (
             grid.x[corner_columns],
             grid.y[corner_rows],
             inverse[corner_rows, corner_columns],
-        )  # (3 pixels, trials)
+        )
         usable = rest[corner_rows, corner_columns].all(0)
         dx = x[1:] - x[0]
         dy = y[1:] - y[0]
@@ -387,13 +387,10 @@ def _measure_extents(piece: np.ndarray, plane: np.ndarray, grid: SightGrid) -> n
     """Return the two extents in m that a rectangle with the piece's second moments would have."""
     depth = piece[::2, ::2] / np.maximum(grid.half.inverse(plane), 1e-6)
     across, down = grid.half.powers
-    first, second = (
-        down[:2] @ depth @ across[:2].T,
-        down @ (depth * depth) @ across.T,
-    )  # of x^i y^j, [j, i]
+    # Moments of x^i y^j, at [j, i].
+    first, second = down[:2] @ depth @ across[:2].T, down @ (depth * depth) @ across.T
     number = np.count_nonzero(depth)
     middle = np.array([first[0, 1], first[1, 0], first[0, 0]]) / number
-    spread = np.linalg.eigvalsh(arrange_squares(second) / number - np.outer(middle, middle))[
-        1:
-    ]  # the smallest is the plane's own thickness
+    # The smallest is the plane's own thickness.
+    spread = np.linalg.eigvalsh(arrange_squares(second) / number - np.outer(middle, middle))[1:]
     return np.sqrt(12.0 * np.maximum(spread, 0.0))

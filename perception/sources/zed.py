@@ -145,9 +145,8 @@ class ZedDevice:
         t_s = self._camera.get_timestamp(sl.TIME_REFERENCE.IMAGE).get_nanoseconds() * 1e-9
         color = validation.convert_color(np.asarray(self._picture.get_data()), "ZED camera")
         right = validation.convert_color(np.asarray(self._right.get_data()), "ZED camera")
-        return RawCapture(
-            color, np.array(self._depth.get_data(), np.float32), t_s, right
-        )  # the SDK reuses its memory
+        # A copy, since the SDK reuses its memory.
+        return RawCapture(color, np.array(self._depth.get_data(), np.float32), t_s, right)
 
     def now_s(self) -> float:
         """Return the time on the SDK's clock; that of a recording stands at its pictures."""

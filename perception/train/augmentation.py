@@ -42,9 +42,8 @@ def recompress_jpeg(pictures: torch.Tensor, quality: torch.Tensor) -> torch.Tens
     steps = (tables * percent).round().clamp(1.0, 255.0)[:, :, None, None]  # (B, 3, 1, 1, 8, 8)
     ycc = torch.einsum("ij,bjhw->bihw", matrix, pictures.clamp(0.0, 1.0) * 255.0)
     ycc = functional.pad(ycc, (0, -width % 8, 0, -height % 8), mode="replicate")
-    blocks = (
-        ycc.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)
-    )  # (B, 3, rows, columns, 8, 8)
+    # (B, 3, rows, columns, 8, 8)
+    blocks = ycc.unflatten(3, (-1, 8)).unflatten(2, (-1, 8)).transpose(3, 4)
     kept = (wave @ (blocks - middle) @ wave.T / steps).round() * steps
     back = (
         (wave.T @ kept @ wave + middle)

@@ -157,9 +157,8 @@ def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
 
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    fitted = [
-        entry for entry in curve if entry["loss"] is not None
-    ]  # the network that it began with was not fitted yet
+    # The network that it began with was not fitted yet.
+    fitted = [entry for entry in curve if entry["loss"] is not None]
     left.plot(
         [entry["update"] for entry in fitted], [entry["loss"] for entry in fitted], color="black"
     )

@@ -25,7 +25,15 @@ link_length base_tilt clock_offset extrinsics
 """.split()  # noqa: SIM905
 OF_SERVOS = ["sag"]
 """Effects of joints that are commanded by position; see `test_servo.py`."""
-OF_FORCES = ["coulomb_friction", "force_offset", "inertia", "viscous_friction"]
+OF_FORCES = [
+    "coulomb_friction",
+    "force_offset",
+    "inertia",
+    "load_friction",
+    "pose_force",
+    "stribeck_friction",
+    "viscous_friction",
+]
 """Effects of joints that are commanded by torque; see `test_force_drive.py`."""
 SMOOTH = [name for name in FIXED if name not in ("frame_loss", "stiction", "quantisation")]
 

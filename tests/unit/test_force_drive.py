@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 from composed import option
+from pendulum import run_drive
 from scipy.integrate import solve_ivp
 
 from actuators.recordings.log_signals import Signal
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError
-from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import api
@@ -33,23 +33,10 @@ def drive() -> Machine:
     return option("machine", "emps")
 
 
-def run(model: Any, machine: Machine, u: np.ndarray, start: float) -> np.ndarray:
-    """Returns positions after each command `(T,)`, from rest."""
-    history = History(
-        q=torch.full((1, machine.num_history, 1), start), u=torch.zeros(1, machine.num_history, 1)
-    )
-    found = []
-    for command in u:
-        history.push_u(torch.full((1, 1), float(command)))
-        history.push_q(model.step(history))
-        found.append(float(history.q[0, -1, 0]))
-    return np.array(found)
-
-
 def test_a_mass_follows_its_differential_equation(drive: Machine) -> None:
     model = replace(option("actuator", "force"), dead_time_s=0.0, **TRUE).build(drive, 1, CPU)
     u = np.full(260, 0.2)
-    found = run(model, drive, u, 0.0)
+    found = run_drive(model, drive, u, 0.0)
     force = 0.2 * drive.max_force[0] - TRUE["offset_n"] - TRUE["coulomb_n"]
 
     def solve(t_s: float, y: np.ndarray) -> list[float]:
@@ -66,9 +53,9 @@ def test_friction_holds_a_joint_and_brings_it_to_rest(drive: Machine) -> None:
     model: Any = replace(option("actuator", "force"), **{**TRUE, "offset_n": 0.0}).build(
         drive, 1, CPU
     )
-    still = run(model, drive, np.full(50, 14.9 / drive.max_force[0]), 0.1)
+    still = run_drive(model, drive, np.full(50, 14.9 / drive.max_force[0]), 0.1)
     np.testing.assert_array_equal(still, np.float32(0.1))
-    pushed = run(model, drive, np.r_[np.full(40, 0.3), np.zeros(200)], 0.05)
+    pushed = run_drive(model, drive, np.r_[np.full(40, 0.3), np.zeros(200)], 0.05)
     assert pushed[40] > 0.051
     assert pushed[-1] == pushed[-2]
 
@@ -120,13 +107,13 @@ CHANGES = {
 
 def test_effects_on_a_drive_are_its_mass_and_friction(drive: Machine) -> None:
     u = 0.3 * np.sin(np.arange(300) / 25.0)
-    whole = run(option("actuator", "force", **TRUE).build(drive, 1, CPU), drive, u, 0.1)
+    whole = run_drive(option("actuator", "force", **TRUE).build(drive, 1, CPU), drive, u, 0.1)
     model: Any = option("actuator", "force", mass_kg=80.0).build(drive, 1, CPU)
     for kind in load_effects(drive, list(CHANGES)):
         model = kind.wrap(model, drive, 1, CPU)
         for name, value in CHANGES[kind.name].items():
             model.parameters[name].fill_(value)
-    np.testing.assert_allclose(run(model, drive, u, 0.1), whole, atol=1e-6)
+    np.testing.assert_allclose(run_drive(model, drive, u, 0.1), whole, atol=1e-6)
 
 
 def test_an_effect_on_a_drive_needs_one(drive: Machine) -> None:

@@ -11,6 +11,7 @@ import hydra
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from composed import option
 from hydra.utils import instantiate
 
 from brokk_rl import record
@@ -114,6 +115,26 @@ def test_a_joint_that_is_pressed_against_its_stop_is_no_finding(
     q[:, 3] += machine.upper[3] - machine.home[3]
     q[:, 3] = np.minimum(q[:, 3], machine.upper[3])
     assert found(changed(whole, u=u, q=q), machine, thresholds) == []
+
+
+def test_a_servo_that_follows_a_slow_target_is_no_finding_and_one_that_leaves_a_held_one_is(
+    thresholds: InspectionThresholds,
+) -> None:
+    arm = option("machine", "so101")
+    t_s = arm.period_s * np.arange(1000)
+    q = np.tile(arm.home, (len(t_s), 1))
+    u = np.zeros_like(q)
+    # a hundredth of full speed for ten seconds, then a hold
+    u[:500, 2], q[:, 2] = 0.01, q[:, 2] + 0.01 * arm.max_speed[2] * np.minimum(t_s, 10.0)
+    q += NOISE * np.random.default_rng(0).standard_normal(q.shape)
+    follows = Recording(
+        machine="so101", joints=arm.joint_names, units=("rad",) * 5, rate_hz=50.0, t_s=t_s,
+        u=u.astype(np.float32), q=q.astype(np.float32),
+    )  # fmt: skip
+    assert found(follows, arm, thresholds) == []
+    q[700:, 2] -= 0.05  # the arm touches something
+    (finding,) = found(changed(follows, q=q.astype(np.float32)), arm, thresholds)
+    assert (finding.kind, finding.joint) == ("no command", "elbow")
 
 
 def test_a_joint_that_sinks_is_found_with_its_speed(

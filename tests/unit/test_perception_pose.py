@@ -11,10 +11,10 @@ from drawn import AXIS, CENTER, RAYS, K, both_views, drawn
 
 from brokk_rl.contracts.vision import HolePose, Rejection
 from perception.ellipse import conic
-from perception.pose import alignment, appearance, plane, rim
-from perception.pose.appearance import IN_DUST
+from perception.pose import alignment, appearance, plane, rim, wall_light
 from perception.pose.plane_conic import as_row as pose_row
 from perception.pose.plane_conic import convert_to_gray
+from perception.pose.wall_light import IN_DUST, WallLight
 
 
 @pytest.fixture(scope="module")
@@ -183,19 +183,29 @@ def test_a_wall_is_lit_by_as_much_as_was_drawn_whatever_the_gradient_of_dust() -
     flat = np.full(frame.depth_m.shape, 180.0)
     columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
     inside = conic.measure_radii(place[0], columns, rows) < 1
-    depth_m = appearance._find_wall_depths(RAYS[inside], face.normal, CENTER, 0.05)
+    depth_m, around = wall_light._find_wall_places(RAYS[inside], face.normal, CENTER, 0.05)
     # by hand: a point of the wall is where the ray leaves the cylinder about the axis
     wall = RAYS[inside] * ((AXIS @ CENTER - depth_m) / (RAYS[inside] @ AXIS))[:, None] - CENTER
     across = wall - np.outer(wall @ AXIS, AXIS)
     np.testing.assert_allclose(np.linalg.norm(across, axis=1), 0.05, atol=2e-3)
-    for share in (0.0, 0.4):
-        lit = share * np.exp(-depth_m / (appearance.FADE * 0.05))
+    np.testing.assert_allclose(np.linalg.norm(around, axis=1), 1.0, atol=0.05)
+    # by hand: a ray from the wall towards the sun leaves within the mouth
+    sun = np.cross(AXIS, [0.3, 1.0, 0.2])
+    sun = 0.8 * sun / np.linalg.norm(sun) - 0.6 * AXIS
+    leaves = across + depth_m[:, None] / 0.6 * (sun + 0.6 * AXIS)
+    facing = np.maximum(-across @ sun / 0.05, 0.0)
+    sunlit = facing * (np.linalg.norm(leaves, axis=1) <= 0.05 + 1e-6)
+    for sky, direct in ((0.0, 0.0), (0.4, 0.0), (0.0, 0.3)):
+        lit = sky * np.exp(-depth_m / (wall_light.FADE * 0.05)) + direct * sunlit
         flat[inside] = 100.0 + 0.3 * (columns[inside] - ellipse.x) + 80.0 * lit
         gray = np.clip(np.rint(flat), 0, 255).astype(np.uint8)
-        glow = appearance.measure_wall_glow(gray, frame.depth_m, *place)
-        assert glow.share == pytest.approx(share, abs=0.05)
-        assert (glow.log_ratio > 0) == (share > 0)
-    assert appearance.WallGlow(1.5, 0.01).log_ratio == 0.0
+        light = wall_light.measure_wall_light(gray, frame.depth_m, *place)
+        if not direct:
+            assert light.sky == pytest.approx(sky, abs=0.05)
+        else:
+            assert light.explained > 0.6
+        assert (light.log_ratio > 0) == (sky + direct > 0)
+    assert WallLight(1.5, 0.01).log_ratio == 0.0
 
 
 def test_in_dust_a_spot_must_be_darker_than_the_grain_and_lit_on_its_wall_or_differ_by_camera(
@@ -205,16 +215,19 @@ def test_in_dust_a_spot_must_be_darker_than_the_grain_and_lit_on_its_wall_or_dif
     spot = appearance.Interior(
         darkness=0.9, slope=0.0, deeper=0.2, unknown=0.4, around=0.9, contrast=3.0
     )
-    lit, even = appearance.WallGlow(0.3, 0.02), appearance.WallGlow(0.0, 0.02)
-    for inside, parallax, glow, passes in (
+    lit, even = WallLight(0.3, 0.02), WallLight(0.0, 0.02)
+    sunlit, shaded = WallLight(0.0, 0.02, 0.2, 0.4), WallLight(0.0, 0.02, 0.2, 0.05)
+    for inside, parallax, light, passes in (
         (spot, 1.0, lit, True),
         (spot, 1.0, even, False),
+        (spot, 1.0, sunlit, True),
+        (spot, 1.0, shaded, False),
         (spot, 3.0, even, True),
-        (spot, float("nan"), appearance.WallGlow(float("nan"), float("nan")), False),
-        (replace(spot, contrast=2.0), 1.0, lit, False),
+        (spot, float("nan"), WallLight(float("nan"), float("nan")), False),
+        (replace(spot, contrast=1.0), 1.0, lit, False),
     ):
         refused = estimator._check_appearance(
-            inside, parallax, glow, masks, pose_row(ellipse), ellipse, True
+            inside, parallax, light, masks, pose_row(ellipse), ellipse, True
         )
         assert (refused is None) == passes
 

@@ -49,7 +49,12 @@ def measure_spreads(cases: list[tuple[dict[str, Any], list[Change]]]) -> dict[st
                 found[f"{change.effect}.{change.parameter}"].append(
                     abs(change.change) / change.error
                 )
-    return {name: float(np.quantile(values, 0.68)) for name, values in found.items()}
+    spreads = {}
+    for name, values in found.items():
+        # a number in whole steps mostly stays: then half of its smallest move
+        moved = [value for value in values if value > 0.0]
+        spreads[name] = float(np.quantile(values, 0.68)) or 0.5 * min(moved, default=2.0)
+    return spreads
 
 
 def count_names(truth: set[str], named: list[str]) -> tuple[int, int, int]:

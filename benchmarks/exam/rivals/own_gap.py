@@ -1,6 +1,6 @@
 """Share of the gap that a rival closes in its own simulator, with everything it fitted.
 
-    python benchmarks/exam/rivals/own_gap.py <sitting> <exam> <opened> <out.json> <rival>=<answers> ...
+    python benchmarks/exam/rivals/own_gap.py <sitting> <exam> <opened> <machine.yaml> <out.json> <rival>=<answers> ...
 
 Free runs of 5 s over the withheld recordings, as the exam's examiner has them: before is the rival's
 simulator as fitted to the reference, after as fitted to the field, floor the first against the same
@@ -46,9 +46,11 @@ def close_gap(rival: str, exam: Path, case: str, answer: Path, arm: Arm) -> dict
     return {"before": before, "after": after, "floor": floor, "closed": closed}
 
 
-def main(sitting: str, exam: Path, opened: Path, out: Path, rivals: dict[str, Path]) -> None:
+def main(
+    sitting: str, exam: Path, opened: Path, machine: Path, out: Path, rivals: dict[str, Path]
+) -> None:
     """Write the shares of all cases with one or several effects."""
-    arm, found = read_arm(exam / "machine.yaml"), {}
+    arm, found = read_arm(machine), {}
     for label in json.loads((exam / "labels.sealed.json").read_text())["cases"]:
         for rival, answers in rivals.items():
             place = answers / label["case"]
@@ -69,7 +71,8 @@ def main(sitting: str, exam: Path, opened: Path, out: Path, rivals: dict[str, Pa
             case: {name: one[case] for name, one in shares.items()} for case in sorted(paired)
         },
         "median": {
-            name: float(np.median([one[case] for case in paired])) for name, one in shares.items()
+            name: float(np.median([one[case] for case in paired])) if paired else None
+            for name, one in shares.items()
         },
         "of": len(paired),
         "cases": found,
@@ -80,6 +83,6 @@ def main(sitting: str, exam: Path, opened: Path, out: Path, rivals: dict[str, Pa
 if __name__ == "__main__":
     main(
         sys.argv[1],
-        *map(Path, sys.argv[2:5]),
-        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[5:])},
+        *map(Path, sys.argv[2:6]),
+        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[6:])},
     )

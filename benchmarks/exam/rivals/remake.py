@@ -1,6 +1,6 @@
 """Make the first cases of an opened exam again, from the salt among its published labels.
 
-    python benchmarks/exam/rivals/remake.py benchmarks/exam/held_out/second 30 runs/rivals/exam
+    python benchmarks/exam/rivals/remake.py benchmarks/exam/held_out/second 30 runs/rivals/exam [workers]
 
 The folder is an exam as `exam.do=make` leaves it, with fewer cases. Labels must come out as published.
 """
@@ -12,18 +12,16 @@ import sys
 from pathlib import Path
 
 import hydra
-import yaml
 from hydra.utils import instantiate
 
 from brokk_rl.extensions import register_options
 from brokk_rl.progress import ItemProgress
-from brokk_rl.session import write_json, write_text
+from brokk_rl.session import write_json
 from exam import dataset
 from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
-from exam.run_cases import MACHINE_FILE, describe_spec
 
 
-def main(opened: Path, num_cases: int, folder: Path) -> None:
+def main(opened: Path, num_cases: int, folder: Path, workers: int) -> None:
     """Write `cases/`, `withheld/`, the labels and `exam.json` into `folder`."""
     published = json.loads((opened / "labels.json").read_text())
     overrides = [
@@ -51,7 +49,7 @@ def main(opened: Path, num_cases: int, folder: Path) -> None:
     cases = dataset.CaseSet(recorder, questions, halves, mode.machine, folder)
     folder.mkdir(parents=True, exist_ok=True)
     with ItemProgress("cases made", num_cases) as progress:
-        labels = dataset.write_cases(cases, published["salt"], 1, progress)
+        labels = dataset.write_cases(cases, published["salt"], workers, progress)
     for label, told in zip(labels, published["cases"], strict=False):
         same = [label[key] == told[key] for key in ("case", "kind", "machine_seed", "effects")]
         if not all(same):
@@ -60,9 +58,7 @@ def main(opened: Path, num_cases: int, folder: Path) -> None:
     facts["num_cases"] = num_cases
     sealed = dataset.seal_labels(folder, {**facts, "cases": labels}, published["salt"])
     write_json(folder / "exam.json", {**facts, "labels_sha256": sealed})
-    known = restrict_machine(mode.machine, published["known"])
-    write_text(folder / MACHINE_FILE, yaml.safe_dump(describe_spec(known), sort_keys=False))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]))
+    main(Path(sys.argv[1]), int(sys.argv[2]), Path(sys.argv[3]), int((sys.argv[4:] or "1")[0]))

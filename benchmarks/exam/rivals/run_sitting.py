@@ -37,9 +37,11 @@ def call_exam(*overrides: str, folder: Path) -> None:
     call("-P", "-m", "brokk_rl", "mode=exam", *overrides, *begun, f"session.out={folder}")
 
 
-def sit_exam(rival: str, exam: Path, sitting: Sitting, answers: Path, args: argparse.Namespace):
+def sit_exam(
+    rival: str, exam: Path, sitting: Sitting, answers: Path, args: argparse.Namespace
+) -> None:
     """Have a rival answer all cases of an exam that it has not answered."""
-    program = [str(args.python), str(HERE.resolve() / "sit.py"), rival]
+    program = [str(args.python.absolute()), str(HERE.resolve() / "sit.py"), rival]
     words = ",".join([*program, "'{case}'", "'{out}'", "'{machine}'"])
     call_exam(
         *sitting.run_options,
@@ -73,22 +75,21 @@ def main(args: argparse.Namespace) -> None:
     args.work.mkdir(parents=True, exist_ok=True)
     choose_rules(sitting, args)
     if args.sitting == "held_out" and not (args.exam / "exam.json").is_file():
-        call(HERE / "remake.py", args.marks, HELD_OUT_CASES, args.exam)
+        call(HERE / "remake.py", args.marks, HELD_OUT_CASES, args.exam, args.workers)
         call_exam("exam.do=register", f"exam.folder={args.exam}", folder=args.work / "registered")
     for rival in sitting.rivals:
         sit_exam(rival, args.exam, sitting, args.work / rival, args)
     if args.until == "answers":
         return
     pairs = [f"{rival}={args.work / rival}" for rival in sitting.rivals]
-    table, gaps = HERE / f"{sitting.name}.json", HERE / f"{sitting.name}_own_gap.json"
+    scored = args.work / "scored"
     call(
-        *(HERE / "table.py", args.sitting, args.exam, args.marks, args.work / "scored", table),
-        *(*pairs, "--workers", args.workers),
+        *(HERE / "table.py", args.sitting, args.exam, args.marks, scored),
+        *(HERE / f"{sitting.name}.json", *pairs, "--workers", args.workers),
     )
-    subprocess.run(
-        [args.python, HERE / "own_gap.py", args.sitting, args.exam, args.marks, gaps, *pairs],
-        check=True,
-    )
+    gaps = HERE / f"{sitting.name}_own_gap.json"
+    words = (args.sitting, args.exam, args.marks, scored / "machine.yaml", gaps, *pairs)
+    subprocess.run([args.python, HERE / "own_gap.py", *words], check=True)
 
 
 if __name__ == "__main__":

@@ -29,8 +29,11 @@ from servo_arm import (
 
 FRICTION = "m1"
 """Of the six models: that of the package's own fit of this servo, `params/feetech_sts3215_7_4V`."""
-GENERATIONS, FIELD_GENERATIONS, SIGMA, FIELD_SIGMA = 150, 60, 0.3, 0.1
+GENERATIONS, FIELD_GENERATIONS, SIGMA, FIELD_SIGMA = 150, 100, 0.3, 0.15
 """Of the reference from the package's start values, of the field from the reference's answer."""
+LIMIT = "max_velocity"
+"""Bound on the speed of targets. Above the motor's own speed it shows nothing, and a search does not
+find its way down from there, so that the field begins at the package's value again."""
 STEPS = 4
 """Time steps of a control period: 5 ms."""
 DELAY_S = (0.05, 0.0, 0.2)
@@ -101,20 +104,25 @@ def fit_servos(windows: Windows, paths: JointPaths, start: np.ndarray | None) ->
     """Return the best numbers of each joint, `(J, numbers)`: the joints' searches go side by side."""
     model = build_model()
     names, bounds = list_bounds(model)
-    first, low, high = bounds.T
+    # numbers that are above 0 for sure are searched by their logarithms
+    by_log = bounds[:, 1] > 0.0
+    _, low, high = np.where(by_log, np.log(np.where(by_log, bounds.T, 1.0)), bounds.T)
     joints = windows.q.shape[2]
-    begin = np.tile(first, (joints, 1)) if start is None else start
+    begin = np.tile(bounds[:, 0], (joints, 1)) if start is None else start.copy()
+    begin[:, names.index(LIMIT)] = bounds[names.index(LIMIT), 0]
     rounds, sigma = (GENERATIONS, SIGMA) if start is None else (FIELD_GENERATIONS, FIELD_SIGMA)
     unit = np.tile([0.0, 1.0], (len(low), 1))
     searches = []
     for j in range(joints):
-        mean = np.clip((begin[j] - low) / (high - low), 0.001, 0.999)
+        at = np.where(by_log, np.log(np.where(by_log, begin[j], 1.0)), begin[j])
+        mean = np.clip((at - low) / (high - low), 0.001, 0.999)
         searches.append(cmaes.CMA(mean, sigma, bounds=unit, seed=j))
     best, least = begin.copy(), np.full(joints, np.inf)
     for _ in range(rounds):
         size = searches[0].population_size
         asked = np.array([[search.ask() for search in searches] for _ in range(size)])
-        vectors = low + asked * (high - low)
+        scaled = low + asked * (high - low)
+        vectors = np.where(by_log, np.exp(np.where(by_log, scaled, 0.0)), scaled)
         errors = np.abs(simulate(model, names, vectors, paths) - windows.q[:, 1:])
         costs = errors.mean((1, 2))
         for j, search in enumerate(searches):

@@ -5,7 +5,7 @@
 What they fitted stands in `changes_<rival>.jsonl` beside it. `<opened>` holds published answers and marks
 of the diagnosis, as `exam.do=score` leaves them. Each rival has two rows: names by the rule of `rules.json`, and all fitted numbers
 taken as they are. Scores and the closed share are those of `mode=exam`; what was examined already
-stays in `<work>`.
+stays in `<work>`, with the machine as rivals know it.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 import hydra
 import naming
 import numpy as np
+import yaml
 from case_data import read_changes
 from choose_rule import CLASSES, QUIET, THRESHOLDS, count_names
 from hydra.utils import instantiate
@@ -28,12 +29,13 @@ from sit import RULES_FILE
 from sittings import SITTINGS, describe_command
 
 from brokk_rl.extensions import register_options
-from brokk_rl.session import write_json
+from brokk_rl.session import write_json, write_text
 from diagnosis.answer import read_answer
 from exam import dataset, score
 from exam.answer_scoring import AnswerScoring
 from exam.generate import restrict_machine
 from exam.metrics import compute_rate
+from exam.run_cases import MACHINE_FILE, describe_spec
 
 OURS = "diagnosis"
 ROWS = (
@@ -193,6 +195,9 @@ def main(
     with hydra.initialize_config_module("conf", version_base="1.3"):
         mode = instantiate(hydra.compose("config", overrides), _convert_="all")
     settings = mode.exam
+    known = json.loads((exam / "exam.json").read_text())["known"]
+    machine = restrict_machine(mode.machine, known)
+    write_text(work / MACHINE_FILE, yaml.safe_dump(describe_spec(machine), sort_keys=False))
     # those that some rival has not answered are left out for all
     sat = [
         label
@@ -202,9 +207,7 @@ def main(
     scoring = AnswerScoring(
         exam=exam,
         labels=sat,
-        machine=restrict_machine(
-            mode.machine, json.loads((exam / "exam.json").read_text())["known"]
-        ),
+        machine=machine,
         fit=settings.oracle,
         classes=settings.mix.classes,
         of_machine=[n for n, one in settings.mix.troubles.items() if one.joints == "all"],
