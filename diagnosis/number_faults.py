@@ -1,4 +1,4 @@
-"""How far a simulator's own numbers are off from day to day: such errors are no effect.
+"""Errors of a simulator's own numbers from day to day, which are no effect.
 
 Axes: `P` numbers, `J` joints.
 """
