@@ -336,19 +336,41 @@ class FunctionPlant:
         q = np.stack([middle, middle + 0.1 * (machine.upper - machine.lower)])
         state = self.start(q, np.zeros_like(q))
         command = read_commands(np.full_like(q, 0.1), machine)
-        one_by_one = np.stack([self._call(*one) for one in zip(state, command, strict=True)])
-        if one_by_one.shape != state.shape:
-            raise ConfigError(
-                f"simulator={name}: a state has {state.shape[1]} numbers, but the function returned {one_by_one.shape[1:]}; "
-                "it must return a state of the same shape"
-            )
+        found = [self._call(*one) for one in zip(state, command, strict=True)]
+        for one in found:
+            if one.shape != state[0].shape:
+                raise ConfigError(
+                    f"simulator={name}: expected a state of {len(state[0])} numbers from step(state, command), as it was "
+                    f"given, got shape {one.shape}; return positions, speeds, then what start(position, speed) added"
+                )
+            if not np.isfinite(one).all():
+                raise ConfigError(
+                    f"simulator={name}: step(state, command) returned NaN or infinity in the middle of the travel, "
+                    f"at rest: {one}; it has to stay finite there"
+                )
+        one_by_one = np.stack(found)
         self._is_vectorised = self._agrees_in_rows(state, command, one_by_one)
 
     def start(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """See `Plant`."""
         if self._start is None:
             return np.concatenate([q, speed], 1)
-        return np.stack([np.asarray(self._start(*one)) for one in zip(q, speed, strict=True)])
+        found = []
+        for one in zip(q, speed, strict=True):
+            try:
+                state = np.asarray(self._start(*one), dtype=float)
+            except Exception as error:
+                raise ConfigError(
+                    f"simulator={self._name}: start(position, speed) failed with {type(error).__name__}: {error}; it got "
+                    f"two arrays of {self._num_joints} numbers"
+                ) from error
+            if state.ndim != 1 or len(state) < 2 * self._num_joints:
+                raise ConfigError(
+                    f"simulator={self._name}: expected a state of {2 * self._num_joints} numbers or more from "
+                    f"start(position, speed), positions and speeds first, got shape {state.shape}"
+                )
+            found.append(state)
+        return np.stack(found)
 
     def place(self, state: np.ndarray, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """See `Plant`."""
@@ -419,10 +441,11 @@ def _import_function(source: str) -> tuple[Callable[..., Any], Callable[..., Any
         sys.path.insert(0, here)
     try:
         module = importlib.import_module(module_name)
-    except ImportError as error:
+    except Exception as error:  # the module is somebody's own: anything may fail in it
+        missing = isinstance(error, ModuleNotFoundError) and error.name == module_name
+        advice = f"run the command in the folder of {module_name}.py" if missing else "mend it"
         raise ConfigError(
-            f"simulator={source}: module '{module_name}' cannot be imported ({error}); "
-            f"run the command in the folder of {module_name}.py"
+            f"simulator={source}: module '{module_name}' cannot be imported ({type(error).__name__}: {error}); {advice}"
         ) from error
     step = getattr(module, function, None)
     if not callable(step):

@@ -14,6 +14,7 @@ from rich.table import Table
 from actuators.recordings import conversion, log_guess, map_draft
 from actuators.recordings.column_guess import Guess
 from actuators.recordings.column_names import UNITS
+from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
 from actuators.recordings.map_draft import Draft
 from brokk_rl.errors import ConfigError, list_choices
@@ -39,12 +40,14 @@ class LogSelection:
         position_unit: Unit of the positions where their names do not say it: one for all joints, or
             a table by joint; `null` to guess.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
+        damaged: `refuse` a log with damage, or `skip` its damaged messages, chunks and frames.
     """
 
     input: str | tuple[str, ...]
     name: str | None
     position_unit: str | dict[str, str] | None
     dbc: str | None
+    damaged: Damaged
 
     def check(self) -> None:
         given = self.position_unit
@@ -94,7 +97,7 @@ class ImportLogs:
             conversion.write_recordings(pieces, self.session.folder / conversion.FOLDER)
             return
         paths = conversion.find_logs(self.log.input)
-        guess = log_guess.guess_logs(paths, self.log.position_unit, self.log.dbc)
+        guess = log_guess.guess_logs(paths, self.log.position_unit, self.log.dbc, self.log.damaged)
         folder = self.session.folder
         figure = log_guess.draw_guess(guess)
         figure.savefig(folder / PICTURE_FILE, dpi=110)

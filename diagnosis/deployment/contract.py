@@ -205,6 +205,12 @@ def load_policy(folder: str, machine: Machine) -> LoadedPolicy:
             f"{path}: its terms have {contract.size} numbers, the network takes {network.size}; "
             "mend observation.terms"
         )
+    num_commands = network.answer(np.zeros((1, contract.size))).shape[-1]
+    if num_commands != len(contract.commands):
+        raise CheckpointError(
+            f"{path}: the network gives {num_commands} commands, the contract names {len(contract.commands)} "
+            f"({', '.join(contract.commands)}); mend joints or command.columns"
+        )
     return LoadedPolicy(contract, network)
 
 
@@ -226,6 +232,13 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
                 f"the {ONNX} beside a contract that names them (docs/doctor.md)"
             )
         is_own = "order" in observation
+        if is_own and (
+            unknown := [name for name in data["joints"] if name not in machine.joint_names]
+        ):
+            raise CheckpointError(
+                f"{path}: the policy commands {', '.join(data['joints'])}, but machine '{machine.name}' has "
+                f"{', '.join(machine.joint_names)}, without {', '.join(unknown)}; give the policy's machine=…"
+            )
         terms = _list_own_terms(data, machine) if is_own else _list_given_terms(observation)
         joints = tuple(data["joints"])
         commands = data.get("command", {}).get("columns") or map(name_command_column, joints)
@@ -242,7 +255,11 @@ def read_contract(path: Path, machine: Machine) -> PolicyContract:
         raise CheckpointError(
             f"{path} is missing; give the folder of a policy, or an ONNX file with its contract"
         ) from None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except KeyError as error:
+        raise CheckpointError(
+            f"{path}: this contract lacks {error}; docs/doctor.md lists its fields"
+        ) from error
+    except (OSError, ValueError, TypeError, AttributeError) as error:
         raise CheckpointError(
             f"{path}: this contract cannot be used ({type(error).__name__}: {error}); docs/doctor.md "
             "lists its fields"

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+from arm import make_machine
 from composed import option
 from onnx import TensorProto, helper, numpy_helper
 
@@ -302,4 +303,24 @@ def test_a_task_made_of_terms_is_refused_by_the_names_of_its_terms(
     contract = {"rate_hz": 20, "joints": list(machine.joint_names), "observation": observation}
     (tmp_path / "policy.json").write_text(json.dumps(contract))
     with pytest.raises(CheckpointError, match=r"terms of the task's own \(distance\)"):
+        load_policy(str(tmp_path), machine)
+
+
+def test_a_policy_of_another_machine_is_refused_by_its_joints() -> None:
+    with pytest.raises(CheckpointError, match="has hinge, without q1, q2, q3, q4, q5; give the"):
+        load_policy("tasks:policies/borehole_insertion", make_machine("hinge"))
+
+
+def test_a_contract_with_too_few_joints_is_refused(
+    folder: Path, machine: Machine, tmp_path: Path
+) -> None:
+    contract = json.loads((folder / "policy.json").read_text())
+    (tmp_path / "policy.onnx").write_bytes((folder / "policy.onnx").read_bytes())
+    contract["joints"] = contract["joints"][:3]
+    (tmp_path / "policy.json").write_text(json.dumps(contract))
+    with pytest.raises(CheckpointError, match="gives 5 commands, the contract names 3"):
+        load_policy(str(tmp_path), machine)
+    del contract["joints"]
+    (tmp_path / "policy.json").write_text(json.dumps(contract))
+    with pytest.raises(CheckpointError, match="lacks 'joints'"):
         load_policy(str(tmp_path), machine)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import runpy
 import sys
@@ -189,6 +190,47 @@ def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: 
         api._load_simulator(other).load(make_machine("shoulder", "elbow"))
 
 
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("def step(state, command): return state[..., :1]", "expected a state of 2 numbers"),
+        ("def step(state, command): return state / 0 * 0", "returned NaN or infinity"),
+        ("def step(state, command): raise KeyError('arm')", "failed with KeyError: 'arm'"),
+        ("def step(state, command) return state", "cannot be imported.*SyntaxError.*mend it"),
+        ("import nothing_here\nstep = 1", "nothing_here.*mend it"),
+        ("def move(state, command): return state", "has no function 'step'"),
+        ("def step(state, command): return state\nstart = lambda q, v: q", "expected a state of 2 numbers or more"),
+        ("def step(state, command): return state\nstart = lambda q: q", r"start\(position, speed\) failed"),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")
+@pytest.mark.filterwarnings("ignore:divide by zero:RuntimeWarning")
+def test_a_function_that_cannot_be_run_is_refused_with_the_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, told: str
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "wrong_sim.py").write_text(text)
+    importlib.invalidate_caches()
+    try:
+        with pytest.raises(ConfigError, match=told):
+            api._load_simulator("wrong_sim:step").load(make_machine("hinge"))
+    finally:
+        sys.modules.pop("wrong_sim", None)
+
+
+def test_what_cannot_be_asked_about_is_one_line(
+    pendulum: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO"):
+        effect_library.load_effects(make_machine("hinge"), None, api._load_simulator(pendulum))
+    (line,) = [one.getMessage() for one in caplog.records if "not asked about" in one.getMessage()]
+    assert (
+        "joint_friction, joint_damping, joint_armature, drive_gain (my_pendulum:step has no" in line
+    )
+    assert "base_tilt, extrinsics, link_length (machine" in line
+    assert line.endswith("is known by its joints only)")
+
+
 def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
     machine = make_machine("hinge")
     inside = {"joint_friction", "joint_damping", "joint_armature", "drive_gain"}
@@ -202,7 +244,9 @@ def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
 
 
 def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
-    name = "my files/arm.xml"
+    name = str(tmp_path / "my files/arm.xml")
+    Path(name).parent.mkdir()
+    Path(name).write_text(ARM)
     asked = why.Why(
         session=Session(out=str(tmp_path), seed=0, device="cpu"),
         machine=make_machine("hinge"),
@@ -210,6 +254,7 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
         log="log.parquet",
         policy={"folder": "policy"},
         simulator=name,
+        own=api._load_option("actuator", "own"),
         sent=True,
         target_in_base_m=None,
         resume=None,
