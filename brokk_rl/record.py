@@ -7,7 +7,7 @@ time.
 import contextlib
 import json
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from glob import glob
@@ -135,12 +135,13 @@ def find_stretches(condition: np.ndarray) -> list[tuple[int, int]]:
 
 
 def split_at_gaps(
-    clocks: Sequence[np.ndarray], longest_gap_s: float
+    clocks: Iterable[np.ndarray], longest_gap_s: float
 ) -> Iterator[tuple[float, float]]:
     """Yield the spans, begin and end in s, in which none of several clocks has a gap."""
-    begin_s, end_s = max(t_s[0] for t_s in clocks), min(t_s[-1] for t_s in clocks)
+    begin_s, end_s = -np.inf, np.inf
     gaps: list[tuple[float, float]] = []
     for t_s in clocks:
+        begin_s, end_s = max(begin_s, float(t_s[0])), min(end_s, float(t_s[-1]))
         rows = np.flatnonzero(np.diff(t_s) > longest_gap_s)
         gaps += zip(t_s[rows].tolist(), t_s[rows + 1].tolist(), strict=True)
     at_s = begin_s

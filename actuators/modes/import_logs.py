@@ -14,6 +14,7 @@ from rich.table import Table
 from actuators.recordings import conversion, log_guess, map_draft
 from actuators.recordings.column_guess import Guess
 from actuators.recordings.column_names import UNITS
+from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
 from actuators.recordings.map_draft import Draft
 from brokk_rl.errors import ConfigError, list_choices
@@ -26,6 +27,12 @@ log = logging.getLogger(__name__)
 
 MAP_FILE, MACHINE_FILE = "column_map.yaml", "machine.yaml"
 GUESS_FILE, PICTURE_FILE, PAGE_FILE = "import.json", "import.png", "import.html"
+SIMULATORS = {
+    "position": "actuator=servo fit=servo",
+    "torque": "actuator=force fit=force",
+    "speed": "actuator=ideal",
+}
+"""Ideal simulator of each command interface, by which recordings are diagnosed first."""
 HEAD = ["subject", "guess", "how sure", "evidence"]
 
 
@@ -39,12 +46,14 @@ class LogSelection:
         position_unit: Unit of the positions where their names do not say it: one for all joints, or
             a table by joint; `null` to guess.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
+        damaged: `refuse` a log with damage, or `skip` its damaged messages, chunks and frames.
     """
 
     input: str | tuple[str, ...]
     name: str | None
     position_unit: str | dict[str, str] | None
     dbc: str | None
+    damaged: Damaged
 
     def check(self) -> None:
         given = self.position_unit
@@ -91,10 +100,15 @@ class ImportLogs:
         """
         if self.machine is not None and self.reader is not None:
             pieces = conversion.read_logs(self.log.input, self.reader, self.machine)
-            conversion.write_recordings(pieces, self.session.folder / conversion.FOLDER)
+            place = self.session.folder / conversion.FOLDER
+            conversion.write_recordings(pieces, place)
+            simulator = SIMULATORS[self.machine.interface]
+            command = f"brokk mode=diagnose machine=… 'diagnosis.field={place}/*' {simulator}"
+            for text in ("then, with the same machine=…:", command):
+                Console().print(text, markup=False, highlight=False, soft_wrap=True)
             return
         paths = conversion.find_logs(self.log.input)
-        guess = log_guess.guess_logs(paths, self.log.position_unit, self.log.dbc)
+        guess = log_guess.guess_logs(paths, self.log.position_unit, self.log.dbc, self.log.damaged)
         folder = self.session.folder
         figure = log_guess.draw_guess(guess)
         figure.savefig(folder / PICTURE_FILE, dpi=110)

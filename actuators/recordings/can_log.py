@@ -171,7 +171,7 @@ class CanLog(LogFile):
         """Refuse a BLF file that is shorter than its header says; python-can reads it without a word."""
         stated, there = getattr(reader, "file_size", 0), self.path.stat().st_size
         if there < stated:
-            raise RecordingError(f"{self.path}: cut off at byte {there} of {stated}")
+            self.report_damage(f"cut off at byte {there} of {stated}", None)
 
     def _iterate(self) -> Iterator[FrameBlock]:
         """Yield the frames that carry data, by blocks."""
@@ -200,9 +200,12 @@ class CanLog(LogFile):
         except Exception as error:  # python-can raises what its parsers stumble over
             if isinstance(error, RecordingError):
                 raise
-            raise RecordingError(
-                f"{self.path}: damaged after frame {count} at {last_s:.6f} s ({type(error).__name__}: {error})"
-            ) from error
+            text = (
+                f"damaged after frame {count} at {last_s:.6f} s ({type(error).__name__}: {error})"
+            )
+            self.report_damage(text, error)
+            if waiting:
+                yield gather_frames(waiting)
 
 
 def is_plain(message: Any) -> bool:

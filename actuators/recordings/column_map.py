@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,19 +26,21 @@ import numpy as np
 from scipy.stats import theilslopes
 
 from actuators.recordings.expression import Expression
-from actuators.recordings.log_files import open_log
+from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import (
     Piece,
     Places,
+    RunClocks,
     RunSignals,
     Signal,
+    compute_by_slices,
     find_first,
     index_columns,
     locate,
     refuse_missing,
     resolve_column,
 )
-from actuators.recordings.log_tables import LogFile, LogRun, Table, join_names
+from actuators.recordings.log_tables import LogFile, LogRun, join_names
 from actuators.recordings.text_log import CsvLayout
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
@@ -204,6 +207,7 @@ class ColumnMap:
         overrun: Command beyond full that is taken for rounding and cut to full; more is refused.
         longest_gap_s: A longer time between two rows splits the log.
         shortest_s: Shorter pieces are left out.
+        damaged: `refuse` a log with damage, or `skip` its damaged messages, chunks and frames.
     """
 
     delimiter: Literal[",", ";", "\t", " "]
@@ -214,6 +218,7 @@ class ColumnMap:
     overrun: float
     longest_gap_s: float
     shortest_s: float
+    damaged: Damaged = "refuse"  # maps from before this field have none
 
     def check(self) -> None:
         if self.delimiter == self.decimal:
@@ -235,7 +240,8 @@ class ColumnMap:
             ConfigError: the map is not for this machine.
             RecordingError: the log cannot be used; names file, line, row and column.
         """
-        return self.read_log(open_log(path, CsvLayout(self.delimiter, self.decimal)), machine)
+        layout = CsvLayout(self.delimiter, self.decimal)
+        return self.read_log(open_log(path, layout, damaged=self.damaged), machine)
 
     def read_log(self, opened: LogFile, machine: Machine) -> list[Recording]:
         """Return the pieces of an opened log; see `read`."""
@@ -250,9 +256,7 @@ class ColumnMap:
         wanted = self._list_wanted(sources, places, opened.path)
         found, num_rows = [], 0
         for run in opened.read_runs(wanted, None):
-            clocks = {
-                name: _read_clock(run, name, table, self) for name, table in run.tables.items()
-            }
+            clocks = RunClocks(run, partial(_read_clock, run, column_map=self))
             found += self._read_run(RunSignals(run, sources, places, clocks), clocks, machine)
             num_rows += max(map(len, clocks.values()))
         if not found:
@@ -319,7 +323,7 @@ class ColumnMap:
     ) -> list[Recording]:
         """Return the pieces of a run; one column after the other is read and resampled."""
         spans_s, num_left_out = [], 0
-        for begin_s, end_s in record.split_at_gaps(list(clocks.values()), self.longest_gap_s):
+        for begin_s, end_s in record.split_at_gaps(clocks.values(), self.longest_gap_s):
             if end_s - begin_s >= max(self.shortest_s, machine.period_s) - 1e-9:
                 spans_s.append((begin_s, end_s))
             else:
@@ -356,17 +360,18 @@ class ColumnMap:
     ) -> Signal:
         signal = signals.read(column.column)
         if isinstance(column, TargetColumn) and column.full_speed is None:
-            q = column.scale * signal.values + column.offset
             low, high = machine.lower[joint], machine.upper[joint]
-            u = (2.0 * q - low - high) / (high - low)
+            middle, half = (high + low) / 2.0, (high - low) / 2.0
+            u = compute_by_slices(
+                lambda part: (column.scale * part + column.offset - middle) / half, signal.values
+            )
         elif isinstance(column, TargetColumn):
             u = column.command(signal.values, signal.t_s)
             # a gap between pieces is no motion of the target
             u[:-1][np.diff(signal.t_s) > self.longest_gap_s] = 0.0
         else:
-            u = column.command(signal.values)
-        with np.errstate(invalid="ignore"):
-            row = find_first(~(np.abs(u) <= 1.0 + self.overrun))
+            u = compute_by_slices(column.command, signal.values)
+        row = find_first(u, lambda part: np.abs(part) <= 1.0 + self.overrun)
         if row is not None:
             where = locate(signals.run, signal.table, row, column.column)
             if np.isnan(u[row]):
@@ -378,7 +383,7 @@ class ColumnMap:
                 f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
                 "neutral or full_speed of the column map, the limits of a joint that is commanded by position, or the log"
             )
-        return Signal(signal.table, signal.t_s, u.clip(-1.0, 1.0), signal.text)
+        return Signal(signal.table, signal.t_s, np.clip(u, -1.0, 1.0, out=u), signal.text)
 
 
 @spec
@@ -398,33 +403,36 @@ class CanColumnMap:
         # Imported here, since a desk without CAN has no python-can.
         from actuators.recordings.can_log import CanLog
 
-        return self.columns.read_log(CanLog(path, self.dbc), machine)
+        opened = CanLog(path, self.dbc)
+        opened.keep_whole = self.columns.damaged == "skip"
+        return self.columns.read_log(opened, machine)
 
 
 def _scale(signals: RunSignals, column: Column, empty: bool = False) -> Signal:
     """Return a column in the unit of the recording."""
     signal = signals.read(column.column, empty)
-    return replace(signal, values=column.scale * signal.values + column.offset)
+    values = compute_by_slices(lambda part: column.scale * part + column.offset, signal.values)
+    return replace(signal, values=values)
 
 
-def _read_clock(run: LogRun, name: str, table: Table, column_map: ColumnMap) -> np.ndarray:
+def _read_clock(run: LogRun, name: str, column_map: ColumnMap) -> np.ndarray:
     """Return the times of a table, `(T,)` s.
 
     Raises:
         RecordingError: They do not increase.
     """
-    time = column_map.find_time(name, run.where)
+    table, time = run.tables[name], column_map.find_time(name, run.where)
     t_s = time.scale * np.asarray(table.columns[time.column], dtype=float)
     if isinstance(time, Column):
-        t_s = t_s + time.offset
+        t_s += time.offset
     if len(t_s) < 2:
         raise RecordingError(
             f"{run.where}: table '{name}' has {len(t_s)} rows; a log has at least 2"
         )
-    if (row := find_first(~np.isfinite(t_s))) is not None:
+    if (row := find_first(t_s, np.isfinite)) is not None:
         text = table.show_cell(row, time.column)
         raise RecordingError(f"{locate(run, name, row, time.column)}: {text} is not a number")
-    if (row := find_first(np.diff(t_s) <= 0)) is not None:
+    if (row := find_first(np.diff(t_s), lambda step_s: step_s > 0)) is not None:
         raise RecordingError(
             f"{locate(run, name, row + 1, time.column)}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
         )

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
+from typing import Literal
 
 from actuators.recordings.array_log import LeRobotLog, MatlabLog, NumpyLog, ParquetLog
 from actuators.recordings.log_tables import LogFile, LogRun
-from actuators.recordings.message_log import BagLog, McapLog
 from actuators.recordings.text_log import CsvLayout, CsvLog
 from brokk_rl.errors import ConfigError, RecordingError
 
@@ -18,6 +18,17 @@ ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *BAG_ENDINGS, ".mcap", ".parquet", ".npz
 """Endings of the files that are logs."""
 SAGE_FILES = ("control.csv", "state_motor.csv")
 """Files of a motion in a folder of SAGE: targets, and what the motors answered."""
+SIGNATURES = {
+    b"\x89MCAP0\r\n": (".mcap", "an MCAP file"),
+    b"LOGG": (".blf", "a BLF file"),
+    b"SQLite format 3\0": (".db3", "a bag of ROS 2"),
+    b"#ROSBAG V": (".bag", "a bag of ROS 1"),
+    b"PAR1": (".parquet", "a Parquet file"),
+    b"PK\x03\x04": (".npz", "a NumPy archive"),
+    b"MATLAB 5.0": (".mat", "a MATLAB file"),
+}
+"""First bytes of files, with the ending and the name of their kind."""
+Damaged = Literal["refuse", "skip"]
 JOINT_LIST = "joint_list.txt"
 """File in which SAGE names the joints, one a line."""
 
@@ -48,29 +59,53 @@ class SageLog(LogFile):
         yield LogRun(self.path.resolve().name, str(self.path), tables)
 
 
-def open_log(path: Path, layout: CsvLayout | None = None, dbc: str | None = None) -> LogFile:
+def open_log(
+    path: Path, layout: CsvLayout | None = None, dbc: str | None = None, damaged: Damaged = "refuse"
+) -> LogFile:
     """Open a log.
 
     Args:
         path: File or folder.
         layout: Signs of a CSV file; `None` to tell them from its beginning.
         dbc: DBC file of a log of a CAN bus.
+        damaged: What to do about damaged parts: `refuse` the log, or `skip` them with a warning.
 
     Raises:
-        ConfigError: A log of a CAN bus without a DBC file.
+        ConfigError: A log of a CAN bus without a DBC file, or a library is not installed.
         RecordingError: It is no log of a known kind, or its beginning cannot be read.
     """
-    if path.is_dir():
-        kind = tell_folder(path)
-        if kind is None:
-            raise RecordingError(
-                f"{path}: expected a folder of SAGE ({', '.join(SAGE_FILES)}), a LeRobotDataset (meta/info.json) or a bag "
-                "of ROS 2 (metadata.yaml)"
-            )
-        return kind(path)
+    try:
+        opened = _open_folder(path) if path.is_dir() else _open_file(path, layout, dbc)
+    except ModuleNotFoundError as error:
+        raise ConfigError(
+            f"{path}: this kind of log needs {error.name}: pip install 'brokk-rl[logs]'"
+        ) from error
+    opened.keep_whole = damaged == "skip"
+    return opened
+
+
+def _open_folder(path: Path) -> LogFile:
+    kind = tell_folder(path)
+    if kind == "sage":
+        return SageLog(path)
+    if kind == "lerobot":
+        return LeRobotLog(path)
+    if kind == "bag":
+        # Imported here, since a desk without logs has no rosbags.
+        from actuators.recordings.bag_log import BagLog
+
+        return BagLog(path)
+    raise RecordingError(
+        f"{path}: expected a folder of SAGE ({', '.join(SAGE_FILES)}), a LeRobotDataset (meta/info.json) or a bag "
+        "of ROS 2 (metadata.yaml)"
+    )
+
+
+def _open_file(path: Path, layout: CsvLayout | None, dbc: str | None) -> LogFile:
     if not path.exists():
         raise RecordingError(f"{path}: no such log")
     ending = path.suffix.lower()
+    _check_ending(path, ending)
     if ending == ".parquet":
         return ParquetLog(path)
     if ending == ".npz":
@@ -78,32 +113,47 @@ def open_log(path: Path, layout: CsvLayout | None = None, dbc: str | None = None
     if ending == ".mat":
         return MatlabLog(path)
     if ending == ".mcap":
+        # Imported here, since a desk without logs has no mcap.
+        from actuators.recordings.mcap_log import McapLog
+
         return McapLog(path)
     if ending in BAG_ENDINGS:
+        from actuators.recordings.bag_log import BagLog
+
         return BagLog(path)
     if ending in CAN_ENDINGS:
-        return _open_can_log(path, dbc)
+        # Imported here, since a desk without CAN has no python-can.
+        from actuators.recordings.can_log import CanLog
+
+        if dbc is None:
+            raise ConfigError(
+                f"{path}: frames of a CAN bus mean nothing without their DBC file: log.dbc=<file>, or a column map that names it"
+            )
+        return CanLog(path, dbc)
     return CsvLog(path, layout)
 
 
-def _open_can_log(path: Path, dbc: str | None) -> LogFile:
-    from actuators.recordings.can_log import CanLog  # here: a desk without CAN has no python-can
+def _check_ending(path: Path, ending: str) -> None:
+    """Refuse an empty file, and one whose first bytes are those of another kind."""
+    with path.open("rb") as file:
+        head = file.read(max(map(len, SIGNATURES)))
+    if not head:
+        raise RecordingError(f"{path}: the file is empty")
+    for signature, (expected, name) in SIGNATURES.items():
+        if head.startswith(signature) and ending != expected:
+            raise RecordingError(
+                f"{path}: ends in '{ending}', its first bytes are those of {name}; rename it to end in '{expected}'"
+            )
 
-    if dbc is None:
-        raise ConfigError(
-            f"{path}: frames of a CAN bus mean nothing without their DBC file: log.dbc=<file>, or a column map that names it"
-        )
-    return CanLog(path, dbc)
 
-
-def tell_folder(path: Path) -> type[LogFile] | None:
+def tell_folder(path: Path) -> Literal["sage", "lerobot", "bag"] | None:
     """Return the kind of log that a folder is, `None` for a folder of something else."""
     if all((path / name).is_file() for name in SAGE_FILES):
-        return SageLog
+        return "sage"
     if (path / "meta" / "info.json").is_file():
-        return LeRobotLog
+        return "lerobot"
     if (path / "metadata.yaml").is_file():
-        return BagLog
+        return "bag"
     return None
 
 

@@ -17,7 +17,7 @@ from actuators.recordings.column_guess import (
     guess_times,
     read_times,
 )
-from actuators.recordings.log_files import open_log
+from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import index_columns
 from actuators.recordings.log_survey import measure_logs
 from actuators.recordings.log_tables import LogRun
@@ -48,6 +48,7 @@ class LogGuess:
         best: Number of the sample that each joint was judged by.
         layout: Signs of CSV files.
         dbc: DBC file of logs of a CAN bus.
+        damaged: What is done about damaged parts.
         remarks: Further remarks.
     """
 
@@ -57,11 +58,15 @@ class LogGuess:
     best: dict[str, int]
     layout: CsvLayout
     dbc: str | None
+    damaged: Damaged
     remarks: list[str]
 
 
 def guess_logs(
-    paths: Sequence[Path], position_unit: str | Mapping[str, str] | None, dbc: str | None
+    paths: Sequence[Path],
+    position_unit: str | Mapping[str, str] | None,
+    dbc: str | None,
+    damaged: Damaged = "refuse",
 ) -> LogGuess:
     """Return the guesses from the beginnings of the logs.
 
@@ -73,7 +78,7 @@ def guess_logs(
     times: dict[str, TimeGuess] = {}
     best: dict[str, tuple[JointGuess, int]] = {}
     for path in paths[:SAMPLED_LOGS]:
-        opened = open_log(path, dbc=dbc)
+        opened = open_log(path, dbc=dbc, damaged=damaged)
         if isinstance(opened, CsvLog):
             layout = opened.layout
         run = next(opened.read_runs(opened.list_tables(), SAMPLED_ROWS), None)
@@ -93,7 +98,7 @@ def guess_logs(
             before = best.get(joint.name)
             if before is None or _rank_joint(joint) > _rank_joint(before[0]):
                 best[joint.name] = (joint, len(samples) - 1)
-    places = index_columns(open_log(paths[0], dbc=dbc).list_tables())
+    places = index_columns(open_log(paths[0], dbc=dbc, damaged=damaged).list_tables())
     used = {places[name][0] for joint, _ in best.values() for name in (joint.command, joint.position)}  # fmt: skip
     return LogGuess(
         {name: time for name, time in times.items() if name in used},
@@ -102,6 +107,7 @@ def guess_logs(
         {name: number for name, (_, number) in best.items()},
         layout,
         dbc,
+        damaged,
         remarks,
     )
 
@@ -116,7 +122,7 @@ def make_draft(guess: LogGuess, paths: Sequence[Path], name: str) -> Draft:
     Raises:
         RecordingError: A log is damaged, or no joint is ever commanded.
     """
-    survey = measure_logs(paths, guess.times, guess.joints, guess.dbc)
+    survey = measure_logs(paths, guess.times, guess.joints, guess.dbc, guess.damaged)
     moving, remarks = [], list(guess.remarks)
     for joint in guess.joints:
         numbers = survey.joints[joint.name]
@@ -126,7 +132,7 @@ def make_draft(guess: LogGuess, paths: Sequence[Path], name: str) -> Draft:
             remarks.append(f"{joint.name} is left out: its command never changes")
     if not moving:
         raise RecordingError(f"{paths[0]}: no command of any joint changes in {len(paths)} logs")
-    return Draft(name, guess.times, moving, survey, guess.layout, guess.dbc, remarks)
+    return Draft(name, guess.times, moving, survey, guess.layout, guess.dbc, guess.damaged, remarks)
 
 
 def draw_guess(guess: LogGuess) -> Figure:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,20 @@ from brokk_rl.record import Recording
 TICK_TOLERANCE = 1e-3
 """Part of a period by which a sample may lie after its tick and still count for it. Seconds since
 1970 are rounded to 0.2 µs, and no logger is as punctual as this."""
+
+
+SLICE = 1 << 18
+"""Samples that are computed at once: temporary arrays of a long column would fill the memory."""
+
+
+def compute_by_slices(
+    compute: Callable[[np.ndarray], np.ndarray], values: np.ndarray
+) -> np.ndarray:
+    """Return `compute(values)` for a function of each value, `(T,)`."""
+    found = np.empty(len(values))
+    for begin in range(0, len(values), SLICE):
+        found[begin : begin + SLICE] = compute(values[begin : begin + SLICE])
+    return found
 
 
 @dataclass(frozen=True)
@@ -61,6 +75,31 @@ Places = Mapping[str, tuple[str, str]]
 """Table and column of each full name."""
 
 
+class RunClocks(Mapping[str, np.ndarray]):
+    """Times of the tables of a run, one of them in memory at a time.
+
+    Args:
+        run: The run.
+        read: Returns the times of a table, `(T,)` s, by its name.
+    """
+
+    def __init__(self, run: LogRun, read: Callable[[str], np.ndarray]) -> None:
+        self._run, self._read = run, read
+        self._newest: tuple[str, np.ndarray] | None = None
+
+    def __getitem__(self, table: str) -> np.ndarray:
+        if self._newest is None or self._newest[0] != table:
+            self._newest = None  # before the next one is read
+            self._newest = (table, self._read(table))
+        return self._newest[1]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._run.tables)
+
+    def __len__(self) -> int:
+        return len(self._run.tables)
+
+
 class RunSignals:
     """The signals of a run, each on the clock of its table.
 
@@ -100,7 +139,7 @@ class RunSignals:
         for name in names:
             other, inner = self._places[name]
             values = np.asarray(self.run.tables[other].columns[inner], dtype=float)
-            if not empty and (row := find_first(~np.isfinite(values))) is not None:
+            if not empty and (row := find_first(values, np.isfinite)) is not None:
                 cell = self.run.tables[other].show_cell(row, inner)
                 raise RecordingError(
                     f"{locate(self.run, other, row, name)}: {cell} is not a number"
@@ -111,7 +150,7 @@ class RunSignals:
         if isinstance(source, str):
             return Signal(table, t_s, columns[source], text)
         values = source.evaluate(columns)
-        if not empty and (row := find_first(~np.isfinite(values))) is not None:
+        if not empty and (row := find_first(values, np.isfinite)) is not None:
             raise RecordingError(
                 f"{locate(self.run, table, row, text)}: the value is {values[row]}, no number"
             )
@@ -160,10 +199,13 @@ def locate(run: LogRun, table: str, row: int, column: str) -> str:
     return f"{run.where}: {run.tables[table].locate(row)}, {inside}column '{column}'"
 
 
-def find_first(condition: np.ndarray) -> int | None:
-    """Return the first row where `condition` holds, or `None`."""
-    rows = np.flatnonzero(condition)
-    return int(rows[0]) if len(rows) else None
+def find_first(values: np.ndarray, is_good: Callable[[np.ndarray], np.ndarray]) -> int | None:
+    """Return the first row whose value is not good, or `None`."""
+    for begin in range(0, len(values), SLICE):
+        rows = np.flatnonzero(~is_good(values[begin : begin + SLICE]))
+        if len(rows):
+            return begin + int(rows[0])
+    return None
 
 
 class Piece:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from actuators.recordings.column_guess import JointGuess, TimeGuess, read_times
-from actuators.recordings.log_files import open_log
+from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import index_columns
 from brokk_rl.errors import RecordingError
 
@@ -83,6 +83,7 @@ def measure_logs(
     times: Mapping[str, TimeGuess],
     joints: Sequence[JointGuess],
     dbc: str | None,
+    damaged: Damaged = "refuse",
 ) -> LogSurvey:
     """Return the numbers of all logs; one column after the other is held in memory.
 
@@ -92,7 +93,7 @@ def measure_logs(
     found = {joint.name: JointSurvey() for joint in joints}
     periods_s, num_runs, seconds = [], 0, 0.0
     for path in paths:
-        opened = open_log(path, dbc=dbc)
+        opened = open_log(path, dbc=dbc, damaged=damaged)
         places = index_columns(opened.list_tables())
         wanted: dict[str, set[str]] = {}
         for joint in joints:

@@ -6,6 +6,7 @@ is `<table>:<column>`; a log with one table leaves the first part out.
 
 from __future__ import annotations
 
+import logging
 import weakref
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -14,6 +15,10 @@ from pathlib import Path
 from tempfile import SpooledTemporaryFile
 
 import numpy as np
+
+from brokk_rl.errors import RecordingError
+
+log = logging.getLogger(__name__)
 
 SPOOLED_BYTES = 4 << 20
 """Bytes of a column that stay in memory; the rest of a long log waits in a temporary file."""
@@ -58,8 +63,24 @@ class LogRun:
 class LogFile(ABC):
     """A log of which only the needed columns are read."""
 
+    keep_whole = False
+    """Whether damaged parts are left out with a warning; a log with damage is refused otherwise."""
+
     def __init__(self, path: Path) -> None:
         self.path = path
+
+    def report_damage(self, text: str, error: Exception | None) -> None:
+        """Raise a `RecordingError` for a damaged part, or warn that it is left out.
+
+        Args:
+            text: Place and kind of the damage.
+            error: What a library raised.
+        """
+        if not self.keep_whole:
+            raise RecordingError(
+                f"{self.path}: {text}; log.damaged=skip, or damaged: skip in the column map, reads what is whole"
+            ) from error
+        log.warning("%s: %s: left out", self.path, text)
 
     @abstractmethod
     def list_tables(self) -> dict[str, list[str]]:
@@ -94,10 +115,17 @@ class StoredColumns(Mapping[str, np.ndarray]):
         self._files = {name: SpooledTemporaryFile(SPOOLED_BYTES) for name in names}  # noqa: SIM115
         weakref.finalize(self, _close_files, list(self._files.values()))
         self._num_rows: int | None = None
+        self._order: np.ndarray | None = None
 
     def add(self, name: str, values: np.ndarray) -> None:
         """Append a block of numbers, `(T,)`, to a column."""
         self._files[name].write(np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+    def sort(self, name: str) -> None:
+        """Bring the rows into the order of a column."""
+        values = self[name]
+        if (np.diff(values) < 0).any():
+            self._order = np.argsort(values, kind="stable")
 
     def cut(self, num_rows: int) -> None:
         """Leave out the rows after the first `num_rows`."""
@@ -106,7 +134,8 @@ class StoredColumns(Mapping[str, np.ndarray]):
     def __getitem__(self, name: str) -> np.ndarray:
         file = self._files[name]
         file.seek(0)
-        return np.frombuffer(file.read(), np.float64)[: self._num_rows]
+        values = np.frombuffer(file.read(), np.float64)[: self._num_rows]
+        return values if self._order is None else values[self._order]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._files)

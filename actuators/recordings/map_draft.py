@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from actuators.recordings.column_guess import Guess, JointGuess, TimeGuess
+from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_survey import JointSurvey, LogSurvey
 from actuators.recordings.text_log import CsvLayout
 
@@ -54,6 +55,7 @@ class Draft:
         survey: Their numbers over all logs.
         layout: Signs of CSV files.
         dbc: DBC file of logs of a CAN bus.
+        damaged: What is done about damaged parts.
         remarks: Further remarks.
     """
 
@@ -63,6 +65,7 @@ class Draft:
     survey: LogSurvey
     layout: CsvLayout
     dbc: str | None
+    damaged: Damaged
     remarks: Sequence[str]
 
     @property
@@ -136,6 +139,7 @@ def format_map(draft: Draft) -> str:
         "overrun: 0.001        # of full command; rounding",
         f"longest_gap_s: {_round_up(GAP_PERIODS * period_s):g}   # s; {GAP_PERIODS} periods of {period_s:.4g} s",
         f"shortest_s: {SHORTEST_S:g}         # s; shorter ones hold no free run worth judging",
+        f"damaged: {draft.damaged}       # skip: leave damaged messages, chunks and frames out",
     ]
     if draft.dbc is not None:
         head, body = lines[:3], [f"  {line}" for line in lines[3:]]

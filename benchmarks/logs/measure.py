@@ -15,195 +15,37 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from made_logs import JOINTS, WRITERS
 
-JOINTS, RATE_HZ = 12, 1000.0
-BLOCK = 20000
-ROW_BYTES = 8 * (1 + 2 * JOINTS)
-PAIRS = JOINTS // 2
-"""CAN frames of a sample: two joints each, command and position of 16 bits."""
-CAN_STEP = 1e-4
-EPISODE_BLOCKS = 3
-"""Blocks of a LeRobot episode: a minute."""
 BITS_LOST = 2000
 """Bytes that the damage overwrites."""
 
 
-def make_block(begin: int) -> np.ndarray:
-    """Return time, commands and positions of `BLOCK` rows, `(BLOCK, 1 + 2 JOINTS)`."""
-    t_s = (begin + np.arange(BLOCK)) / RATE_HZ
-    phase = t_s[:, None] * np.linspace(0.3, 2.1, JOINTS)
-    return np.concatenate([t_s[:, None], np.sin(phase).round(6), np.cos(phase).round(6)], 1)
-
-
-def list_blocks() -> Iterator[np.ndarray]:
-    """Yield blocks without an end."""
-    begin = 0
-    while True:
-        yield make_block(begin)
-        begin += BLOCK
-
-
-def make_arrays(size: int) -> dict[str, np.ndarray]:
-    """Return the arrays of a log of about `size` bytes."""
-    count = max(size // ROW_BYTES // BLOCK, 1)
-    rows = np.concatenate([make_block(k * BLOCK) for k in range(count)])
-    return {"t_s": rows[:, 0], "u": rows[:, 1 : 1 + JOINTS], "q": rows[:, 1 + JOINTS :]}
-
-
-def write_csv(path: Path, size: int) -> None:
-    """Write rows of text."""
-    names = ["t_s", *(f"u_q{j}" for j in range(JOINTS)), *(f"q_q{j}_rad" for j in range(JOINTS))]
-    with path.open("w") as file:
-        file.write(",".join(names) + "\n")
-        for block in list_blocks():
-            np.savetxt(file, block, delimiter=",", fmt="%.6f")
-            if file.tell() >= size:
-                return
-
-
-def write_mat(path: Path, size: int) -> None:
-    """Write a MATLAB file with compression, as MATLAB does; without it there is no checksum."""
-    from scipy import io
-
-    io.savemat(path, make_arrays(size), do_compression=True)
-
-
-def write_parquet(path: Path, size: int) -> None:
-    """Write rows of Parquet without compression, as `.parquet` logs and LeRobot have them."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    writer = None
-    episode = 0
-    for number, block in enumerate(list_blocks()):
-        lists = [
-            pa.FixedSizeListArray.from_arrays(pa.array(part.ravel()), JOINTS)
-            for part in (block[:, 1 : 1 + JOINTS], block[:, 1 + JOINTS :])
-        ]
-        episode = number // EPISODE_BLOCKS
-        columns = {"timestamp": block[:, 0], "action": lists[0], "observation.state": lists[1]}
-        table = pa.table({**columns, "episode_index": np.full(BLOCK, episode)})
-        writer = writer or pq.ParquetWriter(
-            path, table.schema, compression="none", use_dictionary=False
-        )
-        writer.write_table(table)
-        if path.stat().st_size >= size:
-            writer.close()
-            return
-
-
-def write_lerobot(path: Path, size: int) -> None:
-    """Write a LeRobotDataset v3: several episodes a file of 100 MB."""
-    (path / "meta").mkdir(parents=True)
-    feature = {"dtype": "float64", "shape": [JOINTS], "names": [f"q{j}" for j in range(JOINTS)]}
-    features = {"action": feature, "observation.state": feature}
-    info = {"codebase_version": "v3.0", "fps": RATE_HZ, "features": features}
-    (path / "meta" / "info.json").write_text(json.dumps(info))
-    folder = path / "data" / "chunk-000"
-    folder.mkdir(parents=True)
-    for number in range(max(size // 10**8, 1)):
-        write_parquet(folder / f"file-{number:03d}.parquet", min(size, 10**8))
-
-
-def write_mcap(path: Path, size: int) -> None:
-    """Write JSON messages."""
-    from mcap.writer import CompressionType, Writer
-
-    with path.open("wb") as file:
-        writer = Writer(file, compression=CompressionType.NONE)
-        writer.start()
-        schema = writer.register_schema("state", "jsonschema", b"{}")
-        channel = writer.register_channel("/state", "json", schema)
-        for block in list_blocks():
-            for row in block.tolist():
-                content = {"u": row[1 : 1 + JOINTS], "q": row[1 + JOINTS :]}
-                writer.add_message(channel, round(row[0] * 1e9), json.dumps(content).encode(), 0)
-            if file.tell() >= size:
-                break
-        writer.finish()
-
-
-def write_bag(path: Path, size: int) -> None:
-    """Write a rosbag2 (MCAP storage): JointState with command as effort and position."""
-    from rosbags import rosbag2
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    kind = store.types["sensor_msgs/msg/JointState"]
-    stamp, header = (store.types[f"{n}"] for n in ("builtin_interfaces/msg/Time", "std_msgs/msg/Header"))  # fmt: skip
-    names = [f"q{j}" for j in range(JOINTS)]
-    storage = rosbag2.StoragePlugin.MCAP
-    written = 0
-    with rosbag2.Writer(path, version=9, storage_plugin=storage) as writer:
-        connection = writer.add_connection("/state", kind.__msgtype__, typestore=store)
-        for block in list_blocks():
-            for row in block:
-                time_ns = round(row[0] * 1e9)
-                head = header(stamp(time_ns // 10**9, time_ns % 10**9), "")
-                content = kind(head, names, row[1 + JOINTS :], np.empty(0), row[1 : 1 + JOINTS])
-                data = store.serialize_cdr(content, kind.__msgtype__)
-                writer.write(connection, time_ns, data)
-                written += len(data)
-            if written >= size:
-                return
-
-
-def write_blf(path: Path, size: int) -> None:
-    """Write CAN frames, six for a sample, and the DBC beside them."""
-    import can
-
-    lines = ['VERSION ""', "BU_: X"]
-    for pair in range(PAIRS):
-        lines.append(f"BO_ {256 + pair} J{pair}: 8 X")
-        for k in range(2):
-            for at, name in enumerate(("u", "q")):
-                joint = 2 * pair + k
-                lines.append(
-                    f' SG_ {name}{joint} : {32 * k + 16 * at}|16@1- ({CAN_STEP},0) [-3|3] "" X'
-                )
-    path.with_suffix(".dbc").write_text("\n".join(lines) + "\n")
-    with can.BLFWriter(path) as writer:
-        for block in list_blocks():
-            parts = block[:, 1:].reshape(BLOCK, 2, PAIRS, 2).transpose(0, 2, 3, 1)
-            words = np.round(parts / CAN_STEP).astype("<i2").reshape(BLOCK, PAIRS, 4)
-            for t_s, frames in zip(block[:, 0].tolist(), words, strict=True):
-                for pair in range(PAIRS):
-                    writer.on_message_received(
-                        can.Message(
-                            timestamp=t_s,
-                            arbitration_id=256 + pair,
-                            data=frames[pair].tobytes(),
-                            is_extended_id=False,
-                        )
-                    )
-            if path.stat().st_size >= size:
-                return
-
-
-WRITERS: dict[str, Callable[[Path, int], Any]] = {
-    "csv": write_csv,
-    "npz": lambda path, size: np.savez(path, **make_arrays(size)),
-    "mat": write_mat,
-    "parquet": write_parquet,
-    "lerobot": write_lerobot,
-    "mcap": write_mcap,
-    "bag": write_bag,
-    "blf": write_blf,
-}
+ENDINGS = {"csv_iso": "csv", "mcap_json": "mcap", "mcap_protobuf": "mcap", "mcap_ros2": "mcap"}
+FOLDERS = ("lerobot", "lerobot2", "sage", "bag_sqlite", "bag_mcap")
+ARRAYS = ("t_s", "u[{0}]", "q[{0}]")
+LEROBOT = ("timestamp", "action[q{0}]", "observation.state[q{0}]")
+JOINT_STATE = ("header.stamp", "/state:effort[q{0}]", "/state:position[q{0}]")
+CAN = ("time", "J{1}:u{0}", "J{1}:q{0}")
 NAMES = {
     "csv": ("t_s", "u_q{0}", "q_q{0}_rad"),
-    "npz": ("t_s", "u[{0}]", "q[{0}]"),
-    "mat": ("t_s", "u[{0}]", "q[{0}]"),
+    "csv_iso": ("stamp", "u[{0}]", "q[{0}]"),
+    "npz": ARRAYS,
+    "mat": ARRAYS,
     "parquet": ("timestamp", "action[{0}]", "observation.state[{0}]"),
-    "lerobot": ("timestamp", "action[q{0}]", "observation.state[q{0}]"),
-    "mcap": ("log_time", "/state:u[{0}]", "/state:q[{0}]"),
-    "bag": ("header.stamp", "/state:effort[q{0}]", "/state:position[q{0}]"),
-    "blf": ("time", "J{1}:u{0}", "J{1}:q{0}"),
+    "lerobot": LEROBOT,
+    "lerobot2": LEROBOT,
+    "sage": ("timestamp", "control:positions[q{0}]", "state_motor:positions[q{0}]"),
+    "mcap_json": ("log_time", "/state:u[{0}]", "/state:q[{0}]"),
+    "mcap_protobuf": ("log_time", "/state:u[{0}]", "/state:q[{0}]"),
+    "mcap_ros2": JOINT_STATE,
+    "bag_sqlite": JOINT_STATE,
+    "bag_mcap": JOINT_STATE,
+    "blf": CAN,
+    "asc": CAN,
 }
 """Columns of time, command and position; `{0}` is the joint, `{1}` its frame."""
 
@@ -242,11 +84,12 @@ def read_log(kind: str, path: Path) -> None:
         name="made", title="made", mjcf=None, period_s=0.01, dead_time_s=0.01, num_history=13, joints=tuple(joints),
         tool_m=None, exclusive=(), levers=(),
     )  # fmt: skip
+    time_column = Column(column=names[0], scale=1e-6 if kind == "sage" else 1.0, offset=0.0)
     reader: Any = ColumnMap(
-        delimiter=",", decimal=".", time=Column(column=names[0], scale=1.0, offset=0.0), joints=columns, optional={},
+        delimiter=",", decimal=".", time=time_column, joints=columns, optional={},
         overrun=0.0, longest_gap_s=0.1, shortest_s=5.0,
     )  # fmt: skip
-    if kind == "blf":
+    if kind in ("blf", "asc"):
         reader = CanColumnMap(dbc=str(path.with_suffix(".dbc")), columns=reader)
     try:
         recordings = reader.read(path, machine)
@@ -261,6 +104,11 @@ def read_log(kind: str, path: Path) -> None:
         "minutes_of_log": round(sum(one.duration_s for one in recordings) / 60, 1),
     }
     print(json.dumps(found))
+
+
+def name_log(kind: str) -> str:
+    """Return the name of the file or folder of a log."""
+    return "log" if kind in FOLDERS else f"log.{ENDINGS.get(kind, kind)}"
 
 
 def list_files(path: Path) -> list[Path]:
@@ -293,7 +141,7 @@ def main() -> None:
         read_log(given.kind, given.read)
         return
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / ("log" if given.kind in ("bag", "lerobot") else f"log.{given.kind}")
+        path = Path(folder) / name_log(given.kind)
         # a process begins with the largest memory of its parent, so that a child has to write
         made = [given.kind, str(given.size), "-", "--write", str(path)]
         subprocess.run([sys.executable, __file__, *made], check=True)

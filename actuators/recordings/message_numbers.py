@@ -1,0 +1,267 @@
+"""Numbers in messages by their path: `pose.x`, `position[elbow]`, `header.stamp`.
+
+Items of a list are named by the list `name` beside it, or by their own `name`, else by their number.
+A stamp is one number, in s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from operator import attrgetter, itemgetter
+from typing import Any, Protocol
+
+import numpy as np
+
+LONGEST_LIST = 256
+"""Longest list of numbers that is taken for joints; longer ones are pictures and point clouds."""
+LABELS = ("name", "names", "joint_names", "joint_name")
+"""Fields that name the items of the lists beside them."""
+TIMES = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
+"""Fields of a time: whole seconds and nanoseconds."""
+
+Keys = tuple[str | int, ...]
+"""Way from a message to a value in it: fields and numbers of items."""
+
+
+@dataclass(frozen=True)
+class Place:
+    """Stands for a number in a message that is not decoded.
+
+    Attributes:
+        byte: Place of its first byte.
+        kind: NumPy's name of its type with the order of its bytes, `<f8`.
+    """
+
+    byte: int
+    kind: str
+
+
+class DecodingError(Exception):
+    """A message of a block cannot be decoded; `number` is its place in the block."""
+
+    def __init__(self, number: int, reason: object) -> None:
+        super().__init__(str(reason))
+        self.number = number
+
+
+class NumberReader(Protocol):
+    """Reads numbers from the messages of one channel."""
+
+    def find_numbers(self, data: bytes) -> Mapping[str, Keys]:
+        """Return the numbers in a message by their names.
+
+        Raises:
+            DecodingError: It cannot be decoded.
+        """
+        ...
+
+    def read(
+        self, messages: Sequence[bytes], names: Sequence[str]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the named numbers of messages, `(N, K)`, and whether a message has any, `(N,)`.
+
+        NaN stands for a number that a message lacks.
+
+        Raises:
+            DecodingError: A message cannot be decoded.
+        """
+        ...
+
+
+class ObjectReader:
+    """Reads messages that a library decodes one by one: JSON and protobuf.
+
+    Args:
+        decode: Returns the content of a message.
+    """
+
+    def __init__(self, decode: Callable[[bytes], Any]) -> None:
+        self._decode = decode
+        self._label_keys: list[Keys] | None = None
+        self._plans: dict[tuple[Any, ...], list[_Step]] = {}
+        self._stamps: list[int] = []
+
+    def find_numbers(self, data: bytes) -> Mapping[str, Keys]:
+        """Return the numbers in a message by their names; see `NumberReader`."""
+        try:
+            return dict(find_leaves(self._decode(data)))
+        except Exception as error:  # a decoder raises what it stumbles over
+            raise DecodingError(0, f"{type(error).__name__}: {error}") from error
+
+    def read(
+        self, messages: Sequence[bytes], names: Sequence[str]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the named numbers of messages; see `NumberReader`."""
+        self._stamps = [at for at, name in enumerate(names) if name.endswith("stamp")]
+        rows: list[list[Any]] = []
+        try:
+            for data in messages:
+                rows.append(self._read_one(self._decode(data), names))
+        except Exception as error:  # a decoder raises what it stumbles over
+            raise DecodingError(len(rows), f"{type(error).__name__}: {error}") from error
+        present = np.array([row.count(None) < len(row) or not row for row in rows], dtype=bool)
+        try:
+            values = np.array(rows, dtype=float)  # None becomes NaN
+        except (TypeError, ValueError):
+            number, name = _find_no_number(rows, names)
+            raise DecodingError(number, f"'{name}' is no number") from None
+        return values.reshape(len(rows), len(names)), present
+
+    def _read_one(self, message: Any, names: Sequence[str]) -> list[Any]:
+        if self._label_keys is None:
+            self._label_keys = list(_find_labels(message, ()))
+        # names of the items of lists may differ from message to message
+        labels = tuple(tuple(follow(message, keys) or ()) for keys in self._label_keys)
+        if labels not in self._plans:
+            self._plans[labels] = _plan_reading(message, dict(find_leaves(message)), names)
+        values: list[Any] = []
+        for step in self._plans[labels]:
+            try:
+                values += step.take(step.find_parent(message))
+            except (KeyError, IndexError, TypeError, AttributeError):
+                parent = follow(message, step.parent_keys)
+                values += [follow(parent, (key,)) for key in step.keys]
+        for at in self._stamps:
+            values[at] = read_time(values[at])
+        return values
+
+
+@dataclass(frozen=True)
+class _Step:
+    """Numbers beside one another: their parent in a message, and its fields or items."""
+
+    parent_keys: Keys
+    keys: list[str | int]
+    find_parent: Callable[[Any], Any]
+    take: Callable[[Any], Sequence[Any]]
+
+
+def _plan_reading(message: Any, leaves: Mapping[str, Keys], names: Sequence[str]) -> list[_Step]:
+    """Return the steps that read the named numbers, in their order."""
+    groups: list[tuple[Keys, list[str | int]]] = []
+    for name in names:
+        keys = leaves.get(name, ("",))  # no field has an empty name
+        if groups and groups[-1][0] == keys[:-1] and type(groups[-1][1][0]) is type(keys[-1]):
+            groups[-1][1].append(keys[-1])
+        else:
+            groups.append((keys[:-1], [keys[-1]]))
+    is_mapping = isinstance(message, Mapping)
+
+    def get(key: str | int) -> Callable[[Any], Any]:
+        return itemgetter(key) if is_mapping or isinstance(key, int) else attrgetter(key)
+
+    steps = []
+    for parent_keys, keys in groups:
+        getters = [get(key) for key in parent_keys]
+        find_parent = lambda value, getters=getters: reduce(_apply, getters, value)  # noqa: E731
+        several: Any = itemgetter if is_mapping or isinstance(keys[0], int) else attrgetter
+        take = several(*keys)
+        if len(keys) == 1:
+            take = lambda parent, one=take: (one(parent),)  # noqa: E731
+        steps.append(_Step(parent_keys, keys, find_parent, take))
+    return steps
+
+
+def _apply(value: Any, getter: Callable[[Any], Any]) -> Any:
+    return getter(value)
+
+
+def _find_no_number(rows: list[list[Any]], names: Sequence[str]) -> tuple[int, str]:
+    """Return number of the message and name of the first value that is no number."""
+    for number, row in enumerate(rows):
+        for name, value in zip(names, row, strict=True):
+            if value is not None and not isinstance(value, (int, float, np.number)):
+                return number, name
+    raise AssertionError("a block was refused, but none of its values")
+
+
+def find_leaves(value: Any, prefix: str = "", keys: Keys = ()) -> Iterator[tuple[str, Keys]]:
+    """Yield name and way of each number in a message."""
+    listed = list(_list_fields(value))
+    labels = next(([*inner] for name, inner in listed if name in LABELS and _is_names(inner)), None)
+    for name, inner in listed:
+        path = f"{prefix}{name}"
+        is_time = name.endswith("stamp") and find_time(inner) is not None
+        if is_time or _is_number(inner):
+            yield path, (*keys, name)
+        elif _is_sequence(inner):
+            yield from _find_items(inner, path, (*keys, name), labels)
+        elif not isinstance(inner, (str, bytes)):
+            yield from find_leaves(inner, f"{path}.", (*keys, name))
+
+
+def _find_items(
+    items: Any, path: str, keys: Keys, labels: list[str] | None
+) -> Iterator[tuple[str, Keys]]:
+    if len(items) > LONGEST_LIST:
+        return
+    for number, item in enumerate(items):
+        label = labels[number] if labels and len(labels) == len(items) else str(number)
+        own = next((text for name, text in _list_fields(item) if name in LABELS), None)
+        label = own if isinstance(own, str) and own else label
+        if _is_number(item):
+            yield f"{path}[{label}]", (*keys, number)
+        elif not isinstance(item, (str, bytes)) and not _is_sequence(item):
+            yield from find_leaves(item, f"{path}[{label}].", (*keys, number))
+
+
+def _find_labels(value: Any, keys: Keys) -> Iterator[Keys]:
+    """Yield the ways to lists of names."""
+    for name, inner in _list_fields(value):
+        if name in LABELS and _is_names(inner):
+            yield (*keys, name)
+        elif not isinstance(inner, (str, bytes, int, float)):
+            yield from _find_labels(inner, (*keys, name))
+
+
+def _list_fields(value: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the fields of a message: of a dictionary, a dataclass or a protobuf message."""
+    if isinstance(value, Mapping):
+        yield from value.items()
+    elif hasattr(value, "DESCRIPTOR"):
+        for one in value.DESCRIPTOR.fields:
+            yield one.name, getattr(value, one.name)
+
+
+def follow(value: Any, keys: Keys) -> Any:
+    """Return the value at the end of a way, `None` where the message does not have it."""
+    try:
+        for key in keys:
+            is_inside = isinstance(key, int) or isinstance(value, Mapping)
+            value = value[key] if is_inside else getattr(value, str(key))
+    except (KeyError, IndexError, TypeError, AttributeError):
+        return None
+    return value
+
+
+def find_time(value: Any) -> tuple[Any, ...] | None:
+    """Return the parts of a time: one number, or seconds and nanoseconds; `None` for no time."""
+    if _is_number(value):
+        return (value,)
+    for whole, part in TIMES:
+        parts = follow(value, (whole,)), follow(value, (part,))
+        if all(map(_is_number, parts)):
+            return parts
+    return None
+
+
+def read_time(value: Any) -> float | None:
+    """Return a time in s."""
+    parts = find_time(value)
+    if parts is None:
+        return None
+    return sum(float(part) * unit_s for part, unit_s in zip(parts, (1.0, 1e-9), strict=False))
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float, np.number, Place)) and not isinstance(value, bool)
+
+
+def _is_sequence(value: Any) -> bool:
+    return hasattr(value, "__len__") and hasattr(value, "__getitem__") and not isinstance(value, (str, bytes, Mapping))  # fmt: skip
+
+
+def _is_names(value: Any) -> bool:
+    return _is_sequence(value) and len(value) > 0 and all(isinstance(name, str) for name in value)
