@@ -124,7 +124,7 @@ class WhyResult:
 
     @property
     def tone(self) -> Tone:
-        """How the answer is shown."""
+        """Tone of the first paragraph."""
         return "warn" if self.title != TITLES[self.cause] else TONES[self.cause]
 
     def to_json(self) -> dict[str, Any]:
@@ -171,7 +171,10 @@ def write_summary(result: WhyResult) -> str:
     """Return the answer in a few sentences: cause, effect, cost, and what is not the cause."""
     cause, doctor = result.cause, result.doctor
     if cause == "code":
-        return f"{doctor['reason']} Mend this first: machine and task are judged once the code does what was trained."
+        start = (
+            "The deployed code departs from the contract of the policy: " if doctor["named"] else ""
+        )
+        return f"{start}{doctor['reason']} Mend this first, then ask again about the machine."
     if doctor["verdict"] in ("task", "cannot_tell") and cause == doctor["verdict"]:
         return f"{doctor['reason']}{_append(_describe_effects(result))}"
     texts = [_describe_effects(result)]
