@@ -193,6 +193,8 @@ class MatlabLog(LogFile):
             for at, name in enumerate(several):
                 if name in names:
                     columns.add(name, values[:max_rows, at])
+            # Two arrays of a long log would fill the memory.
+            del values
         yield LogRun(self.path.stem, str(self.path), {"": Table(columns)})
 
     def _call(self, reader: Any, **options: Any) -> Any:

@@ -6,8 +6,10 @@ read and decoded by blocks: a BLF file of 1 GB holds tens of millions of them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,14 @@ BLF_FRAME = np.dtype(
 )  # fmt: skip
 """A classic frame in a BLF file, as `can.io.blf` unpacks it: object header, its version 1, CAN message."""
 CLASSIC_KIND, REMOTE_FLAG, ID_BITS = 1, 0x80, 0x1FFFFFFF
+ASC_BLOCK_CHARACTERS = 4 << 20
+"""Characters of an ASC file whose lines are parsed at once."""
+ASC_FRAME = re.compile(
+    r"^[ \t]*(\d+\.\d+)[ \t]+\d+[ \t]+([0-9A-F]+x?)[ \t]+[RT]x[ \t]+d[ \t]+([0-8])((?: [0-9A-F]{2}\b)*).*$",
+    re.MULTILINE | re.IGNORECASE | re.ASCII,
+)
+"""A line of a classic frame with data: time in s, identifier, number of bytes, the bytes."""
+NO_BYTES = " 00" * WORD_BYTES
 TICKS_OF_10_US = 1
 """Time unit of 10 µs; others are of 1 ns."""
 
@@ -77,6 +87,44 @@ class BlfBlockReader(can.BLFReader):
         content = np.where(inside, frames["data"], 0).astype(np.uint8)
         found = FrameBlock(time_s, frames["frame_id"] & ID_BITS, length, content)
         yield select_frames(found, chosen)
+
+
+class AscBlockReader(can.ASCReader):
+    """A reader that parses lines of classic frames by blocks, and leaves others to python-can."""
+
+    def __iter__(self) -> Iterator[Any]:
+        self._extract_header()
+        file: Any = self.file
+        while lines := file.readlines(ASC_BLOCK_CHARACTERS):
+            found = ASC_FRAME.findall("".join(lines)) if self.base == "hex" else []
+            others = lines if not found else []
+            if 0 < len(found) < len(lines):
+                others = [line for line in lines if not ASC_FRAME.match(line)]
+            if found:
+                yield parse_asc_frames(found)
+            if others:
+                # python-can skips the header, whose last line this is.
+                self.file = StringIO("internal events logged\n" + "".join(others))
+                try:
+                    yield from super().__iter__()
+                finally:
+                    self.file = file
+        self.stop()
+
+
+def parse_asc_frames(found: list[tuple[str, str, str, str]]) -> FrameBlock:
+    """Return frames as a block: time, identifier, number and text of the bytes of each."""
+    times, identifiers, lengths, texts = zip(*found, strict=True)
+    numbers = {text: int(text.rstrip("xX"), 16) for text in set(identifiers)}
+    length = np.array(lengths).astype(int)
+    content = []
+    for time, size, text in zip(times, (3 * length).tolist(), texts, strict=True):
+        if len(text) < size:
+            raise ValueError(f"the frame at {time} s has {len(text) // 3} bytes of {size // 3}")
+        content.append(text[:size] + NO_BYTES[size:])
+    data = np.frombuffer(bytes.fromhex("".join(content)), np.uint8)
+    frame_id = np.array([numbers[text] for text in identifiers])
+    return FrameBlock(np.array(times).astype(float), frame_id, length, data.reshape(-1, WORD_BYTES))
 
 
 def select_frames(block: FrameBlock, chosen: np.ndarray) -> FrameBlock:
@@ -173,13 +221,22 @@ class CanLog(LogFile):
         if there < stated:
             self.report_damage(f"cut off at byte {there} of {stated}", None)
 
+    def _open(self) -> Any:
+        ending = self.path.suffix.lower()
+        if ending == ".blf":
+            return BlfBlockReader(self.path)
+        return (
+            AscBlockReader(self.path, encoding="utf-8")
+            if ending == ".asc"
+            else can.LogReader(self.path)
+        )
+
     def _iterate(self) -> Iterator[FrameBlock]:
         """Yield the frames that carry data, by blocks."""
         count, last_s = 0, 0.0
-        is_blf = self.path.suffix.lower() == ".blf"
         waiting: list[can.Message] = []
         try:
-            with BlfBlockReader(self.path) if is_blf else can.LogReader(self.path) as reader:
+            with self._open() as reader:
                 self._check_size(reader)
                 frames: Iterator[Any] = iter(reader)
                 for found in frames:
