@@ -16,6 +16,7 @@ from typing import Any
 import can
 import cantools
 import numpy as np
+from can.io.asc import ASC_MESSAGE_REGEX
 
 from actuators.recordings.log_tables import BLOCK_ROWS, LogFile, LogRun, StoredColumns, Table
 from brokk_rl import registry
@@ -38,10 +39,12 @@ CLASSIC_KIND, REMOTE_FLAG, ID_BITS = 1, 0x80, 0x1FFFFFFF
 ASC_BLOCK_CHARACTERS = 4 << 20
 """Characters of an ASC file whose lines are parsed at once."""
 ASC_FRAME = re.compile(
-    r"^[ \t]*(\d+\.\d+)[ \t]+\d+[ \t]+([0-9A-F]+x?)[ \t]+[RT]x[ \t]+d[ \t]+([0-8])((?: [0-9A-F]{2}\b)*).*$",
-    re.MULTILINE | re.IGNORECASE | re.ASCII,
+    r"^[ \t]*(\d+\.\d+)[ \t]+\d+[ \t]+([0-9A-Fa-f]+[xX]?)[ \t]+[RT]x[ \t]+d[ \t]+([0-8])([ 0-9A-Fa-f]*)",
+    re.MULTILINE | re.ASCII,
 )
-"""A line of a classic frame with data: time in s, identifier, number of bytes, the bytes."""
+"""A line of a classic frame with data: time in s, identifier, number of bytes, the bytes and more."""
+ASC_DATA = re.compile(r"[ \t][RT]x[ \t]+d[ \t]")
+"""Sign of a line of a frame, whatever the rest of it has become."""
 NO_BYTES = " 00" * WORD_BYTES
 TICKS_OF_10_US = 1
 """Time unit of 10 µs; others are of 1 ns."""
@@ -103,12 +106,18 @@ class AscBlockReader(can.ASCReader):
             if found:
                 yield parse_asc_frames(found)
             if others:
+                for line in others:
+                    if ASC_DATA.search(line) and not ASC_MESSAGE_REGEX.match(line.strip()):
+                        raise ValueError(f"the line '{line.strip()}' is no frame")
                 # python-can skips the header, whose last line this is.
                 self.file = StringIO("internal events logged\n" + "".join(others))
                 try:
                     yield from super().__iter__()
                 finally:
                     self.file = file
+            end = lines[-1].strip().lower()
+            if not lines[-1].endswith("\n") and not end.startswith("end triggerblock"):
+                raise ValueError(f"the last line, '{end}', is cut off")
         self.stop()
 
 
@@ -116,15 +125,19 @@ def parse_asc_frames(found: list[tuple[str, str, str, str]]) -> FrameBlock:
     """Return frames as a block: time, identifier, number and text of the bytes of each."""
     times, identifiers, lengths, texts = zip(*found, strict=True)
     numbers = {text: int(text.rstrip("xX"), 16) for text in set(identifiers)}
-    length = np.array(lengths).astype(int)
-    content = []
-    for time, size, text in zip(times, (3 * length).tolist(), texts, strict=True):
-        if len(text) < size:
-            raise ValueError(f"the frame at {time} s has {len(text) // 3} bytes of {size // 3}")
-        content.append(text[:size] + NO_BYTES[size:])
+    length = np.array(list(map(int, lengths)))
+    is_short = np.array(list(map(len, texts))) < 3 * length
+    if is_short.any():
+        number = int(np.argmax(is_short))
+        raise ValueError(
+            f"the frame at {times[number]} s has {len(texts[number]) // 3} bytes of {length[number]}"
+        )
+    sizes = (3 * length).tolist()
+    content = [text[:size] + NO_BYTES[size:] for size, text in zip(sizes, texts, strict=True)]
     data = np.frombuffer(bytes.fromhex("".join(content)), np.uint8)
     frame_id = np.array([numbers[text] for text in identifiers])
-    return FrameBlock(np.array(times).astype(float), frame_id, length, data.reshape(-1, WORD_BYTES))
+    time_s = np.array(list(map(float, times)))
+    return FrameBlock(time_s, frame_id, length, data.reshape(-1, WORD_BYTES))
 
 
 def select_frames(block: FrameBlock, chosen: np.ndarray) -> FrameBlock:

@@ -440,13 +440,15 @@ def test_lines_of_an_asc_log_are_what_python_can_reads(tmp_path: Path) -> None:
     for name in ("time_s", "frame_id", "length", "data"):
         values = np.concatenate([getattr(block, name) for block in found])[order]
         np.testing.assert_allclose(values, getattr(whole, name), rtol=1e-15)
-    text[11] = text[11][:-3]
-    (tmp_path / "a.asc").write_text("\n".join(text) + "\n")
-    with (
-        AscBlockReader(tmp_path / "a.asc") as reader,
-        pytest.raises(ValueError, match=r"the frame at \S+ s has \d bytes of \d"),
+    lines = text.copy()
+    for damaged, refusal in (
+        (text[11][:-3], r"the frame at \S+ s has \d bytes of \d"),
+        (text[11].replace(".", "#", 1), "the line '.*' is no frame"),
     ):
-        list(reader)
+        lines[11] = damaged
+        (tmp_path / "a.asc").write_text("\n".join(lines) + "\n")
+        with AscBlockReader(tmp_path / "a.asc") as reader, pytest.raises(ValueError, match=refusal):
+            list(reader)
 
 
 def test_a_cut_off_blf_is_refused_by_its_frame(tmp_path: Path, carriage: Machine) -> None:
