@@ -56,4 +56,8 @@ def _read_numbers(actuator: Any, machine: Machine) -> dict[str, np.ndarray]:
     """Return the numbers of a model by name, each `(J,)`; empty for one without."""
     model = actuator.build(machine, 1, torch.device("cpu"))
     parameters = getattr(model, "parameters", {})
-    return {name: value[0].numpy().astype(float) for name, value in parameters.items()}
+    found = {name: value[0].numpy().astype(float) for name, value in parameters.items()}
+    motor = getattr(model, "motor", None)
+    if motor is not None:  # inverse dynamics sees its back EMF as viscous friction
+        found["viscous_n_s_m"] = found["viscous_n_s_m"] + motor.back_emf.numpy()
+    return found

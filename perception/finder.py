@@ -195,7 +195,7 @@ class _Judged:
 
 
 class StagedFinder:
-    """See `StagedPerception` and `brokk_rl.contracts.vision.BoreholeFinder`."""
+    """Finder that runs the stages of `StagedPerception`; a `brokk_rl.contracts.vision.BoreholeFinder`."""
 
     def __init__(self, settings: StagedPerception) -> None:
         self.settings = settings

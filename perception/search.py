@@ -17,25 +17,25 @@ STEP = 8
 """Pixels of the picture to a cell of the grid on which regions are built."""
 OCTAVES = 5
 """Resolutions: the full one, half of it, and so on."""
-LEAST = 20
+LEAST_CELLS = 20
 """Cells below which a region is an accident of depth."""
-AROUND = 1.6
+DEPTH_REACH = 1.6
 """Major semi-axes around an ellipse within which the depth of the face limits its size."""
-BEFORE, NOISES = 1.04, 3.0
+OCCLUDER_RATIO, OCCLUDER_SIGMAS = 1.04, 3.0
 """Ratio of inverse depths, and standard deviations of noise on top, from which something is an
 occluder of the face beside it."""
-NEAR = 2
+OCCLUDER_CELLS = 2
 """Cells across which that is compared."""
-NOWHERE = 1e6
+HUGE_PX = 1e6
 """Larger than any hole looks, px."""
 SPREAD_PX = 8
 """Width by which a stereo matcher enlarges an occluder: its true edge lies within."""
 DRAWN_PX = 1
 """Margin beside an occluder in which its own edge and its blur lie."""
-HALF = 1.5
+HALF_HIDDEN = 1.5
 """Factor on the size from which a hole that is half occluded is found: 2 finds little more and
 takes three times as long."""
-UNSEEN = 3.0
+UNSEEN_SIZES = 3.0
 """Sizes of a hole across which a face may go on where depth is unknown: beside an arm, in the part
 that only one camera sees."""
 SIZE_PERCENTILES = 2.0, 98.0
@@ -72,7 +72,7 @@ class SearchLevel:
         if self.sizes_px is None:
             return None
         # An ellipse may lie on the border of two depths; one of them must allow its size.
-        reach = AROUND * one.a
+        reach = DEPTH_REACH * one.a
         rows = slice(max(0, int((one.y - reach) / STEP)), int((one.y + reach) / STEP) + 1)
         columns = slice(max(0, int((one.x - reach) / STEP)), int((one.x + reach) / STEP) + 1)
         near = self.sizes_px[rows, columns]
@@ -157,7 +157,7 @@ def plan_search_levels(
     depth = frame.depth_m[STEP // 2 :: STEP, STEP // 2 :: STEP]
     inside = mask[STEP // 2 :: STEP, STEP // 2 :: STEP]
     known = inside & np.isfinite(depth)
-    if np.count_nonzero(known) < LEAST:
+    if np.count_nonzero(known) < LEAST_CELLS:
         # Without depth any size is possible, so the whole block is searched at full resolution. A
         # margin of 3 % of the width covers a ragged mask. Chosen by hand; not searched.
         return [SearchLevel(1, _dilate(inside, 0.03 * inside.shape[1]), None)]
@@ -173,11 +173,11 @@ def plan_search_levels(
     before_px = _measure_occluders(seen_px, known)
     # Beside an occluder a hole may show only half of itself: search there in a finer resolution.
     # Dilated by one cell: the border of an occluder falls between two cells.
-    beside = cv2.dilate(np.where(before_px < NOWHERE, before_px, np.float32(0.0)), _make_square(1))
+    beside = cv2.dilate(np.where(before_px < HUGE_PX, before_px, np.float32(0.0)), _make_square(1))
     behind = size_px < beside
-    nearest_m = np.where(before_px < NOWHERE, focal_px * radius_m / before_px, np.float32(0.0))
+    nearest_m = np.where(before_px < HUGE_PX, focal_px * radius_m / before_px, np.float32(0.0))
     found, rest = [], known.copy()
-    shown_px = np.where(behind, size_px / HALF, size_px)
+    shown_px = np.where(behind, size_px / HALF_HIDDEN, size_px)
     # Each octave suits a range of sizes; a cell may suit two of them.
     suited = [
         _select_sizes(shown_px, comfortable_px * 2**octave, octave) for octave in range(OCTAVES)
@@ -187,7 +187,7 @@ def plan_search_levels(
         counts = [np.count_nonzero(rest & one) for one in suited]
         number = max(range(OCTAVES), key=lambda octave: (counts[octave], octave))
         here = rest & suited[number]
-        if np.count_nonzero(here) < LEAST:
+        if np.count_nonzero(here) < LEAST_CELLS:
             break
         # Cells that have found their resolution are not searched again in another.
         rest &= ~here
@@ -212,14 +212,14 @@ def _split_region(
     """
     # The upper percentile and not the maximum: one wrong depth must not enlarge the region.
     reach = float(np.percentile(size_px[here], SIZE_PERCENTILES[1])) * (1.0 + slack) / STEP
-    hidden = (_dilate(here, UNSEEN * reach) > 0) & unknown
+    hidden = (_dilate(here, UNSEEN_SIZES * reach) > 0) & unknown
     # Separate regions get separate ranges of size: two blocks at two distances do not share one.
     count, pieces = cv2.connectedComponents(_dilate(here | hidden, reach))
     found = []
     for piece in range(1, count):
         part = pieces == piece
         some_px = size_px[part & here]
-        if len(some_px) >= LEAST:
+        if len(some_px) >= LEAST_CELLS:
             low, high = np.percentile(some_px, SIZE_PERCENTILES)
             prior = SizePrior(float(low) / (1.0 + slack), float(high) * (1.0 + slack))
             found.append((part.astype(np.uint8), prior))
@@ -244,7 +244,7 @@ def merge_levels_to_box(mask: np.ndarray, whole: Sequence[SearchLevel]) -> list[
 
 
 def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
-    """Return the least size of a hole on an occluder of a face, `(h, w)`, `NOWHERE` for no occluder.
+    """Return the least size of a hole on an occluder of a face, `(h, w)`, `HUGE_PX` for no occluder.
 
     Args:
         seen_px: Size of a hole at each cell, 0 for unknown depth.
@@ -259,12 +259,12 @@ def _measure_occluders(seen_px: np.ndarray, face: np.ndarray) -> np.ndarray:
     # A closing over the size of a hole: depth inside a hole is not that of the face. Only on the
     # face: beyond it nothing but the inside of a half-hidden hole may be in reach.
     around = cv2.dilate(np.where(face, seen_px, np.float32(0.0)), reach)
-    around = cv2.erode(np.where(face & (around > 0), around, np.float32(NOWHERE)), reach)
-    least = np.float32(BEFORE + NOISES * noise) * cv2.erode(
-        np.where(face | (seen_px == 0), around, np.float32(NOWHERE)), _make_square(NEAR)
+    around = cv2.erode(np.where(face & (around > 0), around, np.float32(HUGE_PX)), reach)
+    least = np.float32(OCCLUDER_RATIO + OCCLUDER_SIGMAS * noise) * cv2.erode(
+        np.where(face | (seen_px == 0), around, np.float32(HUGE_PX)), _make_square(OCCLUDER_CELLS)
     )
     there = cv2.dilate((seen_px > least).view(np.uint8), _make_square(1))
-    return np.where(there > 0, least, np.float32(NOWHERE))
+    return np.where(there > 0, least, np.float32(HUGE_PX))
 
 
 def _make_square(reach: int) -> np.ndarray:

@@ -207,7 +207,7 @@ class WatchedHole:
 
 
 class PerceivedTargets:
-    """See `PerceivedTarget` and `brokk_rl.contracts.target.TargetSensor`."""
+    """Rendered cameras, finder and trackers of all environments; a `brokk_rl.contracts.target.TargetSensor`."""
 
     def __init__(
         self, settings: PerceivedTarget, machine: Machine, num_envs: int, seed: int

@@ -68,10 +68,18 @@ def compute_bam_friction(numbers: Mapping[str, float]) -> Friction:
 
 
 def log_pendulum(
-    machine: Machine, friction: Friction, damping: float, seed: int, seconds: float
+    machine: Machine,
+    friction: Friction,
+    damping: float,
+    seed: int,
+    seconds: float,
+    drive: str = '<motor joint="arm"/>',
 ) -> Recording:
-    """Returns a log of a controller of its own on the pendulum; the torque is held over each period."""
-    model, rng = build_model(damping), np.random.default_rng(seed)
+    """Returns a log of a controller of its own on the pendulum; the torque is held over each period.
+
+    `drive`: actuator of the file, whose control is the torque that the controller asks for.
+    """
+    model, rng = build_model(damping, drive), np.random.default_rng(seed)
     data, steps = mujoco.MjData(model), round(seconds / machine.period_s)
     rate, phase = rng.uniform(0.7, 7.0, 4), rng.uniform(0.0, 6.0, 4)
     amplitude = rng.uniform(0.5, 1.2) * np.array([0.55, 0.35, 0.2, 0.1])

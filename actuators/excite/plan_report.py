@@ -161,10 +161,9 @@ def draw_plan(
     machine: Machine,
     tool_speed_m_s: np.ndarray | None,
     path: Path,
-    run: int = 0,
     preview: PreviewResult | None = None,
 ) -> None:
-    """Draw one run as PNG: segments, commands, predicted positions, tool speed, and the preview.
+    """Draw the first run as PNG: segments, commands, predicted positions, tool speed, and the preview.
 
     Args:
         plan: Gives names.
@@ -173,7 +172,6 @@ def draw_plan(
         tool_speed_m_s: Predicted speed of the tool point in this run, `(T,)`, where the geometry is
             known.
         path: Where to write.
-        run: Which of the runs.
         preview: Effects that the plan could tell.
     """
     rows = machine.num_joints + (tool_speed_m_s is not None)
@@ -188,10 +186,10 @@ def draw_plan(
     if preview:
         draw_preview(parts[1], preview, machine)
     minutes = track.t_s / 60.0
-    spans = _find_spans(plan, track, run)
+    spans = _find_spans(plan, track)
     _draw_segments(axes[0], spans)
     for j, axis in enumerate(axes[1 : machine.num_joints + 1]):
-        _draw_joint(axis, minutes, track.q[:, run, j], track.u[:, run, j], machine, j)
+        _draw_joint(axis, minutes, track.q[:, 0, j], track.u[:, 0, j], machine, j)
     if tool_speed_m_s is not None:
         axes[-1].fill_between(minutes, tool_speed_m_s, color="#555555", linewidth=0)
         axes[-1].set_ylabel("tool\nm/s", rotation=0, ha="right", va="center")
@@ -221,15 +219,15 @@ def draw_plan(
     plt.close(whole)
 
 
-def _find_spans(plan: ExcitationPlan, track: PlanTrack, run: int) -> list[dict[str, Any]]:
-    """Return start and end in minutes, name and colour of the ways and the programs of a run."""
-    stage, number = track.stage[:, run], track.segment[:, run]
+def _find_spans(plan: ExcitationPlan, track: PlanTrack) -> list[dict[str, Any]]:
+    """Return start and end in minutes, name and colour of the ways and the programs of the first run."""
+    stage, number = track.stage[:, 0], track.segment[:, 0]
     period_s = float(np.median(np.diff(track.t_s))) if len(track.t_s) > 1 else 0.0
     found = []
     for begin, end in split_stretches(
         number * 4 + np.where(stage > PLAYING, PLAYING, stage) + 2 * (stage == BEFORE)
     ):
-        segment = plan.runs[run][number[begin]]
+        segment = plan.runs[0][number[begin]]
         kind = (segment.repeat_of or segment.name).split("_")[0]
         on_way = stage[begin] == BEFORE
         color = (

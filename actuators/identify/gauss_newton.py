@@ -12,7 +12,7 @@ Axes: `C` candidates, `P` parameters, `J` joints, `W` windows, `K` steps, `D` co
 `P` times `J`.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -108,20 +108,16 @@ class CandidateRuns:
         """Return the numbers, in their own units, at `x` `(…, P, J)`."""
         return self._low + (self._high - self._low) * x
 
-    def errors(
-        self, x: np.ndarray, window: np.ndarray, advance: Callable[[int], None] | None = None
-    ) -> np.ndarray:
+    def errors(self, x: np.ndarray, window: np.ndarray) -> np.ndarray:
         """Return scaled errors for each row of `x` `(C, P, J)`.
 
-        The errors are predicted less measured positions, over the root of time and of `K`.
-
-        An error that grows with the root of time counts the same early and late; sums of squares
+        The errors are predicted less measured positions, over the root of time and of `K`. So an
+        error that grows with the root of time counts the same early and late, and sums of squares
         over `K` are means over time.
 
         Args:
             x: Candidates.
             window: Window of each, `(C,)`.
-            advance: Told how many free runs are done.
 
         Returns:
             `(C, K, J)`, zero where a joint is not active.
@@ -136,8 +132,6 @@ class CandidateRuns:
             )
             scaled = (path - part.measured) / np.sqrt(self._ahead * len(self._ahead))
             found[start : start + WORLDS] = np.where(self.active[rows][:, None], scaled, 0.0)
-            if advance:
-                advance(len(rows))
         return found
 
     def squares(self, x: np.ndarray, windows: np.ndarray | None = None) -> np.ndarray:

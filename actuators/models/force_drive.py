@@ -10,7 +10,7 @@ friction of any size is stable and dry friction brings a joint exactly to rest.
 """
 
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import torch
 
@@ -53,7 +53,7 @@ class ForceDrive:
         outside_load: Dry friction over the weight.
         motor_load_at_rest: The same at rest, beyond that in motion.
         outside_load_at_rest: The same of the weight.
-        motor_load_square: Friction at rest over the square of the motor's force, 1/N.
+        motor_load_square: Friction at rest over the square of the motor's force over `max_force`.
         outside_load_square: The same of the weight.
         spread: Relative half width, by field name, of draws per environment and joint at reset.
     """
@@ -89,6 +89,24 @@ class ForceDrive:
         return ForceDriveModel(self, machine, num_envs, device)
 
 
+class Motor(Protocol):
+    """Circuit of motors that are commanded by their duty."""
+
+    @property
+    def limit(self) -> torch.Tensor:
+        """Largest force, `(J,)`."""
+        ...
+
+    @property
+    def back_emf(self) -> torch.Tensor:
+        """Loss of force over speed, `(J,)`."""
+        ...
+
+    def compute_stall(self, duty: torch.Tensor, speed: torch.Tensor) -> torch.Tensor:
+        """Return the force at standstill, `(N, J)`, N or Nm."""
+        ...
+
+
 class ForceDriveModel:
     """Implicit solution over a control period.
 
@@ -97,6 +115,7 @@ class ForceDriveModel:
             candidates side by side.
         drive_changes: Changes of them by effects, `(N, J)` by name: a factor on the mass, force added to
             the others.
+        motor: Circuit of motors that are commanded by their duty; `None`: a command is a force.
     """
 
     def __init__(
@@ -116,6 +135,7 @@ class ForceDriveModel:
         )
         self.parameters = self._parameters.value
         self.drive_changes: dict[str, torch.Tensor] = {}
+        self.motor: Motor | None = None
         self._period_s = machine.period_s
 
         def tensor(values: object) -> torch.Tensor:
@@ -149,17 +169,16 @@ class ForceDriveModel:
         """Return the joint positions one control period later, shape `(N, J)`."""
         value, period_s = self._change_numbers(), self._period_s
         earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / period_s)
-        motor = torch.lerp(later, earlier, part) * self._max_force
+        command = torch.lerp(later, earlier, part)
         q = history.q[:, -1]
         weight = self._weigh(value, q)
         recent = history.q[:, -len(self._slope) :]
         begun = torch.einsum("h,nhj->nj", self._slope, recent)
         before = torch.where(self._fresh[:, None], begun, self._speed)
         mass = value["mass_kg"]
-        speed = (before + period_s * (motor - weight) / mass) / (
-            1.0 + period_s * value["viscous_n_s_m"] / mass
-        )
-        friction = period_s * compute_dry_friction(value, before, motor, weight) / mass
+        motor, speed = self._solve(value, command, weight, before)
+        states = (before, motor, weight, self._max_force)
+        friction = period_s * compute_dry_friction(value, *states) / mass
         speed = speed.sign() * (speed.abs() - friction).clamp(min=0.0)
         moved = q + 0.5 * period_s * (before + speed)
         low, high = torch.minimum(self._lower, q), torch.maximum(self._upper, q)
@@ -167,6 +186,25 @@ class ForceDriveModel:
         self._speed.copy_(speed.masked_fill(held != moved, 0.0))
         self._fresh.fill_(False)
         return held
+
+    def _solve(
+        self,
+        value: dict[str, torch.Tensor],
+        command: torch.Tensor,
+        weight: torch.Tensor,
+        before: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the force of the motor and the speed at the end of the period, without dry friction."""
+        step, viscous = self._period_s / value["mass_kg"], value["viscous_n_s_m"]
+        if self.motor is None:
+            force = command * self._max_force
+            return force, (before + step * (force - weight)) / (1.0 + step * viscous)
+        stall, back_emf = self.motor.compute_stall(command, before), self.motor.back_emf
+        speed = (before + step * (stall - weight)) / (1.0 + step * (viscous + back_emf))
+        # The force falls with the speed: beyond the limit at this one, it is at the limit.
+        limit = self.motor.limit
+        force = torch.minimum(torch.maximum(stall - back_emf * speed, -limit), limit)
+        return force, (before + step * (force - weight)) / (1.0 + step * viscous)
 
     def _weigh(self, value: dict[str, torch.Tensor], q: torch.Tensor) -> torch.Tensor:
         """Return the force from outside against the positive direction, `(N, J)`."""

@@ -18,7 +18,7 @@ OTHER = "other"
 SUITABLE = {
     "speed": "actuator=lag or another model of a speed",
     "position": "actuator=servo",
-    "torque": "actuator=force",
+    "torque": "actuator=force or dc_motor",
 }
 """Actuators for each interface, as an error names them."""
 COMMANDS = {"speed": "valve or velocity", "position": "position", "torque": "torque with max_force"}

@@ -199,29 +199,29 @@ def calibrate_pair(folder: Path, numbers: Sequence[int]) -> RealRig:
     seen = []
     for number in numbers:
         corners = [find_corners(picture) for picture in read_pair(folder, number)]
-        if corners[0] is not None and corners[1] is not None:
-            seen.append([one.astype(np.float32) for one in corners])
+        known = [one.astype(np.float32) for one in corners if one is not None]
+        if len(known) == len(corners):
+            seen.append(known)
     board = [list_board_points().astype(np.float32)] * len(seen)
     left, right = ([pair[side] for pair in seen] for side in (0, 1))
-    lenses = []
-    for corners in (left, right):
-        lenses += cv2.calibrateCamera(board, corners, SIZE_PX, None, None)[1:3]
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS
-    found = cv2.stereoCalibrate(board, left, right, *lenses, SIZE_PX, flags=flags)
-    error_px, *lenses, rotation, shift_m = found[:7]
-    turns = cv2.stereoRectify(*lenses, SIZE_PX, rotation, shift_m, alpha=0)
-    maps = []
-    for side in (0, 1):
-        lens, turn, projection = lenses[2 * side : 2 * side + 2], turns[side], turns[2 + side]
-        maps.append(cv2.initUndistortRectifyMap(*lens, turn, projection, SIZE_PX, cv2.CV_32FC1))
-    matrix = turns[2][:, :3]
-    return RealRig(
-        (maps[0], maps[1]), matrix, float(-turns[3][0, 3] / matrix[0, 0]), float(error_px)
+    first, second = (
+        cv2.calibrateCamera(board, some, SIZE_PX, np.eye(3), np.zeros(5))[1:3]
+        for some in (left, right)
     )
+    error_px, k1, d1, k2, d2, rotation, shift_m = cv2.stereoCalibrate(
+        board, left, right, *first, *second, SIZE_PX, flags=cv2.CALIB_USE_INTRINSIC_GUESS
+    )[:7]
+    r1, r2, p1, p2 = cv2.stereoRectify(k1, d1, k2, d2, SIZE_PX, rotation, shift_m, alpha=0)[:4]
+    maps = (
+        cv2.initUndistortRectifyMap(k1, d1, r1, p1, SIZE_PX, cv2.CV_32FC1),
+        cv2.initUndistortRectifyMap(k2, d2, r2, p2, SIZE_PX, cv2.CV_32FC1),
+    )
+    return RealRig(maps, p1[:, :3], float(-p2[0, 3] / p1[0, 0]), float(error_px))
 
 
 def measure_board(frame: Frame, pose: PlaneConic) -> dict[str, Any]:
     """Return the errors of the plane around the middle of the board."""
+    assert frame.right is not None
     corners, others = find_corners(frame.color), find_corners(frame.right)
     assert corners is not None
     by_picture = locate_by_picture(corners, frame.camera_matrix)

@@ -118,17 +118,17 @@ def build_collision_geoms(scale: float, radius_m: float) -> BlockGeoms:
     )
 
 
-def build_visual_wall(radius_m: float, num_parts: int = NUM_WALL_PARTS) -> BlockGeoms:
+def build_visual_wall(radius_m: float) -> BlockGeoms:
     """Return thin boxes that make the octagon look like a drilled hole, ending below its rim."""
-    # out to the corners of the square between the slabs
+    # Half the thickness that reaches the corners of the square between the slabs.
     half = radius_m * (np.sqrt(2.0) - 1.0) / 2 + WALL_OVERLAP_M
-    angles = 2 * np.pi * np.arange(num_parts) / num_parts
-    width = (radius_m + 2 * half) * np.tan(np.pi / num_parts)
+    angles = 2 * np.pi * np.arange(NUM_WALL_PARTS) / NUM_WALL_PARTS
+    width = (radius_m + 2 * half) * np.tan(np.pi / NUM_WALL_PARTS)
     depth = HOLE_DEPTH_M / 2
-    size = np.tile([half, width, depth], (num_parts, 1))
+    size = np.tile([half, width, depth], (NUM_WALL_PARTS, 1))
     x, y = (radius_m + half) * np.cos(angles), (radius_m + half) * np.sin(angles)
-    pos = np.stack([x, y, np.full(num_parts, -WALL_RECESS_M - depth)], 1)
-    return BlockGeoms(tuple(f"wall_{i}" for i in range(num_parts)), size, pos, angles)
+    pos = np.stack([x, y, np.full(NUM_WALL_PARTS, -WALL_RECESS_M - depth)], 1)
+    return BlockGeoms(tuple(f"wall_{i}" for i in range(NUM_WALL_PARTS)), size, pos, angles)
 
 
 def add_block(spec: mujoco.MjSpec, visual: bool) -> None:

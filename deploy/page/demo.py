@@ -105,7 +105,7 @@ class DemoMachine:
 
 
 class DemoFeed:
-    """See `deploy.page.protocol.PageFeed`.
+    """Feed of a made-up machine, to try the page; a `deploy.page.protocol.PageFeed`.
 
     Args:
         demo: Settings.

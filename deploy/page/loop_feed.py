@@ -111,7 +111,7 @@ def run(stop: Stop, config: PageProcessConfig, memory: LoopMemory) -> None:
 
 
 class LoopFeed:
-    """See `deploy.page.protocol.PageFeed`.
+    """Feed of the running loop, from its shared memory; a `deploy.page.protocol.PageFeed`.
 
     Args:
         config: Settings.

@@ -102,7 +102,7 @@ class CaptureReplay:
 
 
 class ReplayFeed:
-    """See `deploy.page.protocol.PageFeed`.
+    """Feed of a recorded session; a `deploy.page.protocol.PageFeed`.
 
     Args:
         replay: Settings.

@@ -11,7 +11,13 @@ from deploy.study import permutation_tests
 
 SIZES = (5, 6, 8, 10, 12, 14, 16, 20, 24)
 """Numbers of participants in the table of a plan."""
-EFFECTS_DZ = (0.5, 0.8, 1.2)
+LARGE_DZ = 0.8
+"""A large effect (Cohen 1988), for which a sufficient size is looked for."""
+SUFFICIENT_POWER = 0.8
+"""Share of studies that must find a large effect: the usual four in five."""
+MOST_PARTICIPANTS = 40
+"""Largest size that is tried. Chosen by hand."""
+EFFECTS_DZ = (0.5, LARGE_DZ, 1.2)
 """A medium, a large and a very large effect, in standard deviations of a person's difference."""
 STUDIES, MOST_COUNTED = 1000, 60_000_000
 """Studies drawn for each number and effect, and fewer where there are so many ways to count."""
@@ -64,13 +70,12 @@ def evaluate_size(num: int, alpha: float) -> SampleSize:
     return SampleSize(num, permutation_tests.get_smallest_paired_p(num), smallest, tuple(power))
 
 
-def find_sufficient_size(
-    alpha: float, power: float = 0.8, effect: int = 1, most: int = 40
-) -> int | None:
-    """Return the smallest even number of participants that reaches `power`, or `None`."""
+def find_sufficient_size(alpha: float) -> int | None:
+    """Return the smallest even number of participants that reaches `SUFFICIENT_POWER`, or `None`."""
+    large = EFFECTS_DZ.index(LARGE_DZ)
     # Even numbers: both sequences then have as many people.
-    for num in range(6, most + 1, 2):
-        if evaluate_size(num, alpha).power[effect] >= power:
+    for num in range(6, MOST_PARTICIPANTS + 1, 2):
+        if evaluate_size(num, alpha).power[large] >= SUFFICIENT_POWER:
             return num
     return None
 

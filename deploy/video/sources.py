@@ -49,7 +49,7 @@ class VideoSource(Protocol):
 
 
 class TestPattern:
-    """See `deploy.video.settings.PatternCamera`."""
+    """Test pictures that carry their own time; the source of a `PatternCamera`."""
 
     __test__ = False  # no test, whatever pytest makes of the name
 
@@ -112,7 +112,7 @@ def _list_code_bits(num_ticks: int) -> list[int]:
 
 
 class LoopPictures:
-    """See `deploy.video.settings.LoopCamera`."""
+    """Pictures of the camera beside the loop; the source of a `LoopCamera`."""
 
     def __init__(self, slot: Slot, rate_hz: float) -> None:
         self._slot, self._period_s, self._t_s = slot, 1.0 / rate_hz, 0.0
@@ -133,7 +133,7 @@ class LoopPictures:
 
 
 class OpenedDevice:
-    """See `deploy.video.settings.DeviceCamera`."""
+    """Pictures of a video device; the source of a `DeviceCamera`."""
 
     def __init__(self, device: str, container: str | None, options: dict[str, str]) -> None:
         import av  # pyright: ignore[reportMissingImports]

@@ -133,7 +133,7 @@ SEARCH_SLACK = 1.5
 
 
 class ArcDetector:
-    """See `ContourArcs`.
+    """Detector of ellipses by grouping arcs, with the settings `ContourArcs`.
 
     Args:
         settings: The spec.

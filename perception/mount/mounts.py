@@ -188,7 +188,7 @@ class AxesMount:
 
 
 class AxesMountModel:
-    """See `AxesMount` and `CameraMount`."""
+    """Mount with driven axes at work, with the settings `AxesMount`; a `CameraMount`."""
 
     def __init__(self, settings: AxesMount, machine: Machine) -> None:
         self._settings, self._machine = settings, machine
@@ -268,7 +268,7 @@ class PlacesMount:
 
 
 class PlacesMountModel:
-    """See `PlacesMount` and `CameraMount`; a position is the number of a place, `(1,)`."""
+    """Mount that a person carries between places; a position is the number of a place, `(1,)`."""
 
     def __init__(self, settings: PlacesMount) -> None:
         self._settings = settings

@@ -124,7 +124,7 @@ class ExpectedCovariance:
 
 
 class ViewPlanner:
-    """See `ExpectedCovariance`."""
+    """Planner that chooses the view with the smallest `ExpectedCovariance` of the hole."""
 
     def __init__(
         self,

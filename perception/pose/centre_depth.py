@@ -35,7 +35,7 @@ class CentreDepth:
 
 
 class CentreDepthEstimator:
-    """See `CentreDepth`."""
+    """The paper's estimator: depth at the centre and the normals around, with the settings `CentreDepth`."""
 
     NUM_NORMALS = 8
 

@@ -37,7 +37,7 @@ class MonoCircle:
 
 
 class MonoCircleEstimator:
-    """See `MonoCircle`."""
+    """Estimator that uses the known diameter alone, with the settings `MonoCircle`."""
 
     def __init__(self, settings: MonoCircle) -> None:
         self.settings = settings

@@ -28,6 +28,9 @@ DEGENERATE = 1e12
 LEAST, FEWEST = 60, 8
 """Least number of points of a plane; cells from which its covariance is estimated, below which
 bands of rows take their place. Chosen by hand."""
+NUM_TRIALS, NUM_JUDGES = 40, 400
+"""Planes through three random points that are tried for a first guess, and points that judge them:
+as many judge as well as all points do."""
 
 
 @dataclass(frozen=True)
@@ -241,12 +244,11 @@ def compute_upper_median(values: np.ndarray) -> float:
 
 
 def _guess_plane(
-    rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator, trials: int = 40
+    rays: np.ndarray, inverse: np.ndarray, generator: np.random.Generator
 ) -> np.ndarray:
     """Return the plane through three points with the least median residual (Rousseeuw 1984)."""
-    # 400 points judge a plane as well as all do.
-    judge = generator.integers(len(rays), size=min(len(rays), 400))
-    triples = generator.integers(len(rays), size=(trials, 3))
+    judge = generator.integers(len(rays), size=min(len(rays), NUM_JUDGES))
+    triples = generator.integers(len(rays), size=(NUM_TRIALS, 3))
     # Points nearly on a line determine no plane.
     triples = triples[np.abs(np.linalg.det(rays[triples])) > 1e-9]
     if not len(triples):

@@ -27,9 +27,9 @@ LEAST_INSIDE, LEAST_POWER, SMOOTH_PX = 60, 0.1, 1.5
 """Least pixels inside and on the face; least sum of squares of the expected light, in pixels that
 are fully lit; blur before the darkest quarter is taken, px. Chosen by hand."""
 WALL_SKY, DISC_SKY = (0.27, 0.13), (0.0, 0.035)
-"""Mean and standard deviation of the share of the sky on the wall of holes and on flat discs in dust, for 120
-holes and 232 discs at 1 to 4 m of seed 1001 of benchmarks/perception/dust.py; half of them give
-the same within 0.02."""
+"""Mean and standard deviation of the share of the sky on the wall of holes and on flat discs in
+dust, for 120 holes and 232 discs at 1 to 4 m of seed 1001 of benchmarks/perception/dust.py; half of
+them give the same within 0.02."""
 SUN_DIRECTIONS, SUN_HEIGHTS = 24, (0.15, 0.3, 0.6, 1.0, 1.7, 3.0)
 """Directions of the sun around the axis that are tried, and tangents of its height over the face."""
 SUN_PX, MOST_PIXELS, LEAST_LIT = 1.0, 1500, 0.002
@@ -37,8 +37,8 @@ SUN_PX, MOST_PIXELS, LEAST_LIT = 1.0, 1500, 0.002
 square of the expected light: a few lit pixels are an accident of the noise. Chosen by hand."""
 WALL_SUN, DISC_SUN = (-1.78, 0.60), (-2.86, 0.57)
 """Mean and standard deviation of the logarithm of the share of the sun: the best of all directions
-is above 0 on discs too. Of 187 holes and 166 discs at 1 to 4 m of seed 1001, both sensors, with
-bounced light."""
+is above 0 on discs too. Of 187 holes and 166 discs at 1 to 4 m in the first 12 scenes of seed 1001,
+both sensors, bounced light, with two or three holes in a scene instead of one."""
 WALL_EXPLAINED, DISC_EXPLAINED = (-1.35, 0.68), (-2.49, 0.86)
 """The same of the part of the variance that the sun explains."""
 

@@ -271,11 +271,10 @@ def draw_material(
     texel_m: float,
     generator: np.random.Generator,
     tint: float = 0.06,
-    texture: int | None = None,
 ) -> Material:
     """Return a material of about this brightness, of a random pattern and a slight tint."""
     color = brightness * (1.0 + tint * generator.standard_normal(3))
-    pattern = int(generator.integers(NUM_TEXTURES)) if texture is None else texture
+    pattern = int(generator.integers(NUM_TEXTURES))
     shift = tuple(generator.uniform(0, TEXTURE_SIDE, 2))
     red, green, blue = np.clip(color, 0.01, 0.95)
     return Material(

@@ -79,7 +79,7 @@ class _Track:
 
 
 class FusionTracker:
-    """See `VarianceFusion`."""
+    """Tracks of the known boreholes, averaged with the settings `VarianceFusion`."""
 
     def __init__(self, settings: VarianceFusion) -> None:
         self.settings = settings
