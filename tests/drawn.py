@@ -30,9 +30,8 @@ def drawn(
     along, start = RAYS @ AXIS, hit
     across = RAYS - along[..., None] * AXIS
     a, b = (across**2).sum(-1), (across * start).sum(-1)
-    reach = (
-        -b + np.sqrt(np.maximum(b * b - a * ((start**2).sum(-1) - radius_m**2), 0))
-    ) / a  # where the wall is hit
+    # Where the wall is hit.
+    reach = (-b + np.sqrt(np.maximum(b * b - a * ((start**2).sum(-1) - radius_m**2), 0))) / a
     deep = np.minimum(-reach * along, depth_m)
     if depth_m:
         gray[inside] = (120 * np.exp(-deep / 0.04))[inside]

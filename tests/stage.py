@@ -373,9 +373,8 @@ class Stage:
         """Goes the operator's way until the machine moves; where nothing is sent, until there is an advice."""
         self.fault("none")
         self._times += 1
-        side = 1 - 2 * (
-            self._times % 2
-        )  # to and fro: no joint comes to its end, no policy to its goal
+        # To and fro: no joint comes to its end, no policy to its goal.
+        side = 1 - 2 * (self._times % 2)
         self.air.broken, self.air.echo, self.request_s = False, False, 0.05
         self.bridge.clear()
         self.supervised, self.meddle = True, None

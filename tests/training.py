@@ -86,9 +86,8 @@ def train(
     runner, book = make(machine, folder, training)
     with book:
         if resume:
-            torch.manual_seed(
-                999
-            )  # whatever happened in this process before, the checkpoint knows better
+            # Whatever happened in this process before, the checkpoint knows better.
+            torch.manual_seed(999)
             runner.load(str(resume))
         runner.run()
     return runner

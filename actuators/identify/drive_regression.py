@@ -217,7 +217,8 @@ class _JointRegression:
         sizes = np.append(force / size, [force, force])
         self._size = dict(zip(LINEAR, sizes.tolist(), strict=True))
         self._size |= {"stribeck_n": force, "stribeck_m_s": STRIBECK_SPEED * self._max_speed}
-        self._size |= {name: 1.0 / force if "square" in name else 1.0 for name in LOADS}
+        self._full = torch.tensor(float(machine.max_force[j]), dtype=torch.float64)
+        self._size |= dict.fromkeys(LOADS, 1.0)
 
     def start(self) -> dict[str, float]:
         """Return numbers to begin at: those by linear least squares, a tenth of the friction for other terms."""
@@ -299,7 +300,8 @@ class _JointRegression:
             weight = given.get("offset_n", 0.0)
             weight = weight + given.get("pose_sin_n", 0.0) * sin
             weight = weight + given.get("pose_cos_n", 0.0) * cos
-            states = (motion.speed, motion.force, weight)
-            dry = compute_dry_friction(value, *(torch.from_numpy(one) for one in states))
+            speed, motor = torch.from_numpy(motion.speed), torch.from_numpy(motion.force)
+            outside = torch.as_tensor(weight, dtype=torch.float64)
+            dry = compute_dry_friction(value, speed, motor, outside, self._full)
             parts.append(motion.filter(np.sign(motion.speed) * dry.numpy()))
         return np.concatenate(parts)

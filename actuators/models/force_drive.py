@@ -53,7 +53,7 @@ class ForceDrive:
         outside_load: Dry friction over the weight.
         motor_load_at_rest: The same at rest, beyond that in motion.
         outside_load_at_rest: The same of the weight.
-        motor_load_square: Friction at rest over the square of the motor's force, 1/N.
+        motor_load_square: Friction at rest over the square of the motor's force over `max_force`.
         outside_load_square: The same of the weight.
         spread: Relative half width, by field name, of draws per environment and joint at reset.
     """
@@ -177,7 +177,8 @@ class ForceDriveModel:
         before = torch.where(self._fresh[:, None], begun, self._speed)
         mass = value["mass_kg"]
         motor, speed = self._solve(value, command, weight, before)
-        friction = period_s * compute_dry_friction(value, before, motor, weight) / mass
+        states = (before, motor, weight, self._max_force)
+        friction = period_s * compute_dry_friction(value, *states) / mass
         speed = speed.sign() * (speed.abs() - friction).clamp(min=0.0)
         moved = q + 0.5 * period_s * (before + speed)
         low, high = torch.minimum(self._lower, q), torch.maximum(self._upper, q)

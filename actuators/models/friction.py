@@ -7,8 +7,9 @@ Actuators", ICRA 2025. With the force `f` of the motor, the force `w` against it
     coulomb + |motor_load f + outside_load w|
         + rest (stribeck + |motor_load_at_rest f + outside_load_at_rest w| + square)
 
-and viscous friction beside it. `square` is `outside_load_square w^2` where the motor pushes harder than
-the weight, `motor_load_square f^2` where the weight does, and 0 where both push the same way.
+and viscous friction beside it. `square` is `outside_load_square w^2 / full` where the motor pushes harder
+than the weight, `motor_load_square f^2 / full` where the weight does, and 0 where both push the same way;
+`full` is the force at full command, so that all loads are without unit.
 
     M1  coulomb, viscous          M2  and stribeck
     M3  M1 and equal loads        M4  M2, M3 and equal loads at rest
@@ -34,6 +35,7 @@ def compute_dry_friction(
     speed: torch.Tensor,
     motor: torch.Tensor,
     outside: torch.Tensor,
+    full: torch.Tensor,
 ) -> torch.Tensor:
     """Return the largest dry friction, N or Nm; all arrays have one shape, or broadcast to it.
 
@@ -42,6 +44,7 @@ def compute_dry_friction(
         speed: Speed, m/s or rad/s.
         motor: Force of the motor in the positive direction, N or Nm.
         outside: Force from outside against the positive direction.
+        full: Force at full command.
     """
     rest = torch.exp(-((speed.abs() / value["stribeck_m_s"]) ** value["stribeck_power"]))
     moving = (value["motor_load"] * motor + value["outside_load"] * outside).abs()
@@ -51,5 +54,5 @@ def compute_dry_friction(
         value["outside_load_square"] * outside.square(),
         value["motor_load_square"] * motor.square(),
     )
-    square = square * (motor * outside > 0.0)  # they push against each other
+    square = square / full * (motor * outside > 0.0)  # they push against each other
     return value["coulomb_n"] + moving + rest * (value["stribeck_n"] + standing.abs() + square)

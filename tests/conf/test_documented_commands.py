@@ -198,9 +198,8 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     package = projects / "mine/mine"
     with pytest.MonkeyPatch.context() as patch:
         files = {str(path.relative_to(package)): path.read_text() for path in package.rglob("*.*")}
-        files["conf/machine/arm.yaml"] = files[
-            "conf/machine/two_links.yaml"
-        ]  # made in the tutorial
+        # Made in the tutorial.
+        files["conf/machine/arm.yaml"] = files["conf/machine/two_links.yaml"]
         install_package(site, "mine", files, patch)
         extensions.register_options([])
         patch.chdir(projects)

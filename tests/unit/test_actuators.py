@@ -257,9 +257,8 @@ def test_oil_warms_with_work_and_speeds_the_machine_up(machine: Machine) -> None
     history.u[:] = held(machine, 13, q1=1.0)[:, 0]
     early = float((model.step(history) - history.q[:, -1])[0, 0])
     steps = [float((model.step(history) - history.q[:, -1])[0, 0]) for _ in range(200)]
-    assert model.state["oil_c"].item() == pytest.approx(
-        20.0 + 45.0 * 0.4, abs=0.5
-    )  # q1 takes 0.4 of the pump
+    # q1 takes 0.4 of the pump.
+    assert model.state["oil_c"].item() == pytest.approx(20.0 + 45.0 * 0.4, abs=0.5)
     assert steps[-1] > early
     assert steps[-1] / steps[40] > 1.005
 
@@ -321,13 +320,8 @@ def test_an_unknown_spread_lists_the_choices(machine: Machine) -> None:
 
 def test_a_table_by_joint_needs_every_joint_or_other(machine: Machine) -> None:
     assert expand_per_joint({"q2": 2, "other": 1}, machine, "x").tolist() == [1, 2, 1, 1, 1]
-    assert expand_per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [
-        1,
-        1,
-        1,
-        1,
-        1,
-    ]  # a table for several machines
+    # A table for several machines.
+    assert expand_per_joint({"boom": 9, "other": 1}, machine, "x").tolist() == [1, 1, 1, 1, 1]
     with pytest.raises(ConfigError, match="x: no value for q1, q3, q4, q5"):
         expand_per_joint({"q2": 2.0}, machine, "x")
     with pytest.raises(ConfigError, match="x: 'q6' is no joint"):

@@ -144,11 +144,8 @@ def test_the_shipped_machine_at_rest_stays_at_rest(name: str, machine: Machine) 
         torch.as_tensor(bound, dtype=torch.float32) for bound in (machine.lower, machine.upper)
     )
     q = lower + (upper - lower) * torch.rand(num_envs, 5, generator=generator)
-    for level in (
-        0.0,
-        0.03,
-        -0.03,
-    ):  # half of the smallest dead band of the plant; close to it the fit is a few mrad worse
+    # Half of the smallest dead band of the plant; close to it the fit is a few mrad worse.
+    for level in (0.0, 0.03, -0.03):
         model = actuator.build(machine, num_envs, CPU)
         history = History(q=torch.zeros(num_envs, 13, 5), u=torch.zeros(num_envs, 13, 5))
         history.reset(torch.ones(num_envs, dtype=torch.bool), q)

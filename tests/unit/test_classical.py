@@ -178,9 +178,8 @@ def test_errors_are_told_in_the_plane_of_the_arm(machine: Machine) -> None:
     found = classical.guide(
         *at_rest(q, machine), tip + torch.tensor([[0.1, 0.2, 0.3]]), torch.tensor([1.57]), RANGE_M
     )
-    assert found.error_m[0].tolist() == pytest.approx(
-        [0.2, -0.1, 0.3], abs=1e-5
-    )  # radial, tangential, up
+    # radial, tangential, up
+    assert found.error_m[0].tolist() == pytest.approx([0.2, -0.1, 0.3], abs=1e-5)
 
 
 def test_the_block_solver_agrees_with_torch() -> None:

@@ -287,9 +287,8 @@ def test_a_real_clock_is_waited_for_and_a_gap_begins_a_new_file(
     files = list(made(tmp_path / "run", machine).values())
     first, last = files[0], files[-1]
     assert first.metadata["run"] == last.metadata["run"] and first is not last
-    periods_s = np.concatenate(
-        [np.diff(file.t_s) for file in files]
-    )  # busy computers come late more than once
+    # Busy computers come late more than once.
+    periods_s = np.concatenate([np.diff(file.t_s) for file in files])
     assert (
         np.median(periods_s) == pytest.approx(0.05, abs=0.006) and len(np.unique(periods_s)) > 3
     ), "as measured"

@@ -84,9 +84,8 @@ def operator(stop: threading.Event, wire: CanBus, port: int, machine: Machine) -
                 if frame is not None:
                     remote.hear(frame, time.monotonic())
             pace.begin()
-            t_s = (
-                time.monotonic() - begun_s
-            ) % 9.6  # first q1, q3, q4 and q5 together, then q2 with the button
+            # First q1, q3, q4 and q5 together, then q2 with the button.
+            t_s = (time.monotonic() - begun_s) % 9.6
             remote.deadman = 0.5 < t_s % 2 < 1.0
             if int(t_s) % 4 == 1 and not asked:
                 with contextlib.suppress(TimeoutError):

@@ -128,12 +128,8 @@ def test_a_replay_says_what_was_recorded_in_its_own_time_and_sends_nothing(tmp_p
     with BusReplay(path=str(path), speed=2.0).open() as one:
         one.send(CanFrame(0x200, b""))
         found = [one.recv(0.5) for _ in range(4)]
-        assert [frame.frame_id for frame in found if frame] == [
-            0x100,
-            0x101,
-            0x102,
-            0x104,
-        ]  # what was sent from here is left out
+        # What was sent from here is left out.
+        assert [frame.frame_id for frame in found if frame] == [0x100, 0x101, 0x102, 0x104]
         with pytest.raises(LinkError, match="over"):
             one.recv(0.5)
 

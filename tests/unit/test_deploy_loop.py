@@ -150,13 +150,11 @@ def test_valves_that_say_nothing_more_empty_the_ring(machine: Machine) -> None:
 def test_levers_are_those_of_the_paper(machine: Machine) -> None:
     levers = LeverMap(machine.levers, machine)
     angles, button = levers.levers(np.array([0.1, 0.0, 0.3, 0.4, 0.5]))
-    assert (
-        angles == pytest.approx([0.35 * 0.4, 0.35 * 0.1, 0.35 * 0.3, 0.35 * 0.5]) and not button
-    )  # left q4, q1; right q3, q5
+    # Left q4, q1; right q3, q5.
+    assert angles == pytest.approx([0.35 * 0.4, 0.35 * 0.1, 0.35 * 0.3, 0.35 * 0.5]) and not button
     angles, button = levers.levers(np.array([0.0, -0.6, 0.0, 0.0, 0.0]))
-    assert (
-        angles == pytest.approx([0.0, 0.0, -0.21, 0.0]) and button
-    )  # q2 on the right lever, with the button
+    # q2 on the right lever, with the button.
+    assert angles == pytest.approx([0.0, 0.0, -0.21, 0.0]) and button
 
 
 @pytest.mark.parametrize("name", ["machine", "iso", "sae"])

@@ -88,9 +88,10 @@ def test_a_capture_becomes_the_recording_of_what_happened(machine: Machine, tmp_
     assert again.rate_hz == 20.0 and again.num_samples == pytest.approx(59, abs=2)
     assert again.q[:, 0] == pytest.approx(0.1 * again.t_s, abs=1e-3)
     step = int(np.flatnonzero(again.u[:, 0] > 0)[0])
+    # Part of that period.
     assert again.t_s[step] == pytest.approx(1.0) and again.u[step, 0] == pytest.approx(
         0.2, abs=0.11
-    )  # part of that period
+    )
     assert (again.u[step + 1 :, 0] == pytest.approx(0.5)) and not again.u[:, 1].any()
     assert again.extra["oil_c"] == pytest.approx(35.0) and np.isnan(again.extra["advice_q1"][5])
     assert (
@@ -136,9 +137,8 @@ def test_nothing_that_was_flushed_is_lost_when_the_log_is_killed(
     log = write(tmp_path, machine, close=False)  # never closed, as after SIGKILL
     contents = capture_reader.read_capture(tmp_path / MCAP)
     positions = contents.messages["JointPos1"]
-    assert (
-        not contents.whole and positions[-1][0] - positions[0][0] >= 2.49
-    )  # flushed last at 2.5 s
+    # Flushed last at 2.5 s.
+    assert not contents.whole and positions[-1][0] - positions[0][0] >= 2.49
     frames = list(capture_reader.iterate_blf_frames(tmp_path / BLF))
     assert (
         frames[-1].timestamp - frames[0].timestamp >= 2.49

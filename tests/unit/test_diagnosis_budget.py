@@ -80,9 +80,8 @@ def test_a_slewing_error_moves_the_tip_along_its_circle(machine: Machine) -> Non
         .tip_in_base_m.tolist()
     )
     found = measure_tip_error(turned, machine)
-    assert found.tip_rms_m == pytest.approx(
-        2.0 * np.sin(0.005) * np.hypot(x, y), rel=1e-3
-    )  # a chord
+    # A chord.
+    assert found.tip_rms_m == pytest.approx(2.0 * np.sin(0.005) * np.hypot(x, y), rel=1e-3)
     assert found.joint_rms_m["q1"] == pytest.approx(0.01 * np.hypot(x, y), rel=1e-3)
     assert found.joint_part["q1"] == pytest.approx(1.0) and found.joint_rms_m["q3"] == 0.0
 

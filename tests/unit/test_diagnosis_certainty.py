@@ -82,9 +82,8 @@ def test_what_is_left_is_traced_to_what_it_depends_on(
     residuals = moving(machine, random)
     motion = residual_model.SimulatedMotion(residuals, 2)
     column, own = error(motion).ravel(), motion.own.ravel()
-    column = (
-        column if clue in residual_model.FORMS else column - own * (own @ column) / (own @ own)
-    )  # another gain is form
+    # Another gain is form.
+    column = column if clue in residual_model.FORMS else column - own * (own @ column) / (own @ own)
     z = random.standard_normal((machine.num_joints, column.size))
     z[2] += 0.5 * column / column.std()
     earned = residual_model.score_clues(residuals, z)
@@ -96,15 +95,13 @@ def test_what_is_left_is_traced_to_what_it_depends_on(
 def test_work_is_remembered_from_window_to_window_of_a_recording_and_no_further(
     machine: Machine,
 ) -> None:
-    motion = residual_model.SimulatedMotion(
-        moving(machine, np.random.default_rng(6), windows=4), 2
-    )  # two windows a recording
+    # Two windows a recording.
+    motion = residual_model.SimulatedMotion(moving(machine, np.random.default_rng(6), windows=4), 2)
     worked = np.zeros((4, 20))
     worked[0, 19] = 1.0
     found = motion.faded(worked, 0.5)
-    np.testing.assert_allclose(
-        found[1], 0.5 ** np.arange(1, 21), rtol=1e-12
-    )  # half is new, and half of that is kept
+    # Half is new, and half of that is kept.
+    np.testing.assert_allclose(found[1], 0.5 ** np.arange(1, 21), rtol=1e-12)
     assert not found[[0, 2, 3]].any()
 
 
@@ -155,11 +152,12 @@ def test_the_error_of_a_form_is_added_to_that_of_a_size() -> None:
     low, size, high = calibration.widen_interval(
         np.array([0.5 - 1.96 * 0.03, 0.5, 0.5 + 1.96 * 0.03]), 0.08
     )
+    # 3, 4, 5
     assert (
         size == 0.5
         and high - size == pytest.approx(1.96 * 0.05)
         and size - low == pytest.approx(1.96 * 0.05)
-    )  # 3, 4, 5
+    )
 
 
 def test_weights_of_signs_are_those_that_made_the_truth() -> None:
@@ -175,9 +173,8 @@ def test_weights_of_signs_are_those_that_made_the_truth() -> None:
     begin = {"constant": 0.0, "margin": 0.5, "names": 1.0}
     found = fit_logistic(signs, true, begin)
     assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
-    few = fit_logistic(
-        signs[:4], true[:4], begin
-    )  # a handful of answers changes little but how often anything is true
+    # A handful of answers changes little but how often anything is true.
+    few = fit_logistic(signs[:4], true[:4], begin)
     assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
 
 

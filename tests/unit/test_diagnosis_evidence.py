@@ -102,9 +102,8 @@ def test_what_an_effect_earns_is_its_bayes_factor() -> None:
         z = size * column + random.standard_normal(400)
         fine = np.linspace(-2.0, 2.0, 4001)
         likely = -compute_loss(z[:, None] - fine * column[:, None], 0) + compute_loss(z)
-        whole = np.trapezoid(
-            np.exp(likely - 0.5 * fine**2) / np.sqrt(2.0 * np.pi), fine
-        )  # over the prior of the size
+        # Over the prior of the size.
+        whole = np.trapezoid(np.exp(likely - 0.5 * fine**2) / np.sqrt(2.0 * np.pi), fine)
         assert score_responses(fit_faults(z, []), [line(column)])[0].sum() == pytest.approx(
             np.log(whole), abs=0.25
         )
@@ -121,9 +120,8 @@ def test_an_effect_that_is_not_there_earns_less_than_nothing() -> None:
 def test_what_begins_at_a_threshold_is_found_beside_another() -> None:
     random = np.random.default_rng(12)
     a, b = 2.0 * random.standard_normal((2, 800))
-    z = (
-        0.8 * a + 0.16 * 6.0 * b + random.standard_normal(800)
-    )  # size 0.66 of the second, 0.7 of which is below its threshold
+    # Size 0.66 of the second, 0.7 of which is below its threshold.
+    z = 0.8 * a + 0.16 * 6.0 * b + random.standard_normal(800)
     table = joint(z, {"a": [line(a)], "b": [bend(6.0 * b)]})
     both, alone = (
         table.score(frozenset("ab")),
@@ -164,9 +162,8 @@ def test_two_joints_with_the_same_cause_get_one_name_where_another_would_hardly_
     z = columns + random.standard_normal(columns.shape)
     tables = []
     for j, (own, like) in enumerate(zip(columns, near, strict=True)):
-        names = (
-            ("a", "b") if j == 0 else ("b", "a")
-        )  # on the second joint b is a little nearer to the truth
+        # On the second joint b is a little nearer to the truth.
+        names = ("a", "b") if j == 0 else ("b", "a")
         tables.append(joint(z[j], {names[0]: [line(own)], names[1]: [line(like)]}))
         tables[-1].explore({"a": 5.0, "b": 5.0}, 3)
     chosen = choose_set(tables, lambda j, subset: 5.0 * len(subset), 2.0, 0.1)
@@ -210,10 +207,8 @@ def test_a_cause_that_all_joints_share_may_earn_little_on_each() -> None:
 def test_a_cause_that_all_joints_share_gets_the_size_that_most_of_them_have(
     machine: Machine,
 ) -> None:
-    random, sizes = (
-        np.random.default_rng(10),
-        (0.5, 0.55, 0.45, 2.0, 0.5),
-    )  # the fourth joint has another effect too
+    # The fourth joint has another effect too.
+    random, sizes = (np.random.default_rng(10), (0.5, 0.55, 0.45, 2.0, 0.5))
     columns = random.standard_normal((5, 800))
     tables = [
         joint(size * x + random.standard_normal(800), {"clock_offset": [line(x)]})
@@ -284,9 +279,8 @@ def test_an_effect_that_rings_is_simulated_at_sizes_so_close_that_those_between_
         return np.exp(-0.12 * w * t_s) * np.sin(w * t_s)
 
     def in_step(sizes: np.ndarray) -> float:
-        between = np.sqrt(
-            sizes[1:] * sizes[:-1]
-        )  # what is shorter than four samples cannot be seen to ring
+        # What is shorter than four samples cannot be seen to ring.
+        between = np.sqrt(sizes[1:] * sizes[:-1])
         seen = number.typical * between > 4 * machine.period_s
         told = (ringing(sizes)[1:] + ringing(sizes)[:-1]) / 2.0
         return min(

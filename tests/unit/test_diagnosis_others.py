@@ -262,10 +262,8 @@ def test_delays_err_as_they_do_where_no_frame_is_late() -> None:
     found = timing.DelayErrorModel.of(
         [timing.FrameDelays(1.2 * error * random.standard_t(5.0, 4000), error, np.zeros(4000))]
     )
-    assert found.scale == pytest.approx(1.15, abs=0.11) and found.freedom in (
-        5.0,
-        7.0,
-    )  # a little is what all timing is off by
+    # A little is what all timing is off by.
+    assert found.scale == pytest.approx(1.15, abs=0.11) and found.freedom in (5.0, 7.0)
     seen = timing.FrameDelays(np.repeat([0.0, 1.0], [90, 10]), np.full(100, 0.1), np.zeros(100))
     assert (
         found.gain(seen, np.repeat([0.0, 1.0], [9, 1]))

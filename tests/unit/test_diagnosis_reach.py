@@ -52,9 +52,8 @@ def test_the_part_of_an_effect_has_an_interval() -> None:
         name: bootstrap.summarise_draws(values)
         for name, values in gap.compute_shapley(["a", "b"], lambda some: value[some]).items()
     }
-    assert found["a"].mean == pytest.approx(0.6) and found["b"].mean == pytest.approx(
-        0.3
-    )  # (0.5 + 0.7) / 2, (0.2 + 0.4) / 2
+    # (0.5 + 0.7) / 2, (0.2 + 0.4) / 2.
+    assert found["a"].mean == pytest.approx(0.6) and found["b"].mean == pytest.approx(0.3)
     assert found["a"].ci95[0] < 0.6 < found["a"].ci95[1]
 
 
@@ -124,9 +123,8 @@ def test_a_dead_band_and_a_saturation_far_beyond_the_typical_are_fitted_together
         for kind in effect_library.load_effects(axis, ["dead_band", "saturation"])
     }
     all_rays = [ray for name in sorted(ways) for ray in ways[name]]
-    known = np.array(
-        [[2.5], [2.5], [0.0]]
-    )  # a dead band of 0.15, as a search that adds effects up would begin with
+    # A dead band of 0.15, as a search that adds effects up would begin with.
+    known = np.array([[2.5], [2.5], [0.0]])
     sizes = refine.search_sizes(
         residuals, all_rays, np.ones((3, 1), bool), known, np.random.default_rng(0)
     )

@@ -100,9 +100,8 @@ def test_two_errors_share_the_gap_as_their_squares_do(machine: Machine) -> None:
     )
     both = replace(quiet, simulated=one.simulated + other.simulated - quiet.simulated)
     squares = [np.nansum(runs.error**2) for runs in (one, other)]
-    found = located(
-        both, None, machine
-    )  # with a floor, one standard error of chance would be taken off
+    # With a floor, one standard error of chance would be taken off.
+    found = located(both, None, machine)
     assert found.joints["q2"].gap == pytest.approx(squares[0] / sum(squares))
     assert found.joints["q4"].gap == pytest.approx(squares[1] / sum(squares))
     parts = {(p.joint, p.category): p.gap for p in found.parts["regime"]}

@@ -47,19 +47,31 @@ def arm() -> Machine:
         ({"motor_load": 0.1, "outside_load": 0.1}, 3.0, 1.0, 9.0, 0.5 + 0.1 * 4.0),
         ({"motor_load": 0.1, "outside_load": 0.3}, 3.0, -1.0, 9.0, 0.5),
         ({"motor_load_at_rest": 0.1, "outside_load_at_rest": 0.2}, 3.0, 1.0, 0.0, 0.5 + 0.5),
-        ({"outside_load_square": 0.1, "motor_load_square": 7.0}, 3.0, 2.0, 0.0, 0.5 + 0.1 * 4.0),
-        ({"outside_load_square": 7.0, "motor_load_square": 0.1}, 2.0, 3.0, 0.0, 0.5 + 0.1 * 4.0),
+        (
+            {"outside_load_square": 0.1, "motor_load_square": 7.0},
+            3.0,
+            2.0,
+            0.0,
+            0.5 + 0.1 * 4.0 / 2.0,
+        ),
+        (
+            {"outside_load_square": 7.0, "motor_load_square": 0.1},
+            2.0,
+            3.0,
+            0.0,
+            0.5 + 0.1 * 4.0 / 2.0,
+        ),
         ({"outside_load_square": 7.0, "motor_load_square": 7.0}, 2.0, -3.0, 0.0, 0.5),
     ],
 )
 def test_friction_under_load_is_that_of_the_paper(
     numbers: dict[str, float], motor: float, outside: float, speed: float, expected: float
 ) -> None:
-    """M1 to M6 by hand: a Stribeck speed of 0.2, and loads that oppose each other where both are positive."""
+    """M1 to M6 by hand: a Stribeck speed of 0.2, 2 N at full command; both loads positive push against each other."""
     value = {"coulomb_n": 0.5, "stribeck_n": 0.0, "stribeck_m_s": 0.2, "stribeck_power": 1.0}
     value |= dict.fromkeys(LOADS, 0.0) | numbers
     tensors = {name: torch.tensor(one) for name, one in value.items()}
-    found = compute_dry_friction(tensors, *map(torch.tensor, (speed, motor, outside)))
+    found = compute_dry_friction(tensors, *map(torch.tensor, (speed, motor, outside, 2.0)))
     assert float(found) == pytest.approx(expected)
 
 

@@ -147,10 +147,8 @@ def test_the_neutral_value_changes_nothing(
 def test_the_typical_value_changes_something(name: str, machine: Machine) -> None:
     build = shipped("actuator", "ideal").build
     u = commands(machine, 60, 2)
-    seldom = {
-        "frame_loss": {"probability": 0.5},
-        "stiction": {"start": 0.5},
-    }  # seldom seen at their typical size
+    # Seldom seen at their typical size.
+    seldom = {"frame_loss": {"probability": 0.5}, "stiction": {"start": 0.5}}
     model = effect(name, **seldom.get(name, {})).wrap(build(machine, 2, CPU), machine, 2, CPU)
     expected, path = roll(build(machine, 2, CPU), machine, u), roll(model, machine, u)
     seen = model.measure(path[-1])
@@ -207,9 +205,8 @@ def test_ranges_are_drawn_anew_at_each_reset_for_each_environment(
         if low < high:
             assert (value[:200] != before[key][:200]).float().mean() > 0.99
             assert value.mean().item() == pytest.approx((low + high) / 2, abs=0.15 * (high - low))
-            assert value.std().item() == pytest.approx(
-                (high - low) / math.sqrt(12), rel=0.2
-            )  # uniform
+            # As of a uniform distribution.
+            assert value.std().item() == pytest.approx((high - low) / math.sqrt(12), rel=0.2)
             assert len(value.unique()) > 0.99 * value.numel()
 
 
@@ -330,9 +327,8 @@ def test_gradients_agree_with_candidates_side_by_side(name: str, machine: Machin
         if not number.is_on(machine):
             continue
         step = 0.02 * abs(number.typical) or 5.0
-        middle = number.typical + 3.0 * step * (
-            number.none is not None
-        )  # beside grid points such as whole periods
+        # Beside grid points such as whole periods.
+        middle = number.typical + 3.0 * step * (number.none is not None)
         model = spec.wrap(shipped("actuator", "ideal").build(machine, 3, CPU), machine, 3, CPU)
         if "draw" in model.state:
             model.state["draw"].fill_(7)  # the same chances for all candidates

@@ -167,9 +167,8 @@ def test_frame_loss_holds_the_command_for_all_joints_at_once(machine: Machine) -
     first, second = q1
     assert (first.abs() < 1e-4).float().mean().item() == pytest.approx(0.25, abs=0.03)
     assert ((second - 0.8).abs() < 1e-4).float().mean().item() == pytest.approx(0.75, abs=0.03)
-    assert (second.abs() < 1e-4).float().mean().item() == pytest.approx(
-        0.0625, abs=0.015
-    )  # both lost
+    # Both frames are lost.
+    assert (second.abs() < 1e-4).float().mean().item() == pytest.approx(0.0625, abs=0.015)
 
 
 def test_dead_band_on_each_side_leaves_the_full_command(machine: Machine) -> None:
@@ -300,9 +299,8 @@ def test_load_makes_lifting_slower_and_lowering_faster(machine: Machine) -> None
     )
     assert down == pytest.approx(math.sqrt(1 + 0.5 * Q2_SHARE), rel=1e-3) and down > 1.1
     assert up == pytest.approx(-math.sqrt(1 - 0.5 * Q2_SHARE), rel=1e-3)
-    assert roll(model, machine, [1.0], at=level)[-1, 0, 0].item() == pytest.approx(
-        FULL, abs=1e-7
-    )  # the slew bears no weight
+    # The slew bears no weight.
+    assert roll(model, machine, [1.0], at=level)[-1, 0, 0].item() == pytest.approx(FULL, abs=1e-7)
 
 
 def test_creep_sinks_at_zero_command(machine: Machine) -> None:
@@ -327,9 +325,8 @@ def test_flow_sharing_slows_joints_in_proportion(machine: Machine) -> None:
     assert shares(1.0, 2) == pytest.approx([0, 0, 1, 0, 0], abs=1e-4)
     # 0.8 + 0.5 + 0.3 of the pump: 1 / 1.6; q1 is not on it
     assert shares(1.0, 0, 2, 3, 4) == pytest.approx([1, 0, 0.625, 0.625, 0.625], abs=1e-4)
-    assert shares(-0.5, 2, 3, 4) == pytest.approx(
-        [0, 0, -0.5, -0.5, -0.5], abs=1e-4
-    )  # 0.8 of it is enough
+    # 0.8 of it is enough.
+    assert shares(-0.5, 2, 3, 4) == pytest.approx([0, 0, -0.5, -0.5, -0.5], abs=1e-4)
 
 
 def test_no_effect_goes_through_a_stop(machine: Machine) -> None:
@@ -395,9 +392,8 @@ def test_a_free_run_with_sensors_stays_in_measured_positions(machine: Machine) -
     np.testing.assert_allclose(path[:, 0, 0], [0.11, 0.132, 0.154, 0.176], atol=1e-6)
     coarse = affected("ideal", quantisation={"step_rad": 0.05}).build(machine, 1, CPU)
     path = roll(coarse, machine, [0.3] * 10, at=np.zeros(5))
-    assert path[-1, 0, 0].item() == pytest.approx(
-        0.05
-    )  # 0.06 in truth: steps too small to see still add up
+    # 0.06 in truth: steps too small to see still add up.
+    assert path[-1, 0, 0].item() == pytest.approx(0.05)
 
 
 def test_candidates_run_side_by_side(machine: Machine) -> None:
@@ -440,9 +436,8 @@ def test_a_longer_link_is_what_longer_origins_are(machine: Machine) -> None:
     q = torch.rand(4, 5, generator=torch.Generator().manual_seed(2)) - 0.5
     tip_m = Kinematics(machine).pose(q).tip_in_base_m
     expected = Kinematics(replace(machine, joints=tuple(joints))).pose(q).tip_in_base_m
-    model = wrapped(
-        "link_length", machine, num=4, extra_m={"q3": 0.03, "other": 0}
-    )  # from q3 to q4
+    # From q3 to q4.
+    model = wrapped("link_length", machine, num=4, extra_m={"q3": 0.03, "other": 0})
     torch.testing.assert_close(model.tool(tip_m, q), expected, rtol=0, atol=2e-6)
 
 
@@ -456,9 +451,8 @@ def test_tilt_turns_the_tool_with_the_base(machine: Machine) -> None:
     left_up = wrapped("base_tilt", machine, roll_rad=0.1, pitch_rad=0.0).tool(point_m, q)
     np.testing.assert_allclose(left_up, [[3, cos - 0.5 * sin, 0.5 * cos + sin]], atol=1e-6)
     both = wrapped("base_tilt", machine, roll_rad=0.1, pitch_rad=-0.2)
-    np.testing.assert_allclose(
-        both.target(both.tool(point_m, q)), point_m, atol=1e-6
-    )  # the camera stands on the base
+    # The camera stands on the base.
+    np.testing.assert_allclose(both.target(both.tool(point_m, q)), point_m, atol=1e-6)
 
 
 def test_extrinsics_turn_and_displace_what_the_camera_sees(machine: Machine) -> None:

@@ -206,9 +206,8 @@ def test_the_hand_changes_over_when_the_person_sees_it(machine: Machine) -> None
 def test_whoever_it_is_no_joint_moves_beside_an_exclusive_one_and_no_more_than_meant(
     machine: Machine, seed: int, **numbers: Any
 ) -> None:
-    proposed = (
-        torch.rand((60, 5), generator=torch.Generator().manual_seed(seed)) * 2 - 1
-    )  # not even the proposals are exclusive
+    # Not even the proposals are exclusive.
+    proposed = torch.rand((60, 5), generator=torch.Generator().manual_seed(seed)) * 2 - 1
     moving = follow(machine, proposed, **numbers) != 0
     assert not (moving[:, 1] & moving[:, [0, 2, 3, 4]].any(1)).any()
     assert (moving.sum(1) <= (numbers["joints_at_once"] or 5)).all()

@@ -237,9 +237,8 @@ def test_short_recordings_leave_out_the_horizons_that_do_not_fit(
     for path in recordings.iterdir():
         whole = record.read_recording(path, machine)
         part = {"t_s": whole.t_s[:100], "u": whole.u[:100], "q": whole.q[:100]}
-        record.write_recording(
-            Recording(**{**vars(whole), **part}), cut / path.name
-        )  # 5 s less 1.65 s: no window of 5 s
+        # 5 s less 1.65 s: no window of 5 s.
+        record.write_recording(Recording(**{**vars(whole), **part}), cut / path.name)
     result = run(identify(machine, tmp_path / "out", cut, Fit()))
     assert (
         result["joints"]["q1"]["plant"]["5"] is None

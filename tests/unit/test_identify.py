@@ -162,9 +162,8 @@ def test_collect_and_identify_from_the_command(
     for rows in result["joints"].values():
         assert rows["mlp"]["5"]["rmse"] < rows["hold"]["5"]["rmse"]
         assert set(rows["arx"]) == {"1", "2", "5", "10"}
-    assert result["delay_s"]["q1"]["value"] == pytest.approx(
-        0.55 + 0.1, abs=0.06
-    )  # with the lag of 0.1 s
+    # With the lag of 0.1 s.
+    assert result["delay_s"]["q1"]["value"] == pytest.approx(0.55 + 0.1, abs=0.06)
     assert Path("fit/prediction.png").stat().st_size > 1000
     assert (
         brokk(

@@ -251,9 +251,10 @@ def test_parts_of_a_run_that_overlap_in_time_are_told(
         "~preview",
     )
     assert done.code == 0, done.err
+    # 19.95 s - 15 s.
     assert (
         "run sound: a_1.parquet begins 5.0 s before a_0.parquet ends; look at the clock" in done.out
-    )  # 19.95 s - 15 s
+    )
 
 
 def test_inspecting_nothing_is_an_error(brokk: Callable[..., object]) -> None:

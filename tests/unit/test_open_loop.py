@@ -154,9 +154,8 @@ def test_seconds_belong_to_regimes_by_the_commands_that_act_in_them(machine: Mac
     u[40:80, 0], u[80:100, 0], u[60:, 2] = 0.5, -0.9, 0.1
     q = np.tile(0.5 * (machine.lower + machine.upper), (140, 1))
     q[100:, 0] = machine.upper[0]
-    cut = open_loop.cut_windows(
-        [recording(u, q, "a")], machine, 5.0, 100.0
-    )  # from 1.65 s on: 33 samples before
+    # From 1.65 s on: 33 samples before.
+    cut = open_loop.cut_windows([recording(u, q, "a")], machine, 5.0, 100.0)
     drift = np.linspace(0.05, 5.0, 100)[None, :, None] * np.array([0.1, 0.0, 0.2, 0.0, 0.0])
     found = scores(cut, machine, model=cut.measured + drift)
     members = {name: inside[0] for name, inside in classify_seconds(found, np.zeros(5)).items()}

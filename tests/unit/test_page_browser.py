@@ -135,9 +135,8 @@ def test_pixels_are_green_where_the_lever_should_be_and_blue_where_it_is(
         assert len(near) > 30
         return (near.min(0) + near.max(0)) / 2
 
-    np.testing.assert_allclose(
-        center(GREEN, 0.31, advised), advised, atol=0.02
-    )  # the diamond, without what leads to it
+    # The diamond, without what leads to it.
+    np.testing.assert_allclose(center(GREEN, 0.31, advised), advised, atol=0.02)
     blue = center(BLUE, 0.155, own)
     np.testing.assert_allclose(blue, own, atol=0.03)
 
@@ -229,9 +228,8 @@ def test_the_page_comes_back_after_the_server_was_away(
     with served(feed, port):
         page.wait_for_selector("body:not(.lost)")
         eventually(lambda: drawn(page)["left advised"] == pytest.approx((0.9, 0.0), abs=1e-3))
-        eventually(
-            lambda: page.keyboard.press("g") or feed.requests
-        )  # until then it says that it has no connection
+        # Until then it says that it has no connection.
+        eventually(lambda: page.keyboard.press("g") or feed.requests)
         assert set(feed.requests) == {OperatorRequest("start", "")}
 
 
@@ -393,9 +391,8 @@ def test_everything_is_done_by_keys_and_by_gloves(
         eventually(lambda wish=wish: feed.requests[-1] == wish)
     for button in page.locator("button:visible").all():
         box = button.bounding_box()
-        assert min(box["width"], box["height"]) >= 15 / 25.4 * 96, (
-            button.inner_text()
-        )  # 15 mm by CSS
+        # 15 mm by CSS.
+        assert min(box["width"], box["height"]) >= 15 / 25.4 * 96, button.inner_text()
         assert (
             box["x"] >= 0
             and box["x"] + box["width"] <= SIZE["width"]

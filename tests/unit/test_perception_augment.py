@@ -215,9 +215,10 @@ def test_a_crop_is_the_part_that_opencv_cuts_out() -> None:
         )
         / 255.0
     )
+    # Half of 240 px on 80.
     assert matrix[0, 0] == pytest.approx(
         1.5 * np.cos(np.arctan2(matrix[1, 0], matrix[0, 0])), rel=1e-4
-    )  # half of 240 px on 80
+    )
     assert np.abs(seen - theirs).max() < 0.03
 
 

@@ -119,9 +119,8 @@ def test_a_poor_arm_and_wrong_sights_leave_millimetres(
     mm, degrees = np.median(ours, axis=0)
     assert mm <= 3.7 and degrees <= 0.58 and np.max(ours, axis=0)[0] < 8.0
     assert not theirs or mm < (0.2 if wrong else 1.0) * np.median(theirs, axis=0)[0]
-    assert (
-        2.0 < np.mean(surprise) < 12.0
-    )  # six degrees of freedom: 6, and 1.4 is the standard deviation of a mean of six
+    # Six degrees of freedom: 6, and 1.4 is the standard deviation of a mean of six.
+    assert 2.0 < np.mean(surprise) < 12.0
 
 
 @settings(deadline=None, max_examples=5)
@@ -137,18 +136,16 @@ def test_whatever_was_recorded_the_answer_is_a_place(
     machine = option("machine", "brokk170")
     chance = np.random.default_rng(seed)
     poses = board.posed(machine, count, seed, 0.0087, 0.0017, 0.001)
-    poses = replace(
-        poses, q=board.MIDDLE + size * (poses.q - board.MIDDLE)
-    )  # the arm hardly moves, or so it says
+    # The arm hardly moves, or so it says.
+    poses = replace(poses, q=board.MIDDLE + size * (poses.q - board.MIDDLE))
     views, _ = board.views(machine, poses, EXACT * 10 ** chance.uniform(-2, 2), seed, wrong)
     found = hand_eye.solve_hand_eye(views)
     assert found is not None
     place = found.guess.base_from_camera
     assert np.isfinite(place).all() and np.isfinite(found.cov).all()
     spread = np.linalg.eigvalsh(found.cov)
-    assert spread[0] > -1e-12 * max(
-        1.0, spread[-1]
-    )  # an arm that does not move leaves 1e12 square metres open: rounding
+    # An arm that does not move leaves 1e12 square metres open: rounding.
+    assert spread[0] > -1e-12 * max(1.0, spread[-1])
     np.testing.assert_allclose(place[:3, :3] @ place[:3, :3].T, np.eye(3), atol=1e-9)
     assert found.used.sum() >= min(hand_eye.MIN_VIEWS, count)
 
@@ -186,9 +183,8 @@ def test_the_offset_of_the_clocks_is_found_to_a_few_milliseconds(
 ) -> None:
     frame_s, turns, t_s, q = swing(machine, offset_s)
     chance = np.random.default_rng(0)
-    elsewhere = Rotation.from_rotvec(
-        [0.4, 1.0, -0.3]
-    ).as_matrix()  # nobody knows how the camera and the board are turned
+    # Nobody knows how the camera and the board are turned.
+    elsewhere = Rotation.from_rotvec([0.4, 1.0, -0.3]).as_matrix()
     turns = (
         elsewhere
         @ turns
@@ -228,9 +224,8 @@ def test_touched_points_give_the_camera_though_some_are_wrong(
 ) -> None:
     chance = np.random.default_rng(seed)
     there = np.array([2.3, 0.0, 0.5]) + chance.uniform(-1, 1, (count, 3)) * [0.6, 0.7, 0.4]
-    there[:4] = np.array(
-        [[1.8, -0.7, 0.2], [2.8, 0.7, 0.2], [1.9, 0.6, 0.9], [2.8, -0.6, 0.8]]
-    )  # well apart
+    # Well apart
+    there[:4] = np.array([[1.8, -0.7, 0.2], [2.8, 0.7, 0.2], [1.9, 0.6, 0.9], [2.8, -0.6, 0.8]])
     seen = (there - board.CAMERA[:3, 3]) @ board.CAMERA[:3, :3] + 0.002 * chance.standard_normal(
         (count, 3)
     )
@@ -246,9 +241,8 @@ def test_touched_points_give_the_camera_though_some_are_wrong(
     if count - wrong >= 6:
         assert not found.used[count - wrong :].any()
         away = transforms.compute_motion(found.base_from_camera, board.CAMERA)
-        assert (
-            away @ np.linalg.solve(found.cov, away) < 45.0
-        )  # one in ten million of six degrees of freedom, were they normal
+        # One in ten million of six degrees of freedom, were they normal.
+        assert away @ np.linalg.solve(found.cov, away) < 45.0
     np.testing.assert_allclose(
         found.base_from_camera[:3, :3] @ found.base_from_camera[:3, :3].T, np.eye(3), atol=1e-9
     )
@@ -352,9 +346,8 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
 ) -> None:
     poses = board.posed(machine, 12, 1)
     t_s, knots = np.arange(0.0, 14.0, 0.05), np.arange(12.0)
-    eased = np.floor(t_s) + np.clip(
-        (t_s % 1.0 - 0.2) / 0.6, 0.0, 1.0
-    )  # of each second, 0.6 s on the way to the next pose
+    # Of each second, 0.6 s on the way to the next pose.
+    eased = np.floor(t_s) + np.clip((t_s % 1.0 - 0.2) / 0.6, 0.0, 1.0)
     q = np.stack([np.interp(eased, knots, column) for column in poses.q.T], 1)
     recording = Recording(
         machine=machine.name,

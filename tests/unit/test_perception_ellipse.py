@@ -146,9 +146,8 @@ def test_a_round_end_is_no_ellipse_and_as_much_of_a_covered_disc_is(detector) ->
         gray = np.full((240, 320), 210, np.uint8)
         cv2.line(gray, (90, 120), (230, 150), 40, 2 * size, cv2.LINE_AA)
         assert not detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
-        cv2.rectangle(
-            gray, (90 + size // 8, 0), (319, 239), 120, -1
-        )  # hides all but the end, which has sharp corners then
+        # Hides all but the end, which has sharp corners then.
+        cv2.rectangle(gray, (90 + size // 8, 0), (319, 239), 120, -1)
         found = detector.detect(cv2.GaussianBlur(gray, (0, 0), 0.8), None, None)
         assert len(found) == 1 and np.hypot(found[0].x - 90, found[0].y - 120) < 1.5
 
@@ -224,9 +223,8 @@ def test_edge_drawing_is_refused_where_opencv_has_none(monkeypatch: pytest.Monke
 def test_what_edge_drawing_proposes_is_judged_like_the_rest(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = np.array(
-        [[[60.0, 50.0, 0.0, 20.0, 30.0, 0.0]], [[120.0, 50.0, 25.0, 0.0, 0.0, 0.0]]]
-    )  # the second is not there
+    # The second is not there.
+    found = np.array([[[60.0, 50.0, 0.0, 20.0, 30.0, 0.0]], [[120.0, 50.0, 25.0, 0.0, 0.0, 0.0]]])
     drawing = SimpleNamespace(
         setParams=lambda _: None, detectEdges=lambda _: None, detectEllipses=lambda: found
     )

@@ -126,10 +126,8 @@ def test_a_frame_that_is_refused_counts_as_one_in_which_nothing_was_found() -> N
 
 def test_beside_an_arm_a_face_is_searched_where_nobody_knows_its_depth() -> None:
     depth_m = np.full((480, 640), 2.0, np.float32)
-    depth_m[:, 300:360], depth_m[:, 360:] = (
-        np.nan,
-        0.8,
-    )  # what the arm hides from the right camera, and the arm
+    # What the arm hides from the right camera, and the arm.
+    depth_m[:, 300:360], depth_m[:, 360:] = (np.nan, 0.8)
     mask = np.zeros(depth_m.shape, bool)
     mask[100:400, 100:300] = True
     frame = replace(drawn()[0], depth_m=depth_m)
@@ -183,16 +181,14 @@ def test_the_rim_of_a_mouth_that_something_of_unknown_depth_cuts_is_looked_at() 
     depth_m = np.full((480, 640), 1.0, np.float32)
     mouth = np.hypot(columns - 320, rows - 250) < 53
     depth_m[mouth] = 1.3
-    depth_m[rows > 260] = (
-        np.nan
-    )  # beside the mouth's lower half nothing is in reach of it but its own depth
+    # Beside the mouth's lower half nothing is in reach of it but its own depth.
+    depth_m[rows > 260] = np.nan
     mask = (columns > 120) & (columns < 520) & (rows > 80) & (rows <= 260)
     matrix = np.array([[1056.0, 0.0, 320.0], [0.0, 1056.0, 240.0], [0.0, 0.0, 1.0]])
     frame = replace(drawn()[0], depth_m=depth_m, camera_matrix=matrix)
     found = search.plan_search_levels(frame, mask, 0.05, 0.35, 6.5)
-    assert found and not any(
-        level.nearest_m is None or level.nearest_m.any() for level in found
-    )  # nothing stands before the face
+    # Nothing stands before the face.
+    assert found and not any(level.nearest_m is None or level.nearest_m.any() for level in found)
 
 
 def test_the_edge_of_what_stands_before_a_face_is_no_rim_and_beside_it_one_looks_closer() -> None:

@@ -158,9 +158,8 @@ def test_a_tilted_face_has_the_depth_of_its_plane() -> None:
 
 
 def test_a_ray_goes_through_a_chip_into_the_hole_and_out_of_neither() -> None:
-    chip = Chip(
-        np.array([0.05, 0.0, 0.31]), 0.025
-    )  # on the rim, 1 cm above the face: a bowl 22.9 mm wide, 15 mm deep
+    # On the rim, 1 cm above the face: a bowl 22.9 mm wide, 15 mm deep.
+    chip = Chip(np.array([0.05, 0.0, 0.31]), 0.025)
     plain, chipped = (
         drilled(FACING, np.array([0.0, 0.0, 1.0]), chips=chips) for chips in ((), (chip,))
     )
@@ -191,9 +190,10 @@ def test_a_bar_in_the_concrete_is_seen_through_the_hole_alone() -> None:
 
 
 def test_a_cylinder_and_a_box_are_where_they_should_be() -> None:
+    # upright
     post = Cylinder(
         "arm", SolidPose(np.eye(3)[:, [2, 0, 1]], np.array([0.1, 0.0, 1.0])), 0.05, 0.2, (GREY,)
-    )  # upright
+    )
     crate = Box(
         "clutter",
         SolidPose(np.eye(3), np.array([-0.2, 0.0, 1.0])),
@@ -215,14 +215,12 @@ def test_a_shadow_lies_where_the_light_is_blocked() -> None:
     board = Box(
         "arm", SolidPose(np.eye(3), np.array([0.5, 0.0, 1.0])), np.array([0.1, 0.1, 0.01]), (GREY,)
     )
-    to_sun = np.array([1.0, 0.0, -2.0]) / np.sqrt(
-        5
-    )  # from x = 0 on the wall through x = 0.5, z = 1: the middle of the board
+    # From x = 0 on the wall through x = 0.5, z = 1: the middle of the board.
+    to_sun = np.array([1.0, 0.0, -2.0]) / np.sqrt(5)
     view = seen([wall, board], light=Light(to_sun, 1.0, 0.5))
     lit, dark = 0.5 * (0.5 + 2 / np.sqrt(5)), 0.5 * 0.5
-    np.testing.assert_allclose(
-        view.radiance[120, 160], dark, rtol=1e-3
-    )  # the shadow is 0.2 m wide: 20 px about x = 0
+    # The shadow is 0.2 m wide: 20 px about x = 0.
+    np.testing.assert_allclose(view.radiance[120, 160], dark, rtol=1e-3)
     np.testing.assert_allclose(view.radiance[120, 160 + 30], lit, rtol=1e-3)
     np.testing.assert_allclose(view.radiance[120, 160 - 30], lit, rtol=1e-3)
 
@@ -260,9 +258,8 @@ def test_both_pictures_show_the_same_texture() -> None:
     inner[:, :90] = False  # out of the right picture
     error, contrast = (moved - left.radiance)[inner][:, 0], left.radiance[inner][:, 0].std()
     assert inner.sum() > 5000
-    assert (
-        error.std() < 0.35 * contrast
-    )  # resampling of grain as fine as a pixel; unrelated textures would give 1.4
+    # Resampling of grain as fine as a pixel; unrelated textures would give 1.4.
+    assert error.std() < 0.35 * contrast
     assert abs(error.mean()) < 0.01 * left.radiance[inner].mean()
 
 
@@ -306,9 +303,8 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Stereo
     assert abs(np.median(error["refined"])) < 0.02 < abs(np.median(error["plain"]))
     spread = 1.48 * np.median(np.abs(error["refined"] - np.median(error["refined"])))
     assert 0.03 < spread < 0.35  # 0.29 px on real pairs with dense truth
-    assert np.isnan(
-        stereo.depth_m(left, right, 1056.0, 0.12)[:, :20]
-    ).all()  # what the right camera does not see
+    # What the right camera does not see.
+    assert np.isnan(stereo.depth_m(left, right, 1056.0, 0.12)[:, :20]).all()
 
 
 def test_chips_break_the_rim_and_dents_lie_beside_it() -> None:
@@ -333,9 +329,8 @@ def test_dust_takes_contrast_as_it_says() -> None:
     light = np.where(np.arange(60) < 30, 0.2, 0.8).astype(np.float32)[None, :, None] * np.ones(
         (40, 1, 3), np.float32
     )
-    thick = CameraExposure(
-        1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0
-    )  # a quarter is left after 2 m
+    # A quarter is left after 2 m.
+    thick = CameraExposure(1.0, np.log(4.0) / 2.0, 0.6, 0.0, 0.0, 1e9, 0.0, 1.0, 0.0)
     taken = take_picture(
         light,
         depth,
@@ -495,9 +490,8 @@ def test_truth_and_masks_agree_in_every_kind_of_scene(
             x, y = rig.left.project(center)
             if hole.hidden == 0:
                 assert shot.label.hole_mask[round(y), round(x)]
-                assert (
-                    shot.exact_depth_m[round(y), round(x)] > center[2] - 0.06
-                )  # the rim or deeper
+                # The rim or deeper.
+                assert shot.exact_depth_m[round(y), round(x)] > center[2] - 0.06
             assert hole.in_view
 
 
@@ -549,12 +543,10 @@ def test_the_command_renders_the_same_bytes_again_and_goes_on_where_it_stopped(
     assert done.code == 0, done.err
     first = digests(tmp_path / "one" / "frames")
     assert len(first) == 1 + 3 * 5
-    (
-        tmp_path / "one" / "frames" / "00001.truth.json"
-    ).unlink()  # as if stopped while writing this one
-    assert (
-        brokk("mode=render", "scene=varied", "session.out=one", *size).code == 2
-    )  # without resume it is somebody's run
+    # As if stopped while writing this one.
+    (tmp_path / "one" / "frames" / "00001.truth.json").unlink()
+    # Without resume it is somebody's run.
+    assert brokk("mode=render", "scene=varied", "session.out=one", *size).code == 2
     assert brokk("mode=render", "scene=varied", "session.out=one", "resume=one", *size).code == 0
     assert digests(tmp_path / "one" / "frames") == first
     assert (

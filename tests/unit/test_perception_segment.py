@@ -43,9 +43,8 @@ def test_planes_before_their_surroundings_are_the_block(
     assert masks.block.min() >= 0.0 and masks.block.max() <= 1.0
     found = masks.block > 0.5
     assert (found & view.block).sum() > 0.97 * found.sum()
-    front_and_side = (
-        0.8 if distance_m < 3 else 0.7
-    )  # a top seen at a grazing angle is thinner than a matcher's noise
+    # A top seen at a grazing angle is thinner than a matcher's noise.
+    front_and_side = 0.8 if distance_m < 3 else 0.7
     assert cuboid.overlap(found, view.block) > front_and_side
 
 

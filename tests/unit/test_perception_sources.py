@@ -156,10 +156,8 @@ def test_a_frame_that_breaks_the_format_is_refused_by_name_and_the_next_one_read
     with folder(frames).build() as source:
         with pytest.raises(FrameError, match=told):
             source.read_latest()
-        if breach not in (
-            "another resolution",
-            "long lens",
-        ):  # these are the camera's, and so every frame's
+        # These are the camera's, and so every frame's.
+        if breach not in ("another resolution", "long lens"):
             after = source.read_latest()
             assert after is not None and after.name.endswith("00001")
             assert source.read_latest() is None
@@ -231,9 +229,8 @@ def test_a_pair_without_depth_is_matched(tmp_path: Path) -> None:
     wide = np.repeat(np.clip(128 + 120 * grain, 0, 255).astype(np.uint8)[..., None], 3, 2)
     matrix = np.array([[200.0, 0.0, 119.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
     dataset.write_camera(tmp_path, matrix, None, 0.12)
-    dataset.write_frame(
-        tmp_path / "00000", wide[:, 100:340], None, wide[:, 112:352]
-    )  # all of it 12 px: 200 * 0.12 / 12 = 2 m
+    # All of it 12 px: 200 * 0.12 / 12 = 2 m.
+    dataset.write_frame(tmp_path / "00000", wide[:, 100:340], None, wide[:, 112:352])
     found = read(tmp_path)[0]
     assert np.nanmedian(found.depth_m) == pytest.approx(2.0, abs=0.005)
     camera(tmp_path, dist=[0.1, 0.0, 0.0, 0.0])
@@ -384,16 +381,12 @@ def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(
         assert source._device._camera.fill is False
     assert StubZed.opened is None
     assert frame is not None and frame.right is not None
-    assert frame.color[0, 0].tolist() == [12, 11, 10] and frame.right[0, 0].tolist() == [
-        22,
-        21,
-        20,
-    ]  # the SDK gives BGRA
+    # The SDK gives BGRA.
+    assert frame.color[0, 0].tolist() == [12, 11, 10] and frame.right[0, 0].tolist() == [22, 21, 20]
     assert np.isnan(frame.depth_m[0, :3]).all() and (frame.depth_m[1:] == 1.5).all()
     assert frame.t_s == pytest.approx(1.7e9) and frame.baseline_m == pytest.approx(0.11986)
-    assert (
-        frame.distortion is None
-    )  # the picture is rectified; the coefficients are those of the raw one
+    # The picture is rectified; the coefficients are those of the raw one.
+    assert frame.distortion is None
     np.testing.assert_array_equal(frame.camera_matrix, MATRIX)
 
 

@@ -132,9 +132,8 @@ def test_approaches_arrive_on_machines_slower_or_faster_than_their_file(
 def test_exclusive_joints_never_move_together_with_others_on_the_way_either(
     machine: Machine, approach: Approach
 ) -> None:
-    together = constant(
-        {1: 0.5, 3: 0.5}, 2.0, anywhere(machine, 0)
-    )  # no excitation may ask for this; the runner drops q2
+    # No excitation may ask for this; the runner drops q2.
+    together = constant({1: 0.5, 3: 0.5}, 2.0, anywhere(machine, 0))
     track = played(
         [[constant({}, 1.0, anywhere(machine, n)), together] for n in range(6)], machine, approach
     )
@@ -176,9 +175,8 @@ def test_home_takes_the_joint_back_and_goes_on_at_the_next_zero(
     machine: Machine, approach: Approach
 ) -> None:
     u = np.zeros((2000, 5))
-    u[:, 2] = np.where(
-        np.arange(2000) // 500 % 2 == 0, 0.9, -0.2
-    )  # drives into the stop, then slowly back
+    # Drives into the stop, then slowly back.
+    u[:, 2] = np.where(np.arange(2000) // 500 % 2 == 0, 0.9, -0.2)
     track = played([[constant({}, 0.0, machine.home, u=u, stops="home")]], machine, approach)
     stage = track.stage[:, 0]
     begin = np.flatnonzero(stage != plan_report.BEFORE)[0]
@@ -250,9 +248,8 @@ def test_the_tool_is_never_faster_than_allowed_and_proportions_are_kept(
 def test_the_tool_speed_is_that_of_the_kinematics(machine: Machine) -> None:
     import torch
 
-    q = machine.home + np.linspace(0, 0.2, 41)[:, None] * np.array(
-        [1.0, 0, 0, 0, 0]
-    )  # 0.1 rad/s about the vertical
+    # 0.1 rad/s about the vertical.
+    q = machine.home + np.linspace(0, 0.2, 41)[:, None] * np.array([1.0, 0, 0, 0, 0])
     radius_m = float(
         Kinematics(machine)
         .pose(torch.as_tensor(machine.home, dtype=torch.float32))

@@ -117,9 +117,8 @@ def test_a_target_that_is_moved_takes_block_estimate_and_arm_with_it(made: Calla
     block = session.loop.world._mocap_pos[0, 0].numpy()
     np.testing.assert_allclose(block, place, atol=1e-5)
     run(session, 1)
-    np.testing.assert_allclose(
-        session.read().estimate_m[0] - place, error[0], atol=5e-3
-    )  # one more noisy sample in the mean of 22
+    # One more noisy sample in the mean of 22.
+    np.testing.assert_allclose(session.read().estimate_m[0] - place, error[0], atol=5e-3)
     run(session, 400)
     np.testing.assert_allclose(session.read().target_m[0], place, atol=1e-5)
     assert session.read().successes >= 1, "the arm went to the new place"

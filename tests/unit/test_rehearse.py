@@ -71,9 +71,8 @@ class Played:
 @pytest.fixture
 def played(monkeypatch: pytest.MonkeyPatch) -> Played:
     found = Played()
-    monkeypatch.setattr(
-        story, "subprocess", SimpleNamespace(Popen=found)
-    )  # not for those who import meanwhile
+    # Not for those who import meanwhile.
+    monkeypatch.setattr(story, "subprocess", SimpleNamespace(Popen=found))
     return found
 
 

@@ -65,9 +65,8 @@ def nasty_page() -> Report:
 def test_whatever_is_given_is_text_and_never_markup() -> None:
     read = Reader(nasty_page().render())
     assert not {"script", "link", "iframe"} & {tag for tag, _ in read.tags}
-    assert (
-        sum(NASTY in text for text in read.texts) == 16
-    )  # once for each place above, and twice for the title
+    # Once for each place above, and twice for the title.
+    assert sum(NASTY in text for text in read.texts) == 16
     assert [attributes["alt"] for tag, attributes in read.tags if tag == "img"] == [NASTY]
 
 

@@ -250,9 +250,8 @@ def test_a_fused_control_step_is_compiled_once_and_does_what_the_plain_one_does(
         torch.manual_seed(1)
         loop.begin()
         for step in range(20):
-            with torch.inference_mode(
-                step % 2 == 0
-            ):  # rsl-rl rolls out in it, an evaluation does not
+            # rsl-rl rolls out in it, an evaluation does not.
+            with torch.inference_mode(step % 2 == 0):
                 obs, *_ = loop.step(torch.full((8, 5), 0.3))
         ends.append({name: value.clone() for name, value in obs.items()})
     assert all(torch.equal(ends[1][name], value) for name, value in ends[0].items())

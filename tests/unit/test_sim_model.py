@@ -175,9 +175,8 @@ def test_scenes_become_the_geoms_of_their_block(machine):
         block = build_collision_geoms(scale, radius_m)
         np.testing.assert_allclose(size[row, :-1], block.size, atol=1e-7)
         np.testing.assert_allclose(pos[row, :-1], block.pos, atol=1e-7)
-    np.testing.assert_allclose(
-        pos[:, -1, 2], [-0.75, -0.75], atol=1e-7
-    )  # the ground lies under the rim
+    # The ground lies under the rim.
+    np.testing.assert_allclose(pos[:, -1, 2], [-0.75, -0.75], atol=1e-7)
     _, turn = placement.pose(scene)
     np.testing.assert_allclose(turn[1], [np.cos(0.15), 0, 0, np.sin(0.15)], atol=1e-7)
 

@@ -165,9 +165,8 @@ def test_the_cost_is_within_the_tolerance_of_its_minimum(problem):
     assert iterations.max() < 15
     for acceleration, data in zip(found, problem.reference, strict=True):
         least = _cost(data, data.qacc)
-        assert (
-            _cost(data, acceleration.astype(float)) - least < 2.0 * TOLERANCE + 1e-9 * least
-        )  # float32 gets no closer
+        # float32 gets no closer.
+        assert _cost(data, acceleration.astype(float)) - least < 2.0 * TOLERANCE + 1e-9 * least
 
 
 def test_from_the_solution_no_iteration_is_needed(problem):

@@ -135,9 +135,10 @@ def test_what_went_wrong_is_kept_and_said(machine: Machine, tmp_path: Path) -> N
         path.unlink()
     study_folder.write_participant(tmp_path, "P02", {"stopped": True, "reason": "felt unwell"})
     first = json.loads((trials / "P03_1_01.json").read_text())
+    # Done twice
     study_folder.write_trial(
         tmp_path, "P03_1_01", {**first, "created": "2999-01-01", "limit_s": 20.0}
-    )  # done twice
+    )
     study_folder.write_trial(tmp_path, "P99_1_01", {**first, "participant": "P99"})  # unknown
     swapped = "unguided" if first["condition"] == "guided" else "guided"
     study_folder.write_trial(tmp_path, "P03_1_07", {**first, "number": 7, "condition": swapped})
@@ -160,9 +161,8 @@ def test_what_went_wrong_is_kept_and_said(machine: Machine, tmp_path: Path) -> N
         "was filled in twice", "P02: 0 trials guided: is in no comparison",
     ):  # fmt: skip
         assert claim in text, claim
-    assert (
-        len(found.trials) == len(planned) + 3 - 6 - 1 - 1
-    )  # spare ones are still there; the unreadable and missing are not
+    # Spare ones are still there; the unreadable and missing are not.
+    assert len(found.trials) == len(planned) + 3 - 6 - 1 - 1
     assert sum(not t.counts and bool(t.facts["period"]) for t in found.trials) == 4
     assert found.effects["time_s"].num_persons == 5 and found.effects["tlx_raw"].num_persons == 4
     assert math.isnan(found.means["time_s"]["guided"][1])

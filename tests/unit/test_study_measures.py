@@ -45,9 +45,8 @@ def test_the_tool_is_where_the_projects_kinematics_has_it(machine: Machine) -> N
 
 def test_sparc_is_that_of_the_published_algorithm() -> None:
     t = np.arange(-1, 1, 0.01)
-    assert compute_sparc(np.exp(-5 * t**2), 100.0) == pytest.approx(
-        -1.41403, abs=1e-5
-    )  # the example of the authors' own code
+    # The example of the authors' own code.
+    assert compute_sparc(np.exp(-5 * t**2), 100.0) == pytest.approx(-1.41403, abs=1e-5)
     two = np.exp(-40 * (t + 0.5) ** 2) + np.exp(-40 * (t - 0.5) ** 2)
     assert compute_sparc(two, 100.0) < -1.6
     assert compute_sparc(7 * two, 100.0) == pytest.approx(compute_sparc(two, 100.0))
@@ -161,6 +160,5 @@ def test_a_half_filled_questionnaire_has_no_score_and_says_why() -> None:
     assert "effort not answered" in tlx.check(half)[0] and "9 of 15" in tlx.check(half)[1]
     assert "expected 0 to 100" in tlx.check({"ratings": {**ANSWERS["ratings"], "mental": 170}})[0]
     never = {"ratings": {**ANSWERS["ratings"], "frustration": None}, "pairs": ANSWERS["pairs"]}
-    assert tlx.compute_weighted_tlx(never) == pytest.approx(
-        tlx.compute_weighted_tlx(ANSWERS)
-    )  # its weight is 0
+    # Its weight is 0.
+    assert tlx.compute_weighted_tlx(never) == pytest.approx(tlx.compute_weighted_tlx(ANSWERS))

@@ -77,9 +77,8 @@ def test_a_sitting_from_consent_to_the_end_gives_what_a_report_reads(
         trial.facts["outcome"] == "inserted" and trial.facts["twin"] is True for trial in mine
     )
     assert found.loads["weighted"]["guided"][0] == found.loads["raw"]["unguided"][0] == 40.0
-    assert "P01" not in "".join(
-        f"{remark.where}{remark.text}" for remark in found.remarks
-    )  # nothing to say against it
+    # Nothing to say against it.
+    assert "P01" not in "".join(f"{remark.where}{remark.text}" for remark in found.remarks)
     consent = read(tmp_path / "participants" / "P01.json")["consent"]
     assert consent["agreed"] and consent["language"] == "de" and consent["version"] == "v1"
     for trial in mine:

@@ -184,9 +184,8 @@ def test_the_interval_of_dz_turns_back_into_t() -> None:
     low, high = compute_dz_interval(0.8, 4.0, 15)
     assert stats.nct.cdf(3.2, 15, 4 * low) == pytest.approx(0.975)
     assert stats.nct.cdf(3.2, 15, 4 * high) == pytest.approx(0.025)
-    low, high = compute_dz_interval(
-        -300.0, math.sqrt(2), 1
-    )  # two persons who agree: almost anything is possible
+    # Two persons who agree: almost anything is possible.
+    low, high = compute_dz_interval(-300.0, math.sqrt(2), 1)
     assert low < -600 and -40 < high < 0
 
 
@@ -199,13 +198,13 @@ def test_guidance_and_period_come_apart() -> None:
     unguided = 50.0 - 8.0 * first
     found = estimate_effect(guided, unguided, first, np.array([0, 1, 2, 0, 1, 2]))
     assert found.adjusted == pytest.approx(-5.0) and found.period == pytest.approx(-8.0)
-    assert found.difference == pytest.approx(
-        -5.0
-    )  # sequences are equal, so practice cancels in the mean …
+    # Sequences are equal, so practice cancels in the mean …
+    assert found.difference == pytest.approx(-5.0)
     assert found.paired_dz is not None and found.dz is not None
+    # … not in the spread.
     assert found.dz == pytest.approx(-5.0 / math.sqrt((2 + 8) / 4)) and abs(found.paired_dz) < abs(
         found.dz
-    )  # … not in the spread
+    )
     assert found.p == pytest.approx(2 / 8) and found.adjusted_ci95 is not None
     half = stats.t.ppf(0.975, 4) * math.sqrt(2.5) / 2 * math.sqrt(2 / 3)
     assert found.adjusted_ci95 == pytest.approx((-5 - half, -5 + half))

@@ -37,9 +37,8 @@ def test_what_is_given_reaches_the_valves_as_the_bus_rounds_it(tmp_path: Path) -
     for _ in range(20):
         one.period(GIVEN)
     for _ in range(3):
-        one.period(
-            np.array([0.0, 0.6, 0.0, 0.0, 0.0])
-        )  # the exclusive joint: the button goes over the bus, too
+        # The exclusive joint: the button goes over the bus, too.
+        one.period(np.array([0.0, 0.6, 0.0, 0.0, 0.0]))
     found = one.recording()
     assert found.u[2:19] == pytest.approx(np.tile(GIVEN, (17, 1)), abs=0.01)
     assert found.u[-1] == pytest.approx([0.0, 0.6, 0.0, 0.0, 0.0], abs=0.01)

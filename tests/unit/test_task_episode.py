@@ -372,16 +372,14 @@ def test_the_figures_of_a_scripted_episode(machine: Machine) -> None:
         (-0.5, 0.0, (0.3, 0.0, 0.5)),
     ]
     for command, force_n, at_m in script:
-        stage.history.push_u(
-            stage.process.command(torch.tensor([[command, 0.9, 0.0, 0.0, 0.0]]))
-        )  # q2 is masked: not positioning
+        # q2 is masked: not positioning.
+        stage.history.push_u(stage.process.command(torch.tensor([[command, 0.9, 0.0, 0.0, 0.0]])))
         stage.world.contact_force_n.fill_(force_n)
         stage.target_below_tip(*at_m)
         stage.step()
     figures = {name: value.item() for name, value in stage.process.episode.items()}
-    assert figures["valve_travel"] == pytest.approx(
-        (0.5 + 0 + 1.0 + 0 + 0) / 0.05 / 5
-    )  # 6 full strokes a second
+    # 6 full strokes a second.
+    assert figures["valve_travel"] == pytest.approx((0.5 + 0 + 1.0 + 0 + 0) / 0.05 / 5)
     assert figures["time_to_insert_s"] == pytest.approx(0.2)
     assert figures["lateral_error_m"] == pytest.approx(0.005, abs=1e-6)  # when it was inserted
     assert figures["peak_force_n"] == 900.0
