@@ -221,5 +221,6 @@ def _build_mode(
             workers=workers,
             prices=_load_option("prices", "default"),
             certainty=_load_option("certainty", "default"),
+            servo_certainty=_load_option("certainty", "servo"),
         ),
     )

@@ -27,7 +27,7 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
-from brokk_rl.scales import choose_horizon_s, scale_time
+from brokk_rl.scales import choose_horizon_s
 from diagnosis import residual_model
 from diagnosis.case import GapCase, estimate_running_s, split_recordings
 from diagnosis.effect_library import EffectSimulator, EffectType, EffectValues
@@ -38,6 +38,7 @@ from diagnosis.error_covariance import (
     weigh_residuals,
 )
 from diagnosis.free_runs import WindowedRuns
+from diagnosis.number_faults import list_number_faults
 from diagnosis.refine import drop_windows
 from diagnosis.residuals import ParameterRay, Residuals, build_rays
 from diagnosis.responses import (
@@ -55,12 +56,8 @@ log = logging.getLogger(__name__)
 # Chosen by hand; not searched.
 TUNING_STEPS = 3
 """Gauss-Newton steps."""
-TIME_STEP_S = 0.004
-"""Finite difference of a time on the reference of `brokk_rl.scales`, s."""
-NUMBER_STEP = 0.01
-"""Finite difference of a number without a unit."""
 TUNING_PRIOR = 4.0
-"""Prior standard deviation of a number, in finite differences."""
+"""Prior standard deviation of a number, over its error from day to day; see `number_faults`."""
 
 
 def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
@@ -71,10 +68,7 @@ def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
         return {}
     names = list(own)
     start = np.stack([own[name][0].numpy().astype(float) for name in names])  # (P, J)
-    time_step_s = scale_time(first.machine, TIME_STEP_S)
-    size = np.array([time_step_s if name.endswith("_s") else NUMBER_STEP for name in names])[
-        :, None
-    ]
+    size = list_number_faults(names, first.machine)  # (P, J)
     reach = first.machine.num_history * first.machine.period_s - 2.0 * first.machine.period_s
     most = np.where(np.array([name.endswith("_s") for name in names])[:, None], reach, np.inf)
     now, best, lowest = start.copy(), start.copy(), np.full(start.shape[1], np.inf)
@@ -91,7 +85,7 @@ def tune_parameters(parts: Sequence[Residuals]) -> dict[str, np.ndarray]:
             weighted = slopes[j] * weigh_residuals(errors[j])
             normal = weighted @ slopes[j].T + np.eye(len(names)) / TUNING_PRIOR**2
             step[:, j] = np.linalg.solve(
-                normal, weighted @ errors[j] - (now - start)[:, j] / size[:, 0] / TUNING_PRIOR**2
+                normal, weighted @ errors[j] - (now - start)[:, j] / size[:, j] / TUNING_PRIOR**2
             )
         now = np.clip(
             np.where(better, now + step * size, (now + best) / 2),

@@ -26,8 +26,8 @@ from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.parallel import map_parallel
-from brokk_rl.scales import scale_time
 from diagnosis.answer import Estimate
+from diagnosis.number_faults import list_number_faults
 
 log = logging.getLogger(__name__)
 
@@ -300,10 +300,6 @@ def estimate_interval(sizes: np.ndarray, likelihood: np.ndarray) -> tuple[float,
 BATCH_ROWS = 1536
 """Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""
 
-TIME_FAULT_S, NUMBER_FAULT = 0.004, 0.01
-"""What a simulator gets wrong from day to day, and what is no effect: times in s on the reference of
-`brokk_rl.scales`, other numbers."""
-
 EffectValues = Mapping[str, np.ndarray]
 """Numbers of an effect by name, each `(C, J)`, or `(C, 1)` for one that joints do not have."""
 
@@ -431,9 +427,9 @@ class EffectSimulator:
         if not own:
             return np.empty((0, *self.cut.measured.shape), dtype=np.float32)
         varied = {name: np.repeat(value, len(own), 0) for name, value in own.items()}
-        time_fault_s = scale_time(self.machine, TIME_FAULT_S)
+        faults = list_number_faults(list(own), self.machine)
         for number, name in enumerate(own):
-            varied[name][number] += time_fault_s if name.endswith("_s") else NUMBER_FAULT
+            varied[name][number] += faults[number]
         return self.simulate([], len(own), varied)
 
     @cached_property

@@ -88,7 +88,7 @@ class LevelCovariance(ErrorCovariance):
     """Covariance of increments where a loop holds the position, so that errors do not add up.
 
     The error of the position itself is stationary: it has a part of each sample by itself
-    (`sensor`), one over the motion (`change`), and one that forgets over `memory` increments.
+    (`sensor` and `reading`), one over the motion (`change`), and one that forgets over `memory` increments.
 
     Attributes:
         stray: Standard deviation of the error that forgets, rad or m.
@@ -98,12 +98,17 @@ class LevelCovariance(ErrorCovariance):
     stray: float = 0.0
     window: int = 1
 
+    def level_covariance(self, increments: np.ndarray) -> np.ndarray:
+        """Return the covariance of the error of the position after each increment, `(B, S, S)`."""
+        size = increments.shape[1]
+        moved = increments[:, :, None] * increments[:, None, :]
+        alone = self.sensor**2 + self.reading**2
+        level = (self.stray**2 + self.change**2 * moved) * self.remember(size)
+        return level + alone * np.eye(size)
+
     def covariance(self, increments: np.ndarray) -> np.ndarray:
         """Return the covariance of increments in a row, `(B, S, S)`; see `ErrorCovariance`."""
-        size = increments.shape[1]
-        kept = self.remember(size)
-        moved = increments[:, :, None] * increments[:, None, :]
-        level = (self.stray**2 + self.change**2 * moved) * kept + self.sensor**2 * np.eye(size)
+        size, level = increments.shape[1], self.level_covariance(increments)
         goes_on = (np.arange(size) % self.window != 0)[1:, None]
         level[:, 1:] = level[:, 1:] - goes_on * level[:, :-1]
         level[:, :, 1:] = level[:, :, 1:] - goes_on.T * level[:, :, :-1]
@@ -248,19 +253,23 @@ def fit_level_noise(error: np.ndarray, increments: np.ndarray, window: int) -> L
     typical = 1.4826 * np.median(np.abs(level))
     typical = max(typical, MIN_TYPICAL_ERROR * np.sqrt(np.mean(level**2))) + 1e-9
     most = 12.0 * typical
-    level = np.clip(level, -most, most)
-    error = np.diff(level, axis=1, prepend=0.0).reshape(error.shape)
+    level = np.clip(level, -most, most).reshape(error.shape)
+    steps = error.shape[1]
+    # Increments of the error and the error itself have the same whitened values: the one's Cholesky
+    # factor is that of the other, differenced. See `fit_noise` for the border.
+    bordered = np.zeros((len(level), steps + 1, steps + 1))
+    bordered[:, -1, :-1] = level
 
     def build(x: np.ndarray) -> LevelCovariance:
         sensor, change, stray, memory = np.exp(x)
         return LevelCovariance(sensor, change, 0.0, memory, 0.0, stray, window)
 
     def minus_log(x: np.ndarray) -> float:
-        covariance = build(x).covariance(increments) + 1e-18 * np.eye(increments.shape[1])
-        factor = np.linalg.cholesky(covariance)
-        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum()
-        z = np.linalg.solve(factor, error[..., None])
-        return float(compute_loss(z) + log_size)
+        bordered[:, :-1, :-1] = build(x).level_covariance(increments) + 1e-18 * np.eye(steps)
+        bordered[:, -1, -1] = NO_BORDER
+        factor = np.linalg.cholesky(bordered)
+        log_size = np.log(np.diagonal(factor, axis1=1, axis2=2)[:, :-1]).sum()
+        return float(compute_loss(factor[:, -1, :-1]) + log_size)
 
     start = np.log([0.3 * typical, 0.05, typical, 5.0])
     ends = [(typical / 30, 10 * typical), (1e-3, 2.0), (typical / 30, 10 * typical), (1.0, 200.0)]

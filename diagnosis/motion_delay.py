@@ -28,7 +28,8 @@ def measure_motion_delays(
     """Return the delay of each joint, s: measured with its interval, and simulated before and after the effects.
 
     `None` for a joint whose motion does not resemble its command, or resembles it most at the longest
-    shift that is tried; `None` in all for joints commanded by torque, to which no speed belongs.
+    shift that is tried, or whose interval is wider than the delay itself; `None` in all for joints
+    commanded by torque, to which no speed belongs.
     """
     if machine.interface == "torque":
         return None
@@ -54,8 +55,12 @@ def measure_motion_delays(
             continue
         drawn = [_find_peak(products[pick, :, j].sum(0)) for pick in picks]
         ends = np.percentile(drawn, (2.5, 97.5)) * machine.period_s
+        measured_s = _find_peak(total) * machine.period_s
+        if ends[1] - ends[0] > max(measured_s, machine.period_s):
+            found[joint] = None
+            continue
         one: dict[str, Any] = {
-            "measured": _find_peak(total) * machine.period_s,
+            "measured": measured_s,
             "ci95": ends.tolist(),
             "correlation": correlation,
         }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
 OUTSIDE_SIGNS = ("constant", "clue", "form", "curve", "scatter", "strays", "tool")
@@ -99,6 +100,7 @@ class DiagnosisSubject:
         workers: Processes that share the work; 1 where the system has no safe fork.
         prices: Penalties of effects.
         certainty: Calibration of the probabilities.
+        servo_certainty: The same where joints are commanded by position: their errors look different.
     """
 
     case: str | None
@@ -108,6 +110,11 @@ class DiagnosisSubject:
     workers: int
     prices: Penalties
     certainty: ProbabilityModel
+    servo_certainty: ProbabilityModel
+
+    def choose_certainty(self, machine: Machine) -> ProbabilityModel:
+        """Return the calibration for joints that are commanded as those of this machine."""
+        return self.servo_certainty if machine.interface == "position" else self.certainty
 
     def check(self) -> None:
         if self.workers < 1:

@@ -27,6 +27,12 @@ log = logging.getLogger(__name__)
 
 MAP_FILE, MACHINE_FILE = "column_map.yaml", "machine.yaml"
 GUESS_FILE, PICTURE_FILE, PAGE_FILE = "import.json", "import.png", "import.html"
+SIMULATORS = {
+    "position": "actuator=servo fit=servo",
+    "torque": "actuator=force fit=force",
+    "speed": "actuator=ideal",
+}
+"""Ideal simulator of each command interface, by which recordings are diagnosed first."""
 HEAD = ["subject", "guess", "how sure", "evidence"]
 
 
@@ -94,7 +100,12 @@ class ImportLogs:
         """
         if self.machine is not None and self.reader is not None:
             pieces = conversion.read_logs(self.log.input, self.reader, self.machine)
-            conversion.write_recordings(pieces, self.session.folder / conversion.FOLDER)
+            place = self.session.folder / conversion.FOLDER
+            conversion.write_recordings(pieces, place)
+            simulator = SIMULATORS[self.machine.interface]
+            command = f"brokk mode=diagnose machine=… 'diagnosis.field={place}/*' {simulator}"
+            for text in ("then, with the same machine=…:", command):
+                Console().print(text, markup=False, highlight=False, soft_wrap=True)
             return
         paths = conversion.find_logs(self.log.input)
         guess = log_guess.guess_logs(paths, self.log.position_unit, self.log.dbc, self.log.damaged)

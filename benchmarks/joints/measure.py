@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import torch
+from scipy.signal import hilbert
 
 from brokk_rl import extensions
 from brokk_rl.session import write_json
@@ -40,6 +41,13 @@ BASE_MASSES_KG = (100.0, 60.0)
 PARTS = 4
 """Recordings that the log is cut into: a diagnosis needs some that nothing is fitted to."""
 EMPS_FILES = {"emps": ["emps.mat"], "emps_p": ["emps_p.mat"], "both": ["emps.mat", "emps_p.mat"]}
+
+JOINTS = ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll")
+"""Joints of the SO-101 by the names of its columns."""
+SWEEP_ROWS = 300
+"""Rows of the frequency sweep that are taken at one frequency: 6 s, within which it rises by a fifth."""
+SWEEP_HZ = (0.3, 3.0)
+"""Frequencies of the sweep that are used; below them a part holds fewer than two cycles."""
 
 
 def read_set(name: str, folder: Path, patterns: list[str]) -> api.RecordingSet:
@@ -116,7 +124,8 @@ def measure_so101(folder: Path) -> dict[str, Any]:
         api.report(outcome, field, out)
         answer = json.loads((Path(out) / "diagnosis.json").read_text())
     kept = ("verdict", "reason", "selected", "gap", "rivals", "unseen", "gates", "motion_delay_s")
-    return {key: answer.get(key) for key in kept} | {"row_shift_s": measure_row_shifts(folder)}
+    found = {key: answer.get(key) for key in kept}
+    return found | {"row_shift_s": measure_row_shifts(folder), "sweep": measure_sweep(folder)}
 
 
 def measure_row_shifts(folder: Path) -> dict[str, float]:
@@ -129,7 +138,7 @@ def measure_row_shifts(folder: Path) -> dict[str, float]:
     for path in sorted(folder.glob("*.parquet")):
         log = pq.read_table(path)
         period_s = float(np.median(np.diff(log["t_state_s"].to_numpy())))
-        for joint in ("rotation", "pitch", "elbow", "wrist_pitch", "wrist_roll"):
+        for joint in JOINTS:
             target, q = (np.diff(log[f"{name}_{joint}_rad"].to_numpy()) for name in ("target", "q"))
             last = len(q) - len(shifts)
             sums = [float(target[:last] @ q[shift : shift + last]) for shift in shifts]
@@ -139,6 +148,35 @@ def measure_row_shifts(folder: Path) -> dict[str, float]:
         best = int(np.argmax(sums))
         low, top, high = sums[best - 1 : best + 2]
         found[joint] = (best + 0.5 * (low - high) / (low - 2.0 * top + high)) * period_s
+    return found
+
+
+def measure_sweep(folder: Path) -> dict[str, dict[str, float]]:
+    """Return a line through the phase lag over the frequency of each joint, from the frequency sweep alone.
+
+    Its slope is a delay, s; its value at 0 Hz is the lag that does not depend on the frequency, rad,
+    as play has it.
+    """
+    log = pq.read_table(folder / "frequency_sweep.parquet")
+    period_s = float(np.median(np.diff(log["t_state_s"].to_numpy())))
+    found = {}
+    for joint in JOINTS:
+        target, q = (
+            log[f"{name}_{joint}_rad"].to_numpy().astype(float) for name in ("target", "q")
+        )
+        target = target - np.median(target)
+        angle = np.unwrap(np.angle(hilbert(target)))
+        frequency_hz = np.gradient(angle) / (2.0 * np.pi * period_s)
+        rows = []
+        for first in range(0, len(q) - SWEEP_ROWS, SWEEP_ROWS):
+            part = slice(first, first + SWEEP_ROWS)
+            wave = np.exp(-1j * angle[part])
+            response = np.mean((q[part] - q[part].mean()) * wave) / np.mean(target[part] * wave)
+            rows.append((np.median(frequency_hz[part]), -np.angle(response)))
+        hz, lag_rad = np.array(rows).T
+        used = (hz > SWEEP_HZ[0]) & (hz < SWEEP_HZ[1])
+        slope, at_rest = np.polyfit(2.0 * np.pi * hz[used], lag_rad[used], 1)
+        found[joint] = {"delay_s": float(slope), "lag_at_0_hz_rad": float(at_rest)}
     return found
 
 

@@ -109,7 +109,10 @@ class Diagnose:
 
             base = self._base(given, self._kinds, tell)
             generator = self.session.generator("diagnosis")
-            prices, certainty = self.diagnosis.prices, self.diagnosis.certainty
+            prices, certainty = (
+                self.diagnosis.prices,
+                self.diagnosis.choose_certainty(self.machine),
+            )
             work = DiagnosisPipeline(
                 given,
                 base,

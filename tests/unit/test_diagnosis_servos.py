@@ -1,0 +1,133 @@
+"""What the diagnosis knows of position servos: late frames, faults of their own numbers, noise of readings."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from composed import option
+from scipy.signal import cont2discrete
+
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from diagnosis import baseline, effect_library, timing
+from diagnosis.error_covariance import LevelCovariance, compute_loss
+from diagnosis.number_faults import list_number_faults
+from diagnosis.residuals import Residuals
+
+RESPONSE_S, DAMPING = 0.03, 0.8
+SUBSTEPS = 10
+"""Steps of the plant in a control period."""
+
+
+@pytest.fixture(scope="module")
+def arm() -> Machine:
+    """An arm of five position servos."""
+    return option("machine", "so101")
+
+
+def record_arm(arm: Machine, seed: int, lost: float, late_s: float) -> Recording:
+    """Returns a minute and a half of ramps to and fro, followed by a loop of second order.
+
+    A frame is lost with the chance `lost`, else late by up to `late_s`; none overtakes another.
+    """
+    random = np.random.default_rng(seed)
+    count, size = 4500, (5,)
+    slopes = random.uniform(0.3, 1.2, (count // 45, 5)) * arm.period_s
+    slopes[1::2] *= -1.0
+    u = np.cumsum(np.repeat(slopes, 45, 0), 0)
+    u = np.clip(u - u.mean(0), -0.9, 0.9)
+    come_s = arm.period_s * np.arange(count) + random.uniform(0.0, 1.0, count) * late_s
+    arrives = random.random(count) >= lost
+    come_s = np.maximum.accumulate(come_s[arrives])
+    fine_s = arm.period_s / SUBSTEPS * np.arange(count * SUBSTEPS)
+    sent = u[arrives][np.maximum(np.searchsorted(come_s, fine_s, "right") - 1, 0)]
+    middle, half = (arm.upper + arm.lower) / 2, (arm.upper - arm.lower) / 2
+    loop = np.array([[0.0, 1.0], [-(RESPONSE_S**-2), -2.0 * DAMPING / RESPONSE_S]])
+    drive = np.array([[0.0], [RESPONSE_S**-2]])
+    a, b, *_ = cont2discrete((loop, drive, np.eye(2), 0.0 * drive), arm.period_s / SUBSTEPS)
+    state, q = np.stack([middle + half * u[0], np.zeros(size)]), []
+    for k, command in enumerate(sent):
+        if k % SUBSTEPS == 0:
+            q.append(state[0].copy())
+        state = a @ state + b * (middle + half * command)
+    noise = 3e-4 * random.standard_normal((count, 5))
+    return Recording(
+        machine=arm.name,
+        joints=arm.joint_names,
+        units=tuple(joint.unit for joint in arm.joints),
+        rate_hz=1.0 / arm.period_s,
+        t_s=arm.period_s * np.arange(count),
+        u=u.astype(np.float32),
+        q=(np.array(q) + noise).astype(np.float32),
+        extra={},
+        metadata={"run": f"{seed}"},
+    )
+
+
+@pytest.fixture(scope="module")
+def held(arm: Machine) -> dict[str, Residuals]:
+    """The right servo against recordings without late frames, with lost ones, with late ones."""
+    servo = replace(
+        option("actuator", "servo"), dead_time_s=0.0, response_s=RESPONSE_S, damping=DAMPING
+    )
+    kinds = {"whole": (0.0, 0.0), "other": (0.0, 0.0), "lost": (0.2, 0.0), "late": (0.0, 0.045)}
+    found = {}
+    for seed, (name, (lost, late_s)) in enumerate(kinds.items()):
+        rows = [(record_arm(arm, seed, lost, late_s), 0.0)]
+        found[name] = baseline.compare_simulator(servo, rows, arm, 0)
+    noise = baseline.fit_covariances([found["whole"], found["other"]], arm)
+    return {name: replace(one.residuals, noise=noise) for name, one in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("name", "effect", "number", "true"),
+    [("lost", "frame_loss", "probability", 0.2), ("late", "delay_jitter", "jitter_s", 0.045)],
+)
+def test_late_frames_of_servos_are_named_with_their_size(
+    arm: Machine, held: dict[str, Residuals], name: str, effect: str, number: str, true: float
+) -> None:
+    kinds = effect_library.load_effects(arm, ["frame_loss", "delay_jitter"])
+    changes, reference = timing.CommandChanges(held[name]), [held["whole"], held["other"]]
+    found = timing.detect_timing_effect(changes, held[name].error, reference, kinds, 4.0, 12.0)
+    assert found and found.kind.name == effect and found.joints.all()
+    assert found.parameters[number]["elbow"].mean == pytest.approx(true, rel=0.35)
+    # the mean delay is put into the simulator only as far as errors become likelier
+    better = timing.add_mean_delay(held[name], found, [])
+    assert compute_loss(better.z) < compute_loss(held[name].z)
+
+
+def test_frames_that_arrive_in_time_are_not_called_late(
+    arm: Machine, held: dict[str, Residuals]
+) -> None:
+    kinds = effect_library.load_effects(arm, ["frame_loss", "delay_jitter"])
+    other = timing.CommandChanges(held["other"])
+    reference = [held["whole"]]
+    assert (
+        timing.detect_timing_effect(other, held["other"].error, reference, kinds, 4.0, 12.0) is None
+    )
+
+
+def test_an_angle_is_off_by_a_thousandth_of_the_travel(arm: Machine) -> None:
+    play, sag, damping, response_s = list_number_faults(
+        ["play_rad", "sag_rad", "damping", "response_s"], arm
+    )
+    assert play[0] == pytest.approx(0.0016) and sag == pytest.approx(play)  # from -0.8 to 0.8 rad
+    assert damping == pytest.approx([0.01] * 5)
+    # the longer of 0.02 / 0.05 (period) and 0.1 / 0.55 (dead time) of the reference's 4 ms
+    assert response_s == pytest.approx([0.0016] * 5)
+
+
+def test_noise_of_readings_is_noise_of_the_held_position() -> None:
+    generator = np.random.default_rng(5)
+    noise = LevelCovariance(0.001, 0.0, 0.0, 4.0, 0.003, 0.002, 10)
+    still = np.zeros((1, 10))
+    np.testing.assert_allclose(noise.strayed(still), 0.001**2 + 0.002**2 + 0.003**2)
+    quiet = replace(noise, reading=0.0)
+    level = np.linalg.cholesky(quiet.level_covariance(still)[0]) @ generator.standard_normal(
+        (10, 4000)
+    )
+    read = level + 0.003 * generator.standard_normal(level.shape)
+    z = noise.whitener(still)[0] @ np.diff(read, axis=0, prepend=0.0)
+    assert z.std() == pytest.approx(1.0, abs=0.02)
