@@ -113,6 +113,20 @@ class WhyResult:
             return "actuator"
         return told
 
+    @property
+    def title(self) -> str:
+        """The answer in a few words."""
+        if self.cause == "nothing" and self.has_effects:
+            if ALL_EFFECTS in self.costs:
+                return "No cause found: what differs costs no success for sure"
+            return "No sure cause: the machine differs from the simulator"
+        return TITLES[self.cause]
+
+    @property
+    def tone(self) -> Tone:
+        """Tone of the first paragraph."""
+        return "warn" if self.title != TITLES[self.cause] else TONES[self.cause]
+
     def to_json(self) -> dict[str, Any]:
         """Return the result as plain JSON data, as `why.json` holds it."""
         found = self.diagnosis
@@ -157,7 +171,10 @@ def write_summary(result: WhyResult) -> str:
     """Return the answer in a few sentences: cause, effect, cost, and what is not the cause."""
     cause, doctor = result.cause, result.doctor
     if cause == "code":
-        return f"{doctor['reason']} Mend this first: machine and task are judged once the code does what was trained."
+        start = (
+            "The deployed code departs from the contract of the policy: " if doctor["named"] else ""
+        )
+        return f"{start}{doctor['reason']} Mend this first, then ask again about the machine."
     if doctor["verdict"] in ("task", "cannot_tell") and cause == doctor["verdict"]:
         return f"{doctor['reason']}{_append(_describe_effects(result))}"
     texts = [_describe_effects(result)]
@@ -215,7 +232,7 @@ def _describe_effects(result: WhyResult) -> str:
     )
 
 
-CLEARED, GUILTY, UNJUDGED = "cleared", "→ the cause", "not judged"
+CLEARED, GUILTY, UNJUDGED, POSSIBLE = "cleared", "cause", "not judged", "possible"
 Judgement = tuple[str, str]
 """Result for a suspect, and the evidence for it."""
 
@@ -263,6 +280,8 @@ def _judge_machine(result: WhyResult) -> Judgement:
         texts.append(f"effects: {found.verdict}{f', {found.reason}' if found.reason else ''}")
     if result.cause == "actuator":
         return GUILTY, "; ".join(texts)
+    if result.has_effects and ALL_EFFECTS not in result.costs:
+        return POSSIBLE, "; ".join(texts)
     return (UNJUDGED if motion["cannot_tell"] else CLEARED), "; ".join(texts)
 
 

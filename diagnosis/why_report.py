@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,8 +23,6 @@ from diagnosis.why_answer import (
     BEFORE,
     DIAGNOSIS,
     DOCTOR,
-    TITLES,
-    TONES,
     WhyRequest,
     WhyResult,
     judge_suspects,
@@ -35,6 +33,8 @@ from diagnosis.why_answer import (
 )
 
 WHY_PAGE = "why.html"
+LOW_SUCCESS = 0.8
+"""Success without the effects below which the simulator is doubted; chosen by hand."""
 
 
 def write_why_page(
@@ -49,10 +49,10 @@ def write_why_page(
         StorageError: it could not be written.
     """
     result = read_result(folder, request)
-    page = Report(TITLES[result.cause], write_summary(result), TONES[result.cause])
+    page = Report(result.title, write_summary(result), result.tone)
     page.add_table(["suspect", "result", "evidence"], _list_suspects(result))
     _add_evidence(page, result, machine)
-    _add_effects(page, result)
+    _add_effects(page, result, machine.joint_names if machine else ())
     _add_costs(page, result, titles)
     for title, steps in (
         ("What to change", list_changes(result)),
@@ -146,7 +146,7 @@ def draw_motion(folder: Path, machine: Machine) -> Figure | None:
     return figure
 
 
-def _add_effects(page: Report, result: WhyResult) -> None:
+def _add_effects(page: Report, result: WhyResult, names: Sequence[str]) -> None:
     found = result.diagnosis
     if found is None or not found.selected:
         return
@@ -156,22 +156,24 @@ def _add_effects(page: Report, result: WhyResult) -> None:
         for option in registry.list_options()
         if option.group == "effect"
     }
+    numbers = [value for one in found.selected for value in one.parameters.values()]
+    joints = list(dict.fromkeys(joint for by_joint in numbers for joint in by_joint))
+    joints.sort(key=lambda name: names.index(name) if name in names else -1)
     rows: list[list[str | Cell | None]] = []
     for one in found.selected:
         same = ", ".join(report.name_effect(name) for name in one.same_as)
         head: list[str | Cell | None] = [
             Cell(report.name_effect(one.effect), summaries.get(one.effect, "")),
-            ", ".join(one.joints) or "machine",
             Cell(f"{one.probability:.2f}", f"that, or {same}" if same else ""),
         ]
         for parameter, by_joint in one.parameters.items():
-            for joint, value in by_joint.items():
-                rows.append([*head, f"{parameter} {joint}", Cell(*report.format_estimate(value))])
-                head = [""] * len(head)
+            row = [Cell(*report.format_estimate(by_joint.get(joint))) for joint in joints]
+            rows.append([*head, parameter, *row])
+            head = ["", ""]
     page.add_table(
-        ["effect", "joints", "probability", "number", "value, 95 %"],
+        ["effect", "probability", "number", *joints],
         rows,
-        "Units stand in the names; a gain of 1 means no change",
+        "Numbers of each joint with 95 % intervals; units stand in the names; a gain of 1 means no change",
     )
 
 
@@ -188,10 +190,15 @@ def _add_costs(page: Report, result: WhyResult, titles: Mapping[str, str]) -> No
         rows = [[titles.get(BEFORE, BEFORE), format_rate(result.success[BEFORE]), None]]
         for name in sorted(result.costs, key=lambda one: order.index(one) if one in order else -1):
             loss = result.costs[name]
-            low, high = (100 * bound for bound in loss["ci95"])
-            cost = Cell(f"{100 * loss['mean']:.0f} points", f"{low:.0f} to {high:.0f}")
-            rows.append([titles.get(name, name), format_rate(result.success[name]), cost])
-        page.add_table(["simulator", "strict success", "costs"], rows)
+            high, low = (-100 * bound for bound in loss["ci95"])
+            change = Cell(f"{-100 * loss['mean']:+.0f}", f"{low:+.0f} to {high:+.0f}")
+            rows.append([titles.get(name, name), format_rate(result.success[name]), change])
+        page.add_table(["simulator", "strict success", "change, points"], rows)
+        if result.success[BEFORE]["mean"] < LOW_SUCCESS:
+            page.add_text(
+                "The policy often fails in this simulator even without the effects. Is it the one that it was trained in?",
+                "warn",
+            )
     if result.unmeasured:
         names = report.join_words([report.name_effect(name) for name in result.unmeasured])
         page.add_text(f"Not measured: the cost of {names}. {_explain_unmeasured(result)}", "warn")
@@ -220,11 +227,13 @@ def draw_costs(result: WhyResult, titles: Mapping[str, str]) -> Figure:
         colour = GREY if name == BEFORE else RED
         axis.barh(place, mean, color=colour, height=0.6)
         axis.errorbar(mean, place, xerr=[[mean - low], [high - mean]], color="black", capsize=3)
-        axis.annotate(f"{mean:.0f} %", (0, place), (6, 0), textcoords="offset points",
-                      va="center", color="white", fontweight="bold")  # fmt: skip
+        axis.annotate(
+            f"{mean:.0f} %", (high, place), (8, 0), textcoords="offset points", va="center"
+        )
     axis.set_yticks(range(len(names)), [titles[name] for name in names])
     axis.invert_yaxis()
-    axis.set_xlim(0, 100)
+    axis.set_xlim(0, 112)
+    axis.set_xticks(range(0, 101, 20))
     axis.set_xlabel("strict success, %")
     remove_frame(axis)
     return figure

@@ -33,6 +33,9 @@ MATLAB_NUMBERS = (
 )
 """Classes of real arrays as MATLAB names them."""
 
+PARQUET_ERRORS = (OSError, pa.ArrowException, ValueError)
+"""Errors of pyarrow on a damaged file; a name that is no text is a `ValueError`."""
+
 NPZ_ERRORS = (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of the libraries on a damaged archive."""
 
@@ -96,6 +99,8 @@ class LeRobotLog(LogFile):
                 raise RecordingError(f"{file}: column '{EPISODE}' is missing")
             arrays = dict(columns)
             numbers = arrays[EPISODE]
+            if not len(numbers):
+                raise RecordingError(f"{file}: has no rows")
             edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
             for begin, end in pairwise(edges):
                 run = f"{self.path.resolve().name}_{int(numbers[begin]):06d}"
@@ -193,6 +198,8 @@ class MatlabLog(LogFile):
             for at, name in enumerate(several):
                 if name in names:
                     columns.add(name, values[:max_rows, at])
+            # Two arrays of a long log would fill the memory.
+            del values
         yield LogRun(self.path.stem, str(self.path), {"": Table(columns)})
 
     def _call(self, reader: Any, **options: Any) -> Any:
@@ -224,6 +231,13 @@ def _read_labels(features: Mapping[str, Any]) -> dict[str, list[str]]:
 def _name_items(path: Path, labels: Mapping[str, list[str]]) -> dict[str, list[str]]:
     """Return the names that each column of a Parquet file gives: itself, or those of its items."""
     file = _open_parquet(path)
+    try:
+        return _name_fields(file, labels)
+    except PARQUET_ERRORS as error:
+        raise RecordingError(f"{path}: damaged in its first rows ({error})") from error
+
+
+def _name_fields(file: pq.ParquetFile, labels: Mapping[str, list[str]]) -> dict[str, list[str]]:
     items, uncertain = {}, []
     for field in file.schema_arrow:
         if _is_number(field.type):
@@ -256,10 +270,13 @@ def _is_list(kind: pa.DataType) -> bool:
 
 def _open_parquet(path: Path) -> pq.ParquetFile:
     try:
-        return pq.ParquetFile(path)
+        file = pq.ParquetFile(path)
+        # Names of columns are decoded here.
+        _ = file.schema_arrow
+        return file
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: no such log") from error
-    except (OSError, pa.ArrowException) as error:
+    except PARQUET_ERRORS as error:
         raise RecordingError(f"{path}: cannot be read as parquet ({error})") from error
 
 
@@ -280,7 +297,7 @@ def _read_parquet(
             row += batch.num_rows
             if max_rows is not None and row >= max_rows:
                 break
-    except (OSError, pa.ArrowException, ValueError) as error:
+    except PARQUET_ERRORS as error:
         raise RecordingError(
             f"{path}: damaged in the {BLOCK_ROWS} rows from row {row} on ({error})"
         ) from error

@@ -6,14 +6,17 @@ read and decoded by blocks: a BLF file of 1 GB holds tens of millions of them.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import can
 import cantools
 import numpy as np
+from can.io.asc import ASC_MESSAGE_REGEX
 
 from actuators.recordings.log_tables import BLOCK_ROWS, LogFile, LogRun, StoredColumns, Table
 from brokk_rl import registry
@@ -33,6 +36,16 @@ BLF_FRAME = np.dtype(
 )  # fmt: skip
 """A classic frame in a BLF file, as `can.io.blf` unpacks it: object header, its version 1, CAN message."""
 CLASSIC_KIND, REMOTE_FLAG, ID_BITS = 1, 0x80, 0x1FFFFFFF
+ASC_BLOCK_CHARACTERS = 4 << 20
+"""Characters of an ASC file whose lines are parsed at once."""
+ASC_FRAME = re.compile(
+    r"^[ \t]*(\d+\.\d+)[ \t]+\d+[ \t]+([0-9A-Fa-f]+[xX]?)[ \t]+[RT]x[ \t]+d[ \t]+([0-8])([ 0-9A-Fa-f]*)",
+    re.MULTILINE | re.ASCII,
+)
+"""A line of a classic frame with data: time in s, identifier, number of bytes, the bytes and more."""
+ASC_DATA = re.compile(r"[ \t][RT]x[ \t]+d[ \t]")
+"""Sign of a line of a frame, whatever the rest of it has become."""
+NO_BYTES = " 00" * WORD_BYTES
 TICKS_OF_10_US = 1
 """Time unit of 10 µs; others are of 1 ns."""
 
@@ -77,6 +90,54 @@ class BlfBlockReader(can.BLFReader):
         content = np.where(inside, frames["data"], 0).astype(np.uint8)
         found = FrameBlock(time_s, frames["frame_id"] & ID_BITS, length, content)
         yield select_frames(found, chosen)
+
+
+class AscBlockReader(can.ASCReader):
+    """A reader that parses lines of classic frames by blocks, and leaves others to python-can."""
+
+    def __iter__(self) -> Iterator[Any]:
+        self._extract_header()
+        file: Any = self.file
+        while lines := file.readlines(ASC_BLOCK_CHARACTERS):
+            found = ASC_FRAME.findall("".join(lines)) if self.base == "hex" else []
+            others = lines if not found else []
+            if 0 < len(found) < len(lines):
+                others = [line for line in lines if not ASC_FRAME.match(line)]
+            if found:
+                yield parse_asc_frames(found)
+            if others:
+                for line in others:
+                    if ASC_DATA.search(line) and not ASC_MESSAGE_REGEX.match(line.strip()):
+                        raise ValueError(f"the line '{line.strip()}' is no frame")
+                # python-can skips the header, whose last line this is.
+                self.file = StringIO("internal events logged\n" + "".join(others))
+                try:
+                    yield from super().__iter__()
+                finally:
+                    self.file = file
+            end = lines[-1].strip().lower()
+            if not lines[-1].endswith("\n") and not end.startswith("end triggerblock"):
+                raise ValueError(f"the last line, '{end}', is cut off")
+        self.stop()
+
+
+def parse_asc_frames(found: list[tuple[str, str, str, str]]) -> FrameBlock:
+    """Return frames as a block: time, identifier, number and text of the bytes of each."""
+    times, identifiers, lengths, texts = zip(*found, strict=True)
+    numbers = {text: int(text.rstrip("xX"), 16) for text in set(identifiers)}
+    length = np.array(list(map(int, lengths)))
+    is_short = np.array(list(map(len, texts))) < 3 * length
+    if is_short.any():
+        number = int(np.argmax(is_short))
+        raise ValueError(
+            f"the frame at {times[number]} s has {len(texts[number]) // 3} bytes of {length[number]}"
+        )
+    sizes = (3 * length).tolist()
+    content = [text[:size] + NO_BYTES[size:] for size, text in zip(sizes, texts, strict=True)]
+    data = np.frombuffer(bytes.fromhex("".join(content)), np.uint8)
+    frame_id = np.array([numbers[text] for text in identifiers])
+    time_s = np.array(list(map(float, times)))
+    return FrameBlock(time_s, frame_id, length, data.reshape(-1, WORD_BYTES))
 
 
 def select_frames(block: FrameBlock, chosen: np.ndarray) -> FrameBlock:
@@ -173,13 +234,22 @@ class CanLog(LogFile):
         if there < stated:
             self.report_damage(f"cut off at byte {there} of {stated}", None)
 
+    def _open(self) -> Any:
+        ending = self.path.suffix.lower()
+        if ending == ".blf":
+            return BlfBlockReader(self.path)
+        return (
+            AscBlockReader(self.path, encoding="utf-8")
+            if ending == ".asc"
+            else can.LogReader(self.path)
+        )
+
     def _iterate(self) -> Iterator[FrameBlock]:
         """Yield the frames that carry data, by blocks."""
         count, last_s = 0, 0.0
-        is_blf = self.path.suffix.lower() == ".blf"
         waiting: list[can.Message] = []
         try:
-            with BlfBlockReader(self.path) if is_blf else can.LogReader(self.path) as reader:
+            with self._open() as reader:
                 self._check_size(reader)
                 frames: Iterator[Any] = iter(reader)
                 for found in frames:

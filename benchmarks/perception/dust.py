@@ -57,7 +57,8 @@ def main() -> None:
     until = time.monotonic() + 60 * given.minutes
     rows: list[dict[str, Any]] = []
     if given.out.exists():
-        rows = json.loads(given.out.read_text())["rows"]
+        known = json.loads(given.out.read_text())["rows"]
+        rows = [row for row in known if row["scene"] < given.count]
     done = {tuple(row[name] for name in ("sensor", "kind", "distance_m", "scene")) for row in rows}
     for number in range(given.count):
         for sensor, distance_m, condition in itertools.product(

@@ -7,6 +7,7 @@ than nearly all of them. Axes: `M` drawn machines, `W` windows, `K` steps, `J` j
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -24,6 +25,8 @@ from brokk_rl.record import Recording
 from brokk_rl.scales import choose_horizon_s
 from brokk_rl.split import group_by_run
 from diagnosis.deployment.contract import TARGET_COLUMNS
+
+log = logging.getLogger(__name__)
 
 NUM_MACHINES = 200
 """Machines that are drawn; one that is as they are exceeds all of them in 1 of 201 cases a joint."""
@@ -124,6 +127,8 @@ def check_motion(
     torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
     cpu = torch.device("cpu")
     plain = open_loop.roll_out(actuator, machine, cut, cpu)
+    # A simulator of one's own can take minutes here.
+    log.info("running the log on %d machines that the training draws", NUM_MACHINES)
     many = _repeat_windows(cut, NUM_MACHINES)
     with torch.random.fork_rng([]):
         torch.manual_seed(seed)

@@ -65,10 +65,10 @@ class RangeEvidence:
 def compare_with_training(log: RunLog, contract: PolicyContract) -> RangeEvidence:
     """Compare the newest values of a log with the range of training."""
     if contract.training is None:
+        is_own = "order" in contract.data["observation"]
+        advice = "export it again by mode=export" if is_own else "add training_observations"
         return RangeEvidence(
-            (),
-            "the bundle does not hold the range of its training's observations; export it again "
-            "(mode=export) from its checkpoint",
+            (), f"{contract.source.name} lacks the range of the training's observations; {advice}"
         )
     table: RangeTable = dict(contract.training["ranges"])
     found = []

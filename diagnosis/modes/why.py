@@ -128,7 +128,7 @@ class Why:
 
     def _print(self, result: WhyResult) -> None:
         console = Console(highlight=False, markup=False)
-        console.print(why_answer.TITLES[result.cause], style="bold")
+        console.print(result.title, style="bold")
         console.print(why_answer.write_summary(result))
         for step in (*why_answer.list_changes(result), *why_answer.list_records(result)):
             for line in filter(None, step):

@@ -224,8 +224,10 @@ def fit_plane(
             m = np.linalg.solve(sums, heavy @ inverse)
         first = sigma if ring == rings[0] else first
         extent = ring
-    # Residuals of the last ring, to which the weights belong.
+    # Residuals of the last plane, and their own weights: with those of the step before, points that
+    # left the reach would count.
     residual = points.inverse[:number] - rays @ m
+    weight = np.maximum(1 - (residual / reach) ** 2, 0.0) ** 2
     cov = estimate_sandwich_covariance(
         rays * compute_psi_slope(residual / reach)[:, None],
         rays * weight[:, None],
@@ -271,15 +273,16 @@ def number_cells(cell: np.ndarray) -> np.ndarray:
 
 
 def compute_psi_slope(off: np.ndarray) -> np.ndarray:
-    """Return the derivative of Tukey's influence function over its weight, `(P,)`.
+    """Return the derivative of Tukey's influence function over its weight, `(P,)`; 0 beyond its reach.
 
     `off` is in units of the biweight's reach. The influence of a growing residual falls, so that a
     fit varies more than its weights alone tell: by a fifth with a reach of 4.7 standard
     deviations, by a half with one of 3.
     """
-    # Just below 1, where the derivative has its pole.
-    square = np.minimum(off**2, 1.0 - 1e-9)
-    return (1.0 - 5.0 * square) / (1.0 - square)
+    square = off**2
+    within = square < 1.0
+    # The quotient has a pole at the reach, where the weight is 0.
+    return np.where(within, (1.0 - 5.0 * square) / np.where(within, 1.0 - square, 1.0), 0.0)
 
 
 def estimate_sandwich_covariance(

@@ -271,6 +271,37 @@ def test_a_cut_off_file_is_refused_by_name(
         reader.read(path, carriage)
 
 
+def test_a_lerobot_dataset_with_random_bytes_is_refused_by_its_file(
+    tmp_path: Path, carriage: Machine
+) -> None:
+    write_lerobot(tmp_path / "set", "v2.1")
+    path = tmp_path / "set" / "data" / "chunk-000" / "episode_000000.parquet"
+    whole = path.read_bytes()
+    generator = np.random.default_rng(0)
+    reader = make_map("action[slide]", "observation.state[slide]", "timestamp")
+    refusals: list[str] = []
+    for _ in range(60):
+        data = np.frombuffer(whole, np.uint8).copy()
+        data[generator.integers(len(data), size=20)] = generator.integers(256, size=20)
+        path.write_bytes(data.tobytes())
+        try:
+            reader.read(tmp_path / "set", carriage)
+        except RecordingError as error:
+            refusals.append(str(error))
+    assert len(refusals) > 40
+    assert all(str(path) in text for text in refusals)
+
+
+def test_a_file_with_the_ending_of_another_kind_is_named(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", **make_signals())
+    (tmp_path / "a.npz").rename(tmp_path / "a.csv")
+    with pytest.raises(RecordingError, match=r"ends in '\.csv', .* a NumPy archive; rename it to end in '\.npz'"):  # fmt: skip
+        open_log(tmp_path / "a.csv")
+    (tmp_path / "b.csv").touch()
+    with pytest.raises(RecordingError, match=r"b\.csv: the file is empty"):
+        open_log(tmp_path / "b.csv")
+
+
 def test_a_damaged_array_is_named(tmp_path: Path, carriage: Machine) -> None:
     path = tmp_path / "a.npz"
     np.savez(path, **make_signals())

@@ -17,7 +17,14 @@ from carriage import check, make_carriage, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
-from actuators.recordings.can_log import BlfBlockReader, CanLog, extract_signal, gather_frames
+from actuators.recordings.can_log import (
+    AscBlockReader,
+    BlfBlockReader,
+    CanLog,
+    FrameBlock,
+    extract_signal,
+    gather_frames,
+)
 from actuators.recordings.column_map import AlignedTime, Column
 from actuators.recordings.log_files import open_log
 from brokk_rl.errors import ConfigError, RecordingError
@@ -408,6 +415,40 @@ def test_a_block_of_classic_frames_is_what_python_can_reads(tmp_path: Path) -> N
     for name in ("time_s", "frame_id", "length", "data"):
         found = np.concatenate([getattr(block, name) for block in blocks])
         np.testing.assert_allclose(found, getattr(frames, name), rtol=1e-15)
+
+
+def test_lines_of_an_asc_log_are_what_python_can_reads(tmp_path: Path) -> None:
+    frames = [
+        can.Message(timestamp=k * 0.01, arbitration_id=300 * k, is_extended_id=k > 5, data=bytes(range(k % 9)), is_fd=k == 7)
+        for k in range(1, 40)
+    ]  # fmt: skip
+    with can.Logger(tmp_path / "a.asc") as logger:
+        for frame in frames:
+            logger.on_message_received(frame)
+    text = (tmp_path / "a.asc").read_text().splitlines()
+    text[8:8] = ["// a comment", " 0.035000 1  Statistic: D 1 R 0", " 0.036000 1  ErrorFrame"]
+    text[12] += "  Length = 240000 BitCount = 124 ID = 10"
+    (tmp_path / "a.asc").write_text("\n".join(text) + "\n")
+    found: list[Any] = []
+    with AscBlockReader(tmp_path / "a.asc") as reader:
+        for one in reader:
+            found += [one] if isinstance(one, FrameBlock) else []
+            found += [gather_frames([one])] if isinstance(one, can.Message) and not one.is_error_frame else []  # fmt: skip
+    with can.ASCReader(tmp_path / "a.asc") as reader:
+        whole = gather_frames([one for one in reader if not one.is_error_frame])
+    order = np.argsort(np.concatenate([block.time_s for block in found]), kind="stable")
+    for name in ("time_s", "frame_id", "length", "data"):
+        values = np.concatenate([getattr(block, name) for block in found])[order]
+        np.testing.assert_allclose(values, getattr(whole, name), rtol=1e-15)
+    lines = text.copy()
+    for damaged, refusal in (
+        (text[11][:-3], r"the frame at \S+ s has \d bytes of \d"),
+        (text[11].replace(".", "#", 1), "the line '.*' is no frame"),
+    ):
+        lines[11] = damaged
+        (tmp_path / "a.asc").write_text("\n".join(lines) + "\n")
+        with AscBlockReader(tmp_path / "a.asc") as reader, pytest.raises(ValueError, match=refusal):
+            list(reader)
 
 
 def test_a_cut_off_blf_is_refused_by_its_frame(tmp_path: Path, carriage: Machine) -> None:

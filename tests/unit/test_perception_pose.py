@@ -176,6 +176,24 @@ def test_in_dust_the_light_on_its_wall_tells_a_hole_from_a_flat_disc(estimator) 
     assert isinstance(stain, Rejection) and stain.reason == "brightness inside over outside"
 
 
+def test_a_plane_among_gross_errors_is_as_uncertain_as_it_varies() -> None:
+    chance = np.random.default_rng(3)
+    true, sigmas = np.array([0.05, -0.1, 0.25]), []
+    for _ in range(60):
+        rays = np.column_stack([chance.uniform(-0.2, 0.2, (1500, 2)), np.ones(1500)])
+        gross = chance.random(1500) < 0.3
+        noise = np.where(gross, chance.uniform(-8e-3, 8e-3, 1500), chance.normal(0, 1e-3, 1500))
+        radii = np.sort(chance.uniform(1.25, 12.0, 1500))
+        points = plane.FaceSupport(rays, rays @ true + noise, radii, np.arange(1500) % 40, 1.0)
+        face = plane.fit_plane(points, (2.6, 4.0, 7.0, 12.0), 1e-4, np.random.default_rng(0))
+        assert face is not None
+        off = face.m - true
+        sigmas.append(off @ np.linalg.solve(face.cov, off))
+    # chi-squared with three degrees of freedom: its mean is 3, that of 60 within 0.95 in 3 sigma
+    assert 1.8 < np.mean(sigmas) < 4.5
+    assert max(sigmas) < 25.0
+
+
 def test_a_wall_is_lit_by_as_much_as_was_drawn_whatever_the_gradient_of_dust() -> None:
     frame, _, ellipse = drawn(depth_m=0.0)
     face = plane.FacePlane(AXIS / (AXIS @ CENTER), np.eye(3) * 1e-6, 1e-3, 1000, 7.0)

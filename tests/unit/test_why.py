@@ -15,6 +15,7 @@ from diagnosis.why_answer import (
     BEFORE,
     WhyRequest,
     WhyResult,
+    judge_suspects,
     list_changes,
     list_records,
     write_summary,
@@ -61,6 +62,13 @@ def test_an_effect_within_chance_is_no_cause(tmp_path: Path) -> None:
     result = make_result(tmp_path, 0.95)  # 5 points; the interval of the loss goes below 0
     assert result.cause == "nothing"
     assert "costs no success for sure" in write_summary(result)
+    assert result.tone == "warn"
+
+
+def test_an_effect_whose_cost_is_unknown_is_a_possible_cause(tmp_path: Path) -> None:
+    result = make_result(tmp_path, None)
+    assert result.title == "No sure cause: the machine differs from the simulator"
+    assert judge_suspects(result)[1][0] == "possible"
 
 
 def test_code_comes_before_an_effect_that_costs_success(tmp_path: Path) -> None:
