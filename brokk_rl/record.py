@@ -52,7 +52,7 @@ def check_metadata(metadata: Mapping[str, str], machine: str) -> Iterator[Breach
     for key in ("schema", "machine", "rate_hz"):
         if key not in metadata:
             yield Breach(
-                f"metadata 'brokk.{key}' is missing; not a recording, or one made by another program"
+                f"metadata 'brokk.{key}' is missing; not a recording, or one made by another program: mode=import reads such logs"
             )
     if metadata.get("schema", SCHEMA) != SCHEMA:
         yield Breach(f"brokk.schema is '{metadata['schema']}', this version reads '{SCHEMA}'")
@@ -297,7 +297,9 @@ def examine_recording(path: Path, machine: Machine) -> tuple[Recording | None, l
     except FileNotFoundError:
         return None, [Breach("no such recording")]
     except (pa.ArrowException, OSError) as error:
-        return None, [Breach(f"truncated or not a Parquet file ({error})")]
+        return None, [
+            Breach(f"truncated or not a Parquet file; mode=import reads other logs ({error})")
+        ]
     metadata = {}
     for key, value in (table.schema.metadata or {}).items():
         metadata[key.decode()] = value.decode()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import shutil
 import subprocess
 import sys
@@ -143,7 +144,9 @@ def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) ->
             words += [f"resume={place}"]
         else:
             shutil.rmtree(place)  # an unfinished stage has no record
-    with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words]) as process:
+    # The command sets this for Hydra; a stage that inherited it would print a traceback of user errors.
+    env = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
+    with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words], env=env) as process:
         try:
             code = process.wait()
         except BaseException:

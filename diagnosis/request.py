@@ -100,7 +100,8 @@ class DiagnosisSubject:
         workers: Processes that share the work; 1 where the system has no safe fork.
         prices: Penalties of effects.
         certainty: Calibration of the probabilities.
-        servo_certainty: The same where joints are commanded by position: their errors look different.
+        servo_certainty: The same for joints that are commanded by position and a simulator that was
+            fitted to a reference: it was learned from such cases, and their errors look different.
     """
 
     case: str | None
@@ -112,9 +113,10 @@ class DiagnosisSubject:
     certainty: ProbabilityModel
     servo_certainty: ProbabilityModel
 
-    def choose_certainty(self, machine: Machine) -> ProbabilityModel:
-        """Return the calibration for joints that are commanded as those of this machine."""
-        return self.servo_certainty if machine.interface == "position" else self.certainty
+    def choose_certainty(self, machine: Machine, is_fitted: bool) -> ProbabilityModel:
+        """Return the calibration for a machine and a simulator that was fitted to a reference, or was not."""
+        is_servo = machine.interface == "position" and is_fitted
+        return self.servo_certainty if is_servo else self.certainty
 
     def check(self) -> None:
         if self.workers < 1:

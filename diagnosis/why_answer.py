@@ -120,7 +120,19 @@ class WhyResult:
             if ALL_EFFECTS in self.costs:
                 return "No cause found: what differs costs no success for sure"
             return "No sure cause: the machine differs from the simulator"
+        if self.cause == "nothing" and not self.is_complete:
+            return "No cause found, but not all could be judged"
         return TITLES[self.cause]
+
+    @property
+    def is_complete(self) -> bool:
+        """True if machine and effects could be judged."""
+        found = self.diagnosis
+        return (
+            found is not None
+            and found.verdict != "unknown"
+            and not self.doctor["actuator"]["cannot_tell"]
+        )
 
     @property
     def tone(self) -> Tone:

@@ -126,7 +126,9 @@ def log_undetermined(facts: dict[str, Any]) -> None:
                 ", ".join(vague),
                 name,
             )
-        if stuck := [joint for joint, cell in row.items() if cell["at_bound"]]:
+        # A number that ended at 0 is not needed: no wider range would make sense.
+        ends = {joint: cell["value"] for joint, cell in row.items() if cell["at_bound"]}
+        if stuck := [joint for joint, value in ends.items() if value != 0.0]:
             log.warning(
                 "%s: at the end of fit.free.%s for %s; widen it if that makes sense",
                 name,

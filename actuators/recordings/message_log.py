@@ -7,6 +7,7 @@ the sensor, both in s. Messages are read by blocks of one topic.
 
 from __future__ import annotations
 
+import re
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -104,7 +105,10 @@ class MessageLog(LogFile):
 
         Messages without any wanted number are left out: several programs may send to one topic.
         """
-        names = {topic: sorted(set(columns) - {LOG_TIME}) for topic, columns in wanted.items()}
+        names = {
+            topic: sorted(set(columns) - {LOG_TIME}, key=_pad_numbers)
+            for topic, columns in wanted.items()
+        }
         stores = {topic: StoredColumns([LOG_TIME, *several]) for topic, several in names.items()}
         rows, seen = dict.fromkeys(wanted, 0), dict.fromkeys(wanted, 0)
         begin_ns = None
@@ -184,3 +188,8 @@ class MessageLog(LogFile):
 def describe(error: Exception) -> str:
     """Return kind and text of an error of a library."""
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+
+
+def _pad_numbers(name: str) -> str:
+    """Return a key that puts `q[10]` after `q[2]`."""
+    return re.sub(r"\d+", lambda number: number[0].zfill(9), name)

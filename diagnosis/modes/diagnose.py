@@ -111,7 +111,7 @@ class Diagnose:
             generator = self.session.generator("diagnosis")
             prices, certainty = (
                 self.diagnosis.prices,
-                self.diagnosis.choose_certainty(self.machine),
+                self.diagnosis.choose_certainty(self.machine, bool(given.reference)),
             )
             work = DiagnosisPipeline(
                 given,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -14,7 +13,6 @@ import torch
 from composed import option
 
 from brokk_rl.errors import ConfigError
-from diagnosis import api
 
 CPU = torch.device("cpu")
 SUPPLY_V, OHM, CONSTANT, GEAR, ROTOR = 12.0, 2.0, 0.02, 100.0, 2e-6
@@ -85,20 +83,3 @@ def test_a_supply_sags_under_a_motor_that_stalls() -> None:
 def test_a_motor_refuses_numbers_that_make_no_sense() -> None:
     with pytest.raises(ConfigError, match=r"no_load_m_s: expected > 0"):
         build(no_load_m_s=0.0)
-
-
-@pytest.mark.slow
-def test_a_diagnosis_names_the_friction_that_a_motor_lacks(tmp_path: Path) -> None:
-    """Logs of MuJoCo's motor under duties; back EMF and weight are known, and no phantom stands for them."""
-    machine = pendulum.make_pendulum(STALL_NM)
-    logs = []
-    for seed in range(5):
-        logs.append(pendulum.log_pendulum(machine, lambda *_: 0.4, 0.05, seed, 8.0, DRIVE))
-    load = replace(option("actuator", "force"), **LOAD, viscous_n_s_m=0.05)
-    simulator = replace(option("actuator", "dc_motor"), load=load, no_load_m_s=NO_LOAD)
-    recordings = api.RecordingSet(tuple(logs), machine)
-    answer = api.diagnose(recordings, tmp_path, simulator=simulator).answer
-    assert "coulomb_friction" in {one.effect for one in answer.selected}
-    (found,) = [one for one in answer.selected if one.effect == "coulomb_friction"]
-    assert found.parameters["coulomb_n"]["arm"].mean == pytest.approx(0.4, rel=0.1)
-    assert "viscous_friction" not in {one.effect for one in answer.selected}

@@ -285,6 +285,20 @@ def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(
     np.testing.assert_array_equal(begin.u, whole.u[: begin.num_samples])
 
 
+def test_items_of_lists_keep_their_order(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("state", "jsonschema", b"{}")
+        channel = writer.register_channel("/state", "json", schema)
+        writer.add_message(channel, 0, json.dumps({"q": list(range(12))}).encode(), 0)
+        writer.finish()
+    opened = open_log(path)
+    (run,) = opened.read_runs(opened.list_tables(), None)
+    assert list(run.tables["/state"].columns)[1:] == [f"q[{j}]" for j in range(12)]
+
+
 DEFINITION = """std_msgs/Header header
 bool flag
 uint8 small

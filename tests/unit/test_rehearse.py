@@ -34,7 +34,8 @@ class Played:
         self.commands: dict[str, list[str]] = {}
         self.failing = ""
 
-    def __call__(self, words: list[str]) -> Self:
+    def __call__(self, words: list[str], env: dict[str, str]) -> Self:
+        assert "HYDRA_FULL_ERROR" not in env  # a stage would print a traceback of user errors
         place = Path(
             next(word for word in words if word.startswith("session.out=")).partition("=")[2]
         )

@@ -95,6 +95,8 @@ def test_next_steps_are_commands_with_their_paths(tmp_path: Path) -> None:
 
 def test_a_diagnosis_without_an_answer_asks_for_recordings(tmp_path: Path) -> None:
     result = replace(make_result(tmp_path, None), diagnosis=None)
+    assert result.title == "No cause found, but not all could be judged"
+    assert result.tone == "warn"
     ((text, command),) = list_records(result)
     assert "a minute or more in two files" in text
     assert "mode=collect" in command
