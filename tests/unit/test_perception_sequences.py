@@ -141,7 +141,7 @@ def test_a_camera_day_runs_its_stages_once_and_goes_on(
     played: list[list[str]] = []
 
     class Stage:
-        def __init__(self, words: list[str]) -> None:
+        def __init__(self, words: list[str], env: dict[str, str]) -> None:
             out = Path(words[-1].partition("=")[2])
             played.append([out.name, *words[words.index("brokk_rl") + 1 :]])
             self._code = int(out.name == "labels" and len(played) < 5)
