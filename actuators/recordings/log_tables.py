@@ -64,7 +64,7 @@ class LogFile(ABC):
     """A log of which only the needed columns are read."""
 
     keep_whole = False
-    """Whether damaged parts are left out with a warning; a log with damage is refused otherwise."""
+    """True leaves damaged parts out with a warning; False refuses a log with damage."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

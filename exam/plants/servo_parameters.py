@@ -8,6 +8,8 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from exam.plants.faults import FAULTS as VALVE_FAULTS
+from exam.plants.faults import FaultSizes
 from exam.plants.plant_parameters import PlantParameters
 
 MAKES = ("bristle", "dry")
@@ -62,29 +64,9 @@ def draw_servos(machine: Machine, seed: int, roughness: float) -> tuple[str, Pla
     return make, found
 
 
-FaultSizes = Mapping[str, np.ndarray]
-"""Parameters of an effect by name, `(J,)`, neutral where a joint lacks it."""
-
-
-def _add_dead_time(n: PlantParameters, size: FaultSizes) -> None:
-    n["transport_s"] = n["transport_s"] + size["dead_time_s"]
-
-
-def _add_delay_jitter(n: PlantParameters, size: FaultSizes) -> None:
-    n["jitter_s"] = n["jitter_s"] + size["jitter_s"]
-
-
-def _add_frame_loss(n: PlantParameters, size: FaultSizes) -> None:
-    n["loss"] = n["loss"] + size["probability"]
-
-
 def _add_lag(n: PlantParameters, size: FaultSizes) -> None:
     """Add the firmware's smoothing of targets: two equal stages with the same mean delay."""
     n["filter_s"] = n["filter_s"] + 0.5 * size["time_constant_s"]
-
-
-def _add_rate_limit(n: PlantParameters, size: FaultSizes) -> None:
-    n["stroke_s"] = n["stroke_s"] + size["stroke_s"]
 
 
 def _add_backlash(n: PlantParameters, size: FaultSizes) -> None:
@@ -104,10 +86,6 @@ def _add_quantisation(n: PlantParameters, size: FaultSizes) -> None:
     n["step_rad"] = np.maximum(n["step_rad"], size["step_rad"])
 
 
-def _add_sensor_noise(n: PlantParameters, size: FaultSizes) -> None:
-    n["extra_noise_rad"] = n["extra_noise_rad"] + size["sigma_rad"]
-
-
 def _add_joint_friction(n: PlantParameters, size: FaultSizes) -> None:
     n["added_friction_n_m"] = n["added_friction_n_m"] + size["part"] * n["full_n_m"]
 
@@ -124,16 +102,15 @@ def _add_drive_gain(n: PlantParameters, size: FaultSizes) -> None:
     n["stiffness"] = n["stiffness"] * size["gain"]
 
 
+LIKE_VALVES = ("dead_time", "delay_jitter", "frame_loss", "rate_limit", "sensor_noise")
+"""Effects that change the same parameters as on a valve."""
 FAULTS: dict[str, Callable[[PlantParameters, FaultSizes], None]] = {
-    "dead_time": _add_dead_time,
-    "delay_jitter": _add_delay_jitter,
-    "frame_loss": _add_frame_loss,
+    # of the bus, of the slope of targets, of readings: as on valves
+    **{name: VALVE_FAULTS[name] for name in LIKE_VALVES},
     "lag": _add_lag,
-    "rate_limit": _add_rate_limit,
     "backlash": _add_backlash,
     "sag": _add_sag,
     "quantisation": _add_quantisation,
-    "sensor_noise": _add_sensor_noise,
     "joint_friction": _add_joint_friction,
     "joint_damping": _add_joint_damping,
     "joint_armature": _add_joint_armature,

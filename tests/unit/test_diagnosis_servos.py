@@ -1,4 +1,4 @@
-"""What the diagnosis knows of position servos: late frames, faults of their own numbers, noise of readings."""
+"""Diagnosis of position servos: late frames, faults of their own numbers, noise of readings."""
 
 from __future__ import annotations
 

@@ -28,9 +28,10 @@ from servo_arm import (
 )
 
 FRICTION = "m1"
-"""Of the six models: that of the package's own fit of this servo, `params/feetech_sts3215_7_4V`."""
+"""Friction model, one of six: that of the package's own fit of this servo, `params/feetech_sts3215_7_4V`."""
 GENERATIONS, FIELD_GENERATIONS, SIGMA, FIELD_SIGMA = 150, 100, 0.3, 0.15
-"""Of the reference from the package's start values, of the field from the reference's answer."""
+"""Generations and first spread of the searches. That of the reference begins at the package's values, that
+of the field at the answer of the reference."""
 LIMIT = "max_velocity"
 """Bound on the speed of targets. Above the motor's own speed it shows nothing, and a search does not
 find its way down from there, so that the field begins at the package's value again."""
