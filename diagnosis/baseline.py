@@ -1,9 +1,7 @@
 """The simulator that is held against the field, and its errors on reference recordings left out of its fit.
 
 The simulator is fitted to the reference and cross-validated there. Its own numbers are then tuned
-by free runs, because a fit and a diagnosis weigh errors differently. Effects that the reference
-shows already (a valve that overshoots, a pin that rubs) are put around it: the field lacks them
-again, so they are no change of the machine.
+by free runs, because a fit and a diagnosis weigh errors differently.
 Axes: `F` parts of the reference, `P` numbers of the simulator, `J` joints, `E` entries (whitened
 increments).
 """
@@ -12,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -30,7 +28,7 @@ from brokk_rl.record import Recording
 from brokk_rl.scales import choose_horizon_s
 from diagnosis import residual_model
 from diagnosis.case import GapCase, estimate_running_s, split_recordings
-from diagnosis.effect_library import EffectSimulator, EffectType, EffectValues
+from diagnosis.effect_library import EffectSimulator
 from diagnosis.error_covariance import (
     ErrorCovariance,
     compute_loss,
@@ -39,16 +37,7 @@ from diagnosis.error_covariance import (
 )
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.number_faults import list_number_faults
-from diagnosis.refine import drop_windows
-from diagnosis.residuals import ParameterRay, Residuals, build_rays
-from diagnosis.responses import (
-    MIN_RESPONSE,
-    Response,
-    fit_faults,
-    list_shape_trials,
-    simulate_trials,
-)
-from diagnosis.search import SubsetTable
+from diagnosis.residuals import Residuals
 
 log = logging.getLogger(__name__)
 
@@ -225,7 +214,7 @@ def fit_baseline(
 
     A fit with `refit` is fitted again without each fold. Any other fit is slow, so it is fitted
     once, without the last fold. `refined` may change the simulator before its discrepancy is
-    learned; see `add_reference_effects`.
+    learned; see `diagnosis.reference_effects`.
 
     Raises:
         RecordingError: too little reference.
@@ -245,7 +234,7 @@ def fit_baseline(
         actuator = apply_changes(actuator, tuned, machine)
         changed = [apply_changes(one.residuals.simulator.base, tuned, machine) for one in left_out]
         left_out = [one.with_base(base) for one, base in zip(left_out, changed, strict=True)]
-        left_out = _set_covariances(left_out, machine)
+        left_out = set_covariances(left_out, machine)
         field = field.with_base(actuator)
     field = replace(
         field, residuals=replace(field.residuals, valid_mask=_find_known_windows(case, field))
@@ -262,12 +251,9 @@ def learn_errors(base: Baseline, machine: Machine) -> Baseline:
         replace(one, residuals=replace(one.residuals, bias=bias))
         for one, bias in zip(base.left_out, biases, strict=True)
     ]
-    left_out = _set_covariances(left_out, machine)
-    widths = residual_model.estimate_fault_scales([one.residuals for one in left_out])
-    left_out = [replace(one, residuals=replace(one.residuals, widths=widths)) for one in left_out]
-    field = replace(
-        base.field.residuals, noise=left_out[0].residuals.noise, bias=of_field, widths=widths
-    )
+    left_out = _set_fault_scales(set_covariances(left_out, machine))
+    known = left_out[0].residuals
+    field = replace(base.field.residuals, noise=known.noise, bias=of_field, widths=known.widths)
     return replace(base, field=replace(base.field, residuals=field), left_out=left_out)
 
 
@@ -283,6 +269,8 @@ def accept_simulator(
 
     There is no reference here. The residuals of `fit` on recordings left out of its fit replace it:
     they give noise, penalty and floor. Where `fit` fails, the noise is that of the simulator.
+    Their own numbers may be far off, so their errors in these are estimated; else an effect would
+    have to pay for them.
     """
     machine = case.machine
     field = compare_simulator(actuator, _list_started(case.field), machine, seed)
@@ -292,6 +280,7 @@ def accept_simulator(
             left_out = _cross_validate(case.field, pieces, fit, machine, folder, seed, device)[1]
     except RecordingError as error:
         log.warning("no floor: a flexible model cannot be fitted to the field (%s)", error)
+    left_out = _set_fault_scales(left_out) if left_out else []
     known = left_out[0].residuals.noise if left_out else fit_covariances([field], machine)
     return Baseline(
         actuator,
@@ -330,14 +319,21 @@ def _cross_validate(
         actuator = fit.fit(machine, rest[: max(1, len(rest) - 1)], rest[-1:], folder, seed, device)
         left = [one for one, out in zip(begun, last, strict=True) if out]
         left_out.append(compare_simulator(actuator, left, machine, seed))
-    return actuator, _set_covariances(left_out, machine)
+    return actuator, set_covariances(left_out, machine)
 
 
-def _set_covariances(
+def set_covariances(
     left_out: Sequence[SimulatorComparison], machine: Machine
 ) -> list[SimulatorComparison]:
+    """Return the same with the noise of their residuals."""
     known = fit_covariances(left_out, machine)
     return [replace(one, residuals=replace(one.residuals, noise=known)) for one in left_out]
+
+
+def _set_fault_scales(left_out: Sequence[SimulatorComparison]) -> list[SimulatorComparison]:
+    """Return the same with the errors of the simulators' own numbers, as the recordings show them."""
+    widths = residual_model.estimate_fault_scales([one.residuals for one in left_out])
+    return [replace(one, residuals=replace(one.residuals, widths=widths)) for one in left_out]
 
 
 def _list_started(recordings: Sequence[Recording]) -> StartedRecordings:
@@ -370,125 +366,3 @@ def _find_known_windows(case: GapCase, field: SimulatorComparison) -> np.ndarray
     most = np.abs(u).max(0) + 0.05
     beyond = np.abs(cut.u) > most
     return (outside.mean(1) < 0.1) & (beyond.mean(1) < 0.1)
-
-
-# Chosen by hand. SURE_GAIN was 8 before; no comparison is recorded.
-REFERENCE_SIZES = (0.12, 0.3, 0.45, 0.6, 1.0)
-"""Sizes over the typical one."""
-SURE_GAIN = 6.0
-"""Log Bayes factor, all parts together, from which an effect is there."""
-AGREEING_SHARE = 0.75
-"""Share of the parts in which its gain must be positive."""
-REFERENCE_WINDOWS = 3
-"""One of so many stretches of each part is searched, which saves time."""
-
-RaysByTrial = Mapping[str, Sequence[ParameterRay]]
-
-
-def add_reference_effects(
-    base: Baseline, kinds: Sequence[EffectType], machine: Machine
-) -> Baseline:
-    """Return the simulator with the effects around it that the reference shows.
-
-    Args:
-        base: A simulator, and fits that left out parts of the reference, their noise known, before
-            any discrepancy is learned.
-        kinds: The library.
-        machine: The machine.
-    """
-    ways: dict[str, list[ParameterRay]] = {}
-    for kind in kinds:
-        if _is_one_sided(kind):
-            ways |= _list_trials(kind)
-    if len(base.left_out) < 2 or base.is_flexible:
-        return base
-    parts = [drop_windows(one.residuals, REFERENCE_WINDOWS) for one in base.left_out]
-    found = _find_effects(parts, ways, machine.joint_names)
-    return _wrap_simulator(base, found, machine) if found else base
-
-
-def _is_one_sided(kind: EffectType) -> bool:
-    """Return True where free runs show the effect on a joint alone, and sizes have one sign only.
-
-    Sizes of both signs have been settled by the fit of the simulator.
-    """
-    if kind.target.stochastic or kind.target.side not in ("speed", "command"):
-        return False
-    rays = build_rays(kind, REFERENCE_SIZES)
-    return bool(rays) and all(ray.sizes.min() >= 0.0 for ray in rays)
-
-
-def _list_trials(kind: EffectType) -> dict[str, list[ParameterRay]]:
-    """Return the ways in which an effect can grow, by a name for each of its shapes."""
-    found = {}
-    for place, trial in enumerate(list_shape_trials(kind)):
-        shape = {name: np.full(kind.num_joints, part) for name, part in trial.items()}
-        rays = build_rays(kind, REFERENCE_SIZES)
-        found[f"{kind.name} {place}"] = [replace(ray, shape=shape) for ray in rays]
-    return found
-
-
-def _find_effects(
-    parts: Sequence[Residuals], ways: RaysByTrial, joint_names: Sequence[str]
-) -> list[tuple[EffectType, EffectValues]]:
-    """Return the effect that each joint shows most surely in all parts together, with its numbers, each `(1, J)`."""
-    responses = simulate_trials(parts, ways)
-    of_part = np.repeat(np.arange(len(parts)), [part.z.shape[1] for part in parts])
-    found: dict[str, tuple[EffectType, dict[str, np.ndarray]]] = {}
-    for j in range(parts[0].z.shape[0]):
-        joint = fit_faults(
-            np.concatenate([part.z[j] for part in parts]),
-            np.concatenate([part.faults[j] for part in parts], 1),
-        )
-        shapes: dict[str, list[Response]] = {}
-        for key, way in ways.items():
-            changes = [np.concatenate([one[j] for one in own], 1) for own in responses[key]]
-            if max(np.abs(change).max() for change in changes) >= MIN_RESPONSE:
-                pairs = zip(way, changes, strict=True)
-                shapes[key] = [Response(ray.sizes, change) for ray, change in pairs]
-        table = SubsetTable(joint, shapes, of_part)
-        scored = {key: table.score(frozenset({key})) for key in shapes}
-        best = max(scored, key=lambda key: scored[key].total, default=None)
-        if best is None or scored[best].total < SURE_GAIN:
-            continue
-        # A fault of one recording is no property of the machine.
-        if np.mean(np.bincount(of_part, scored[best].gain) > 0) < AGREEING_SHARE:
-            continue
-        kind = ways[best][0].kind
-        log.info("the reference shows %s on %s already", kind.name, joint_names[j])
-        _, values = found.setdefault(
-            kind.name, (kind, _expand_values(kind, ways[best], np.zeros(len(ways[best]))))
-        )
-        for name, value in _expand_values(kind, ways[best], scored[best].sizes[best]).items():
-            values[name][:, j] = value[:, j]
-    return list(found.values())
-
-
-def _expand_values(
-    kind: EffectType, ways: Sequence[ParameterRay], sizes: np.ndarray
-) -> dict[str, np.ndarray]:
-    """Return the numbers of an effect at sizes along its rays, the same on all joints, each `(1, J)`."""
-    found = {
-        name: np.broadcast_to(kind.typical(name), (1, kind.num_joints)) for name in kind.shaping
-    }
-    for ray, size in zip(ways, sizes, strict=True):
-        found |= ray.values(np.full((1, kind.num_joints), size))
-    shape = (1, kind.num_joints)
-    return {name: np.broadcast_to(value, shape).copy() for name, value in found.items()}
-
-
-def _wrap_simulator(
-    base: Baseline, effects: Sequence[tuple[EffectType, EffectValues]], machine: Machine
-) -> Baseline:
-    """Return the simulator with effects around it, and the noise of its residuals with them."""
-
-    def around(one: SimulatorComparison) -> SimulatorComparison:
-        simulator = one.residuals.simulator
-        fixed = replace(simulator, fixed=[*simulator.fixed, *effects])
-        return replace(
-            one, residuals=Residuals(fixed, one.residuals.noise, one.residuals.valid_mask)
-        )
-
-    left_out = [around(one) for one in base.left_out]
-    left_out = _set_covariances(left_out, machine)
-    return replace(base, field=around(base.field), left_out=left_out)

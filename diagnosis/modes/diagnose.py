@@ -20,7 +20,16 @@ from brokk_rl.parallel import use_workers
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from diagnosis import answer, baseline, case, effect_library, effects_file, report, report_checks
+from diagnosis import (
+    answer,
+    baseline,
+    case,
+    effect_library,
+    effects_file,
+    reference_effects,
+    report,
+    report_checks,
+)
 from diagnosis.answer import Answer, Outcome
 from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
@@ -166,7 +175,7 @@ class Diagnose:
 
         def refine(base: Baseline) -> Baseline:
             tell("what the reference shows", 0.15)
-            return baseline.add_reference_effects(base, kinds, self.machine)
+            return reference_effects.add_reference_effects(base, kinds, self.machine)
 
         if given.reference:
             return baseline.fit_baseline(given, self.fit, folder / "base", seed, device, refine)

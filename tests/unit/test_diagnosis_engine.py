@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from brokk_rl.contracts.actuator import Effect
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from diagnosis import answer, baseline, case, effect_library, effects_file
+from diagnosis import answer, baseline, case, effect_library, effects_file, reference_effects
 from diagnosis.answer import (
     Answer,
     Estimate,
@@ -36,6 +37,7 @@ from diagnosis.answer import (
 from diagnosis.case import GapCase
 from diagnosis.pipeline import DiagnosisPipeline
 from diagnosis.request import Penalties
+from diagnosis.residuals import build_rays
 
 CPU = torch.device("cpu")
 PRICES = Penalties(joint=4.0, reference=2.0, name=6.0, partial=6.0, share=0.06)
@@ -110,10 +112,34 @@ def test_what_the_reference_shows_already_is_put_around_the_simulator(
     )
     given = GapCase(axis, soft, soft[:1])
     after = baseline.fit_baseline(
-        given, fit, tmp_path, 0, CPU, lambda base: baseline.add_reference_effects(base, kinds, axis)
+        given,
+        fit,
+        tmp_path,
+        0,
+        CPU,
+        lambda base: reference_effects.add_reference_effects(base, kinds, axis),
     )
     ((kind, values),) = after.field.residuals.simulator.fixed
     assert kind.name == "compliance" and values["ringing_s"][0, 0] == pytest.approx(0.3, abs=0.1)
+
+
+def test_an_effect_that_only_mends_a_fault_of_the_simulator_is_not_put_around_it(
+    axis: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lag and a response that is too short compensate each other; the simulator keeps its response."""
+    (kind,) = effect_library.load_effects(axis, ("lag",))
+    rays = build_rays(kind, reference_effects.REFERENCE_SIZES)
+    slow, error = 8.0 * np.sin(np.arange(400) / 7.0), 2.0 * np.cos(np.arange(400) / 11.0)
+    change = np.array(rays[0].sizes)[:, None] * slow  # of the lag, at each size
+
+    def found_with(z: np.ndarray) -> list[Any]:
+        part: Any = SimpleNamespace(z=z[None], faults=(error - slow)[None, None])
+        responses = {"lag": [[change[None]] for _ in rays]}
+        monkeypatch.setattr(reference_effects, "simulate_trials", lambda parts, ways: responses)
+        return reference_effects._find_effects([part], {"lag": rays}, axis.joint_names)
+
+    assert not found_with(error)  # the lag and the fault explain it together only
+    assert [kind.name for kind, _ in found_with(0.6 * slow)] == ["lag"]
 
 
 @pytest.mark.slow
