@@ -73,6 +73,8 @@ def count_names(truth: set[str], named: list[str]) -> tuple[int, int, int]:
 def main(exam: Path, answers: Path, rival: str) -> None:
     """Write spreads and threshold of the rival into the file of rules."""
     cases = list(read_answers(exam, answers))
+    if not cases:
+        raise SystemExit(f"{answers}: expected answers to {exam} with changes.json, found none")
     spreads = measure_spreads(cases)
     table = []
     for threshold in THRESHOLDS:
