@@ -1,12 +1,13 @@
-"""Marks of the published answers to the exam of position servos, without the examiner's runs on withheld recordings.
+"""Marks of the published answers to an exam of position servos, without the examiner's runs on withheld recordings.
 
-`python benchmarks/exam/servos/score_answers.py`, in the project's root, reads `labels.json` and
-`answers_diagnosis.jsonl` beside it and writes `marks.json`.
+`python benchmarks/exam/servos/score_answers.py <folder>`, in the project's root, reads `labels.json` and
+`answers_diagnosis.jsonl` in the folder and writes `marks.json` there.
 """
 
 from __future__ import annotations
 
 import json
+import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +19,6 @@ from diagnosis import answer
 from exam import score
 from exam.metrics import compute_metrics
 
-HERE = Path(__file__).parent
 NEEDS_EXAMINER = (
     "closed_of_oracle",
     "closed_examined",
@@ -39,10 +39,10 @@ def read_published(row: Mapping[str, Any]) -> answer.Answer | None:
         return answer.read_answer(path)
 
 
-def main() -> None:
+def main(folder: Path) -> None:
     """Write `marks.json`."""
-    labels = json.loads((HERE / "labels.json").read_text())
-    rows = map(json.loads, (HERE / "answers_diagnosis.jsonl").read_text().splitlines())
+    labels = json.loads((folder / "labels.json").read_text())
+    rows = map(json.loads, (folder / "answers_diagnosis.jsonl").read_text().splitlines())
     said = {row["case"]: row for row in rows}
     mix = load_option("exam_mix", "servos")
     shared = [name for name, one in mix.troubles.items() if one.joints == "all"]
@@ -52,8 +52,8 @@ def main() -> None:
         marks.append(score.score_answer(label, found, mix.classes, shared))
     metrics = {k: v for k, v in compute_metrics(marks).items() if k not in NEEDS_EXAMINER}
     facts = {"engine": said["0000"]["note"]["engine"], "seed": labels["seed"]}
-    write_json(HERE / "marks.json", {**facts, "candidates": {"diagnosis": metrics}})
+    write_json(folder / "marks.json", {**facts, "candidates": {"diagnosis": metrics}})
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]))
