@@ -1,11 +1,13 @@
 """Share of the gap that a rival closes in its own simulator, with everything it fitted.
 
-    python benchmarks/exam/rivals/own_gap.py <sitting> <exam> <opened> <machine.yaml> <out.json> <rival>=<answers> ...
+    python benchmarks/exam/rivals/own_gap.py <sitting> <exam> <scored> <out.json> <rival>=<answers> ...
+
+`<scored>` is the work folder of `table.py`, with the machine and what was examined.
 
 Free runs of 5 s over the withheld recordings, as the exam's examiner has them: before is the rival's
 simulator as fitted to the reference, after as fitted to the field, floor the first against the same
 machine without the cause. No name of an effect counts here. `paired` has the cases with a gap that all rivals answered, beside
-the diagnosis's published closing by its named effects. Runs in the rivals' environment.
+the diagnosis's closing by its named effects. Runs in the rivals' environment.
 """
 
 from __future__ import annotations
@@ -46,11 +48,9 @@ def close_gap(rival: str, exam: Path, case: str, answer: Path, arm: Arm) -> dict
     return {"before": before, "after": after, "floor": floor, "closed": closed}
 
 
-def main(
-    sitting: str, exam: Path, opened: Path, machine: Path, out: Path, rivals: dict[str, Path]
-) -> None:
+def main(sitting: str, exam: Path, scored: Path, out: Path, rivals: dict[str, Path]) -> None:
     """Write the shares of all cases with one or several effects."""
-    arm, found = read_arm(machine), {}
+    arm, found = read_arm(scored / "machine.yaml"), {}
     for label in json.loads((exam / "labels.sealed.json").read_text())["cases"]:
         for rival, answers in rivals.items():
             place = answers / label["case"]
@@ -58,7 +58,7 @@ def main(
                 found.setdefault(rival, {})[label["case"]] = close_gap(
                     rival, exam, label["case"], place, arm
                 )
-    ours = json.loads((opened / "examined.json").read_text())["diagnosis"]
+    ours = json.loads((scored / "examined.json").read_text())["diagnosis"]
     shares = {name: {case: one["closed"] for case, one in x.items()} for name, x in found.items()}
     shares["diagnosis"] = {case: one["closed"] for case, one in ours.items()}
     paired = []
@@ -83,6 +83,6 @@ def main(
 if __name__ == "__main__":
     main(
         sys.argv[1],
-        *map(Path, sys.argv[2:6]),
-        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[6:])},
+        *map(Path, sys.argv[2:5]),
+        {name: Path(folder) for name, _, folder in (one.partition("=") for one in sys.argv[5:])},
     )

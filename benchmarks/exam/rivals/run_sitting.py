@@ -4,7 +4,7 @@
     python benchmarks/exam/rivals/run_sitting.py held_out <exam> benchmarks/exam/held_out/second <work> --workers 16
 
 `<exam>` is a folder of `exam.do=make`; for `held_out` it is made from the published salt where it is
-missing. `<marks>` holds the diagnosis's answers to it and their marks, as `exam.do=score` writes them.
+missing. `<marks>` holds the published answers of the diagnosis; closings that its `examined.json` lacks are measured.
 Answers, examinations and a development exam go to `<work>`. A rival without a rule in `rules.json`
 first sits the development exam, and its rule is chosen there. Results stand beside this file.
 `--until answers` stops before the labels are opened, so that `<marks>` need not exist yet.
@@ -88,7 +88,7 @@ def main(args: argparse.Namespace) -> None:
         *(HERE / f"{sitting.name}.json", *pairs, "--workers", args.workers),
     )
     gaps = HERE / f"{sitting.name}_own_gap.json"
-    words = (args.sitting, args.exam, args.marks, scored / "machine.yaml", gaps, *pairs)
+    words = (args.sitting, args.exam, scored, gaps, *pairs)
     subprocess.run([args.python, HERE / "own_gap.py", *words], check=True)
 
 

@@ -83,7 +83,7 @@ def measure_within(
 
 
 def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
-    """Write the published answers of the diagnosis as the exam left them, and their examinations."""
+    """Write the published answers of the diagnosis as the exam left them, and their examinations where there are any."""
     for line in (opened / f"answers_{OURS}.jsonl").read_text().splitlines():
         row = json.loads(line)
         if row["case"] in cases:
@@ -91,11 +91,10 @@ def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
             place.mkdir(parents=True, exist_ok=True)
             write_json(place / "diagnosis.json", row["answer"])
             write_json(place / "sitting.json", row["note"])
-    examined = json.loads((opened / "examined.json").read_text())[OURS]
-    known = {case: one for case, one in examined.items() if case in cases}
-    path = work / "examined.json"
-    if not path.is_file():
-        write_json(path, {OURS: known})
+    published, path = opened / "examined.json", work / "examined.json"
+    if published.is_file() and not path.is_file():
+        examined = json.loads(published.read_text())[OURS]
+        write_json(path, {OURS: {case: one for case, one in examined.items() if case in cases}})
 
 
 def write_named(answers: Path, cases: list[str], rule: dict[str, Any], out: Path) -> None:
