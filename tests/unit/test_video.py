@@ -182,18 +182,19 @@ def test_a_page_without_its_video_says_so_and_goes_on(page: Any) -> None:
 def test_pictures_cover_nothing_and_their_words_are_whole(
     page: Any, tmp_path: Path, size: tuple[int, int]
 ) -> None:
-    ending, left = threading.Event(), threading.Event()
+    ending = threading.Event()
 
     async def promise_cameras() -> None:
-        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        relays: list[asyncio.StreamWriter] = []
+
+        def answer(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             writer.write(b'{"cameras": ["front", "boom"]}\n')
-            await reader.read()  # until the relay goes
-            writer.close()
-            await writer.wait_closed()
-            left.set()
+            relays.append(writer)
 
         async with await asyncio.start_unix_server(answer, tmp_path / SOCKET):
             await asyncio.to_thread(ending.wait)
+            for relay in relays:
+                relay.close()
 
     cameras = threading.Thread(target=asyncio.run, args=(promise_cameras(),))
     cameras.start()
@@ -218,7 +219,6 @@ def test_pictures_cover_nothing_and_their_words_are_whole(
         assert covered == []
     finally:
         page.close()
-        left.wait(10)
         ending.set()
         cameras.join(10)
 
