@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -215,6 +216,25 @@ def test_a_cut_off_mcap_is_refused_by_its_place(
     path.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(RecordingError, match=r"a\.mcap: .*whole up to byte \d+ of \d+"):
         reader.read(path, carriage)
+
+
+@pytest.mark.parametrize(("page", "most"), [(0.6, 0.7), (0.9, 0.95)])
+def test_a_damaged_sqlite_bag_is_refused_by_its_place(
+    tmp_path: Path, carriage: Machine, page: float, most: float
+) -> None:
+    """SQLite keeps messages in the order of its pages of 4096 bytes."""
+    reader = WRITERS["sqlite"](tmp_path / "bag")
+    (file,) = (tmp_path / "bag").glob("*.db3")
+    data = bytearray(file.read_bytes())
+    begin = int(page * len(data)) // 4096 * 4096
+    data[begin : begin + 4096] = b"\xff" * 4096
+    file.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"\.db3: damaged after \d+ messages, ") as told:
+        reader.read(tmp_path / "bag", carriage)
+    (count, seconds) = re.findall(r"after (\d+) messages, ([\d.]+) s", str(told.value))[0]
+    rows = list_rows()
+    assert 0.5 * page < int(count) / (2 * len(rows)) < most
+    assert float(seconds) == pytest.approx((rows[(int(count) - 1) // 2][0] - rows[0][0]) * 1e-9)
 
 
 def test_a_flipped_byte_of_an_mcap_is_refused(tmp_path: Path, carriage: Machine) -> None:
