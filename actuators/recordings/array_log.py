@@ -191,7 +191,8 @@ class MatlabLog(LogFile):
             several = _name_array_columns(array, shape)
             if not any(name in names for name in several):
                 continue
-            values = self._call(matlab.loadmat, variable_names=[array])[array]
+            at_array = f"array '{array}' "
+            values = self._call(matlab.loadmat, at_array, variable_names=[array])[array]
             if values.dtype.kind not in "fiu":
                 raise RecordingError(f"{self.path}: array '{array}' is not real")
             values = values.reshape(-1, 1) if len(shape) == 1 else values
@@ -202,7 +203,7 @@ class MatlabLog(LogFile):
             del values
         yield LogRun(self.path.stem, str(self.path), {"": Table(columns)})
 
-    def _call(self, reader: Any, **options: Any) -> Any:
+    def _call(self, reader: Any, place: str = "", **options: Any) -> Any:
         try:
             return reader(self.path, **options)
         except NotImplementedError as error:
@@ -211,7 +212,7 @@ class MatlabLog(LogFile):
             ) from error
         except Exception as error:  # SciPy raises what its parser stumbles over
             raise RecordingError(
-                f"{self.path}: cannot be read as a MATLAB file up to version 7 ({error})"
+                f"{self.path}: {place}cannot be read as a MATLAB file up to version 7 ({error})"
             ) from error
 
 

@@ -271,6 +271,18 @@ def test_a_cut_off_file_is_refused_by_name(
         reader.read(path, carriage)
 
 
+def test_a_damaged_array_of_matlab_is_refused_by_name(tmp_path: Path, carriage: Machine) -> None:
+    path, values = tmp_path / "a.mat", np.random.default_rng(0).random(4000)
+    scipy.io.savemat(
+        path, {"t": np.arange(4000) * 0.01, "u": values, "q": values}, do_compression=True
+    )
+    data = bytearray(path.read_bytes())
+    data[-len(values) * 4 :] = bytes(len(values) * 4)  # the second half of the last array
+    path.write_bytes(data)
+    with pytest.raises(RecordingError, match=r"a\.mat: array 'q' cannot be read"):
+        make_map("u", "q", "t").read(path, carriage)
+
+
 def test_a_lerobot_dataset_with_random_bytes_is_refused_by_its_file(
     tmp_path: Path, carriage: Machine
 ) -> None:
