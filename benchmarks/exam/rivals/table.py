@@ -15,6 +15,7 @@ import json
 import os
 import platform
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,9 @@ from sittings import SITTINGS, describe_command
 
 from brokk_rl.extensions import register_options
 from brokk_rl.session import write_json, write_text
+from diagnosis import effect_library, effects_file
 from diagnosis.answer import read_answer
+from diagnosis.effect_library import EffectType
 from exam import dataset, score
 from exam.answer_scoring import AnswerScoring
 from exam.generate import restrict_machine
@@ -82,7 +85,9 @@ def measure_within(
     return {"top1": compute_rate(firsts), "effects_named": {"value": named, "of": there}}
 
 
-def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
+def unpack_published(
+    opened: Path, cases: list[str], work: Path, kinds: Sequence[EffectType]
+) -> None:
     """Write the published answers of the diagnosis as the exam left them, and their examinations where there are any."""
     for line in (opened / f"answers_{OURS}.jsonl").read_text().splitlines():
         row = json.loads(line)
@@ -91,6 +96,8 @@ def unpack_published(opened: Path, cases: list[str], work: Path) -> None:
             place.mkdir(parents=True, exist_ok=True)
             write_json(place / "diagnosis.json", row["answer"])
             write_json(place / "sitting.json", row["note"])
+            path = place / effects_file.EFFECTS_FILE  # for the examiner
+            effects_file.write_effects(read_answer(place / "diagnosis.json"), kinds, path)
     published, path = opened / "examined.json", work / "examined.json"
     if published.is_file() and not path.is_file():
         examined = json.loads(published.read_text())[OURS]
@@ -181,7 +188,6 @@ def main(
     """Name, examine, score, write."""
     labels = dataset.open_labels(exam)["cases"]
     cases = [label["case"] for label in labels]
-    unpack_published(opened, cases, work)
     rules = json.loads(RULES_FILE.read_text())
     folders = {OURS: work / OURS}
     for name, answers in rivals.items():
@@ -196,6 +202,7 @@ def main(
     settings = mode.exam
     known = json.loads((exam / "exam.json").read_text())["known"]
     machine = restrict_machine(mode.machine, known)
+    unpack_published(opened, cases, work, effect_library.load_effects(machine))
     write_text(work / MACHINE_FILE, yaml.safe_dump(describe_spec(machine), sort_keys=False))
     # those that some rival has not answered are left out for all
     sat = [
