@@ -314,6 +314,8 @@ def explain(error: BaseException) -> str | None:
 
 
 def _explain_missing_value(key: str) -> str:
+    if "[" in key:  # an item of a list cannot be overridden
+        return f"{key} has no value: fill in ??? in its file"
     return f"{key} has no default and must be given: {key}=<value>"
 
 

@@ -73,8 +73,14 @@ def load_option(group: str, name: str, **fields: object) -> Any:
         group: Config group.
         name: Name of the option, of this package or of an installed extension; or `@<path>` of a file.
         fields: Values that replace those of its file.
+
+    Raises:
+        ConfigError: There is no such option or file, or it is not valid.
     """
     register_options([f"{group}={name}"])
+    known = {option.name for option in registry.list_options() if option.group == group}
+    if not name.startswith("@") and name not in known:
+        raise ConfigError(f"there is no {group}={name}; {list_choices(name, known)}")
     changes = [f"subject.{field}={value}" for field, value in fields.items()]
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject='{name}'", *changes])

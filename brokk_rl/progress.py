@@ -52,7 +52,8 @@ class ItemProgress:
         # Tables and figures go to stdout; whoever redirects them still sees the bar.
         self._bar = Progress(
             *columns,
-            console=Console(stderr=True),
+            # A notebook without ipywidgets would get a warning for each bar.
+            console=Console(stderr=True, force_jupyter=False),
             transient=True,
             speed_estimate_period=SPEED_WINDOW_S,
             disable=quiet,

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from actuators.recordings import conversion, log_guess, map_draft
-from actuators.recordings.column_guess import Guess
+from actuators.recordings.column_guess import CommandKind, GivenColumns, Guess
 from actuators.recordings.column_names import UNITS
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
@@ -29,7 +29,7 @@ MAP_FILE, MACHINE_FILE = "column_map.yaml", "machine.yaml"
 GUESS_FILE, PICTURE_FILE, PAGE_FILE = "import.json", "import.png", "import.html"
 SIMULATORS = {
     "position": "actuator=servo fit=servo",
-    "torque": "actuator=force fit=force",
+    "torque": "actuator=force actuator.mass_kg=<of your simulator> fit=force",
     "speed": "actuator=ideal",
 }
 """Ideal simulator of each command interface, by which recordings are diagnosed first."""
@@ -43,6 +43,9 @@ class LogSelection:
     Attributes:
         input: Glob, or list of globs, of logs of one kind; a folder stands for the logs in it.
         name: Name of the machine that is drafted; `null`: that of the folder of the logs.
+        joints: Columns of command and position by joint, where their names do not say it; `null`
+            to find them by their names.
+        command: `velocity`, `position` or `torque`, the quantity that commands set; `null` to guess.
         position_unit: Unit of the positions where their names do not say it: one for all joints, or
             a table by joint; `null` to guess.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
@@ -51,6 +54,8 @@ class LogSelection:
 
     input: str | tuple[str, ...]
     name: str | None
+    joints: dict[str, tuple[str, str]] | None
+    command: CommandKind | None
     position_unit: str | dict[str, str] | None
     dbc: str | None
     damaged: Damaged
@@ -108,7 +113,8 @@ class ImportLogs:
                 Console().print(text, markup=False, highlight=False, soft_wrap=True)
             return
         paths = conversion.find_logs(self.log.input)
-        guess = log_guess.guess_logs(paths, self.log.position_unit, self.log.dbc, self.log.damaged)
+        given = GivenColumns(self.log.joints, self.log.command, self.log.position_unit)
+        guess = log_guess.guess_logs(paths, given, self.log.dbc, self.log.damaged)
         folder = self.session.folder
         figure = log_guess.draw_guess(guess)
         figure.savefig(folder / PICTURE_FILE, dpi=110)
@@ -158,7 +164,10 @@ def _summarise(draft: Draft, guesses: list[Guess]) -> str:
     unsure = sum(guess.sureness == "unsure" for guess in guesses)
     end = "No guess is unsure."
     if unsure:
-        end = f"{unsure} guesses are unsure: fill in {map_draft.MISSING} in {MAP_FILE}."
+        many = "1 guess is" if unsure == 1 else f"{unsure} guesses are"
+        end = f"{many} unsure: fill in {map_draft.MISSING} in {MAP_FILE}."
+    if any(joint.kind == "torque" for joint in draft.joints):
+        end += f" The force at full command is not in the logs: fill in {map_draft.MISSING} in {MACHINE_FILE}."
     return (
         f"{draft.survey.num_runs} runs, {draft.survey.minutes:.1f} minutes, {len(draft.joints)} joints at "
         f"{1.0 / draft.survey.period_s:.4g} Hz. {end}"
@@ -175,7 +184,9 @@ def _write_page(draft: Draft, guesses: list[Guess], folder: Path, command: str) 
     page.add_heading("Guesses")
     rows = [[guess.subject, guess.value, guess.sureness, guess.reason] for guess in guesses]
     page.add_table(
-        HEAD, rows, "sure: name and numbers agree; likely: one of them speaks; unsure: fill it in"
+        HEAD,
+        rows,
+        "sure: name and numbers agree, or given; likely: one of the two; unsure: fill it in",
     )
     if draft.remarks:
         page.add_list(list(draft.remarks))

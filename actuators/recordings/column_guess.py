@@ -2,7 +2,8 @@
 
 Names propose, numbers decide. A guess is `sure` where name and numbers agree, `likely` where one of
 them speaks and the other does not contradict, and `unsure` else. An unsure guess is never used: the
-column map that is written has `???` in its place, with the candidates beside it.
+column map that is written has `???` in its place, with the candidates beside it. A person who knows
+columns that are named otherwise gives them, and nothing is guessed about these.
 """
 
 from __future__ import annotations
@@ -26,10 +27,15 @@ from actuators.recordings.column_names import (
     read_column_name,
     split_words,
 )
+from actuators.recordings.log_signals import index_columns
 from actuators.recordings.log_tables import LogRun, Table, join_names
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import RecordingError, list_choices
 
 Sureness = Literal["sure", "likely", "unsure"]
+CommandKind = Literal["velocity", "position", "torque"]
+"""Quantity that commands set, as `command` of a joint in a machine file."""
+Pairing = Literal["same name", "same place in their order", "as given by log.joints"]
+"""Reason for which a command and a position belong to one joint."""
 
 RATES_HZ = (1.0, 5000.0)
 """Slowest and fastest rate of a log of joints; a unit of time that gives another one is wrong."""
@@ -37,8 +43,15 @@ LONGEST_LAG_S = 1.5
 """Longest lag from command to motion that is tried: more than twice the 0.55 s of the slowest machine known."""
 CLEAR_CORRELATION = 0.8
 """From here on the numbers confirm a pair: two thirds of the variance are explained."""
+NO_CORRELATION = 0.3
+"""Below it the numbers contradict a pair: less than a tenth of the variance is explained."""
 MARGIN = 0.1
 """A partner that correlates better by so much contradicts a pair."""
+COMMAND_KINDS: dict[CommandKind, str] = {
+    "velocity": "sets the speed",
+    "position": "a target of the position",
+    "torque": "sets a force or torque",
+}
 TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
 GRID_ROWS = 20000
@@ -82,6 +95,21 @@ class TimeGuess:
 
 
 @dataclass(frozen=True)
+class GivenColumns:
+    """Meanings that a person gives, which are then not guessed.
+
+    Attributes:
+        joints: Columns of command and position by joint; `None` to find them by their names.
+        command: Quantity that commands set; `None` to guess it.
+        position_unit: Unit of the positions, for all joints or by joint; `None` to guess it.
+    """
+
+    joints: Mapping[str, tuple[str, str]] | None = None
+    command: CommandKind | None = None
+    position_unit: str | Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True)
 class JointGuess:
     """The columns of a joint.
 
@@ -89,7 +117,7 @@ class JointGuess:
         name: Name of the joint.
         command: Full name of the column of its command.
         position: Full name of the column of its position.
-        kind: Whether the command is a target position, or sets the speed.
+        kind: The command is a target position, or sets the speed or a torque.
         sign: -1 where larger commands move to smaller positions.
         lag_s: Lag of the motion behind the command at the best correlation.
         unit: `rad` or `m`.
@@ -100,7 +128,7 @@ class JointGuess:
     name: str
     command: str
     position: str
-    kind: Literal["target", "speed"]
+    kind: Literal["target", "speed", "torque"]
     sign: int
     lag_s: float
     unit: str
@@ -208,19 +236,54 @@ def _list_families(run: LogRun, times: Mapping[str, TimeGuess]) -> list[_Family]
 
 
 def guess_joints(
-    run: LogRun, times: Mapping[str, TimeGuess], position_unit: str | Mapping[str, str] | None
+    run: LogRun, times: Mapping[str, TimeGuess], given: GivenColumns
 ) -> tuple[list[JointGuess], list[str]]:
     """Return the joints of a run, and remarks on what was left out.
 
     Args:
         run: Beginning of a log, with all columns.
         times: Clock of each table.
-        position_unit: Unit of the positions as a person gives it, for all joints or by joint; `None`
-            to guess it.
+        given: Meanings that a person gives.
 
     Raises:
-        RecordingError: No command or no position can be proposed.
+        RecordingError: No command or no position can be proposed, or a given column is missing.
     """
+    if given.joints is None:
+        pairs, pairing, remarks = _pair_by_names(run, times)
+    else:
+        pairs, pairing, remarks = _pair_as_given(run, times, given.joints), "as given by log.joints", []  # fmt: skip
+    comparison = _Comparison(run, times, pairs)
+    return [
+        _judge_joint(joint, *pair, comparison, pairing, given) for joint, pair in pairs.items()
+    ], remarks
+
+
+Pairs = dict[str, tuple[ColumnName, ColumnName]]
+"""Columns of command and position by joint."""
+
+
+def _pair_as_given(
+    run: LogRun, times: Mapping[str, TimeGuess], given: Mapping[str, tuple[str, str]]
+) -> Pairs:
+    places = index_columns({name: [*table.columns] for name, table in run.tables.items()})
+    pairs: Pairs = {}
+    for joint, columns in given.items():
+        for column in columns:
+            if column not in places:
+                raise RecordingError(
+                    f"{run.where}: log.joints: '{joint}' has column '{column}', which is missing; {list_choices(column, places)}"
+                )
+            if places[column][0] not in times:
+                raise RecordingError(
+                    f"{run.where}: log.joints: column '{column}' of '{joint}' has no clock: no column of its table only increases"
+                )
+        command, position = (read_column_name(*places[column]) for column in columns)
+        pairs[joint] = (command, position)
+    return pairs
+
+
+def _pair_by_names(run: LogRun, times: Mapping[str, TimeGuess]) -> tuple[Pairs, Pairing, list[str]]:
+    """Return the pairs that the names propose, their reason, and remarks."""
     families = _list_families(run, times)
     commands = [f for f in families if f.role == "command" and f.quantity != "effort"]
     positions = [f for f in families if f.role != "command" and f.quantity in ("position", "unknown")]  # fmt: skip
@@ -230,8 +293,8 @@ def guess_joints(
         lacking = "commands" if not commands else "positions"
         known = [join_names(t, c) for t, content in run.tables.items() for c in content.columns]
         raise RecordingError(
-            f"{run.where}: no column is named like {lacking}; write a column map by hand (import=@<file>), its columns are "
-            f"{', '.join(known)}"
+            f"{run.where}: no column is named like {lacking}; name those of each joint: "
+            f"'log.joints={{boom: [<command>, <position>]}}'; its columns are {', '.join(known)}"
         )
 
     def rank(pair: tuple[_Family, _Family]) -> tuple[int, int, int]:
@@ -242,13 +305,14 @@ def guess_joints(
 
     command, position = max(((c, p) for c in commands for p in positions), key=rank)
     shared = [joint for joint in command.members if joint in position.members]
-    remarks = []
+    remarks: list[str] = []
+    pairing: Pairing = "same name"
+    pairs: Pairs = {}
     if shared:
         pairs = {joint: (command.members[joint], position.members[joint]) for joint in shared}
-        is_named = True
     elif len(command.members) == len(position.members):
-        is_named = len(command.members) == 1
-        pairs = {}
+        if len(command.members) > 1:
+            pairing = "same place in their order"
         for one, other in zip(command.members.values(), position.members.values(), strict=True):
             pairs[one.joint or other.joint] = (one, other)
         remarks.append("commands and positions have different names and are paired in their order")
@@ -256,16 +320,12 @@ def guess_joints(
         raise RecordingError(
             f"{run.where}: {len(command.members)} commands ({', '.join(c.column for c in command.members.values())}) and "
             f"{len(position.members)} positions ({', '.join(p.column for p in position.members.values())}) share no names; "
-            "write a column map by hand (import=@<file>)"
+            "name those of each joint: 'log.joints={boom: [<command>, <position>]}'"
         )
     rivals = [join_names(f.table, next(iter(f.members.values())).column) for f in commands if f is not command]  # fmt: skip
     if rivals:
         remarks.append(f"other commands that were not taken: {', '.join(rivals)}")
-    comparison = _Comparison(run, times, pairs)
-    return [
-        _judge_joint(joint, *pair, comparison, is_named, position_unit)
-        for joint, pair in pairs.items()
-    ], remarks
+    return pairs, pairing, remarks
 
 
 class _Comparison:
@@ -328,8 +388,8 @@ def _judge_joint(
     command: ColumnName,
     position: ColumnName,
     comparison: _Comparison,
-    is_named: bool,
-    position_unit: str | Mapping[str, str] | None,
+    pairing: Pairing,
+    given: GivenColumns,
 ) -> JointGuess:
     target_r, speed_r = comparison.correlate(joint, joint)
     u, q = comparison.commands[joint], comparison.positions[joint]
@@ -338,8 +398,11 @@ def _judge_joint(
     is_like_target = TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] and target_r >= CLEAR_CORRELATION
     is_target = is_like_target and (says_target or target_r > abs(speed_r))
     is_target = is_target or (says_target and abs(speed_r) < CLEAR_CORRELATION)
+    if given.command is not None:
+        is_target = given.command == "position"
     r = target_r if is_target else speed_r
-    lag_s = comparison.find_lag(joint, is_target)
+    # The motion that a force causes has no lag of its own: inertia delays it.
+    lag_s = 0.0 if given.command == "torque" else comparison.find_lag(joint, is_target)
     name, full_command = name_joint(joint), join_names(command.table, command.column)
     full_position = join_names(position.table, position.column)
     rival, rival_r = "", 0.0
@@ -350,15 +413,20 @@ def _judge_joint(
             rival, rival_r = max((rival, rival_r), (other, size), key=lambda one: one[1])
     signal = "position" if is_target else "speed"
     reason = f"correlation of {signal} with command {r:.2f}, {lag_s:.2f} s later"
+    is_named = pairing != "same place in their order"
     sureness: Sureness = "likely" if is_named else "unsure"
-    if np.ptp(u) == 0:
+    if pairing == "as given by log.joints":
+        sureness = "sure"
+    elif np.ptp(u) == 0:
         reason = "its command does not change in the beginning of the log"
     elif rival_r > abs(r) + MARGIN and abs(r) < CLEAR_CORRELATION:
         sureness = "unsure" if not is_named or rival_r > CLEAR_CORRELATION else "likely"
         reason += f"; with the command of {rival} {rival_r:.2f}"
     elif abs(r) >= CLEAR_CORRELATION:
         sureness = "sure" if is_named else "likely"
-    pairing = "same name" if is_named else "same place in their order"
+    elif max(abs(target_r), abs(speed_r)) < NO_CORRELATION:
+        sureness = "unsure"
+        reason += "; its position does not follow its command"
     guesses = {
         "columns": Guess(
             f"{name}: columns",
@@ -367,15 +435,21 @@ def _judge_joint(
             f"{pairing}; {reason}",
         )
     }
-    guesses["kind"] = _judge_kind(name, is_target, says_target, target_r, speed_r)
-    given = position_unit.get(name) if isinstance(position_unit, Mapping) else position_unit
-    unit, scale, guesses["unit"] = _judge_unit(name, position, q, given)
-    sign = 1 if is_target or r >= 0 else -1
+    guesses["kind"] = _judge_kind(name, is_target, command.quantity, target_r, speed_r)
+    if given.command is not None:
+        value = COMMAND_KINDS[given.command]
+        guesses["kind"] = Guess(f"{name}: command", value, "sure", "as given by log.command")
+    unit = given.position_unit
+    if isinstance(unit, Mapping):
+        unit = unit.get(name)
+    unit, scale, guesses["unit"] = _judge_unit(name, position, q, unit)
+    is_torque = given.command == "torque"
+    sign = 1 if is_target or is_torque or r >= 0 else -1
     return JointGuess(
         name,
         full_command,
         full_position,
-        "target" if is_target else "speed",
+        "torque" if is_torque else "target" if is_target else "speed",
         sign,
         lag_s,
         unit,
@@ -385,14 +459,16 @@ def _judge_joint(
 
 
 def _judge_kind(
-    name: str, is_target: bool, says_target: bool, target_r: float, speed_r: float
+    name: str, is_target: bool, quantity: Quantity, target_r: float, speed_r: float
 ) -> Guess:
-    value = "a target of the position" if is_target else "sets the speed"
+    says_target = quantity == "position"
+    value = COMMAND_KINDS["position" if is_target else "velocity"]
     reason = f"correlation with position {target_r:.2f}, with speed {speed_r:.2f}"
     clear = abs(target_r if is_target else speed_r) >= CLEAR_CORRELATION
     if is_target == says_target:
         return Guess(f"{name}: command", value, "sure" if clear else "likely", reason)
-    return Guess(f"{name}: command", value, "likely" if clear else "unsure", f"{reason}; its name says otherwise")  # fmt: skip
+    says = "does not say it" if quantity == "unknown" else "says otherwise"
+    return Guess(f"{name}: command", value, "likely" if clear else "unsure", f"{reason}; its name {says}")  # fmt: skip
 
 
 def _judge_unit(

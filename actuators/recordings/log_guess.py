@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from actuators.recordings.column_guess import (
+    GivenColumns,
     JointGuess,
     TimeGuess,
     guess_joints,
@@ -63,10 +64,7 @@ class LogGuess:
 
 
 def guess_logs(
-    paths: Sequence[Path],
-    position_unit: str | Mapping[str, str] | None,
-    dbc: str | None,
-    damaged: Damaged = "refuse",
+    paths: Sequence[Path], given: GivenColumns, dbc: str | None, damaged: Damaged = "refuse"
 ) -> LogGuess:
     """Return the guesses from the beginnings of the logs.
 
@@ -87,10 +85,12 @@ def guess_logs(
         clocks = guess_times(run)
         if not clocks:
             columns = ", ".join(index_columns(opened.list_tables()))
+            if not columns:
+                raise RecordingError(f"{path}: no column of numbers can be read in it")
             raise RecordingError(
                 f"{path}: no column only increases at a rate of 1 to 5000 Hz, so none can be the time; columns: {columns}"
             )
-        joints, more = guess_joints(run, clocks, position_unit)
+        joints, more = guess_joints(run, clocks, given)
         samples.append(run)
         times = times or clocks
         remarks += [remark for remark in more if remark not in remarks]
@@ -159,7 +159,7 @@ def draw_guess(guess: LogGuess) -> Figure:
             other.set_ylabel(joint.command, color=ORANGE, fontsize=7)
             other.spines["top"].set_visible(False)
         columns, kind = joint.guesses["columns"], joint.guesses["kind"]
-        relation = f"{joint.command} {kind.value}" if joint.kind == "speed" else f"{joint.command} is {kind.value}"  # fmt: skip
+        relation = f"{joint.command} is {kind.value}" if joint.kind == "target" else f"{joint.command} {kind.value}"  # fmt: skip
         axis.set_title(
             f"{joint.name} ({columns.sureness}): {relation} ({kind.sureness}); {run.name}",
             loc="left",

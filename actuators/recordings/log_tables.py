@@ -6,6 +6,7 @@ is `<table>:<column>`; a log with one table leaves the first part out.
 
 from __future__ import annotations
 
+import functools
 import logging
 import weakref
 from abc import ABC, abstractmethod
@@ -60,6 +61,12 @@ class LogRun:
     tables: Mapping[str, Table]
 
 
+@functools.cache
+def _warn_once(text: str) -> None:
+    """Warn of a damage; a log is read several times, and each time it is met again."""
+    log.warning("%s", text)
+
+
 class LogFile(ABC):
     """A log of which only the needed columns are read."""
 
@@ -80,7 +87,7 @@ class LogFile(ABC):
             raise RecordingError(
                 f"{self.path}: {text}; log.damaged=skip, or damaged: skip in the column map, reads what is whole"
             ) from error
-        log.warning("%s: %s: left out", self.path, text)
+        _warn_once(f"{self.path}: {text}: left out")
 
     @abstractmethod
     def list_tables(self) -> dict[str, list[str]]:

@@ -78,15 +78,19 @@ class Draft:
         found = [time.guess for time in self.times.values()]
         for joint in self.joints:
             found += joint.guesses.values()
-            if joint.kind == "speed":
+            if joint.kind != "target":
                 found.append(scale_command(joint, self.survey.joints[joint.name]).guess)
         return found
 
 
 def scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
-    """Return neutral and full commands of a joint whose command sets its speed."""
+    """Return neutral and full commands of a joint whose command sets its speed, or a force."""
     low, high = survey.lowest_command, survey.highest_command
     subject = f"{joint.name}: full command"
+    if joint.kind == "torque":  # a joint at rest may be held by a force, so 0 is neutral
+        full = max(abs(low), abs(high))
+        guess = Guess(subject, f"-{full:.6g} to {full:.6g}", "likely", "the largest command of the logs, both ways")  # fmt: skip
+        return CommandDraft(0.0, full, -full, guess)
     is_unit = -1.001 <= low < -0.5 and 0.5 < high <= 1.001
     if is_unit:
         neutral, low, high = 0.0, -1.0, 1.0
@@ -257,6 +261,15 @@ def format_machine(draft: Draft) -> str:
         ]
         if draft.has_targets:
             lines.append("    command: position   # full commands are the ends of the travel")
+        elif joint.kind == "torque":
+            full = scale_command(joint, survey).full_plus
+            force = "Nm" if joint.unit == "rad" else "N"
+            lines += [
+                "    command: torque",
+                f"    # {MISSING}: {force} at full command, which is {full:g} of '{joint.command}'",
+                f"    max_force: {{_target_: brokk_rl.machine.Dimension, value: {QUOTED_MISSING}, "
+                'source: "given by hand", confidence: medium}',
+            ]
     return "\n".join(lines) + "\n"
 
 

@@ -20,6 +20,8 @@ from actuators.recordings.message_log import Gatherer, MessageBlock, MessageLog,
 from actuators.recordings.message_numbers import NumberReader, ObjectReader
 from brokk_rl.errors import RecordingError
 
+MAGIC = b"\x89MCAP0\r\n"
+"""Begin of an MCAP file."""
 RECORD_HEAD = struct.Struct("<BQ")
 """Kind of an MCAP record and size of what follows."""
 MESSAGE_HEAD = struct.Struct("<HIQQ")
@@ -197,6 +199,9 @@ def _find_reader(encoding: str, schema: Any) -> NumberReader | None:
 def _find_damage(path: Path) -> str:
     """Return the place to which an MCAP file can be read."""
     with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            return "it does not begin as an MCAP file does"
+        file.seek(0)
         at = 0
         try:
             for _ in StreamReader(file, emit_chunks=True, validate_crcs=False).records:

@@ -8,6 +8,7 @@ the sensor, both in s. Messages are read by blocks of one topic.
 from __future__ import annotations
 
 import re
+import struct
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
@@ -187,6 +188,8 @@ class MessageLog(LogFile):
 
 def describe(error: Exception) -> str:
     """Return kind and text of an error of a library."""
+    if isinstance(error, struct.error):  # its name is `error`
+        return f"cut off ({error})"
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 

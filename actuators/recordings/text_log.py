@@ -10,7 +10,9 @@ from __future__ import annotations
 import csv
 import logging
 import re
+import sys
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -77,6 +79,22 @@ class CsvTable(Table):
         return cells[header.index(name)] or "''"
 
 
+@contextmanager
+def _hide_bad_text() -> Iterator[None]:
+    """Hide the traceback of a bad line that is no text: pyarrow prints it before its own error."""
+    before = sys.unraisablehook
+
+    def hide(found: sys.UnraisableHookArgs) -> None:
+        if found.exc_type is not UnicodeDecodeError:
+            before(found)
+
+    sys.unraisablehook = hide
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+
+
 class CsvLog(LogFile):
     """A CSV file as a log with one table."""
 
@@ -135,6 +153,7 @@ class CsvLog(LogFile):
         table = CsvTable(columns, self.path, self._layout.delimiter)
         yield LogRun(self.path.stem, str(self.path), {"": table})
 
+    @_hide_bad_text()
     def _read(self, wanted: dict[str, list[str]], max_rows: int | None) -> StoredColumns:
         columns = StoredColumns(name for several in wanted.values() for name in several)
         skipped: list[int] = []

@@ -201,12 +201,52 @@ def test_one_of_machine_and_map_alone_is_refused(brokk: Callable[..., Done]) -> 
     assert "import=… is missing" in done.err
 
 
-def test_a_log_without_commands_lists_its_columns(brokk: Callable[..., Done]) -> None:
-    rows = np.arange(100.0)
-    write_table(Path("a.csv"), {"t": rows / 50, "q": np.sin(rows), "vir": rows})
+def test_columns_that_no_name_tells_are_given_with_the_torque_that_they_set(
+    brokk: Callable[..., Done],
+) -> None:
+    t_s = np.arange(500) / RATE_HZ
+    volts = 5.0 * np.sin(2.0 * t_s) + np.where(t_s > 5, 3.0, 0.0)
+    q = np.cumsum(np.cumsum(volts)) / RATE_HZ**2 / 10.0
+    write_table(Path("a.csv"), {"t": t_s, "q": q, "vir": volts})
     done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
     assert done.code == 2
     assert "no column is named like commands" in done.err and "vir" in done.err
+    assert "log.joints={boom" in done.err
+    done = brokk("mode=import", "log.input=a.csv", "log.joints={slide: [vir, qm]}")
+    assert done.code == 2 and "'qm', which is missing; did you mean 'q'?" in done.err
+    given = ("log.joints={slide: [vir, q]}", "log.command=torque", "log.position_unit=m")
+    done = brokk("mode=import", "log.input=a.csv", *given, "session.out=draft")
+    assert done.code == 0, done.err
+    assert read_guesses("draft")["slide: columns"]["sureness"] == "sure"
+    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv")
+    done = brokk("mode=import", *options, "session.out=out")
+    assert done.code == 2 and "max_force.value has no value: fill in ???" in done.err
+    machine = Path("draft/machine.yaml")
+    machine.write_text(machine.read_text().replace('value: "???"', "value: 40.0"))
+    done = brokk("mode=import", *options, "session.out=out")
+    assert done.code == 0, done.err
+    assert "actuator=force actuator.mass_kg=" in done.out
+    import pyarrow.parquet as pq
+
+    (path,) = Path("out/recordings").iterdir()
+    u = pq.read_table(path)["u_slide"].to_numpy()
+    np.testing.assert_allclose(u, volts[: len(u)] / np.abs(volts).max(), atol=1e-4)
+
+
+def test_a_position_that_does_not_follow_its_command_is_left_to_a_person(
+    brokk: Callable[..., Done],
+) -> None:
+    targets = make_targets()
+    columns = {"t_s": np.arange(len(targets)) / RATE_HZ}
+    for j, name in enumerate(("hip", "knee")):
+        columns[f"{name}_target"] = targets[:, j]
+    columns["hip_pos_rad"] = delay(targets)[:, 0]
+    columns["knee_pos_rad"] = np.random.default_rng(0).normal(size=len(targets))
+    write_table(Path("a.csv"), columns)
+    assert brokk("mode=import", "log.input=a.csv", "session.out=draft").code == 0
+    guesses = read_guesses("draft")
+    assert guesses["hip: columns"]["sureness"] == "sure"
+    assert guesses["knee: columns"]["sureness"] == "unsure"
 
 
 @pytest.mark.parametrize(

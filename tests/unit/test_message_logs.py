@@ -282,7 +282,7 @@ def write_chunks(path: Path) -> Any:
 
 
 def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(
-    tmp_path: Path, carriage: Machine
+    tmp_path: Path, carriage: Machine, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "a.mcap"
     reader = write_chunks(path)
@@ -296,6 +296,8 @@ def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(
         reader.read(path, carriage)
     skipping = replace(reader, damaged="skip")
     first, second = skipping.read(path, carriage)
+    skipping.read(path, carriage)
+    assert len([one for one in caplog.messages if "left out" in one]) == 1
     np.testing.assert_array_equal(first.u, whole.u[: first.num_samples])
     np.testing.assert_array_equal(second.u, whole.u[-second.num_samples :])
     assert first.num_samples + second.num_samples < whole.num_samples
@@ -303,6 +305,9 @@ def test_what_is_whole_of_a_damaged_mcap_is_read_when_asked(
         reader.read(cut, carriage)
     (begin,) = skipping.read(cut, carriage)
     np.testing.assert_array_equal(begin.u, whole.u[: begin.num_samples])
+    path.write_text("no log")
+    with pytest.raises(RecordingError, match="does not begin as an MCAP file does"):
+        reader.read(path, carriage)
 
 
 def test_items_of_lists_keep_their_order(tmp_path: Path) -> None:

@@ -201,3 +201,8 @@ def test_a_training_of_an_earlier_version_acts_as_it_did() -> None:
     registry.upgrade_fields(config)
     found = instantiate(config, _convert_="all")
     assert found == replace(load_option("rl", "ppo"), fault_steps=0)
+
+
+def test_an_option_that_does_not_exist_is_told_with_the_choices_in_a_program_too() -> None:
+    with pytest.raises(ConfigError, match=r"no machine=brokk17; did you mean 'brokk170'\? choices: "):
+        load_option("machine", "brokk17")
