@@ -18,6 +18,7 @@ from hydra.utils import instantiate
 import brokk_rl
 import conf
 from brokk_rl import registry
+from brokk_rl.errors import ConfigError
 from brokk_rl.modes import doctor
 from brokk_rl.modes.doctor import Doctor, DoctorFinding, DoctorLimits
 from brokk_rl.registry import Option
@@ -204,5 +205,7 @@ def test_a_training_of_an_earlier_version_acts_as_it_did() -> None:
 
 
 def test_an_option_that_does_not_exist_is_told_with_the_choices_in_a_program_too() -> None:
-    with pytest.raises(ConfigError, match=r"no machine=brokk17; did you mean 'brokk170'\? choices: "):
+    with pytest.raises(
+        ConfigError, match=r"no machine=brokk17; did you mean 'brokk170'\? choices: "
+    ):
         load_option("machine", "brokk17")
