@@ -4,7 +4,7 @@ import math
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from typing import Any, TypeVar, Union, dataclass_transform
 
 from brokk_rl.errors import ConfigError
@@ -45,11 +45,15 @@ def restore_spec(kind: type[T], values: Mapping[str, Any]) -> T:
     """
     hints = typing.get_type_hints(kind)
     names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    needed = {field.name for field in fields(kind) if field.default is MISSING}  # type: ignore[arg-type]
+    needed = {field.name for field in fields(kind) if _is_needed(field)}  # type: ignore[arg-type]
     if wrong := (values.keys() - names) | (needed - values.keys()):
         odd = ", ".join(sorted(wrong))
         raise ConfigError(f"{kind.__name__}: unknown or missing fields: {odd}")
     return kind(**{name: restore_value(hints[name], value) for name, value in values.items()})
+
+
+def _is_needed(field: Field[Any]) -> bool:
+    return field.default is MISSING and field.default_factory is MISSING
 
 
 def restore_value(hint: Any, value: Any) -> Any:

@@ -356,7 +356,7 @@ def describe_detected_effect(
     near = sorted(found.rivals, key=lambda name: -found.rivals[name])
     least = max(SAME_SHARE * found.gain, found.gain - SAME_NATS)
     like = tuple([name for name in near if found.rivals[name] > least][:MAX_EQUIVALENTS])
-    form = weights.form[found.kind.stage]
+    form = weights.get_form_error(found.kind.name, found.kind.stage)
     parameters: dict[str, dict[str, Estimate]] = {}
     for name, estimates in found.parameters.items():
         none = found.kind.numbers[name].none or 0.0

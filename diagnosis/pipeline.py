@@ -239,7 +239,10 @@ class DiagnosisPipeline:
                 probability=probability,
                 parameters=verdict.mark_bounds(
                     decision.estimate_numbers(
-                        result, kind, self.case.machine, self.calibration.form[kind.stage]
+                        result,
+                        kind,
+                        self.case.machine,
+                        self.calibration.get_form_error(kind.name, kind.stage),
                     ),
                     result.fitted,
                     kind,

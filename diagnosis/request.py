@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import field
 from pathlib import Path
 
 from brokk_rl.errors import ConfigError, list_choices
@@ -52,6 +53,7 @@ class ProbabilityModel:
             logarithm of the odds.
         right: Of the signs that an effect is rightly named.
         form: Relative model-form error of the size of an effect, 1 sigma, by stage.
+        form_of_effect: The same of single effects, in place of that of their stage.
         choice: Of the signs of hypotheses, by verdict, and the `stakes`: factors on the probability of
             each verdict when one is told.
     """
@@ -60,6 +62,11 @@ class ProbabilityModel:
     right: dict[str, float]
     form: dict[str, float]
     choice: dict[str, dict[str, float]]
+    form_of_effect: dict[str, float] = field(default_factory=dict)  # older files lack it
+
+    def get_form_error(self, effect: str, stage: str) -> float:
+        """Return the relative 1-sigma model-form error of an effect that lies on `stage`."""
+        return self.form_of_effect.get(effect, self.form[stage])
 
     def check(self) -> None:
         known = {
@@ -82,8 +89,10 @@ class ProbabilityModel:
                 raise ConfigError(
                     f"certainty.{name}: expected a number for {', '.join(missing)} too"
                 )
-        if min(self.form.values()) < 0:
-            raise ConfigError("certainty: expected form of 0 or more")
+        for name in ("form", "form_of_effect"):
+            for key, value in getattr(self, name).items():
+                if value < 0:
+                    raise ConfigError(f"certainty.{name}.{key}: expected 0 or more, got {value}")
 
 
 @spec

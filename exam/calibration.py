@@ -28,7 +28,7 @@ from diagnosis.detection import DetectionResult
 from diagnosis.effect_library import EffectType
 from diagnosis.request import Penalties, ProbabilityModel
 from exam import dataset, score
-from exam.score import QUIET_KINDS, CaseScore, ParameterScore
+from exam.score import QUIET_KINDS, CaseScore
 
 log = logging.getLogger(__name__)
 
@@ -49,6 +49,27 @@ FORM_ERRORS = np.linspace(0.0, 0.3, 61)
 """Model-form errors that are tried, relative, in steps of 0.005."""
 TARGET_COVERAGE = 0.9
 """Share of true sizes that 90 % intervals must cover."""
+LEAST_NUMBERS = 8
+"""Sizes of an effect from which it has a model-form error of its own: of fewer, one decides. Chosen by hand."""
+
+
+@dataclass(frozen=True)
+class SizeError:
+    """Error of a stated size of an effect, over its true size.
+
+    Attributes:
+        error: Absolute error.
+        deviation: Stated standard deviation, without the error of the effect's form.
+        said: The stated size.
+    """
+
+    error: float
+    deviation: float
+    said: float
+
+    def is_covered(self, form: float) -> bool:
+        """Return whether the 90 % interval holds the truth at a model-form error of `form`."""
+        return self.error <= 1.645 * float(np.hypot(self.deviation, form * self.said))
 
 
 @dataclass(frozen=True)
@@ -274,7 +295,8 @@ class PenaltyFit:
             "right": fit_logistic(named, true, start.right) if len(set(true)) > 1 else start.right
         }
         choice = fit_choice(cases, weights.choice)
-        return replace(weights, form=self.forms(cases, weights.form), choice=choice, **found)
+        by_stage, by_effect = self.fit_forms(cases, weights)
+        return replace(weights, form=by_stage, form_of_effect=by_effect, choice=choice, **found)
 
     def _named(
         self, cases: Sequence[WeighedCase], prices: Penalties, weights: ProbabilityModel
@@ -289,23 +311,36 @@ class PenaltyFit:
                     true.append(name in stand)
         return signs, true
 
-    def forms(self, cases: Sequence[WeighedCase], now: Mapping[str, float]) -> dict[str, float]:
-        """Return the smallest model-form errors with which 90 % intervals cover 90 %.
+    def fit_forms(
+        self, cases: Sequence[WeighedCase], now: ProbabilityModel
+    ) -> tuple[dict[str, float], dict[str, float]]:
+        """Return the smallest model-form errors, by stage and by effect, with which 90 % intervals cover 90 %.
 
-        Timing and actuation share one; sensing, kinematics and perception share another.
+        Timing and actuation share one; sensing, kinematics and perception share another. An effect with
+        `LEAST_NUMBERS` sizes or more has its own. What the cases do not decide stays.
         """
-        stages, found = {kind.name: kind.stage for kind in self.kinds}, dict(now)
+        stages = {kind.name: kind.stage for kind in self.kinds}
+        errors = self.collect_size_errors(cases, now)
+        by_stage = dict(now.form)
         for group in (("timing", "actuation"), ("sensing", "kinematics", "perception")):
-            errors: list[tuple[ParameterScore, float]] = []
-            for item in cases:
-                mark = score.score_answer(item.label, item.said, self.classes, self.of_machine)
-                for one in mark.numbers:
-                    if stages[one.effect] in group:
-                        errors.append((one, now[stages[one.effect]]))
-            least = _find_form_error(errors)
-            # no parameter of the group, or no error that is enough: the present one stays
+            mine = [effect for effect in errors if stages[effect] in group]
+            least = find_form_error([one for effect in mine for one in errors[effect]])
             if least is not None:
-                found |= dict.fromkeys(group, round(least, 3))
+                by_stage |= dict.fromkeys(group, least)
+        return by_stage, now.form_of_effect | find_effect_forms(errors)
+
+    def collect_size_errors(
+        self, cases: Sequence[WeighedCase], now: ProbabilityModel
+    ) -> dict[str, list[SizeError]]:
+        """Return the errors of all stated sizes, by effect; `now` stated their intervals."""
+        stages = {kind.name: kind.stage for kind in self.kinds}
+        found: dict[str, list[SizeError]] = {}
+        for item in cases:
+            mark = score.score_answer(item.label, item.said, self.classes, self.of_machine)
+            for one in mark.numbers:
+                form = now.get_form_error(one.effect, stages[one.effect])
+                own = np.sqrt(max(one.deviation**2 - (form * one.said) ** 2, 0.0))
+                found.setdefault(one.effect, []).append(SizeError(one.error, float(own), one.said))
         return found
 
     def _drawn(self, near: Penalties, half: int, generator: np.random.Generator) -> Penalties:
@@ -406,18 +441,21 @@ def _is_right(name: str, item: WeighedCase) -> bool:
     return name in left if left else name == "none"
 
 
-def _find_form_error(errors: Sequence[tuple[ParameterScore, float]]) -> float | None:
+def find_effect_forms(errors: Mapping[str, Sequence[SizeError]]) -> dict[str, float]:
+    """Return the model-form error of each effect with enough sizes."""
+    found = {}
+    for effect, sizes in sorted(errors.items()):
+        least = find_form_error(sizes) if len(sizes) >= LEAST_NUMBERS else None
+        if least is not None:
+            found[effect] = least
+    return found
+
+
+def find_form_error(errors: Sequence[SizeError]) -> float | None:
     """Return the smallest model-form error that covers enough, `None` where none does."""
     if not errors:
         return None
     for form in FORM_ERRORS:
-        covered = [_is_covered(number, was, form) for number, was in errors]
-        if np.mean(covered) >= TARGET_COVERAGE:
-            return float(form)
+        if np.mean([one.is_covered(form) for one in errors]) >= TARGET_COVERAGE:
+            return round(float(form), 3)
     return None
-
-
-def _is_covered(number: ParameterScore, was: float, form: float) -> bool:
-    """Return whether the 90 % interval covers the truth at a model-form error of `form`."""
-    own = np.sqrt(max(number.deviation**2 - (was * number.said) ** 2, 0.0))
-    return bool(number.error <= 1.645 * np.hypot(own, form * number.said))

@@ -22,7 +22,16 @@ from diagnosis.residuals import Residuals
 from diagnosis.responses import Response, fit_faults
 from diagnosis.search import SubsetTable
 from exam import dataset
-from exam.calibration import PenaltyFit, WeighedCase, fit_choice, load_weighed_cases
+from exam.calibration import (
+    LEAST_NUMBERS,
+    PenaltyFit,
+    SizeError,
+    WeighedCase,
+    find_effect_forms,
+    find_form_error,
+    fit_choice,
+    load_weighed_cases,
+)
 
 SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 
@@ -191,3 +200,31 @@ def test_answers_that_do_not_say_what_was_weighed_are_named(tmp_path: Path) -> N
     dataset.seal_labels(tmp_path, {"cases": []}, "salt")
     with pytest.raises(RecordingError, match=r"what was weighed"):
         load_weighed_cases([tmp_path / "answers"])
+
+
+def test_a_model_form_error_is_the_smallest_that_covers_nine_of_ten() -> None:
+    # ten sizes of 1 with errors of 0.01 to 0.10 and no error of their own: the ninth, 0.09, must lie
+    # within 1.645 sigma, so that the form is 0.09 / 1.645 = 0.0547; the next of the trials is 0.055
+    errors = [SizeError(0.01 * k, 0.0, 1.0) for k in range(1, 11)]
+    assert find_form_error(errors) == 0.055
+    # stated deviations cover them without any error of the form
+    assert find_form_error([SizeError(one.error, 0.06, 1.0) for one in errors]) == 0.0
+    assert find_form_error([SizeError(9.0, 0.0, 1.0)] * 10) is None
+
+
+def test_an_effect_of_few_sizes_has_no_form_of_its_own() -> None:
+    sizes = [SizeError(0.1, 0.0, 1.0)] * LEAST_NUMBERS
+    assert find_effect_forms({"lag": sizes, "sag": sizes[1:]}) == {"lag": 0.065}  # 0.1 / 1.645
+
+
+def test_the_form_of_an_effect_takes_the_place_of_that_of_its_stage(
+    weights: ProbabilityModel,
+) -> None:
+    own = dataclasses.replace(weights, form_of_effect={"lag": 0.5})
+    assert own.get_form_error("lag", "actuation") == 0.5
+    assert own.get_form_error("dead_band", "actuation") == weights.form["actuation"]
+
+
+def test_a_negative_form_is_refused_by_name(weights: ProbabilityModel) -> None:
+    with pytest.raises(ConfigError, match=r"certainty.form_of_effect.lag: expected 0 or more"):
+        dataclasses.replace(weights, form_of_effect={"lag": -0.1})
