@@ -9,6 +9,8 @@ Once a control period, joint by joint:
     reached  held target less the sag under gravity, `sag_rad + sag_slope * (held - middle of travel)`
     joint    `response_s^2 q'' + 2 damping response_s q' + q = reached`, solved exactly; viscous friction
              and the derivative gain are in the damping
+    torque   the pull `held - q` is at most `limit_rad`; weight and damping act beside it, so that the
+             joint falls where the limit is below the sag
     limits   speed at most `top_speed` of the machine's `max_speed`
 
 With `response_s`, play and sag of 0 the joint is at its target after one period: the ideal servo.
@@ -33,6 +35,13 @@ SHORTEST_RESPONSE_S = 1e-5
 NEAR_CRITICAL = 1e-4
 """Distance of the squared damping from 1 within which the loop counts as critically damped: there
 the two solutions agree to a ten-thousandth, and 0 / 0 is avoided."""
+FULL_TORQUE_TRAVEL = 0.05
+"""Error of position, over the travel, that `shortage` counts in; as in `brokk_rl.sim.mjcf_plant`."""
+NO_LIMIT_RAD = 1e6
+"""Pull without a limit; finite, so that no gradient is NaN."""
+SUBSTEPS = 2
+"""Steps of a part of a period in which the limit acts. At 50 Hz, 20 loops and limits moved by steps of
+the target keep within 0.06 mrad of scipy's solution with 2, within 0.11 mrad with 1."""
 
 
 @spec
@@ -50,6 +59,8 @@ class Servo:
             negative direction (m for a sliding joint).
         sag_slope: Change of the sag over the change of the target.
         spread: Relative half width, by field name, of draws per environment and joint at reset.
+        limit_rad: Error of the held target from which on the motor pulls no harder: its largest torque
+            over the stiffness of the loop (m for a sliding joint); `null` for no limit.
     """
 
     label: ClassVar = "servo"
@@ -63,6 +74,8 @@ class Servo:
     sag_rad: PerJoint
     sag_slope: PerJoint
     spread: dict[str, float]
+    # Files from before there was a limit lack it; neutral.
+    limit_rad: PerJoint | None = None
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ServoModel":
         """Return a model for `num_envs` environments on `device`.
@@ -77,8 +90,10 @@ class ServoModel:
     """Exact solution of the loop over each part of a period with one command.
 
     Attributes:
-        parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
-            candidates side by side.
+        parameters: Numbers by name, `(N, J)`, `limit_rad` only where there is one. Write in place or
+            replace an entry to simulate `N` candidates side by side.
+        drive_changes: Changes by effects, `(N, J)` by name: `shortage`, the error of 5 % of the travel
+            over another limit, 0 for none. The lower limit counts.
     """
 
     def __init__(
@@ -87,15 +102,16 @@ class ServoModel:
         check_interface(machine, "position", "a servo follows positions")
         nominal = read_parameters(
             config,
-            NUMBERS,
+            NUMBERS if config.limit_rad is None else (*NUMBERS, "limit_rad"),
             machine,
-            positive=("damping", "top_speed"),
+            positive=("damping", "top_speed", "limit_rad"),
             not_negative=("response_s", "play_rad"),
         )
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"
         )
         self.parameters = self._parameters.value
+        self.drive_changes: dict[str, torch.Tensor] = {}
         self._period_s = machine.period_s
 
         def tensor(values: object) -> torch.Tensor:
@@ -134,7 +150,7 @@ class ServoModel:
         speed = torch.where(fresh, speed, self._state["speed"])
         first = self.hold(held, earlier)
         second = self.hold(first, later)
-        moved, speed = self.move(q, speed, first, second, self.solve(part))
+        moved, speed = self.move(q, speed, first, second, self.solve(part, self.read_limit()))
         self._state["held"].copy_(second)
         self._state["speed"].copy_(speed)
         self._fresh.fill_(False)
@@ -168,15 +184,33 @@ class ServoModel:
         half = 0.5 * self.parameters["play_rad"]
         return torch.minimum(torch.maximum(held, target - half), target + half)
 
-    def solve(self, part: torch.Tensor) -> "tuple[LoopSolution, LoopSolution]":
-        """Return the motion of the loop over the two parts of a period."""
+    def read_limit(self) -> torch.Tensor | None:
+        """Return the pull at the limit of the torque, `(N, J)`; `None` where there can be none."""
+        own, shortage = self.parameters.get("limit_rad"), self.drive_changes.get("shortage")
+        if shortage is None:
+            return own
+        full = 2.0 * FULL_TORQUE_TRAVEL * self._half
+        limit = full / torch.maximum(shortage, full / NO_LIMIT_RAD)
+        return limit if own is None else torch.minimum(own, limit)
+
+    def solve(
+        self, part: torch.Tensor, limit_rad: torch.Tensor | None
+    ) -> "tuple[PartSolution, PartSolution]":
+        """Return the motion over the two parts of a period; `limit_rad`: see `read_limit`."""
         value = self.parameters
-        first_s, second_s = part * self._period_s, (1.0 - part) * self._period_s
-        response_s, damping = value["response_s"], value["damping"]
-        return (
-            LoopSolution.build(response_s, damping, first_s),
-            LoopSolution.build(response_s, damping, second_s),
-        )
+        found = []
+        for share in (part, 1.0 - part):
+            loop = LoopSolution.build(
+                value["response_s"], value["damping"], share * self._period_s
+            )
+            limited = None
+            if limit_rad is not None:
+                limited = LimitedSolution.build(
+                    value["response_s"], value["damping"], share * self._period_s, limit_rad
+                )
+            found.append(PartSolution(loop, limited))
+        first, second = found
+        return first, second
 
     def move(
         self,
@@ -184,14 +218,18 @@ class ServoModel:
         speed: torch.Tensor,
         first: torch.Tensor,
         second: torch.Tensor,
-        solutions: "tuple[LoopSolution, LoopSolution]",
+        solutions: "tuple[PartSolution, PartSolution]",
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return positions and speeds after a period with two held targets, each `(N, J)`."""
         value, begin = self.parameters, q
         for held, solution in zip((first, second), solutions, strict=True):
             reached = held - value["sag_rad"] - value["sag_slope"] * (held - self._middle)
-            q, speed = solution.advance(q - reached, speed)
-            q = q + reached
+            error, free_speed = solution.loop.advance(q - reached, speed)
+            free = error + reached, free_speed
+            if solution.limited is not None:
+                weight = value["sag_rad"] + value["sag_slope"] * (q - self._middle)
+                free = solution.limited.advance(q, speed, held, reached, weight, free)
+            q, speed = free
         most = value["top_speed"] * self._max_speed
         way = most * self._period_s
         limited = torch.minimum(torch.maximum(q, begin - way), begin + way)
@@ -239,6 +277,95 @@ class LoopSolution:
         return (self.kept * error + self.gained * speed, self.pulled * error + self.carried * speed)
 
 
+@dataclass(frozen=True, eq=False)
+class LimitedSolution:
+    """Motion in `SUBSTEPS` equal steps, each of them with a pull at the limit or below it.
+
+    Attributes:
+        limit_rad: Largest pull, `(N, J)`, rad or m.
+        loop: The loop below the limit, over a step.
+        pace: Final speed for one of pull, 1/s.
+        drifted: Motion over a step for one of final speed, s.
+        slipped: Motion over a step for one of speed beyond the final speed, s.
+        faded: Share of this speed that is left after a step.
+    """
+
+    limit_rad: torch.Tensor
+    loop: LoopSolution
+    pace: torch.Tensor
+    drifted: torch.Tensor
+    slipped: torch.Tensor
+    faded: torch.Tensor
+
+    @classmethod
+    def build(
+        cls,
+        response_s: torch.Tensor,
+        damping: torch.Tensor,
+        time_s: torch.Tensor,
+        limit_rad: torch.Tensor,
+    ) -> "LimitedSolution":
+        """Return the motion over `time_s`, `(N, J)`, with a limit `(N, J)`."""
+        step_s, response_s = time_s / SUBSTEPS, response_s.clamp(min=SHORTEST_RESPONSE_S)
+        fade_s = 0.5 * response_s / damping
+        faded = torch.exp(-step_s / fade_s)
+        return cls(
+            limit_rad,
+            LoopSolution.build(response_s, damping, step_s),
+            0.5 / (damping * response_s),
+            step_s,
+            fade_s * (1.0 - faded),
+            faded,
+        )
+
+    def advance(
+        self,
+        q: torch.Tensor,
+        speed: torch.Tensor,
+        held: torch.Tensor,
+        reached: torch.Tensor,
+        weight: torch.Tensor,
+        free: tuple[torch.Tensor, torch.Tensor],
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return positions and speeds after the time, each `(N, J)`.
+
+        Args:
+            q: Positions before, rad or m.
+            speed: Speeds before, rad/s or m/s.
+            held: Held targets.
+            reached: Held targets less the sag.
+            weight: Pull of the weight in the negative direction.
+            free: Positions and speeds after the time without a limit; exact where it never acts.
+        """
+        acts = torch.zeros_like(q, dtype=torch.bool)
+        for _ in range(SUBSTEPS):
+            error, loop_speed = self.loop.advance(q - reached, speed)
+            away, loop_q = held - q, error + reached
+            side = torch.sign(away + (held - loop_q))
+            final = self.pace * (side * self.limit_rad - weight)
+            beyond = speed - final
+            limited_q = q + final * self.drifted + beyond * self.slipped
+            # The mean of the pull over the step decides; a stiff loop is past its target by then.
+            is_limited = side * (away + (held - limited_q)) > 2.0 * self.limit_rad
+            q = torch.where(is_limited, limited_q, loop_q)
+            speed = torch.where(is_limited, final + beyond * self.faded, loop_speed)
+            acts = acts | is_limited
+        return torch.where(acts, q, free[0]), torch.where(acts, speed, free[1])
+
+
+@dataclass(frozen=True, eq=False)
+class PartSolution:
+    """Motion over a part of a period with one command.
+
+    Attributes:
+        loop: Without a limit of the torque.
+        limited: With one; `None` where there is none.
+    """
+
+    loop: LoopSolution
+    limited: LimitedSolution | None
+
+
 class ServoRun:
     """A run of a `ServoModel`; see `brokk_rl.contracts.actuator.PlannedRun`.
 
@@ -251,7 +378,10 @@ class ServoRun:
             u, model.parameters["dead_time_s"] / model.period_s, first
         )
         self._earlier, self._later = model.read_target(earlier), model.read_target(later)
-        self._solutions = model.solve(part)
+        limit_rad = model.read_limit()
+        if limit_rad is not None and not bool((limit_rad < NO_LIMIT_RAD).any()):
+            limit_rad = None
+        self._solutions = model.solve(part, limit_rad)
         self._held: torch.Tensor | None = None
         self._speed: torch.Tensor | None = None
 
