@@ -19,6 +19,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
 from brokk_rl.session import Session
 from brokk_rl.sim.mjcf_changes import JointFinding, write_changed_mjcf
+from brokk_rl.sim.mjcf_plant import MjcfPlant
 from diagnosis import api, baseline, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
 from diagnosis.closure import Estimate
@@ -130,6 +131,7 @@ CHANGES: dict[str, dict[str, float]] = {
     "drive_gain": {"gain": 0.7},
     "joint_damping": {"part": 0.3},
     "joint_armature": {"part": 0.8},
+    "drive_limit": {"shortage": 2.0},
 }
 
 
@@ -232,3 +234,18 @@ def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="its verdict is 'none', so there is nothing to change"):
         mode.run()
     assert not (tmp_path / "out").exists()
+
+
+def test_a_lower_range_of_the_file_stays(tmp_path: Path) -> None:
+    """60 Nm/rad times 5 % of 3 rad are 9 Nm: a shortage of 2 is a limit of 4.5 Nm."""
+    machine, source = make_machine("shoulder", "elbow"), tmp_path / "arm.xml"
+    source.write_text(ARM.replace('kv="4"', 'kv="4" forcerange="-3 20"'))
+    finding = JointFinding("drive_limit", "shoulder", {"shortage": 2.0}, {"shortage": (1.5, 3.0)})
+    changes, left = write_changed_mjcf(source, machine, [finding], tmp_path / "changed.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "changed.xml"))
+    assert left == {} and model.actuator_forcerange.tolist() == [[-3.0, 4.5], [0.0, 0.0]]
+    assert model.actuator_forcelimited.tolist() == [1, 0]
+    assert changes[1].interval == (3.0, 6.0)
+    plant = MjcfPlant(source, machine).change_model({"limit": np.array([2.0, 0.0])})
+    assert plant.actuator_forcerange.tolist() == model.actuator_forcerange.tolist()
+    assert plant.actuator_forcelimited.tolist() == [1, 0]
