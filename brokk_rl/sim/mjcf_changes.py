@@ -223,7 +223,9 @@ def _limit_force(to: _Editor) -> str | None:
         return rule
 
     for side in (0, 1):
-        to.write("actuator", "forcerange", side, "shortage", narrow(side))
+        held = float(to.drive.forcerange[side])
+        if not limited or narrow(side)(held, shortage) != held:
+            to.write("actuator", "forcerange", side, "shortage", narrow(side))
     to.drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
     return None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from diagnosis import api, baseline, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
 from diagnosis.closure import Estimate
 from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
+from diagnosis.simulator_changes import write_sysid_priors
 
 DELAY_S, FRICTION_NM = 0.06, 0.5
 
@@ -245,7 +247,10 @@ def test_a_lower_range_of_the_file_stays(tmp_path: Path) -> None:
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "changed.xml"))
     assert left == {} and model.actuator_forcerange.tolist() == [[-3.0, 4.5], [0.0, 0.0]]
     assert model.actuator_forcelimited.tolist() == [1, 0]
-    assert changes[1].interval == (3.0, 6.0)
+    assert [one.interval for one in changes] == [(3.0, 6.0)]  # the other side keeps its range
+    free = replace(changes[0], attribute="forcerange[0]", before=0.0, after=-4.5, interval=(-6.0, -3.0))
+    write_sysid_priors([free], tmp_path / "priors.py")
+    assert '"shoulder.forcerange[0]", -4.5, -7.5, -1.5,' in (tmp_path / "priors.py").read_text()
     plant = MjcfPlant(source, machine).change_model({"limit": np.array([2.0, 0.0])})
     assert plant.actuator_forcerange.tolist() == model.actuator_forcerange.tolist()
     assert plant.actuator_forcelimited.tolist() == [1, 0]
