@@ -172,15 +172,21 @@ class TorqueLimit(EffectSpec):
         joints: Joints it acts on, or `all`.
         shortage: Error of 5 % of the travel over the error at which the torque is at its limit; 0 for no
             limit, 1 for a limit at that error.
+        firmware_damping: Part of the servo's damping within the limit; see `actuators.models.servo`.
     """
 
     joints: Joints
     shortage: Value
+    firmware_damping: Value
     side = "drive"
     interfaces = frozenset({"position"})
-    drives = MappingProxyType({"shortage": "shortage"})
+    drives = MappingProxyType({"shortage": "shortage", "firmware_damping": "firmware_damping"})
     numbers: ClassVar = {
         # STS3215: 20 % of its 2.9 Nm over 24 to 40 Nm/rad are reached at 0.02 rad, 2.5 % of a travel
         # of 0.8 rad. The largest is 0.25 % of the travel, where an arm falls.
-        "shortage": EffectNumber("1", none=0.0, typical=2.0, bounds=(0.0, 20.0))
+        "shortage": EffectNumber("1", none=0.0, typical=2.0, bounds=(0.0, 20.0)),
+        # The derivative gain is within a limit of the duty, back EMF is not: about as large on STS3215.
+        "firmware_damping": EffectNumber(
+            "1", none=None, typical=0.5, bounds=(0.0, 1.0), trials=(0.5,)
+        ),
     }

@@ -9,15 +9,16 @@ Once a control period, joint by joint:
     reached  held target less the sag under gravity, `sag_rad + sag_slope * (held - middle of travel)`
     joint    `response_s^2 q'' + 2 damping response_s q' + q = reached`, solved exactly; viscous friction
              and the derivative gain are in the damping
-    torque   the pull `held - q` is at most `limit_rad`; weight and damping act beside it, so that the
-             joint falls where the limit is below the sag
+    torque   the pull `held - q - 2 firmware_damping damping response_s q'` is at most `limit_rad`; weight
+             and the other damping (back EMF, friction) act beside it: where the limit is below the sag,
+             the joint falls
     limits   speed at most `top_speed` of the machine's `max_speed`
 
 With `response_s`, play and sag of 0 the joint is at its target after one period: the ideal servo.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import torch
 
@@ -30,6 +31,7 @@ from brokk_rl.spec import spec
 NUMBERS = (
     "dead_time_s", "response_s", "damping", "top_speed", "play_rad", "sag_rad", "sag_slope",
 )  # fmt: skip
+LIMIT_NUMBERS = ("limit_rad", "firmware_damping")
 SHORTEST_RESPONSE_S = 1e-5
 """Response from which a loop is at its target within a period, to the last bit; avoids 0 / 0."""
 NEAR_CRITICAL = 1e-4
@@ -41,6 +43,8 @@ NO_LIMIT_RAD = 1e6
 """Pull without a limit; finite, so that no gradient is NaN."""
 SMALL_SHARE = 0.05
 """Time over the time constant below which a series of three terms is exact to 2e-6."""
+LEAST_OUTSIDE = 0.02
+"""Part of the damping that always acts beside the limit; avoids 0 / 0."""
 SUBSTEPS = 2
 """Steps of a part of a period in which the limit acts. At 50 Hz, 20 loops and limits moved by steps of
 the target keep within 0.06 mrad of scipy's solution with 2, within 0.11 mrad with 1."""
@@ -63,6 +67,8 @@ class Servo:
         spread: Relative half width, by field name, of draws per environment and joint at reset.
         limit_rad: Error of the held target from which on the motor pulls no harder: its largest torque
             over the stiffness of the loop (m for a sliding joint); `null` for no limit.
+        firmware_damping: Part of the damping that the loop itself commands, so that it lies within the
+            limit; the rest is back EMF and viscous friction. Nothing without a limit.
     """
 
     label: ClassVar = "servo"
@@ -78,6 +84,7 @@ class Servo:
     spread: dict[str, float]
     # Files from before there was a limit lack it; neutral.
     limit_rad: PerJoint | None = None
+    firmware_damping: PerJoint = 0.5
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ServoModel":
         """Return a model for `num_envs` environments on `device`.
@@ -92,10 +99,10 @@ class ServoModel:
     """Exact solution of the loop over each part of a period with one command.
 
     Attributes:
-        parameters: Numbers by name, `(N, J)`, `limit_rad` only where there is one. Write in place or
-            replace an entry to simulate `N` candidates side by side.
+        parameters: Numbers by name, `(N, J)`, those of `LIMIT_NUMBERS` only where there is a limit.
+            Write in place or replace an entry to simulate `N` candidates side by side.
         drive_changes: Changes by effects, `(N, J)` by name: `shortage`, the error of 5 % of the travel
-            over another limit, 0 for none. The lower limit counts.
+            over another limit, 0 for none, and its `firmware_damping`. The lower limit counts.
     """
 
     def __init__(
@@ -104,10 +111,10 @@ class ServoModel:
         check_interface(machine, "position", "a servo follows positions")
         nominal = read_parameters(
             config,
-            NUMBERS if config.limit_rad is None else (*NUMBERS, "limit_rad"),
+            NUMBERS if config.limit_rad is None else (*NUMBERS, *LIMIT_NUMBERS),
             machine,
             positive=("damping", "top_speed", "limit_rad"),
-            not_negative=("response_s", "play_rad"),
+            not_negative=("response_s", "play_rad", "firmware_damping"),
         )
         self._parameters = SpreadParameters(
             nominal, config.spread, num_envs, device, "actuator.spread"
@@ -186,31 +193,31 @@ class ServoModel:
         half = 0.5 * self.parameters["play_rad"]
         return torch.minimum(torch.maximum(held, target - half), target + half)
 
-    def read_limit(self) -> torch.Tensor | None:
-        """Return the pull at the limit of the torque, `(N, J)`; `None` where there can be none."""
-        own, shortage = self.parameters.get("limit_rad"), self.drive_changes.get("shortage")
-        if shortage is None:
-            return own
+    def read_limit(self) -> "TorqueLimit | None":
+        """Return the limit of the torque; `None` where there can be none."""
+        own, changes = self.parameters, self.drive_changes
+        if "shortage" not in changes:
+            if "limit_rad" not in own:
+                return None
+            return TorqueLimit(own["limit_rad"], own["firmware_damping"])
         full = 2.0 * FULL_TORQUE_TRAVEL * self._half
-        limit = full / torch.maximum(shortage, full / NO_LIMIT_RAD)
-        return limit if own is None else torch.minimum(own, limit)
+        limit_rad = full / torch.maximum(changes["shortage"], full / NO_LIMIT_RAD)
+        inside = changes["firmware_damping"]
+        if "limit_rad" not in own:
+            return TorqueLimit(limit_rad, inside)
+        inside = torch.where(own["limit_rad"] < limit_rad, own["firmware_damping"], inside)
+        return TorqueLimit(torch.minimum(own["limit_rad"], limit_rad), inside)
 
     def solve(
-        self, part: torch.Tensor, limit_rad: torch.Tensor | None
+        self, part: torch.Tensor, limit: "TorqueLimit | None"
     ) -> "tuple[PartSolution, PartSolution]":
-        """Return the motion over the two parts of a period; `limit_rad`: see `read_limit`."""
+        """Return the motion over the two parts of a period; `limit`: see `read_limit`."""
         value = self.parameters
         found = []
         for share in (part, 1.0 - part):
-            loop = LoopSolution.build(
-                value["response_s"], value["damping"], share * self._period_s
-            )
-            limited = None
-            if limit_rad is not None:
-                limited = LimitedSolution.build(
-                    value["response_s"], value["damping"], share * self._period_s, limit_rad
-                )
-            found.append(PartSolution(loop, limited))
+            loop = value["response_s"], value["damping"], share * self._period_s
+            limited = None if limit is None else LimitedSolution.build(*loop, limit)
+            found.append(PartSolution(LoopSolution.build(*loop), limited))
         first, second = found
         return first, second
 
@@ -279,12 +286,25 @@ class LoopSolution:
         return (self.kept * error + self.gained * speed, self.pulled * error + self.carried * speed)
 
 
+class TorqueLimit(NamedTuple):
+    """Limit of a servo's torque.
+
+    Attributes:
+        limit_rad: Largest pull, `(N, J)`, rad or m.
+        inside: Part of the damping within the limit, `(N, J)`.
+    """
+
+    limit_rad: torch.Tensor
+    inside: torch.Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class LimitedSolution:
     """Motion in `SUBSTEPS` equal steps, each of them with a pull at the limit or below it.
 
     Attributes:
         limit_rad: Largest pull, `(N, J)`, rad or m.
+        brake: Pull for one of speed that the damping within the limit takes, s.
         loop: The loop below the limit, over a step.
         slipped: Motion over a step for one of speed, under a constant pull, s.
         faded: Speed for one of speed.
@@ -293,6 +313,7 @@ class LimitedSolution:
     """
 
     limit_rad: torch.Tensor
+    brake: torch.Tensor
     loop: LoopSolution
     slipped: torch.Tensor
     faded: torch.Tensor
@@ -305,19 +326,21 @@ class LimitedSolution:
         response_s: torch.Tensor,
         damping: torch.Tensor,
         time_s: torch.Tensor,
-        limit_rad: torch.Tensor,
+        limit: TorqueLimit,
     ) -> "LimitedSolution":
-        """Return the motion over `time_s`, `(N, J)`, with a limit `(N, J)`."""
+        """Return the motion over `time_s`, `(N, J)`, with a limit."""
         step_s, response_s = time_s / SUBSTEPS, response_s.clamp(min=SHORTEST_RESPONSE_S)
-        fade_s = 0.5 * response_s / damping
+        outside = damping * (1.0 - limit.inside).clamp(min=LEAST_OUTSIDE)
+        fade_s = 0.5 * response_s / outside
         share = step_s / fade_s
         left = -torch.expm1(-share)
         # The difference of the two loses all its digits for a small share: there a series.
         series = share.square() * (0.5 - share * (1.0 / 6.0 - share / 24.0))
         behind = torch.where(share < SMALL_SHARE, series, share - left)
-        final_1_s = 0.5 / (damping * response_s)  # final speed for one of pull
+        final_1_s = 0.5 / (outside * response_s)  # final speed for one of pull
         return cls(
-            limit_rad,
+            limit.limit_rad,
+            2.0 * limit.inside * damping * response_s,
             LoopSolution.build(response_s, damping, step_s),
             fade_s * left,
             1.0 - left,
@@ -347,14 +370,16 @@ class LimitedSolution:
         acts, twice_held, twice_limit = None, held + held, self.limit_rad + self.limit_rad
         for _ in range(SUBSTEPS):
             error, loop_speed = self.loop.advance(q - reached, speed)
-            loop_q, away = error + reached, twice_held - q
-            side = torch.sign(away - loop_q)
+            loop_q, away = error + reached, twice_held - q - self.brake * speed
+            side = torch.sign(away - loop_q - self.brake * loop_speed)
             pull = side * self.limit_rad - weight
             limited_q = q + self.slipped * speed + self.moved * pull
+            limited_speed = self.faded * speed + self.pushed * pull
             # The mean pull over the step decides; a stiff loop is past its target by then.
-            is_limited = side * (away - limited_q) > twice_limit
+            mean = away - limited_q - self.brake * limited_speed
+            is_limited = side * mean > twice_limit
             q = torch.where(is_limited, limited_q, loop_q)
-            speed = torch.where(is_limited, self.faded * speed + self.pushed * pull, loop_speed)
+            speed = torch.where(is_limited, limited_speed, loop_speed)
             acts = is_limited if acts is None else acts | is_limited
         assert acts is not None, "there is a step"
         return torch.where(acts, q, free[0]), torch.where(acts, speed, free[1])
@@ -385,10 +410,10 @@ class ServoRun:
             u, model.parameters["dead_time_s"] / model.period_s, first
         )
         self._earlier, self._later = model.read_target(earlier), model.read_target(later)
-        limit_rad = model.read_limit()
-        if limit_rad is not None and not bool((limit_rad < NO_LIMIT_RAD).any()):
-            limit_rad = None
-        self._solutions = model.solve(part, limit_rad)
+        limit = model.read_limit()
+        if limit is not None and not bool((limit.limit_rad < NO_LIMIT_RAD).any()):
+            limit = None
+        self._solutions = model.solve(part, limit)
         self._held: torch.Tensor | None = None
         self._speed: torch.Tensor | None = None
 

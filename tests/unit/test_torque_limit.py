@@ -32,6 +32,7 @@ def arm() -> Machine:
 
 
 def make_servo(**numbers: Any) -> Servo:
+    numbers = {"firmware_damping": 0.0} | numbers
     return replace(option("actuator", "servo"), top_speed=50.0, **numbers)
 
 
@@ -81,6 +82,20 @@ def test_a_saturated_joint_comes_up_slower_than_down(arm: Machine) -> None:
         )
 
 
+def test_damping_of_the_firmware_lies_within_the_limit(arm: Machine) -> None:
+    """With half of it inside, the final speeds are (0.02 -+ 0.01) / (0.5 * 0.05): 0.4 and 1.2 rad/s."""
+    servo = make_servo(
+        response_s=0.05, damping=0.5, limit_rad=0.02, sag_rad=0.01, firmware_damping=0.5
+    )
+    for to, speed_rad_s in ((0.9, 0.4), (-0.9, -1.2)):
+        u = np.zeros((45, 2))
+        u[5:] = to
+        found = run(servo.build(arm, 1, CPU), arm, u)
+        np.testing.assert_allclose(
+            (found[-1] - found[-6]) / (5 * arm.period_s), speed_rad_s, rtol=2e-3
+        )
+
+
 @pytest.mark.parametrize("response_s", [0.0, 0.04])
 def test_a_joint_falls_where_the_limit_is_below_its_sag(arm: Machine, response_s: float) -> None:
     """It comes to rest at its lower stop; the same joint above that limit keeps its sag."""
@@ -106,22 +121,26 @@ def test_the_weight_of_a_falling_joint_is_that_of_its_place(arm: Machine) -> Non
     np.testing.assert_allclose(found[-1], -0.2, atol=1e-3)
 
 
+@pytest.mark.parametrize("inside", [0.0, 0.6])
 @pytest.mark.parametrize("limit_rad", [0.01, 0.03, 0.08])
 @pytest.mark.parametrize(("response_s", "damping"), [(0.03, 0.8), (0.06, 0.4), (0.02, 2.0)])
 def test_a_limited_servo_follows_its_differential_equation(
-    arm: Machine, limit_rad: float, response_s: float, damping: float
+    arm: Machine, inside: float, limit_rad: float, response_s: float, damping: float
 ) -> None:
     dead_time_s, sag_rad = 0.03, 0.008
     servo = make_servo(
-        dead_time_s=dead_time_s, response_s=response_s, damping=damping, sag_rad=sag_rad, limit_rad=limit_rad
+        dead_time_s=dead_time_s, response_s=response_s, damping=damping, sag_rad=sag_rad, limit_rad=limit_rad,
+        firmware_damping=inside,
     )  # fmt: skip
     u = draw_levels(arm, 0)
     targets = read_targets(u, arm)[:, 0]
 
     def solve(t_s: float, y: np.ndarray) -> list[float]:
         k = max(int(np.floor((t_s - dead_time_s) / arm.period_s + 1e-9)), 0)
-        pull = np.clip(targets[min(k, len(u) - 1)] - y[0], -limit_rad, limit_rad)
-        return [y[1], (pull - sag_rad) / response_s**2 - 2.0 * damping * y[1] / response_s]
+        brake = 2.0 * damping * response_s * y[1]
+        pull = targets[min(k, len(u) - 1)] - y[0] - inside * brake
+        pull = np.clip(pull, -limit_rad, limit_rad)
+        return [y[1], (pull - sag_rad - (1.0 - inside) * brake) / response_s**2]
 
     t_s = arm.period_s * np.arange(1, len(u) + 1)
     solved: Any = solve_ivp(
@@ -129,7 +148,7 @@ def test_a_limited_servo_follows_its_differential_equation(
     )
     found = run(servo.build(arm, 1, CPU), arm, u)[:, 0]
     assert np.abs(found - targets).max() > limit_rad  # it is reached
-    np.testing.assert_allclose(found, solved.y[0], atol=3e-4)  # of steps by 0.5 rad
+    np.testing.assert_allclose(found, solved.y[0], atol=5e-4)  # of steps by 0.5 rad
 
 
 def test_a_limited_servo_moves_as_a_position_actuator_of_mujoco(arm: Machine) -> None:
@@ -177,7 +196,7 @@ def test_a_limit_that_never_acts_changes_no_bit(arm: Machine) -> None:
 
 def test_the_effect_is_the_limit_of_the_servo(arm: Machine) -> None:
     """5 % of a travel of 3 rad over a shortage of 5 is a limit of 0.03 rad; the lower limit counts."""
-    servo = make_servo(response_s=0.04, damping=0.8, sag_rad=0.01)
+    servo = make_servo(response_s=0.04, damping=0.8, sag_rad=0.01, firmware_damping=0.5)
     u = draw_levels(arm, 3)
     inside = run(replace(servo, limit_rad=0.03).build(arm, 1, CPU), arm, u)
     around = run(limit_torque(servo.build(arm, 1, CPU), arm, 5.0), arm, u)
@@ -284,3 +303,15 @@ def test_a_withheld_limit_is_named(arm: Machine, tmp_path: Any, limit_n_m: float
     # 5 % of 3 rad at 30 Nm/rad are 4.5 Nm
     shortage = answer.selected[0].parameters["shortage"]["elbow"]
     assert shortage.mean == pytest.approx(4.5 / limit_n_m, rel=0.2)
+
+
+def test_a_limit_is_fitted_where_it_is_asked_for(arm: Machine) -> None:
+    servo = make_servo(response_s=0.04, damping=0.8, limit_rad=0.05)
+    u = np.concatenate([draw_levels(arm, seed, 20, 25) for seed in range(2)])
+    q = run(servo.build(arm, 1, CPU), arm, u)
+    # A command acts on the position of the row after it.
+    log = make_motion(arm, "log", arm.period_s * np.arange(len(u) - 1), u[1:], q[:-1])
+    fit = option("fit", "servo")
+    fit = replace(fit, free={"limit_rad": (0.01, 0.5)})
+    found = fit.refit(replace(servo, limit_rad=0.2), arm, [log])
+    assert list(found.limit_rad.values()) == pytest.approx([0.05] * 2, rel=0.03)
