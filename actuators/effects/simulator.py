@@ -1,5 +1,4 @@
-"""Effects on numbers inside of a simulator that is given as an MJCF file: friction, damping, armature, gain,
-limit of the force.
+"""Effects on numbers inside of an MJCF file: friction, damping, armature, gain and limit of its drives.
 
 They exist around `actuators.models.own_simulator` only. The way back is a change of the file.
 """

@@ -188,7 +188,9 @@ class MjcfPlant:
             for place in np.flatnonzero(changes["limit"] > 0.0):
                 drive = drives[place]
                 most = unit["limit"][place] / changes["limit"][place]
-                held = model.actuator_forcerange[drive] if model.actuator_forcelimited[drive] else None
+                held = (
+                    model.actuator_forcerange[drive] if model.actuator_forcelimited[drive] else None
+                )
                 model.actuator_forcerange[drive] = narrow_force_range(held, float(most))
                 model.actuator_forcelimited[drive] = True
         mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by

@@ -248,7 +248,9 @@ def test_a_lower_range_of_the_file_stays(tmp_path: Path) -> None:
     assert left == {} and model.actuator_forcerange.tolist() == [[-3.0, 4.5], [0.0, 0.0]]
     assert model.actuator_forcelimited.tolist() == [1, 0]
     assert [one.interval for one in changes] == [(3.0, 6.0)]  # the other side keeps its range
-    free = replace(changes[0], attribute="forcerange[0]", before=0.0, after=-4.5, interval=(-6.0, -3.0))
+    free = replace(
+        changes[0], attribute="forcerange[0]", before=0.0, after=-4.5, interval=(-6.0, -3.0)
+    )
     write_sysid_priors([free], tmp_path / "priors.py")
     assert '"shoulder.forcerange[0]", -4.5, -7.5, -1.5,' in (tmp_path / "priors.py").read_text()
     plant = MjcfPlant(source, machine).change_model({"limit": np.array([2.0, 0.0])})

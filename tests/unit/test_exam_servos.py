@@ -147,7 +147,9 @@ def test_a_torque_limit_is_a_cap_of_the_duty(arm: Machine, plants: ServoPlants) 
     limited = {"torque_limit": {"shortage": of_elbow(0.0, 2.0)}}
     _, n = servo_parameters.draw_servos(arm, RUN.seed, 1.0)
     changed = servo_parameters.change_servos(n, limited, arm)
-    assert changed["duty_cap"][ELBOW] == pytest.approx(0.0175 * n["stiffness"][2] / n["stall_n_m"][2])
+    assert changed["duty_cap"][ELBOW] == pytest.approx(
+        0.0175 * n["stiffness"][2] / n["stall_n_m"][2]
+    )
     assert np.delete(changed["duty_cap"], ELBOW).tolist() == [1.0] * 4
     # the neutral value of the mix reaches no joint
     least = option("exam_mix", "servos").troubles["torque_limit"].numbers["shortage"][0]

@@ -14,8 +14,16 @@ from typing import Any
 import numpy as np
 import pytest
 from arm import (
-    ARM, NOISE_RAD, draw_targets, keep, limit_force, make_machine, record_arm, rub, weaken,
-)  # fmt: skip
+    ARM,
+    NOISE_RAD,
+    draw_targets,
+    keep,
+    limit_force,
+    make_machine,
+    record_arm,
+    rub,
+    weaken,
+)
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from brokk_rl import open_loop

@@ -20,7 +20,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
-from diagnosis import api, baseline, effect_library
+from diagnosis import api
 
 CPU = torch.device("cpu")
 
@@ -106,17 +106,13 @@ def test_a_joint_falls_where_the_limit_is_below_its_sag(arm: Machine, response_s
     if response_s == 0.0:
         np.testing.assert_allclose(fallen[-1], arm.lower, atol=1e-5)
     else:  # 0.01 / (2 * 0.04) rad/s
-        np.testing.assert_allclose(
-            fallen[-1] - fallen[-51], -0.125 * 50 * arm.period_s, rtol=1e-3
-        )
+        np.testing.assert_allclose(fallen[-1] - fallen[-51], -0.125 * 50 * arm.period_s, rtol=1e-3)
     np.testing.assert_allclose(kept[-1], -0.05, atol=1e-5)
 
 
 def test_the_weight_of_a_falling_joint_is_that_of_its_place(arm: Machine) -> None:
     """With 0.06 + 0.1 q of sag and a limit of 0.04 the joint falls no further than -0.2 rad."""
-    servo = make_servo(
-        response_s=0.04, damping=1.0, sag_rad=0.06, sag_slope=0.1, limit_rad=0.04
-    )
+    servo = make_servo(response_s=0.04, damping=1.0, sag_rad=0.06, sag_slope=0.1, limit_rad=0.04)
     found = run(servo.build(arm, 1, CPU), arm, np.zeros((1500, 2)))
     np.testing.assert_allclose(found[-1], -0.2, atol=1e-3)
 
