@@ -194,23 +194,23 @@ class ServoModel:
         half = 0.5 * self.parameters["play_rad"]
         return torch.minimum(torch.maximum(held, target - half), target + half)
 
-    def read_limit(self) -> "TorqueLimit | None":
+    def read_limit(self) -> "PullLimit | None":
         """Return the limit of the torque; `None` where there can be none."""
         own, changes = self.parameters, self.drive_changes
         if "shortage" not in changes:
             if "limit_rad" not in own:
                 return None
-            return TorqueLimit(own["limit_rad"], own["firmware_damping"])
+            return PullLimit(own["limit_rad"], own["firmware_damping"])
         full = 2.0 * FULL_TORQUE_TRAVEL * self._half
         limit_rad = full / torch.maximum(changes["shortage"], full / NO_LIMIT_RAD)
         inside = changes["firmware_damping"]
         if "limit_rad" not in own:
-            return TorqueLimit(limit_rad, inside)
+            return PullLimit(limit_rad, inside)
         inside = torch.where(own["limit_rad"] < limit_rad, own["firmware_damping"], inside)
-        return TorqueLimit(torch.minimum(own["limit_rad"], limit_rad), inside)
+        return PullLimit(torch.minimum(own["limit_rad"], limit_rad), inside)
 
     def solve(
-        self, part: torch.Tensor, limit: "TorqueLimit | None"
+        self, part: torch.Tensor, limit: "PullLimit | None"
     ) -> "tuple[PartSolution, PartSolution]":
         """Return the motion over the two parts of a period; `limit`: see `read_limit`."""
         value = self.parameters
@@ -287,7 +287,7 @@ class LoopSolution:
         return (self.kept * error + self.gained * speed, self.pulled * error + self.carried * speed)
 
 
-class TorqueLimit(NamedTuple):
+class PullLimit(NamedTuple):
     """Limit of a servo's torque.
 
     Attributes:
@@ -327,7 +327,7 @@ class LimitedSolution:
         response_s: torch.Tensor,
         damping: torch.Tensor,
         time_s: torch.Tensor,
-        limit: TorqueLimit,
+        limit: PullLimit,
     ) -> "LimitedSolution":
         """Return the motion over `time_s`, `(N, J)`, with a limit."""
         step_s, response_s = time_s / SUBSTEPS, response_s.clamp(min=SHORTEST_RESPONSE_S)

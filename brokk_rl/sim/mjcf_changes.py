@@ -17,7 +17,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
-from brokk_rl.sim.mjcf_plant import MjcfPlant, narrow_force_range
+from brokk_rl.sim.mjcf_plant import MjcfPlant, limit_force_range
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def _limit_force(to: _Editor) -> str | None:
         def rule(old: float, new: float) -> float:
             most = to.unit["limit"] / max(new, 1e-9)
             held = (-np.inf, np.inf) if not limited else (old, old)
-            return float(narrow_force_range(held, most)[side])
+            return float(limit_force_range(held, most)[side])
 
         return rule
 

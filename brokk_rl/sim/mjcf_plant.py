@@ -191,7 +191,7 @@ class MjcfPlant:
                 held = (
                     model.actuator_forcerange[drive] if model.actuator_forcelimited[drive] else None
                 )
-                model.actuator_forcerange[drive] = narrow_force_range(held, float(most))
+                model.actuator_forcerange[drive] = limit_force_range(held, float(most))
                 model.actuator_forcelimited[drive] = True
         mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by
         return model
@@ -214,7 +214,7 @@ class MjcfPlant:
         return models
 
 
-def narrow_force_range(held: Sequence[float] | np.ndarray | None, most: float) -> np.ndarray:
+def limit_force_range(held: Sequence[float] | np.ndarray | None, most: float) -> np.ndarray:
     """Return the range of a drive's force, `(2,)`, within `most` both ways and the range `held` before."""
     low, high = (-np.inf, np.inf) if held is None else held
     return np.array([max(low, -most), min(high, most)])
