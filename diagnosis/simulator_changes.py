@@ -212,7 +212,7 @@ def write_sysid_priors(changes: Sequence[Any], path: Path) -> None:
         ends = one.interval or (one.after, one.after)
         half = max(WIDER * 0.5 * (ends[1] - ends[0]), LEAST_SPREAD * abs(one.after - one.before))
         low, high = one.after - half, one.after + half
-        if one.before >= 0.0:
+        if one.before >= 0.0 and one.after >= 0.0:
             low = max(0.0, low)
         text += PRIOR.format(
             comment=f"{one.effect} on {one.joint}: {one.before:.6g} in the file",

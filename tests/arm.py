@@ -129,3 +129,10 @@ def weaken(spec: Any) -> None:
     gain, bias = drive.gainprm.copy(), drive.biasprm.copy()
     gain[0], bias[1] = 0.6 * gain[0], 0.6 * bias[1]
     drive.gainprm, drive.biasprm = gain, bias
+
+
+def limit_force(spec: Any) -> None:
+    """Limits the drive of the shoulder to 5 Nm; the arm weighs 3.6 Nm stretched out."""
+    drive = spec.actuators[0]
+    drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    drive.forcerange = np.array([-5.0, 5.0])

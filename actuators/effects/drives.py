@@ -1,6 +1,6 @@
-"""Effects on drives: joints that are commanded by force or torque.
+"""Effects on drives: joints that are commanded by force or torque, and servos.
 
-They change the mass or the friction of the simulated drive itself, which solves both together: friction
+They change mass, friction or torque of the simulated drive itself, which solves all together: friction
 that stops a joint within a period cannot be put around a model that does not know of it.
 """
 
@@ -158,4 +158,35 @@ class PoseForce(EffectSpec):
         # A servo that bears a tenth of its largest torque in the outermost pose.
         "pose_sin_n": EffectNumber("N", none=0.0, typical=0.1, bounds=(-1.0, 1.0), scale="force"),
         "pose_cos_n": EffectNumber("N", none=0.0, typical=0.1, bounds=(-1.0, 1.0), scale="force"),
+    }
+
+
+@spec
+class TorqueLimit(EffectSpec):
+    """A servo that pulls no harder from some error on: a limit in its firmware, a weak motor or supply.
+
+    Weight acts beside the pull: a joint comes up slower than down, and falls where the limit is below
+    its sag. `sag` as another effect shifts the target and does not load the motor here.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        shortage: Error of 5 % of the travel over the error at which the torque is at its limit; 0 for no
+            limit, 1 for a limit at that error.
+        firmware_damping: Part of the servo's damping within the limit; see `actuators.models.servo`.
+    """
+
+    joints: Joints
+    shortage: Value
+    firmware_damping: Value
+    side = "drive"
+    interfaces = frozenset({"position"})
+    drives = MappingProxyType({"shortage": "shortage", "firmware_damping": "firmware_damping"})
+    numbers: ClassVar = {
+        # STS3215: 20 % of its 2.9 Nm over 24 to 40 Nm/rad are reached at 0.02 rad, 2.5 % of a travel
+        # of 0.8 rad. The largest is 0.25 % of the travel, where an arm falls.
+        "shortage": EffectNumber("1", none=0.0, typical=2.0, bounds=(0.0, 20.0)),
+        # The derivative gain is within a limit of the duty, back EMF is not: about as large on STS3215.
+        "firmware_damping": EffectNumber(
+            "1", none=None, typical=0.5, bounds=(0.0, 1.0), trials=(0.5,)
+        ),
     }

@@ -266,8 +266,7 @@ class EffectChain:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        for name, effect in self._drives.items():
-            change_drive(self.inner, effect.drives, self.get_values(name), name)
+        self._change_drives()
         if not (self.commands or self.motions):
             return self.inner.step(history)
         fresh = self._fresh
@@ -287,6 +286,7 @@ class EffectChain:
         self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
     ) -> PlannedRun | None:
         """See `brokk_rl.contracts.actuator.PlannedModel`."""
+        self._change_drives()
         return ChainRun.plan(self, u, first, q)
 
     @property
@@ -356,6 +356,11 @@ class EffectChain:
             return self.target(self.tool(tip_m, q)) - tip_m
         inner = getattr(self.inner, "misplacement", None)
         return torch.zeros_like(q[:, :3]) if inner is None else inner(q)
+
+    def _change_drives(self) -> None:
+        """Write the numbers of effects on drives into the drive; an entry may have been replaced."""
+        for name, effect in self._drives.items():
+            change_drive(self.inner, effect.drives, self.get_values(name), name)
 
     def _change_commands(
         self, history: History, fresh: torch.Tensor, counter: torch.Tensor | None

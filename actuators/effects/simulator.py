@@ -1,4 +1,4 @@
-"""Effects on numbers inside of a simulator that is given as an MJCF file: friction, damping, armature, gain.
+"""Effects on numbers inside of an MJCF file: friction, damping, armature, gain and limit of its drives.
 
 They exist around `actuators.models.own_simulator` only. The way back is a change of the file.
 """
@@ -107,7 +107,27 @@ class DriveGain(_InsideEffect):
     numbers: ClassVar = {"gain": EffectNumber("1", none=1.0, typical=0.8, bounds=(0.1, 5.0))}
 
 
+@spec
+class DriveLimit(_InsideEffect):
+    """Largest force of the drive: `forcerange`, as narrow or narrower than that of the file.
+
+    Attributes:
+        joints: Joints it acts on, or `all`.
+        shortage: Torque of the drive at an error of 5 % of the travel (position), at full speed
+            (velocity) or at full command (torque), over its largest torque; 0 for no limit.
+    """
+
+    joints: Joints
+    shortage: Value
+    quantity = "limit"
+    # As `torque_limit` around a servo; a drive at its full command is limited from 1 on.
+    numbers: ClassVar = {"shortage": EffectNumber("1", none=0.0, typical=2.0, bounds=(0.0, 20.0))}
+
+
 EFFECTS = MappingProxyType(
-    {kind.name(): kind for kind in (JointFriction, JointDamping, JointArmature, DriveGain)}
+    {
+        kind.name(): kind
+        for kind in (JointFriction, JointDamping, JointArmature, DriveGain, DriveLimit)
+    }
 )
 """The effects by name."""

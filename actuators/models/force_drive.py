@@ -252,7 +252,8 @@ def change_drive(
         model = model.inner
     if not hasattr(model, "drive_changes"):
         raise ConfigError(
-            f"{where}: it changes mass or friction of a drive, and {type(model).__name__} has none; choose actuator=force"
+            f"{where}: it changes numbers of a drive, and {type(model).__name__} has none; choose actuator=force (joints "
+            "commanded by torque) or actuator=servo (by position)"
         )
     for name, changed in drives.items():
         model.drive_changes[changed] = value[name]

@@ -17,7 +17,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
-from brokk_rl.sim.mjcf_plant import MjcfPlant
+from brokk_rl.sim.mjcf_plant import MjcfPlant, limit_force_range
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,7 @@ class _Editor:
         self.unit = {name: float(row[place]) for name, row in plant.read_references().items()}
         self.joint = spec.joint(finding.joint)
         self.drive = spec.actuators[int(plant.drives[place])]
+        self.is_limited = bool(plant.model.actuator_forcelimited[plant.drives[place]])
         self.timestep_s = float(plant.model.opt.timestep)
         self.changes: list[MjcfChange] = []
 
@@ -205,6 +206,30 @@ def _scale_drive(to: _Editor) -> None:
         to.write("actuator", "biasprm", 2, "gain", lambda old, new: old * new)
 
 
+def _limit_force(to: _Editor) -> str | None:
+    shortage = to.get("shortage")
+    if shortage <= 0.0:
+        return "no limit was found there"
+    limited = to.is_limited
+    if not limited:  # MJCF: a range of 0 is none
+        to.drive.forcerange = np.zeros(2)
+
+    def narrow(side: int) -> Callable[[float, float], float]:
+        def rule(old: float, new: float) -> float:
+            most = to.unit["limit"] / max(new, 1e-9)
+            held = (-np.inf, np.inf) if not limited else (old, old)
+            return float(limit_force_range(held, most)[side])
+
+        return rule
+
+    for side in (0, 1):
+        held = float(to.drive.forcerange[side])
+        if not limited or narrow(side)(held, shortage) != held:
+            to.write("actuator", "forcerange", side, "shortage", narrow(side))
+    to.drive.forcelimited = mujoco.mjtLimited.mjLIMITED_TRUE
+    return None
+
+
 def _scale_command(to: _Editor) -> None:
     to.write("actuator", "gainprm", 0, "gain", lambda old, new: old * new)
 
@@ -258,6 +283,7 @@ RULES: Mapping[tuple[str, str], Callable[[_Editor], str | None]] = {
     **{("joint_damping", kind): _add_damping for kind in ("speed", "position", "torque")},
     **{("joint_armature", kind): _add_armature for kind in ("speed", "position", "torque")},
     **{("drive_gain", kind): _scale_drive for kind in ("speed", "position", "torque")},
+    **{("drive_limit", kind): _limit_force for kind in ("speed", "position", "torque")},
     **{("dead_time", kind): _add_delay for kind in ("speed", "position", "torque")},
 }
 """Change of the file for an effect on machines of an interface."""

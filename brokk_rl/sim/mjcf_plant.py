@@ -1,6 +1,6 @@
 """An MJCF file as a plant: joint motion under commands, simulated by MuJoCo C.
 
-Numbers of joints and drives (friction, damping, armature, gain) can differ from row to row, so that
+Numbers of joints and drives (friction, damping, armature, gain, limit) can differ from row to row, so that
 candidates are simulated side by side. Axes: `N` rows, `T` control periods, `J` joints, `S` numbers of a
 state.
 """
@@ -8,7 +8,7 @@ state.
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import mujoco
@@ -24,7 +24,7 @@ MAX_STATES = 4_000_000
 REFERENCE_TRAVEL = 0.05
 """Error of position, over the travel, at which a position drive gives its reference torque. Chosen by
 hand: a drive that holds an arm errs by a few percent."""
-QUANTITIES = ("friction", "damping", "armature", "gain")
+QUANTITIES = ("friction", "damping", "armature", "gain", "limit")
 """Numbers that a row may change; see `MjcfPlant.read_references`."""
 
 
@@ -131,7 +131,8 @@ class MjcfPlant:
 
         Friction is counted in the torque that a drive gives for an error of 5 % of the travel
         (position), at full speed (velocity), or at full command (torque), Nm or N. Damping is counted
-        in that torque over the full speed, armature in the inertia of the joint, gain in itself.
+        in that torque over the full speed, armature in the inertia of the joint, gain in itself. A limit
+        is counted in the same force of the drive, as if its force had no range.
         """
         model, machine = self.model, self._machine
         gain = np.abs(model.actuator_gainprm[self.drives, 0] * model.actuator_gear[self.drives, 0])
@@ -141,6 +142,9 @@ class MjcfPlant:
             "speed": gain * machine.max_speed,
             "torque": machine.max_force,
         }[machine.interface]
+        unlimited = full
+        if machine.interface == "torque":
+            unlimited = full / np.abs(model.actuator_gear[self.drives, 0])
         limited = model.actuator_forcelimited[self.drives].astype(bool)
         limit = np.abs(model.actuator_forcerange[self.drives]).max(1)
         full = np.where(limited, np.minimum(full, limit), full)
@@ -151,6 +155,7 @@ class MjcfPlant:
             "damping": full / machine.max_speed,
             "armature": inertia,
             "gain": ones,
+            "limit": unlimited,
         }
 
     def change_model(self, changes: Mapping[str, np.ndarray]) -> mujoco.MjModel:
@@ -158,7 +163,8 @@ class MjcfPlant:
 
         Args:
             changes: `friction`, `damping` and `armature` are added, in the units of `read_references`;
-                `gain` multiplies the drive's.
+                `gain` multiplies the drive's. `limit` is the unit of a limit over the largest force of the
+                drive, 0 for none; a lower limit of the file stays.
         """
         model, unit = copy.copy(self.model), self.read_references()
         dofs, drives = self.dofs, self.drives
@@ -178,6 +184,15 @@ class MjcfPlant:
             model.actuator_biasprm[drives, 1] *= changes["gain"]
             if self._machine.interface == "speed":
                 model.actuator_biasprm[drives, 2] *= changes["gain"]
+        if "limit" in changes:
+            for place in np.flatnonzero(changes["limit"] > 0.0):
+                drive = drives[place]
+                most = unit["limit"][place] / changes["limit"][place]
+                held = (
+                    model.actuator_forcerange[drive] if model.actuator_forcelimited[drive] else None
+                )
+                model.actuator_forcerange[drive] = limit_force_range(held, float(most))
+                model.actuator_forcelimited[drive] = True
         mujoco.mj_setConst(model, mujoco.MjData(model))  # inertias that constraints are scaled by
         return model
 
@@ -197,6 +212,12 @@ class MjcfPlant:
                 self._models[key] = self.change_model(dict(zip(names, row, strict=True)))
             models.append(self._models[key])
         return models
+
+
+def limit_force_range(held: Sequence[float] | np.ndarray | None, most: float) -> np.ndarray:
+    """Return the range of a drive's force, `(2,)`, within `most` both ways and the range `held` before."""
+    low, high = (-np.inf, np.inf) if held is None else held
+    return np.array([max(low, -most), min(high, most)])
 
 
 def _find_joint(model: mujoco.MjModel, path: Path, name: str) -> int:

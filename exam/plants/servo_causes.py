@@ -1,6 +1,6 @@
 """Causes outside the library that servos have. Each has a severity by joint: 1 plainly, 0 not at all.
 
-torque_limit    the firmware cuts the motor's torque
+wind_up         the firmware has an integral term that winds up: the joint overshoots and hunts
 heat            the motor's torque falls as it works, and recovers in pauses
 bad_tooth       a sector of the gear in which the joint goes hard
 overload_trip   after some tenths of a second at high duty the servo lets go for a while
@@ -18,11 +18,11 @@ from brokk_rl.machine import Machine
 from exam.plants.servo_drive import STEP_S
 
 CAUSES = (
-    "torque_limit", "heat", "bad_tooth", "overload_trip", "weak_side", "cross_talk", "feed_forward", "warm_delay",
+    "wind_up", "heat", "bad_tooth", "overload_trip", "weak_side", "cross_talk", "feed_forward", "warm_delay",
 )  # fmt: skip
 
 # Sizes at severity 1, chosen by hand so that each shows plainly in the motion.
-LIMIT_LOSS = 0.8
+WIND_S, WIND_RAD = 0.2, 0.08
 HEAT_LOSS, HEAT_S, WORK = 0.7, 15.0, 0.15
 TOOTH_N_M, TOOTH_TRAVEL = 0.6, 0.12
 TRIP_DUTY, TRIP_S, AWAY_S = 0.35, 0.2, 0.8
@@ -50,6 +50,7 @@ class ServoCauses:
             self._of[kind] = severity * has[:, None]
         none = np.zeros_like(severity)
         self._heat, self._strained_s, self._away_s = none.copy(), none.copy(), none.copy()
+        self._wound_rad = none.copy()
         self._before: np.ndarray | None = None
 
     def command(self, u: np.ndarray) -> np.ndarray:
@@ -59,6 +60,13 @@ class ServoCauses:
         self._before = u
         return u + LEAD_S / self._period_s * self._of["feed_forward"] * (u - before)
 
+    def target(self, target: np.ndarray, reading: np.ndarray) -> np.ndarray:
+        """Return the targets that the proportional loop sees, `(N, J)`, rad, once a time step."""
+        size = self._of["wind_up"]
+        wound = self._wound_rad + STEP_S / WIND_S * size * (target - reading)
+        self._wound_rad = np.clip(wound, -WIND_RAD * size, WIND_RAD * size)
+        return target + self._wound_rad
+
     def delay_s(self, t_s: np.ndarray) -> np.ndarray:
         """Return the extra delay of a frame, `(N, J)`, after a running time of `t_s`, `(N,)`."""
         return WARM_S * self._of["warm_delay"] * (1.0 - np.exp(-t_s / WARMING_S))[:, None]
@@ -67,7 +75,7 @@ class ServoCauses:
         """Return the largest duties of the coming step, `(N, J)`, after duties of the last one."""
         work = np.minimum(np.abs(duty) / WORK, 1.0)
         self._heat += (work - self._heat) * STEP_S / HEAT_S
-        cap = 1.0 - LIMIT_LOSS * self._of["torque_limit"]
+        cap = np.ones_like(duty)
         size = self._of["overload_trip"]
         if size.any():
             self._strained_s = np.where(np.abs(duty) > TRIP_DUTY, self._strained_s + STEP_S, 0.0)

@@ -60,6 +60,7 @@ def draw_servos(machine: Machine, seed: int, roughness: float) -> tuple[str, Pla
     # time steps between two of the firmware's loop
     found["ticks"] = np.full(count, float(generator.integers(1, 4)))
     found["step_rad"] = np.full(count, COUNT_RAD)
+    found["duty_cap"] = np.ones(count)
     found |= {name: np.zeros(count) for name in ZERO_WITHOUT_FAULT}
     return make, found
 
@@ -102,6 +103,12 @@ def _add_drive_gain(n: PlantParameters, size: FaultSizes) -> None:
     n["stiffness"] = n["stiffness"] * size["gain"]
 
 
+def _add_torque_limit(n: PlantParameters, size: FaultSizes) -> None:
+    """Cap the motor's duty, as firmware does: back EMF and its own damping lie within the cap."""
+    limit_n_m = n["full_n_m"] / np.maximum(size["shortage"], 1e-9)
+    n["duty_cap"] = np.minimum(n["duty_cap"], limit_n_m / n["stall_n_m"])
+
+
 LIKE_VALVES = ("dead_time", "delay_jitter", "frame_loss", "rate_limit", "sensor_noise")
 """Effects that change the same parameters as on a valve."""
 FAULTS: dict[str, Callable[[PlantParameters, FaultSizes], None]] = {
@@ -111,6 +118,7 @@ FAULTS: dict[str, Callable[[PlantParameters, FaultSizes], None]] = {
     "backlash": _add_backlash,
     "sag": _add_sag,
     "quantisation": _add_quantisation,
+    "torque_limit": _add_torque_limit,
     "joint_friction": _add_joint_friction,
     "joint_damping": _add_joint_damping,
     "joint_armature": _add_joint_armature,

@@ -125,8 +125,10 @@ class ServoArm:
     def _step(self, t_s: float) -> None:
         n, causes, loop = self._n, self._causes, self._loop
         q, speed = self._plant.read(self._state)
-        target = self._targets.step(self._bus.at(t_s))
-        self._duty = loop.step(target, self._measure(q), speed, causes.cap(self._duty))
+        reading = self._measure(q)
+        target = causes.target(self._targets.step(self._bus.at(t_s)), reading)
+        cap = np.minimum(n["duty_cap"], causes.cap(self._duty))
+        self._duty = loop.step(target, reading, speed, cap)
         motor = causes.weaken(loop.torque(self._duty, speed))
         # the weight goes through the gear: the motor's torque of the step before stands for it
         loaded = n["load_friction"] * np.abs(self._through)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,12 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
 from brokk_rl.session import Session
 from brokk_rl.sim.mjcf_changes import JointFinding, write_changed_mjcf
+from brokk_rl.sim.mjcf_plant import MjcfPlant
 from diagnosis import api, baseline, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
 from diagnosis.closure import Estimate
 from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
+from diagnosis.simulator_changes import write_sysid_priors
 
 DELAY_S, FRICTION_NM = 0.06, 0.5
 
@@ -130,6 +133,7 @@ CHANGES: dict[str, dict[str, float]] = {
     "drive_gain": {"gain": 0.7},
     "joint_damping": {"part": 0.3},
     "joint_armature": {"part": 0.8},
+    "drive_limit": {"shortage": 2.0},
 }
 
 
@@ -232,3 +236,23 @@ def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="its verdict is 'none', so there is nothing to change"):
         mode.run()
     assert not (tmp_path / "out").exists()
+
+
+def test_a_lower_range_of_the_file_stays(tmp_path: Path) -> None:
+    """60 Nm/rad times 5 % of 3 rad are 9 Nm: a shortage of 2 is a limit of 4.5 Nm."""
+    machine, source = make_machine("shoulder", "elbow"), tmp_path / "arm.xml"
+    source.write_text(ARM.replace('kv="4"', 'kv="4" forcerange="-3 20"'))
+    finding = JointFinding("drive_limit", "shoulder", {"shortage": 2.0}, {"shortage": (1.5, 3.0)})
+    changes, left = write_changed_mjcf(source, machine, [finding], tmp_path / "changed.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "changed.xml"))
+    assert left == {} and model.actuator_forcerange.tolist() == [[-3.0, 4.5], [0.0, 0.0]]
+    assert model.actuator_forcelimited.tolist() == [1, 0]
+    assert [one.interval for one in changes] == [(3.0, 6.0)]  # the other side keeps its range
+    free = replace(
+        changes[0], attribute="forcerange[0]", before=0.0, after=-4.5, interval=(-6.0, -3.0)
+    )
+    write_sysid_priors([free], tmp_path / "priors.py")
+    assert '"shoulder.forcerange[0]", -4.5, -7.5, -1.5,' in (tmp_path / "priors.py").read_text()
+    plant = MjcfPlant(source, machine).change_model({"limit": np.array([2.0, 0.0])})
+    assert plant.actuator_forcerange.tolist() == model.actuator_forcerange.tolist()
+    assert plant.actuator_forcelimited.tolist() == [1, 0]

@@ -23,7 +23,7 @@ dead_time delay_jitter frame_loss dead_band flow_gain asymmetry saturation rate_
 load_dependence flow_sharing creep thermal_drift compliance quantisation sensor_noise encoder_bias encoder_scale
 link_length base_tilt clock_offset extrinsics
 """.split()  # noqa: SIM905
-OF_SERVOS = ["sag"]
+OF_SERVOS = ["sag", "torque_limit"]
 """Effects of joints that are commanded by position; see `test_servo.py`."""
 OF_FORCES = [
     "coulomb_friction",

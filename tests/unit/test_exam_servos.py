@@ -26,7 +26,7 @@ SIZES = {
     "lag": ("time_constant_s", 0.0, 0.1), "rate_limit": ("stroke_s", 0.0, 0.6), "backlash": ("gap_rad", 0.0, 0.04),
     "sag": ("sag_rad", 0.0, 0.03), "quantisation": ("step_rad", 0.0, 0.012), "sensor_noise": ("sigma_rad", 0.0, 0.004),
     "joint_friction": ("part", 0.0, 0.3), "joint_damping": ("part", 0.0, 0.4), "joint_armature": ("part", 0.0, 1.0),
-    "drive_gain": ("gain", 1.0, 0.6),
+    "drive_gain": ("gain", 1.0, 0.6), "torque_limit": ("shortage", 0.0, 2.0),
 }  # fmt: skip
 
 
@@ -140,3 +140,31 @@ def test_the_mix_asks_for_effects_that_servos_and_library_have(
 
     mix = option("exam_mix", "servos")
     assert set(mix.troubles) <= set(plants.effects) & {kind.name for kind in load_effects(arm)}
+
+
+def test_a_torque_limit_is_a_cap_of_the_duty(arm: Machine, plants: ServoPlants) -> None:
+    """5 % of 0.7 rad at the elbow's stiffness, over a shortage of 2, over its torque at standstill."""
+    limited = {"torque_limit": {"shortage": of_elbow(0.0, 2.0)}}
+    _, n = servo_parameters.draw_servos(arm, RUN.seed, 1.0)
+    changed = servo_parameters.change_servos(n, limited, arm)
+    assert changed["duty_cap"][ELBOW] == pytest.approx(
+        0.0175 * n["stiffness"][2] / n["stall_n_m"][2]
+    )
+    assert np.delete(changed["duty_cap"], ELBOW).tolist() == [1.0] * 4
+    # the neutral value of the mix reaches no joint
+    least = option("exam_mix", "servos").troubles["torque_limit"].numbers["shortage"][0]
+    faults = {"torque_limit": {"shortage": np.full(5, least)}}
+    runs = [RUN, replace(RUN, faults=faults)]
+    path = play(plants.build(arm, runs, 2.0), wave(arm), 2)
+    assert np.abs(path[:, 1] - path[:, 0]).max() < 2e-3
+
+
+def test_a_firmware_that_winds_up_overshoots(arm: Machine, plants: ServoPlants) -> None:
+    """An integral term passes the target after a step, and takes away the sag that stays without it."""
+    wound = replace(RUN, outside_fault=UnknownFault("wind_up", of_elbow(0.0, 1.0)))
+    u = np.tile(find_rest(arm.home, arm), (200, 1))
+    u[40:, ELBOW] += 0.6
+    path = play(plants.build(arm, [RUN, wound], 4.5), u, 2)[:, :, ELBOW]
+    target = read_targets(u, arm)[-1, ELBOW]
+    assert path[40:, 0].max() < target + 0.02 < path[40:, 1].max()
+    assert abs(path[-1, 1] - target) < 0.5 * abs(path[-1, 0] - target)

@@ -13,7 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from arm import ARM, NOISE_RAD, draw_targets, keep, make_machine, record_arm, rub, weaken
+from arm import (
+    ARM,
+    NOISE_RAD,
+    draw_targets,
+    keep,
+    limit_force,
+    make_machine,
+    record_arm,
+    rub,
+    weaken,
+)
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from brokk_rl import open_loop
@@ -67,6 +77,8 @@ def measure_errors(
         # 0.5 Nm over kp 30 Nm/rad times 5 % of a travel of 3 rad.
         (rub, 0, {"joint_friction": {"part": np.array([[0.0, 0.5 / 4.5]])}}),
         (weaken, 0, {"drive_gain": {"gain": np.array([[0.6, 1.0]])}}),
+        # 60 Nm/rad times 5 % of 3 rad over 5 Nm.
+        (limit_force, 0, {"drive_limit": {"shortage": np.array([[9.0 / 5.0, 0.0]])}}),
     ],
 )
 def test_a_file_with_the_fault_as_effect_is_the_faulty_machine(
@@ -225,7 +237,8 @@ def test_what_cannot_be_asked_about_is_one_line(
         effect_library.load_effects(make_machine("hinge"), None, api._load_simulator(pendulum))
     (line,) = [one.getMessage() for one in caplog.records if "not asked about" in one.getMessage()]
     assert (
-        "joint_friction, joint_damping, joint_armature, drive_gain (my_pendulum:step has no" in line
+        "joint_friction, joint_damping, joint_armature, drive_gain, drive_limit (my_pendulum:step has "
+        "no" in line
     )
     assert "base_tilt, extrinsics, link_length (machine" in line
     assert line.endswith("is known by its joints only)")
@@ -233,7 +246,7 @@ def test_what_cannot_be_asked_about_is_one_line(
 
 def test_effects_inside_are_for_files_only(arm: Path, pendulum: str) -> None:
     machine = make_machine("hinge")
-    inside = {"joint_friction", "joint_damping", "joint_armature", "drive_gain"}
+    inside = {"joint_friction", "joint_damping", "joint_armature", "drive_gain", "drive_limit"}
     for source, found in ((pendulum, set()), (arm, inside)):
         kinds = effect_library.load_effects(machine, None, api._load_simulator(source))
         assert {kind.name for kind in kinds} & inside == found
@@ -278,6 +291,7 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
         (keep, 3, "dead_time", ("shoulder", "elbow")),
         (rub, 0, "joint_friction", ("elbow",)),
         (weaken, 0, "drive_gain", ("shoulder",)),
+        (limit_force, 0, "drive_limit", ("shoulder",)),
     ],
 )
 def test_a_withheld_fault_is_named_around_the_file(

@@ -117,6 +117,7 @@ def test_effects_of_valves_are_refused_by_servos_and_the_other_way_round(
     known = {kind.name for kind in load_effects(arm)}
     assert known == {
         "backlash", "dead_time", "delay_jitter", "frame_loss", "lag", "quantisation", "rate_limit", "sag", "sensor_noise",
+        "torque_limit",
     }  # fmt: skip
     model = option("actuator", "servo").build(arm, 1, CPU)
     with pytest.raises(ConfigError, match="commanded by position, where it does not occur"):

@@ -1,0 +1,313 @@
+"""A servo whose torque is limited: by hand, against scipy and MuJoCo C, planned and stepped, and its diagnosis."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from arm import make_machine
+from composed import option
+from scipy.integrate import solve_ivp
+
+from actuators.effects.drives import TorqueLimit
+from actuators.models.servo import Servo
+from brokk_rl.commands import read_targets
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording, make_motion
+from diagnosis import api
+
+CPU = torch.device("cpu")
+
+
+@pytest.fixture(scope="module")
+def arm() -> Machine:
+    """Two position servos at 50 Hz, each with a travel of 3 rad."""
+    return make_machine("shoulder", "elbow")
+
+
+def make_servo(**numbers: Any) -> Servo:
+    numbers = {"firmware_damping": 0.0} | numbers
+    return replace(option("actuator", "servo"), top_speed=50.0, **numbers)
+
+
+def run(model: Any, machine: Machine, u: np.ndarray) -> np.ndarray:
+    """Returns positions after each command `(T, J)`, from rest at the first one."""
+    start = torch.as_tensor(read_targets(u[0], machine), dtype=torch.float32)
+    rows = torch.as_tensor(u, dtype=torch.float32)
+    shape = (1, machine.num_history, 1)
+    history = History(q=start.repeat(*shape), u=rows[0].repeat(*shape))
+    found = []
+    for command in rows:
+        history.push_u(command[None])
+        history.push_q(model.step(history))
+        found.append(history.q[0, -1].numpy().copy())
+    return np.array(found)
+
+
+def limit_torque(model: Any, machine: Machine, shortage: float) -> Any:
+    """Returns the model with the effect around it."""
+    spec = replace(option("effect", "torque_limit"), shortage=shortage)
+    return spec.wrap(model, machine, 1, CPU)
+
+
+def draw_levels(machine: Machine, seed: int, count: int = 12, hold: int = 15) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    return np.repeat(generator.uniform(-0.4, 0.4, (count, machine.num_joints)), hold, 0)
+
+
+def test_a_saturated_joint_accelerates_by_its_limit(arm: Machine) -> None:
+    """0.02 rad over (0.05 s)^2 are 8 rad/s^2: 14.4 mrad in 60 ms from rest."""
+    servo = make_servo(response_s=0.05, damping=1e-4, limit_rad=0.02)
+    u = np.tile([[0.0, 0.0]], (8, 1))
+    u[5:] = 0.5  # 0.75 rad away
+    found = run(servo.build(arm, 1, CPU), arm, u)
+    np.testing.assert_allclose(found[-1], 0.5 * 8.0 * 0.06**2, rtol=1e-3)
+
+
+def test_a_saturated_joint_comes_up_slower_than_down(arm: Machine) -> None:
+    """The final speed is (limit -+ sag) / (2 damping response): 0.2 up and 0.6 rad/s down."""
+    servo = make_servo(response_s=0.05, damping=0.5, limit_rad=0.02, sag_rad=0.01)
+    for to, speed_rad_s in ((0.9, 0.2), (-0.9, -0.6)):
+        u = np.zeros((40, 2))
+        u[5:] = to
+        found = run(servo.build(arm, 1, CPU), arm, u)
+        np.testing.assert_allclose(
+            (found[-1] - found[-6]) / (5 * arm.period_s), speed_rad_s, rtol=1e-3
+        )
+
+
+def test_damping_of_the_firmware_lies_within_the_limit(arm: Machine) -> None:
+    """With half of it inside, the final speeds are (0.02 -+ 0.01) / (0.5 * 0.05): 0.4 and 1.2 rad/s."""
+    servo = make_servo(
+        response_s=0.05, damping=0.5, limit_rad=0.02, sag_rad=0.01, firmware_damping=0.5
+    )
+    for to, speed_rad_s in ((0.9, 0.4), (-0.9, -1.2)):
+        u = np.zeros((45, 2))
+        u[5:] = to
+        found = run(servo.build(arm, 1, CPU), arm, u)
+        np.testing.assert_allclose(
+            (found[-1] - found[-6]) / (5 * arm.period_s), speed_rad_s, rtol=2e-3
+        )
+
+
+@pytest.mark.parametrize("response_s", [0.0, 0.04])
+def test_a_joint_falls_where_the_limit_is_below_its_sag(arm: Machine, response_s: float) -> None:
+    """It comes to rest at its lower stop; the same joint above that limit keeps its sag."""
+    u = np.zeros((150, 2))
+    weak = make_servo(response_s=response_s, damping=1.0, sag_rad=0.05, limit_rad=0.04)
+    strong = replace(weak, limit_rad=0.06)
+    fallen, kept = (run(one.build(arm, 1, CPU), arm, u) for one in (weak, strong))
+    if response_s == 0.0:
+        np.testing.assert_allclose(fallen[-1], arm.lower, atol=1e-5)
+    else:  # 0.01 / (2 * 0.04) rad/s
+        np.testing.assert_allclose(fallen[-1] - fallen[-51], -0.125 * 50 * arm.period_s, rtol=1e-3)
+    np.testing.assert_allclose(kept[-1], -0.05, atol=1e-5)
+
+
+def test_the_weight_of_a_falling_joint_is_that_of_its_place(arm: Machine) -> None:
+    """With 0.06 + 0.1 q of sag and a limit of 0.04 the joint falls no further than -0.2 rad."""
+    servo = make_servo(response_s=0.04, damping=1.0, sag_rad=0.06, sag_slope=0.1, limit_rad=0.04)
+    found = run(servo.build(arm, 1, CPU), arm, np.zeros((1500, 2)))
+    np.testing.assert_allclose(found[-1], -0.2, atol=1e-3)
+
+
+@pytest.mark.parametrize("inside", [0.0, 0.6])
+@pytest.mark.parametrize("limit_rad", [0.01, 0.03, 0.08])
+@pytest.mark.parametrize(("response_s", "damping"), [(0.03, 0.8), (0.06, 0.4), (0.02, 2.0)])
+def test_a_limited_servo_follows_its_differential_equation(
+    arm: Machine, inside: float, limit_rad: float, response_s: float, damping: float
+) -> None:
+    dead_time_s, sag_rad = 0.03, 0.008
+    servo = make_servo(
+        dead_time_s=dead_time_s, response_s=response_s, damping=damping, sag_rad=sag_rad, limit_rad=limit_rad,
+        firmware_damping=inside,
+    )  # fmt: skip
+    u = draw_levels(arm, 0)
+    targets = read_targets(u, arm)[:, 0]
+
+    def solve(t_s: float, y: np.ndarray) -> list[float]:
+        k = max(int(np.floor((t_s - dead_time_s) / arm.period_s + 1e-9)), 0)
+        brake = 2.0 * damping * response_s * y[1]
+        pull = targets[min(k, len(u) - 1)] - y[0] - inside * brake
+        pull = np.clip(pull, -limit_rad, limit_rad)
+        return [y[1], (pull - sag_rad - (1.0 - inside) * brake) / response_s**2]
+
+    t_s = arm.period_s * np.arange(1, len(u) + 1)
+    solved: Any = solve_ivp(
+        solve, (0.0, t_s[-1]), [targets[0], 0.0], t_eval=t_s, max_step=1e-3, rtol=1e-6, atol=1e-8
+    )
+    found = run(servo.build(arm, 1, CPU), arm, u)[:, 0]
+    assert np.abs(found - targets).max() > limit_rad  # it is reached
+    np.testing.assert_allclose(found, solved.y[0], atol=5e-4)  # of steps by 0.5 rad
+
+
+def test_a_limited_servo_moves_as_a_position_actuator_of_mujoco(arm: Machine) -> None:
+    """A mass of 2 kg on a vertical slide, 800 N/m and 30 N s/m, and a force of 26 N at most."""
+    mass, stiffness, viscous, limit_n = 2.0, 800.0, 30.0, 26.0
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.0005" integrator="implicitfast"/><worldbody><body>
+        <joint name="lift" type="slide" axis="0 0 1" damping="{viscous}"/>
+        <geom type="sphere" size="0.1" mass="{mass}" contype="0"/></body></worldbody>
+        <actuator><position joint="lift" kp="{stiffness}" forcerange="{-limit_n} {limit_n}"/>
+        </actuator></mujoco>"""
+    )
+    data = mujoco.MjData(model)
+    u = draw_levels(arm, 1)
+    targets = read_targets(u, arm)[:, 0]
+    data.qpos[0] = targets[0]
+    expected = []
+    for target in targets:
+        data.ctrl[0] = target
+        for _ in range(40):
+            mujoco.mj_step(model, data)
+        expected.append(float(data.qpos[0]))
+    response_s = np.sqrt(mass / stiffness)
+    servo = make_servo(
+        response_s=float(response_s),
+        damping=float(viscous / (2.0 * np.sqrt(mass * stiffness))),
+        sag_rad=mass * 9.81 / stiffness,
+        limit_rad=limit_n / stiffness,
+    )
+    found = run(servo.build(arm, 1, CPU), arm, u)[:, 0]
+    np.testing.assert_allclose(found, expected, atol=2e-3)  # of steps by 0.5 m
+    free = run(replace(servo, limit_rad=None).build(arm, 1, CPU), arm, u)[:, 0]
+    assert np.abs(free - expected).max() > 0.1
+
+
+def test_a_limit_that_never_acts_changes_no_bit(arm: Machine) -> None:
+    servo = make_servo(dead_time_s=0.03, response_s=0.04, damping=0.5, play_rad=0.01, sag_rad=0.01)
+    u = draw_levels(arm, 2)
+    plain = run(servo.build(arm, 1, CPU), arm, u)
+    beyond = replace(servo, limit_rad=2.0)  # targets step by 1.2 rad at most
+    np.testing.assert_array_equal(run(beyond.build(arm, 1, CPU), arm, u), plain)
+    neutral = limit_torque(servo.build(arm, 1, CPU), arm, 0.0)
+    np.testing.assert_array_equal(run(neutral, arm, u), plain)
+
+
+def test_the_effect_is_the_limit_of_the_servo(arm: Machine) -> None:
+    """5 % of a travel of 3 rad over a shortage of 5 is a limit of 0.03 rad; the lower limit counts."""
+    servo = make_servo(response_s=0.04, damping=0.8, sag_rad=0.01, firmware_damping=0.5)
+    u = draw_levels(arm, 3)
+    inside = run(replace(servo, limit_rad=0.03).build(arm, 1, CPU), arm, u)
+    around = run(limit_torque(servo.build(arm, 1, CPU), arm, 5.0), arm, u)
+    np.testing.assert_allclose(around, inside, atol=1e-5)
+    for own_rad, shortage in ((0.03, 2.0), (0.3, 5.0)):
+        both = limit_torque(replace(servo, limit_rad=own_rad).build(arm, 1, CPU), arm, shortage)
+        np.testing.assert_allclose(run(both, arm, u), inside, atol=1e-5)
+    assert "limit_rad" not in servo.build(arm, 1, CPU).parameters  # no number to be tuned
+
+
+def test_a_planned_run_moves_as_its_steps_do(arm: Machine) -> None:
+    num_envs, size = 4, arm.num_history
+    u = torch.as_tensor(
+        np.stack([draw_levels(arm, seed) for seed in range(num_envs)], 1), dtype=torch.float32
+    )
+    servo = make_servo(dead_time_s=0.03, response_s=0.04, damping=0.5, sag_rad=0.01, play_rad=0.01)
+
+    def build() -> Any:
+        model: Any = servo.build(arm, num_envs, CPU)
+        for name, numbers in {"lag": {"time_constant_s": 0.05}, "torque_limit": {"shortage": 5.0}}.items():  # fmt: skip
+            model = replace(option("effect", name), **numbers).wrap(model, arm, num_envs, CPU)
+        # An entry may be replaced after the effect was put around the model.
+        model.parameters["shortage"] = torch.tensor([0.0, 3.0, 6.0, 9.0])[:, None].expand(-1, 2)
+        return model
+
+    q = torch.zeros(len(u) + 1, num_envs, 2)
+    stepped, planned = q.clone(), q.clone()
+    with torch.inference_mode():
+        model = build()
+        for k in range(size, len(q)):
+            past = slice(k - size, k)
+            history = History(q=stepped[past].transpose(0, 1), u=u[past].transpose(0, 1))
+            stepped[k] = model.step(history)
+        plan = build().plan_run(u, size, planned)
+        assert plan is not None
+        for k in range(size, len(q)):
+            planned[k] = plan.step(k, planned)
+    assert (stepped - planned).abs().max() < 1e-5
+    free, limited = stepped[:, 0], stepped[:, 3]
+    assert (free - limited).abs().max() > 0.05
+
+
+def test_gradients_of_a_limited_servo_are_finite(arm: Machine) -> None:
+    model = limit_torque(make_servo(response_s=0.04, damping=0.8).build(arm, 1, CPU), arm, 3.0)
+    shortage = torch.tensor([[3.0, 0.0]], requires_grad=True)
+    model.parameters["shortage"] = shortage
+    still = torch.zeros(1, arm.num_history, 2)
+    found = model.step(History(q=still, u=still + 0.5))
+    found.sum().backward()
+    assert shortage.grad is not None and bool(shortage.grad.isfinite().all())
+    assert float(shortage.grad[0, 0]) < 0.0 == float(shortage.grad[0, 1])  # a lower limit, less way
+
+
+def test_only_joints_commanded_by_position_have_it(machine: Machine, arm: Machine) -> None:
+    with pytest.raises(ConfigError, match="it is for joints commanded by position"):
+        option("effect", "torque_limit").wrap(option("actuator", "lag").build(machine, 1, CPU), machine, 1, CPU)  # fmt: skip
+    with pytest.raises(ConfigError, match="limit_rad: expected > 0"):
+        make_servo(limit_rad=0.0).build(arm, 1, CPU)
+    assert TorqueLimit.numbers["shortage"].none == 0.0
+
+
+def record_limited(arm: Machine, seed: int, limit_n_m: float, seconds: float) -> Recording:
+    """Returns a motion of two pendulum-like joints in MuJoCo C whose second drive is limited."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><option timestep="0.002" integrator="implicitfast" gravity="0 0 -9.81"/><worldbody>
+        <body pos="0 0 0"><joint name="shoulder" axis="0 0 1" damping="1.2" armature="0.03"/>
+        <geom type="sphere" size="0.05" mass="0.1" contype="0"/></body>
+        <body pos="0 2 0"><joint name="elbow" axis="0 -1 0" damping="1.2" armature="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0.3 0 0" size="0.02" mass="0.25" contype="0"/></body></worldbody>
+        <actuator><position joint="shoulder" kp="30"/>
+        <position joint="elbow" kp="30" forcerange="{-limit_n_m} {limit_n_m}"/></actuator></mujoco>"""
+    )
+    data, generator = mujoco.MjData(model), np.random.default_rng(seed)
+    count = round(seconds / arm.period_s)
+    u = np.repeat(generator.uniform(-0.35, 0.35, (count // 30 + 1, 2)), 30, 0)[:count]
+    steps = 2.0 * arm.period_s / 1.5  # targets move by 2 rad/s at most
+    for k in range(1, count):
+        u[k] = u[k - 1] + np.clip(u[k] - u[k - 1], -steps, steps)
+    targets, q = read_targets(u, arm), np.empty((count, 2))
+    data.qpos[:] = targets[0]
+    for k in range(count):
+        q[k] = data.qpos
+        data.ctrl[:] = targets[k]
+        mujoco.mj_step(model, data, 10)
+    q += 2e-4 * generator.standard_normal(q.shape)
+    return make_motion(arm, f"{seed}", arm.period_s * np.arange(count), u, q)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("limit_n_m", [1.3, 100.0])
+def test_a_withheld_limit_is_named(arm: Machine, tmp_path: Any, limit_n_m: float) -> None:
+    """The weight of the elbow is 0.37 Nm; a drive without a limit has no gap."""
+    reference = api.RecordingSet(
+        tuple(record_limited(arm, seed, 100.0, 60.0) for seed in range(4)), arm
+    )
+    field = api.RecordingSet(
+        tuple(record_limited(arm, 10 + seed, limit_n_m, 45.0) for seed in range(4)), arm
+    )
+    answer = api.diagnose(field, tmp_path / "run", reference=reference, fit="servo").answer
+    if limit_n_m > 10.0:
+        assert answer.verdict == "none"
+        return
+    assert [(one.effect, one.joints) for one in answer.selected] == [("torque_limit", ("elbow",))]
+    # 5 % of 3 rad at 30 Nm/rad are 4.5 Nm
+    shortage = answer.selected[0].parameters["shortage"]["elbow"]
+    assert shortage.mean == pytest.approx(4.5 / limit_n_m, rel=0.2)
+
+
+def test_a_limit_is_fitted_where_it_is_asked_for(arm: Machine) -> None:
+    servo = make_servo(response_s=0.04, damping=0.8, limit_rad=0.05)
+    u = np.concatenate([draw_levels(arm, seed, 20, 25) for seed in range(2)])
+    q = run(servo.build(arm, 1, CPU), arm, u)
+    # A command acts on the position of the row after it.
+    log = make_motion(arm, "log", arm.period_s * np.arange(len(u) - 1), u[1:], q[:-1])
+    fit = option("fit", "servo")
+    fit = replace(fit, free={"limit_rad": (0.01, 0.5)})
+    found = fit.refit(replace(servo, limit_rad=0.2), arm, [log])
+    assert list(found.limit_rad.values()) == pytest.approx([0.05] * 2, rel=0.03)
