@@ -20,7 +20,7 @@ from actuators.recordings.map_draft import Draft
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.report import Report
-from brokk_rl.session import Session, write_json, write_text
+from brokk_rl.session import Session, read_record, write_json, write_text
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -48,8 +48,9 @@ class LogSelection:
         command: `velocity`, `position` or `torque`, the quantity that commands set; `null` to guess.
         position_unit: Unit of the positions where their names do not say it: one for all joints, or
             a table by joint; `null` to guess.
+        clock_offset_s: Seconds added to the clock of a table, a number by table; `null`: none.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
-        damaged: `refuse` a log with damage, or `skip` its damaged messages, chunks and frames.
+        damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
     """
 
     input: str | tuple[str, ...]
@@ -57,6 +58,7 @@ class LogSelection:
     joints: dict[str, tuple[str, str]] | None
     command: CommandKind | None
     position_unit: str | dict[str, str] | None
+    clock_offset_s: dict[str, float] | None
     dbc: str | None
     damaged: Damaged
 
@@ -108,12 +110,18 @@ class ImportLogs:
             place = self.session.folder / conversion.FOLDER
             conversion.write_recordings(pieces, place)
             simulator = SIMULATORS[self.machine.interface]
-            command = f"brokk mode=diagnose machine=… 'diagnosis.field={place}/*' {simulator}"
-            for text in ("then, with the same machine=…:", command):
+            choices = (read_record(self.session.folder) or {}).get("choices", {})
+            machine = choices.get("machine", "…")
+            command = (
+                f"brokk mode=diagnose machine={machine} 'diagnosis.field={place}/*' {simulator}"
+            )
+            for text in ("then:", command):
                 Console().print(text, markup=False, highlight=False, soft_wrap=True)
             return
         paths = conversion.find_logs(self.log.input)
-        given = GivenColumns(self.log.joints, self.log.command, self.log.position_unit)
+        given = GivenColumns(
+            self.log.joints, self.log.command, self.log.position_unit, self.log.clock_offset_s
+        )
         guess = log_guess.guess_logs(paths, given, self.log.dbc, self.log.damaged)
         folder = self.session.folder
         figure = log_guess.draw_guess(guess)
