@@ -13,7 +13,7 @@ from rich.table import Table
 
 from actuators.recordings import conversion, log_guess, map_draft
 from actuators.recordings.column_guess import CommandKind, GivenColumns, Guess
-from actuators.recordings.column_names import UNITS
+from actuators.recordings.column_names import UNITS, read_unit
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
 from actuators.recordings.map_draft import Draft
@@ -46,8 +46,8 @@ class LogSelection:
         joints: Columns of command and position by joint, where their names do not say it; `null`
             to find them by their names.
         command: `velocity`, `position` or `torque`, the quantity that commands set; `null` to guess.
-        position_unit: Unit of the positions where their names do not say it: one for all joints, or
-            a table by joint; `null` to guess.
+        position_unit: Unit of the positions where their names do not say it, `deg` or `0.00153 rad`: one
+            for all joints, or a table by joint; `null` to guess.
         clock_offset_s: Seconds added to the clock of a table, a number by table; `null`: none.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
         damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
@@ -65,9 +65,10 @@ class LogSelection:
     def check(self) -> None:
         given = self.position_unit
         for unit in given.values() if isinstance(given, dict) else (given,):
-            if unit is not None and unit not in UNITS:
+            if unit is not None and read_unit(unit) is None:
                 raise ConfigError(
-                    f"log.position_unit: unknown unit '{unit}'; {list_choices(unit, UNITS)}"
+                    f"log.position_unit: unknown unit '{unit}'; {list_choices(unit, UNITS)}, or a number of one of them, "
+                    "such as '0.00153 rad' for a count of an encoder"
                 )
         if self.name is not None and not re.fullmatch(r"[a-z]\w*", self.name):
             raise ConfigError(
@@ -174,6 +175,8 @@ def _summarise(draft: Draft, guesses: list[Guess]) -> str:
     if unsure:
         many = "1 guess is" if unsure == 1 else f"{unsure} guesses are"
         end = f"{many} unsure: fill in {map_draft.MISSING} in {MAP_FILE}."
+    if any(joint.guesses["unit"].sureness == "unsure" for joint in draft.joints):
+        end += f" Without a unit {MACHINE_FILE} lacks limits and speeds: better run this again with log.position_unit=…"
     if any(joint.kind == "torque" for joint in draft.joints):
         end += f" The force at full command is not in the logs: fill in {map_draft.MISSING} in {MACHINE_FILE}."
     return (

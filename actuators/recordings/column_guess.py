@@ -25,6 +25,7 @@ from actuators.recordings.column_names import (
     Role,
     name_joint,
     read_column_name,
+    read_unit,
     split_words,
 )
 from actuators.recordings.log_signals import index_columns
@@ -589,8 +590,8 @@ def _judge_unit(
 ) -> tuple[str, float, Guess]:
     """Return unit of the recording, that unit for one of the log, and how sure it is."""
     subject = f"{name}: unit"
-    if given is not None:
-        return *UNITS[given], Guess(subject, given, "sure", "as given by log.position_unit")
+    if given is not None and (known := read_unit(given)) is not None:
+        return *known, Guess(subject, given, "sure", "as given by log.position_unit")
     if position.unit is not None:
         return *UNITS[position.unit], Guess(subject, position.unit, "sure", "unit in its name")
     largest = float(np.abs(q).max())
@@ -600,7 +601,7 @@ def _judge_unit(
             1.0,
             Guess(subject, "rad", "likely", f"largest value {largest:.3g}, at most a turn"),
         )
-    reason = f"largest value {largest:.4g}: degrees, per cent, or a length? Give log.position_unit"
+    reason = f"largest value {largest:.4g}: degrees, per cent, counts, or a length? Give log.position_unit"
     return "rad", math.pi / 180.0, Guess(subject, "deg", "unsure", reason, ("cm", "mm"))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from typing import Literal
@@ -91,6 +92,19 @@ class ColumnName:
     quantity: Quantity
     unit: str | None
     joint: str
+
+
+def read_unit(text: str) -> tuple[str, float] | None:
+    """Return the unit of the recording and its number for one of the log, of `deg` or `0.00153 rad`; else `None`."""
+    number, _, name = text.rpartition(" ")
+    if name not in UNITS:
+        return None
+    try:
+        factor = float(number or 1.0)
+    except ValueError:
+        return None
+    unit, scale = UNITS[name]
+    return (unit, factor * scale) if 0.0 < abs(factor) < math.inf else None
 
 
 def split_words(text: str) -> list[str]:

@@ -254,14 +254,19 @@ def format_machine(draft: Draft) -> str:
                 low, high = low - spare, high + spare
         speed = measure_full_speed(joint, survey)
         unit = f"{joint.unit}/s"
+        is_known = joint.guesses["unit"].sureness != "unsure"
+        home = f"{(low + high) / 2:.3f}" if is_known else QUOTED_MISSING
+        low, high = math.floor(1000 * low) / 1000, math.ceil(1000 * high) / 1000
+        if not is_known:
+            low = high = speed = None
         lines += [
             "  - _target_: brokk_rl.machine.Joint",
             f"    name: {joint.name}",
             "    part: null",
             f"    kind: {'hinge' if joint.unit == 'rad' else 'slide'}",
-            f"    lower: {_format_dimension(math.floor(1000 * low) / 1000, 'smallest position or target in its logs')}",
-            f"    upper: {_format_dimension(math.ceil(1000 * high) / 1000, 'largest position or target in its logs')}",
-            f"    home: {(low + high) / 2:.3f}   # {joint.unit}; middle of the range",
+            f"    lower: {_format_dimension(low, 'smallest position or target in its logs')}",
+            f"    upper: {_format_dimension(high, 'largest position or target in its logs')}",
+            f"    home: {home}   # {joint.unit}; middle of the range",
             f"    max_speed: {_format_dimension(speed, f'fastest target or motion in its logs, {unit}')}",
             "    body: null",
         ]
@@ -279,8 +284,9 @@ def format_machine(draft: Draft) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _format_dimension(value: float, source: str) -> str:
-    return f"{{_target_: brokk_rl.machine.Dimension, value: {value:g}, source: {_quote(source)}, confidence: low}}"
+def _format_dimension(value: float | None, source: str) -> str:
+    shown = QUOTED_MISSING if value is None else f"{value:g}"
+    return f"{{_target_: brokk_rl.machine.Dimension, value: {shown}, source: {_quote(source)}, confidence: low}}"
 
 
 def _explain(guess: Guess) -> str:

@@ -129,6 +129,10 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[
     )
     brokk("mode=import", "log.input=a.csv", "session.out=one")
     assert read_guesses("one")["joint: unit"]["sureness"] == "unsure"
+    (joint,) = yaml.safe_load(Path("one/machine.yaml").read_text())["joints"]
+    assert {joint[name]["value"] for name in ("lower", "upper", "max_speed")} == {"???"}
+    brokk("mode=import", "log.input=a.csv", "log.position_unit=0.5 cm", "session.out=counts")
+    assert "scale: 0.005," in Path("counts/column_map.yaml").read_text()
     brokk("mode=import", "log.input=a.csv", "log.position_unit=cm", "session.out=two")
     assert read_guesses("two")["joint: unit"]["sureness"] == "sure"
     assert "kind: slide" in Path("two/machine.yaml").read_text()
