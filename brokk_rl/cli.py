@@ -309,7 +309,10 @@ def explain(error: BaseException) -> str | None:
     if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith(
         "Config group override must"
     ):
-        return str(error)
+        text = str(error)
+        if "override_grammar" in text:
+            text += '\nQuote words with brackets, braces or colons: \'log.joints={hip: ["tau[0]", "q[0]"]}\''
+        return text
     return None
 
 

@@ -116,7 +116,8 @@ def _serve_items(
     logging.disable()  # a lock of the log may be held by a thread that is not here
     _workers.set(1)
     found = {}
-    with contextlib.suppress(Exception):
+    # Ctrl-C reaches the helpers too; the first process says it once.
+    with contextlib.suppress(Exception, KeyboardInterrupt):
         while (number := _take(place, len(items))) is not None:
             found[number] = function(items[number])
     sending.send(found)

@@ -89,7 +89,7 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     if hint is Any:
         return value
     if origin in (Union, types.UnionType):
-        return _convert_union(value, args, where, hint)
+        return _convert_union(value, args, where)
     if origin is typing.Literal:
         if value not in args:
             raise ConfigError(
@@ -126,7 +126,7 @@ def _convert(value: Any, hint: Any, where: str) -> Any:
     return value
 
 
-def _convert_union(value: Any, hints: tuple[Any, ...], where: str, whole: Any) -> Any:
+def _convert_union(value: Any, hints: tuple[Any, ...], where: str) -> Any:
     for hint in hints:
         if hint is type(None):
             if value is None:
@@ -136,4 +136,14 @@ def _convert_union(value: Any, hints: tuple[Any, ...], where: str, whole: Any) -
             return _convert(value, hint, where)
         except ConfigError:
             continue
-    raise ConfigError(f"{where}: expected {whole}, got {type(value).__name__} {value!r}")
+    expected = " or ".join(map(_name_hint, hints))
+    raise ConfigError(f"{where}: expected {expected}, got {type(value).__name__} {value!r}")
+
+
+def _name_hint(hint: Any) -> str:
+    """Return a type as a message names it: the values of a literal, `null` for none."""
+    if hint is type(None):
+        return "null"
+    if typing.get_origin(hint) is typing.Literal:
+        return " or ".join(map(repr, typing.get_args(hint)))
+    return str(hint) if typing.get_args(hint) else getattr(hint, "__name__", str(hint))

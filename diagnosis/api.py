@@ -24,7 +24,7 @@ import torch
 
 from brokk_rl import extensions, open_loop, record
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
-from brokk_rl.errors import RecordingError
+from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
@@ -124,9 +124,11 @@ def diagnose(
         workers: Processes that share the work, on Linux.
 
     Raises:
-        RecordingError: There is too little data to fit to.
+        RecordingError: There are no recordings, or too few to fit to.
         ConfigError: There is neither simulator nor reference, or an effect is unknown.
     """
+    if not field.recordings:
+        raise RecordingError("diagnose: expected a recording or more of the machine, got none")
     asked = _build_mode(field.machine, folder, simulator, fit, effects, seed, workers)
     asked.session.seed_all()
     before = () if reference is None else reference.recordings
@@ -178,7 +180,13 @@ def _load_option(group: str, option: Any) -> Any:
 
 def _load_simulator(simulator: str | Path | Actuator | Callable[..., Any] | None) -> Any:
     """Return the spec of an option, of a function or of an MJCF file."""
-    if isinstance(simulator, FunctionType):
+    if callable(simulator) and not hasattr(simulator, "build"):
+        name = getattr(simulator, "__qualname__", "")
+        if not isinstance(simulator, FunctionType) or "<" in name:
+            raise ConfigError(
+                f"simulator: expected a function at the top of a module, got {simulator!r}; write 'def step(state, command):' "
+                "there, and call yours in it"
+            )
         simulator = f"{simulator.__module__}:{simulator.__qualname__}"
     if isinstance(simulator, str | Path) and (
         ":" in str(simulator) or str(simulator).endswith(".xml")

@@ -92,7 +92,7 @@ def _add_evidence(page: Report, result: WhyResult, machine: Machine | None) -> N
             page.add_picture(
                 figure,
                 "The joint with the largest gap under the recorded commands: the machine (black), the "
-                "simulator as it is (red), and with the found effects (blue). A simulated line begins "
+                "simulator as it is (orange), and with the found effects (blue). A simulated line begins "
                 "at the measured position.",
             )
             return

@@ -37,7 +37,7 @@ simulator."""
 MIN_WARM_UP = 15
 """Samples before a run that give its speed; a simulator with a memory gets the whole warm-up."""
 TRIAL_TOLERANCE = 1e-9
-"""Largest difference between a function called for two states at once and one by one."""
+"""Largest difference between a function called for two states at once and one by one, or twice."""
 
 
 class Plant(Protocol):
@@ -348,6 +348,12 @@ class FunctionPlant:
                     f"simulator={name}: step(state, command) returned NaN or infinity in the middle of the travel, "
                     f"at rest: {one}; it has to stay finite there"
                 )
+        again = self._call(state[0], command[0])
+        if not np.allclose(again, found[0], rtol=0, atol=TRIAL_TOLERANCE):
+            raise ConfigError(
+                f"simulator={name}: step(state, command) gave two answers to one state and command, {found[0]} and {again}; "
+                "keep what it remembers in the state that start(position, speed) begins, and switch its noise off"
+            )
         one_by_one = np.stack(found)
         self._is_vectorised = self._agrees_in_rows(state, command, one_by_one)
 

@@ -17,10 +17,10 @@ OTHER = "other"
 
 SUITABLE = {
     "speed": "actuator=lag or another model of a speed",
-    "position": "actuator=servo",
-    "torque": "actuator=force or dc_motor",
+    "position": "actuator=servo fit=servo",
+    "torque": "actuator=force (or dc_motor) fit=force",
 }
-"""Actuators for each interface, as an error names them."""
+"""Actuators and fits for each interface, as an error names them."""
 COMMANDS = {"speed": "valve or velocity", "position": "position", "torque": "torque with max_force"}
 """Commands of a joint that have each interface."""
 
@@ -42,7 +42,7 @@ def check_interface(machine: Machine, interface: str, title: str) -> None:
     """
     if machine.interface != interface:
         raise ConfigError(
-            f"actuator: {title}, but machine '{machine.name}' is commanded by {machine.interface}; choose "
+            f"actuator or fit: {title}, but machine '{machine.name}' is commanded by {machine.interface}; choose "
             f"{SUITABLE[machine.interface]}, or write another command at its joints: {COMMANDS[interface]}"
         )
 

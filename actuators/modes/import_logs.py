@@ -13,14 +13,14 @@ from rich.table import Table
 
 from actuators.recordings import conversion, log_guess, map_draft
 from actuators.recordings.column_guess import CommandKind, GivenColumns, Guess
-from actuators.recordings.column_names import UNITS
+from actuators.recordings.column_names import UNITS, read_unit
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
 from actuators.recordings.map_draft import Draft
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.report import Report
-from brokk_rl.session import Session, write_json, write_text
+from brokk_rl.session import Session, read_record, write_json, write_text
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -46,10 +46,11 @@ class LogSelection:
         joints: Columns of command and position by joint, where their names do not say it; `null`
             to find them by their names.
         command: `velocity`, `position` or `torque`, the quantity that commands set; `null` to guess.
-        position_unit: Unit of the positions where their names do not say it: one for all joints, or
-            a table by joint; `null` to guess.
+        position_unit: Unit of the positions where their names do not say it, `deg` or `0.00153 rad`: one
+            for all joints, or a table by joint; `null` to guess.
+        clock_offset_s: Seconds added to the clock of a table, a number by table; `null`: none.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
-        damaged: `refuse` a log with damage, or `skip` its damaged messages, chunks and frames.
+        damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
     """
 
     input: str | tuple[str, ...]
@@ -57,15 +58,17 @@ class LogSelection:
     joints: dict[str, tuple[str, str]] | None
     command: CommandKind | None
     position_unit: str | dict[str, str] | None
+    clock_offset_s: dict[str, float] | None
     dbc: str | None
     damaged: Damaged
 
     def check(self) -> None:
         given = self.position_unit
         for unit in given.values() if isinstance(given, dict) else (given,):
-            if unit is not None and unit not in UNITS:
+            if unit is not None and read_unit(unit) is None:
                 raise ConfigError(
-                    f"log.position_unit: unknown unit '{unit}'; {list_choices(unit, UNITS)}"
+                    f"log.position_unit: unknown unit '{unit}'; {list_choices(unit, UNITS)}, or a number of one of them, "
+                    "such as '0.00153 rad' for a count of an encoder"
                 )
         if self.name is not None and not re.fullmatch(r"[a-z]\w*", self.name):
             raise ConfigError(
@@ -108,12 +111,18 @@ class ImportLogs:
             place = self.session.folder / conversion.FOLDER
             conversion.write_recordings(pieces, place)
             simulator = SIMULATORS[self.machine.interface]
-            command = f"brokk mode=diagnose machine=… 'diagnosis.field={place}/*' {simulator}"
-            for text in ("then, with the same machine=…:", command):
+            choices = (read_record(self.session.folder) or {}).get("choices", {})
+            machine = choices.get("machine", "…")
+            command = (
+                f"brokk mode=diagnose machine={machine} 'diagnosis.field={place}/*' {simulator}"
+            )
+            for text in ("then:", command):
                 Console().print(text, markup=False, highlight=False, soft_wrap=True)
             return
         paths = conversion.find_logs(self.log.input)
-        given = GivenColumns(self.log.joints, self.log.command, self.log.position_unit)
+        given = GivenColumns(
+            self.log.joints, self.log.command, self.log.position_unit, self.log.clock_offset_s
+        )
         guess = log_guess.guess_logs(paths, given, self.log.dbc, self.log.damaged)
         folder = self.session.folder
         figure = log_guess.draw_guess(guess)
@@ -166,6 +175,8 @@ def _summarise(draft: Draft, guesses: list[Guess]) -> str:
     if unsure:
         many = "1 guess is" if unsure == 1 else f"{unsure} guesses are"
         end = f"{many} unsure: fill in {map_draft.MISSING} in {MAP_FILE}."
+    if any(joint.guesses["unit"].sureness == "unsure" for joint in draft.joints):
+        end += f" Without a unit {MACHINE_FILE} lacks limits and speeds: better run this again with log.position_unit=…"
     if any(joint.kind == "torque" for joint in draft.joints):
         end += f" The force at full command is not in the logs: fill in {map_draft.MISSING} in {MACHINE_FILE}."
     return (

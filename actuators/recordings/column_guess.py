@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -25,10 +25,12 @@ from actuators.recordings.column_names import (
     Role,
     name_joint,
     read_column_name,
+    read_unit,
     split_words,
 )
 from actuators.recordings.log_signals import index_columns
 from actuators.recordings.log_tables import LogRun, Table, join_names
+from actuators.recordings.whole_rows import is_later, leave_broken_rows_out
 from brokk_rl.errors import RecordingError, list_choices
 
 Sureness = Literal["sure", "likely", "unsure"]
@@ -54,6 +56,11 @@ COMMAND_KINDS: dict[CommandKind, str] = {
 }
 TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
+LATER_SHARE = 0.9
+"""Share of the rows in which a clock must increase; a coarser one repeats its values for another reason."""
+CLEAR_SHARE = 0.3
+"""Of two explanations the better one leaves at most this part of what the other leaves unexplained;
+by hand: swapped columns leave less than 0.1, servos with play or friction more than 0.5."""
 GRID_ROWS = 20000
 """Rows on which pairs are compared; correlations change by less than 0.01 beyond."""
 
@@ -86,12 +93,14 @@ class TimeGuess:
         scale: Seconds for one of it.
         anchor: Column of the recorder's clock, to s; `None` without one.
         guess: How sure it is.
+        offset_s: Seconds added to it, as given.
     """
 
     column: str
     scale: float
     anchor: str | None
     guess: Guess
+    offset_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,11 +111,13 @@ class GivenColumns:
         joints: Columns of command and position by joint; `None` to find them by their names.
         command: Quantity that commands set; `None` to guess it.
         position_unit: Unit of the positions, for all joints or by joint; `None` to guess it.
+        clock_offset_s: Seconds added to the clocks of tables.
     """
 
     joints: Mapping[str, tuple[str, str]] | None = None
     command: CommandKind | None = None
     position_unit: str | Mapping[str, str] | None = None
+    clock_offset_s: Mapping[str, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -122,7 +133,9 @@ class JointGuess:
         lag_s: Lag of the motion behind the command at the best correlation.
         unit: `rad` or `m`.
         scale: That unit for one of the log.
-        guesses: How sure each part is.
+        target_scale: The same for its targets.
+        target_offset: Position at a target of 0, in that unit.
+        guesses: How sure each part is; `target` where the unit of the targets is in question.
     """
 
     name: str
@@ -133,27 +146,65 @@ class JointGuess:
     lag_s: float
     unit: str
     scale: float
+    target_scale: float
+    target_offset: float
     guesses: dict[str, Guess]
 
 
-def guess_times(run: LogRun) -> dict[str, TimeGuess]:
-    """Return the clock of each table that has one."""
+def guess_times(
+    run: LogRun, skip: bool = False, offsets_s: Mapping[str, float] | None = None
+) -> dict[str, TimeGuess]:
+    """Return the clock of each table that has one.
+
+    Args:
+        run: Beginning of a log, with all columns.
+        skip: Accept a clock that repeats or lacks some times; these rows will be left out.
+        offsets_s: Seconds added to the clocks of tables.
+    """
     found = {}
     for name, table in run.tables.items():
-        time = _guess_time(name, table)
+        time = _guess_time(name, table, skip)
         if time is not None:
             found[name] = time
+    for name, offset_s in (offsets_s or {}).items():
+        if name not in found:
+            raise RecordingError(
+                f"{run.where}: log.clock_offset_s: table '{name}' is missing or has no clock; {list_choices(name, found)}"
+            )
+        found[name] = replace(found[name], offset_s=float(offset_s))
     return found
 
 
-def _guess_time(name: str, table: Table) -> TimeGuess | None:
+def describe_broken_clocks(run: LogRun) -> list[str]:
+    """Return a sentence for each column that could be a time if it increased in all rows."""
+    found = []
+    for table in run.tables.values():
+        for column, values in table.columns.items():
+            later = is_later(values)
+            if later.all() or not (_is_named_time(column) or later.mean() >= LATER_SHARE):
+                continue
+            row = int(np.argmin(later))
+            found.append(
+                f"'{column}' does not increase in {int((~later).sum())} of {len(later)} rows, first in {table.locate(row)}"
+            )
+    return found
+
+
+def _is_named_time(column: str) -> bool:
+    return any(word in TIME_WORDS or word in TIME_UNITS for word in split_words(column))
+
+
+def _guess_time(name: str, table: Table, skip: bool) -> TimeGuess | None:
     candidates = []
     for column in table.columns:
-        words = split_words(column)
-        is_named = any(word in TIME_WORDS or word in TIME_UNITS for word in words)
+        words, is_named = split_words(column), _is_named_time(column)
         values = table.columns[column]
-        if len(values) < 2 or not np.all(np.diff(values) > 0):
+        if len(values) < 2:
             continue
+        later = is_later(values)
+        if not later.all() and not (skip and is_named and later.mean() >= LATER_SHARE):
+            continue
+        values = values[later]
         unit = next((TIME_UNITS[word] for word in reversed(words) if word in TIME_UNITS), None)
         period = float(np.median(np.diff(values)))
         scales = [s for s in (1.0, 1e-3, 1e-6, 1e-9) if RATES_HZ[0] <= 1.0 / (period * s) <= RATES_HZ[1]]  # fmt: skip
@@ -172,11 +223,16 @@ def _guess_time(name: str, table: Table) -> TimeGuess | None:
     if best is None:
         return None
     _, column, scale, source = best
-    rate_hz = 1.0 / (float(np.median(np.diff(table.columns[column]))) * scale)
+    later = is_later(table.columns[column])
+    rate_hz = 1.0 / (float(np.median(np.diff(table.columns[column][later]))) * scale)
     sure: Sureness = "sure" if named and source else ("likely" if named else "unsure")
     reason = f"only increases; 1 = {scale:g} s ({source or 'the only unit that gives a rate of 1 to 5000 Hz'}): {rate_hz:.4g} Hz"
     if not source and named and RATES_HZ[0] <= rate_hz / 1000 * 1.0:
         reason += "; a unit 1000 times longer would do too"
+    if not later.all():
+        reason = reason.replace(
+            "only increases", f"increases but for {int((~later).sum())} of {len(later)} rows"
+        )
     others = tuple(c[1] for c in candidates if c[1] != column)
     subject = f"time of '{name}'" if name else "time"
     return TimeGuess(column, scale, None, Guess(subject, column, sure, reason, others))
@@ -225,8 +281,12 @@ def _list_families(run: LogRun, times: Mapping[str, TimeGuess]) -> list[_Family]
             base = column.partition("[")[0]  # a list is one family, whatever its items are called
             if base == column:
                 joint = name.joint.split("_")
-                base = " ".join(word for word in split_words(column) if word not in joint)
+                words = [word for word in split_words(column) if word not in joint]
+                # a hinge in rad beside a slide in mm: the unit does not part them
+                base = " ".join(word for word in words if word not in UNITS)
                 base = re.sub(r"\d+$", "", base)
+                if name.joint in groups.get((table, base), {}):
+                    base = re.sub(r"\d+$", "", " ".join(words))
             groups.setdefault((table, base), {})[name.joint] = name
     families = []
     for (table, _), members in groups.items():
@@ -294,7 +354,7 @@ def _pair_by_names(run: LogRun, times: Mapping[str, TimeGuess]) -> tuple[Pairs, 
         known = [join_names(t, c) for t, content in run.tables.items() for c in content.columns]
         raise RecordingError(
             f"{run.where}: no column is named like {lacking}; name those of each joint: "
-            f"'log.joints={{boom: [<command>, <position>]}}'; its columns are {', '.join(known)}"
+            f'\'log.joints={{boom: ["<command>", "<position>"]}}\'; its columns are {", ".join(known)}'
         )
 
     def rank(pair: tuple[_Family, _Family]) -> tuple[int, int, int]:
@@ -320,7 +380,7 @@ def _pair_by_names(run: LogRun, times: Mapping[str, TimeGuess]) -> tuple[Pairs, 
         raise RecordingError(
             f"{run.where}: {len(command.members)} commands ({', '.join(c.column for c in command.members.values())}) and "
             f"{len(position.members)} positions ({', '.join(p.column for p in position.members.values())}) share no names; "
-            "name those of each joint: 'log.joints={boom: [<command>, <position>]}'"
+            'name those of each joint: \'log.joints={boom: ["<command>", "<position>"]}\''
         )
     rivals = [join_names(f.table, next(iter(f.members.values())).column) for f in commands if f is not command]  # fmt: skip
     if rivals:
@@ -337,15 +397,20 @@ class _Comparison:
         times: Mapping[str, TimeGuess],
         pairs: Mapping[str, tuple[ColumnName, ColumnName]],
     ) -> None:
+        run = leave_broken_rows_out(
+            run, {name: time.column for name, time in times.items()}, {}, False
+        )
         clocks = {name: read_times(run.tables[name], time) for name, time in times.items()}
         used = {name.table for pair in pairs.values() for name in pair}
         begin_s = max(clocks[table][0] for table in used)
         end_s = min(clocks[table][-1] for table in used)
         if end_s <= begin_s:
-            spans = ", ".join(f"{t}: {clocks[t][0]:.6g} to {clocks[t][-1]:.6g} s" for t in used)
+            spans = ", ".join(f"{t}: {clocks[t][0]:.12g} to {clocks[t][-1]:.12g} s" for t in used)
+            first, last = min(used, key=lambda t: clocks[t][0]), max(used, key=lambda t: clocks[t][0])  # fmt: skip
+            apart_s = float(clocks[first][0] - clocks[last][0])
             raise RecordingError(
-                f"{run.where}: the clocks of its tables have no time in common ({spans}); give the offset of one of them in a "
-                "column map (time.<table>.offset)"
+                f"{run.where}: the clocks of its tables have no time in common ({spans}); if they began together, give "
+                f"'log.clock_offset_s={{{last}: {apart_s:.12g}}}'"
             )
         slowest_s = max(float(np.median(np.diff(clocks[table]))) for table in used)
         num_rows = min(GRID_ROWS, max(int((end_s - begin_s) / slowest_s), 2))
@@ -355,7 +420,10 @@ class _Comparison:
         for joint, (command, position) in pairs.items():
             for name, store in ((command, self.commands), (position, self.positions)):
                 values = np.asarray(run.tables[name.table].columns[name.column], dtype=float)
-                store[joint] = np.interp(self.grid_s, clocks[name.table], values)
+                known = np.isfinite(values)
+                store[joint] = np.zeros(num_rows)
+                if known.any():
+                    store[joint] = np.interp(self.grid_s, clocks[name.table][known], values[known])
 
     def correlate(self, command: str, position: str) -> tuple[float, float]:
         """Return the correlations, at the best lag, of position with target and of speed with command."""
@@ -368,6 +436,24 @@ class _Comparison:
         u = self.commands[joint]
         speed = np.gradient(self.positions[joint], self.period_s)
         return self._find_best(np.gradient(u, self.period_s) if is_target else u, speed)[1]
+
+    def fit_target(self, joint: str) -> tuple[float, float]:
+        """Return slope and offset of the line from targets to positions, at the best lag."""
+        u, q = self.commands[joint], self.positions[joint]
+        rows = round(self._find_best(u, q)[1] / self.period_s)
+        u, q = u[: len(u) - rows], q[rows:]
+        if np.ptp(u) == 0:
+            return 0.0, 0.0
+        slope, offset = np.polyfit(u, q, 1)
+        return float(slope), float(offset)
+
+    def find_lead(self, joint: str) -> float:
+        """Return the time by which the position leads its target, s; 0 where it does not, clearly."""
+        u, q = self.commands[joint], self.positions[joint]
+        (behind, _), (before, lead_s) = self._find_best(u, q), self._find_best(q, u)
+        left, left_behind = 1.0 - abs(before), 1.0 - abs(behind)
+        is_leading = abs(before) >= CLEAR_CORRELATION and left < CLEAR_SHARE * left_behind
+        return lead_s if is_leading else 0.0
 
     def _find_best(self, a: np.ndarray, b: np.ndarray) -> tuple[float, float]:
         """Return the largest correlation, in size, of `b` with `a` before it, and its lag."""
@@ -393,11 +479,18 @@ def _judge_joint(
 ) -> JointGuess:
     target_r, speed_r = comparison.correlate(joint, joint)
     u, q = comparison.commands[joint], comparison.positions[joint]
-    slope = float(np.polyfit(u, q, 1)[0]) if np.ptp(u) > 0 else 0.0
+    slope, rest = comparison.fit_target(joint)
     says_target = command.quantity == "position"
-    is_like_target = TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1] and target_r >= CLEAR_CORRELATION
-    is_target = is_like_target and (says_target or target_r > abs(speed_r))
+    is_in_unit = TARGET_SLOPE[0] <= slope <= TARGET_SLOPE[1]
+    is_target = (
+        is_in_unit and target_r >= CLEAR_CORRELATION and (says_target or target_r > abs(speed_r))
+    )
     is_target = is_target or (says_target and abs(speed_r) < CLEAR_CORRELATION)
+    # A target in another unit, as of a policy whose actions are scaled and added to a pose.
+    is_unnamed = command.quantity == "unknown" and abs(target_r) >= CLEAR_CORRELATION
+    is_target = is_target or (
+        is_unnamed and 1.0 - abs(target_r) < CLEAR_SHARE * (1.0 - abs(speed_r))
+    )
     if given.command is not None:
         is_target = given.command == "position"
     r = target_r if is_target else speed_r
@@ -427,6 +520,13 @@ def _judge_joint(
     elif max(abs(target_r), abs(speed_r)) < NO_CORRELATION:
         sureness = "unsure"
         reason += "; its position does not follow its command"
+    lead_s = comparison.find_lead(joint) if is_target else 0.0
+    if lead_s > 0.0:
+        reason += (
+            f"; but the position leads it by {lead_s:.2f} s: columns swapped, or clocks apart?"
+        )
+        if pairing != "as given by log.joints":
+            sureness = "unsure"
     guesses = {
         "columns": Guess(
             f"{name}: columns",
@@ -443,6 +543,18 @@ def _judge_joint(
     if isinstance(unit, Mapping):
         unit = unit.get(name)
     unit, scale, guesses["unit"] = _judge_unit(name, position, q, unit)
+    target_scale, target_offset = scale, 0.0
+    if is_target and abs(target_r) >= CLEAR_CORRELATION:
+        if command.unit is not None and UNITS[command.unit][0] == unit:
+            target_scale = UNITS[command.unit][1]
+        if not TARGET_SLOPE[0] <= slope * scale / target_scale <= TARGET_SLOPE[1]:
+            target_scale, target_offset = slope * scale, rest * scale
+            guesses["target"] = Guess(
+                f"{name}: unit of targets",
+                f"{slope:.3g} × target + {rest:.3g}",
+                "unsure",
+                "this line fits the positions best; fill in scale and offset, those of the code that commands",
+            )
     is_torque = given.command == "torque"
     sign = 1 if is_target or is_torque or r >= 0 else -1
     return JointGuess(
@@ -454,6 +566,8 @@ def _judge_joint(
         lag_s,
         unit,
         scale,
+        target_scale,
+        target_offset,
         guesses,
     )
 
@@ -476,8 +590,8 @@ def _judge_unit(
 ) -> tuple[str, float, Guess]:
     """Return unit of the recording, that unit for one of the log, and how sure it is."""
     subject = f"{name}: unit"
-    if given is not None:
-        return *UNITS[given], Guess(subject, given, "sure", "as given by log.position_unit")
+    if given is not None and (known := read_unit(given)) is not None:
+        return *known, Guess(subject, given, "sure", "as given by log.position_unit")
     if position.unit is not None:
         return *UNITS[position.unit], Guess(subject, position.unit, "sure", "unit in its name")
     largest = float(np.abs(q).max())
@@ -487,12 +601,11 @@ def _judge_unit(
             1.0,
             Guess(subject, "rad", "likely", f"largest value {largest:.3g}, at most a turn"),
         )
-    reason = f"largest value {largest:.4g}: degrees, per cent, or a length? Give log.position_unit"
+    reason = f"largest value {largest:.4g}: degrees, per cent, counts, or a length? Give log.position_unit"
     return "rad", math.pi / 180.0, Guess(subject, "deg", "unsure", reason, ("cm", "mm"))
 
 
 def read_times(table: Table, time: TimeGuess) -> np.ndarray:
     """Return the times of a table, `(T,)` s, by the recorder's clock where it has one."""
-    return np.asarray(table.columns[time.anchor or time.column]) * (
-        1.0 if time.anchor else time.scale
-    )
+    scale = 1.0 if time.anchor else time.scale
+    return np.asarray(table.columns[time.anchor or time.column]) * scale + time.offset_s

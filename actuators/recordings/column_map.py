@@ -42,6 +42,7 @@ from actuators.recordings.log_signals import (
 )
 from actuators.recordings.log_tables import LogFile, LogRun, join_names
 from actuators.recordings.text_log import CsvLayout
+from actuators.recordings.whole_rows import HOW_TO_SKIP, leave_broken_rows_out
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -207,7 +208,7 @@ class ColumnMap:
         overrun: Command beyond full that is taken for rounding and cut to full; more is refused.
         longest_gap_s: A longer time between two rows splits the log.
         shortest_s: Shorter pieces are left out.
-        damaged: `refuse` a log with damage, or `skip` its damaged messages, chunks and frames.
+        damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
     """
 
     delimiter: Literal[",", ";", "\t", " "]
@@ -256,15 +257,36 @@ class ColumnMap:
         wanted = self._list_wanted(sources, places, opened.path)
         found, num_rows = [], 0
         for run in opened.read_runs(wanted, None):
+            if self.damaged == "skip":
+                run = self._leave_broken_rows_out(run, sources, places)
             clocks = RunClocks(run, partial(_read_clock, run, column_map=self))
             found += self._read_run(RunSignals(run, sources, places, clocks), clocks, machine)
             num_rows += max(map(len, clocks.values()))
         if not found:
             raise RecordingError(
                 f"{opened.path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
-                f"{num_rows} rows; is import.time.scale right?"
+                f"{num_rows} rows; mend longest_gap_s or the scale of time in the column map"
             )
         return found
+
+    def _leave_broken_rows_out(
+        self, run: LogRun, sources: Mapping[str, Expression | str], places: Places
+    ) -> LogRun:
+        """Return a run without rows of which a joint's cell or the time cannot be used."""
+        needed: dict[str, set[str]] = {}
+        for joint in self.joints.values():
+            for text in (joint.command.column, joint.position.column):
+                source = sources[text]
+                for name in (source,) if isinstance(source, str) else source.names:
+                    table, column = places[name]
+                    needed.setdefault(table, set()).add(column)
+        clocks = {}
+        for table, columns in needed.items():
+            time = self.find_time(table, run.where)
+            clocks[table] = time.column
+            if isinstance(time, AlignedTime):
+                columns.add(time.anchor.column)
+        return leave_broken_rows_out(run, clocks, needed)
 
     def _check_interface(self, machine: Machine) -> None:
         """Raise a `ConfigError` where targets are read as another quantity than the machine's command."""
@@ -379,9 +401,16 @@ class ColumnMap:
                     f"{where}: {signal.values[row]:g} lies on the side of neutral for which the column map has no full "
                     "command; give both full_plus and full_minus, or mend neutral"
                 )
+            if isinstance(column, TargetColumn) and column.full_speed is None:
+                target = column.scale * signal.values[row] + column.offset
+                raise RecordingError(
+                    f"{where}: the target is {target:.5g} {machine.joints[joint].unit}, beyond the limits {machine.lower[joint]:g} "
+                    f"to {machine.upper[joint]:g} of '{machine.joints[joint].name}'; mend lower and upper in the machine file, "
+                    "scale or offset in the column map, or the log"
+                )
             raise RecordingError(
                 f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
-                "neutral or full_speed of the column map, the limits of a joint that is commanded by position, or the log"
+                "neutral or full_speed of the column map, or the log"
             )
         return Signal(signal.table, signal.t_s, np.clip(u, -1.0, 1.0, out=u), signal.text)
 
@@ -431,10 +460,13 @@ def _read_clock(run: LogRun, name: str, column_map: ColumnMap) -> np.ndarray:
         )
     if (row := find_first(t_s, np.isfinite)) is not None:
         text = table.show_cell(row, time.column)
-        raise RecordingError(f"{locate(run, name, row, time.column)}: {text} is not a number")
+        raise RecordingError(
+            f"{locate(run, name, row, time.column)}: {text} is not a number; {HOW_TO_SKIP}"
+        )
     if (row := find_first(np.diff(t_s), lambda step_s: step_s > 0)) is not None:
         raise RecordingError(
-            f"{locate(run, name, row + 1, time.column)}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s)"
+            f"{locate(run, name, row + 1, time.column)}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s); "
+            f"{HOW_TO_SKIP}"
         )
     if isinstance(time, AlignedTime):
         anchor = np.asarray(table.columns[time.anchor.column], dtype=float)

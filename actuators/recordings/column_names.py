@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass
 from typing import Literal
@@ -9,19 +10,45 @@ from typing import Literal
 Role = Literal["command", "measured"]
 Quantity = Literal["position", "velocity", "effort", "unknown"]
 
-TIME_WORDS = {"t", "time", "timestamp", "stamp", "clock", "sec", "seconds", "nanosec", "epoch"}
+TIME_WORDS = {
+    "t",
+    "time",
+    "timestamp",
+    "stamp",
+    "clock",
+    "sec",
+    "seconds",
+    "nanosec",
+    "epoch",
+    "ts",
+    "datetime",
+    "date",
+    "zeit",
+    "zeitstempel",
+}
 COMMAND_WORDS = {
     "u", "cmd", "cmds", "command", "commands", "commanded", "control", "ctrl", "action", "actions", "target", "targets",
-    "goal", "setpoint", "sp", "desired", "des", "ref", "reference", "demand", "request", "valve", "flow", "pwm", "duty",
+    "goal", "setpoint", "sp", "desired", "des", "ref", "reference", "demand", "request", "valve", "flow", "pwm", "duty", "soll",
 }  # fmt: skip
 MEASURED_WORDS = {
     "q", "state", "states", "actual", "act", "meas", "measured", "ms", "feedback", "fb", "obs", "observation", "encoder",
-    "enc", "present", "status", "sensor",
+    "enc", "present", "status", "sensor", "ist",
 }  # fmt: skip
-TARGET_WORDS = {"target", "targets", "goal", "setpoint", "sp", "desired", "des", "ref", "reference"}
+TARGET_WORDS = {
+    "target",
+    "targets",
+    "goal",
+    "setpoint",
+    "sp",
+    "desired",
+    "des",
+    "ref",
+    "reference",
+    "soll",
+}
 """Words for commands that are positions unless another word says velocity or effort."""
 QUANTITY_WORDS: dict[Quantity, set[str]] = {
-    "position": {"q", "pos", "position", "positions", "angle", "angles", "length", "stroke", "ms"},
+    "position": {"q", "pos", "position", "positions", "angle", "angles", "length", "stroke", "ms", "ticks", "counts"},
     "velocity": {"qd", "dq", "vel", "vels", "velocity", "velocities", "speed", "speeds", "rate"},
     "effort": {
         "tau", "torque", "torques", "effort", "efforts", "load", "loads", "current", "force", "pressure", "temp",
@@ -67,6 +94,19 @@ class ColumnName:
     joint: str
 
 
+def read_unit(text: str) -> tuple[str, float] | None:
+    """Return the unit of the recording and its number for one of the log, of `deg` or `0.00153 rad`; else `None`."""
+    number, _, name = text.rpartition(" ")
+    if name not in UNITS:
+        return None
+    try:
+        factor = float(number or 1.0)
+    except ValueError:
+        return None
+    unit, scale = UNITS[name]
+    return (unit, factor * scale) if 0.0 < abs(factor) < math.inf else None
+
+
 def split_words(text: str) -> list[str]:
     """Return the words of a name in lower case: `Boom Cmd`, `boomCmd` and `boom_cmd` are the same."""
     spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
@@ -83,6 +123,8 @@ def read_column_name(table: str, column: str) -> ColumnName:
     if quantity == "unknown":
         quantity = _find_quantity(outer)
     unit = next((word for word in reversed(words) if word in UNITS), None)
+    if unit is not None and words[-2:] == [unit, "s"]:  # `rad_s` is rad/s
+        words, quantity, unit = words[:-2], "velocity", None
     roles = COMMAND_WORDS | MEASURED_WORDS | set().union(*QUANTITY_WORDS.values())
     known = roles | FILLER_WORDS | set(UNITS)
     left = [word for word in words if word not in known]

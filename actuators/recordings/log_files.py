@@ -33,15 +33,16 @@ JOINT_LIST = "joint_list.txt"
 """File in which SAGE names the joints, one a line."""
 
 
-class SageLog(LogFile):
-    """A folder of SAGE: `control.csv` and `state_motor.csv` of one motion, each on its clock."""
+class CsvFolderLog(LogFile):
+    """A folder with the CSV files of one run, each on its clock, as SAGE writes them."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         labels = []
         if (path / JOINT_LIST).is_file():
             labels = (path / JOINT_LIST).read_text(errors="replace").split()
-        self._logs = {Path(name).stem: CsvLog(path / name, None, labels) for name in SAGE_FILES}
+        names = SAGE_FILES if tell_folder(path) == "sage" else _list_csv_files(path)
+        self._logs = {Path(name).stem: CsvLog(path / name, None, labels) for name in names}
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the columns of both files, items of lists by the joints where they are listed."""
@@ -87,7 +88,7 @@ def open_log(
 def _open_folder(path: Path) -> LogFile:
     kind = tell_folder(path)
     if kind == "sage":
-        return SageLog(path)
+        return CsvFolderLog(path)
     if kind == "lerobot":
         return LeRobotLog(path)
     if kind == "bag":
@@ -95,6 +96,8 @@ def _open_folder(path: Path) -> LogFile:
         from actuators.recordings.bag_log import BagLog
 
         return BagLog(path)
+    if len(_list_csv_files(path)) > 1:
+        return CsvFolderLog(path)
     raise RecordingError(
         f"{path}: expected a folder of SAGE ({', '.join(SAGE_FILES)}), a LeRobotDataset (meta/info.json) or a bag "
         "of ROS 2 (metadata.yaml)"
@@ -169,8 +172,11 @@ def expand_logs(paths: list[Path]) -> list[Path]:
             found.append(path)
             continue
         inside = []
+        runs = _list_csv_runs(path)
         for entry in sorted(path.iterdir()):
-            if entry.is_dir() and not entry.name.startswith("."):
+            if entry in runs:
+                inside.append(entry)
+            elif entry.is_dir() and not entry.name.startswith("."):
                 inside += _find_below(entry)
             elif entry.suffix.lower() in ENDINGS:
                 inside.append(entry)
@@ -180,6 +186,23 @@ def expand_logs(paths: list[Path]) -> list[Path]:
             )
         found += inside
     return found
+
+
+def _list_csv_files(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.glob("*.csv"))
+
+
+def _list_csv_runs(folder: Path) -> list[Path]:
+    """Return the folders below that hold several CSV files by the same names: each is a run."""
+    by_names: dict[tuple[str, ...], list[Path]] = {}
+    for entry in folder.iterdir():
+        if entry.is_dir() and not entry.name.startswith(".") and tell_folder(entry) is None:
+            by_names.setdefault(tuple(_list_csv_files(entry)), []).append(entry)
+    runs = []
+    for names, entries in by_names.items():
+        if len(names) > 1 and len(entries) > 1:
+            runs += entries
+    return runs
 
 
 def _find_below(folder: Path) -> list[Path]:

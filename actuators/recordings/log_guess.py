@@ -14,6 +14,7 @@ from actuators.recordings.column_guess import (
     GivenColumns,
     JointGuess,
     TimeGuess,
+    describe_broken_clocks,
     guess_joints,
     guess_times,
     read_times,
@@ -24,6 +25,7 @@ from actuators.recordings.log_survey import measure_logs
 from actuators.recordings.log_tables import LogRun
 from actuators.recordings.map_draft import Draft
 from actuators.recordings.text_log import CsvLayout, CsvLog
+from actuators.recordings.whole_rows import HOW_TO_SKIP
 from brokk_rl.errors import RecordingError
 
 if TYPE_CHECKING:
@@ -82,13 +84,15 @@ def guess_logs(
         run = next(opened.read_runs(opened.list_tables(), SAMPLED_ROWS), None)
         if run is None:
             raise RecordingError(f"{path}: no row")
-        clocks = guess_times(run)
+        clocks = guess_times(run, damaged == "skip", given.clock_offset_s)
         if not clocks:
             columns = ", ".join(index_columns(opened.list_tables()))
             if not columns:
                 raise RecordingError(f"{path}: no column of numbers can be read in it")
+            broken = "; ".join(describe_broken_clocks(run))
             raise RecordingError(
-                f"{path}: no column only increases at a rate of 1 to 5000 Hz, so none can be the time; columns: {columns}"
+                f"{path}: no column only increases at a rate of 1 to 5000 Hz, so none can be the time; "
+                + (f"{broken}; {HOW_TO_SKIP}" if broken else f"columns: {columns}")
             )
         joints, more = guess_joints(run, clocks, given)
         samples.append(run)
@@ -152,7 +156,8 @@ def draw_guess(guess: LogGuess) -> Figure:
         begin_s = min(t_s[0] for t_s, _ in curves.values())
         (command_s, u), (position_s, q) = curves[joint.command], curves[joint.position]
         axis.plot(position_s - begin_s, q, color=BLUE, lw=1.2)
-        other = axis if joint.kind == "target" else axis.twinx()
+        is_same_unit = joint.kind == "target" and joint.target_scale == joint.scale
+        other = axis if is_same_unit else axis.twinx()
         other.step(command_s - begin_s, u, color=ORANGE, lw=0.9, where="post")
         axis.set_ylabel(joint.position, color=BLUE, fontsize=7)
         if other is not axis:

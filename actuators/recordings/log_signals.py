@@ -10,6 +10,7 @@ import numpy as np
 
 from actuators.recordings.expression import Expression, parse_expression
 from actuators.recordings.log_tables import LogRun, join_names
+from actuators.recordings.whole_rows import HOW_TO_SKIP
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -142,7 +143,7 @@ class RunSignals:
             if not empty and (row := find_first(values, np.isfinite)) is not None:
                 cell = self.run.tables[other].show_cell(row, inner)
                 raise RecordingError(
-                    f"{locate(self.run, other, row, name)}: {cell} is not a number"
+                    f"{locate(self.run, other, row, name)}: {cell} is not a number; {HOW_TO_SKIP}"
                 )
             columns[name] = (
                 values if other == table else np.interp(t_s, self._clocks[other], values)

@@ -11,6 +11,7 @@ import numpy as np
 from actuators.recordings.column_guess import JointGuess, TimeGuess, read_times
 from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import index_columns
+from actuators.recordings.whole_rows import leave_broken_rows_out
 from brokk_rl.errors import RecordingError
 
 REST_SPEED = 0.02
@@ -68,12 +69,14 @@ class LogSurvey:
     Attributes:
         joints: By joint.
         period_s: Median period of the positions.
+        slowest_period_s: Median period of the slowest table.
         num_runs: Number of runs.
         minutes: Length of all runs.
     """
 
     joints: Mapping[str, JointSurvey]
     period_s: float
+    slowest_period_s: float
     num_runs: int
     minutes: float
 
@@ -91,7 +94,7 @@ def measure_logs(
         RecordingError: A log is damaged, or lacks a column that the first one has.
     """
     found = {joint.name: JointSurvey() for joint in joints}
-    periods_s, num_runs, seconds = [], 0, 0.0
+    periods_s, slowest_s, num_runs, seconds = [], 0.0, 0, 0.0
     for path in paths:
         opened = open_log(path, dbc=dbc, damaged=damaged)
         places = index_columns(opened.list_tables())
@@ -106,6 +109,9 @@ def measure_logs(
                 columns = wanted.setdefault(table, set())
                 columns |= {column, times[table].column, times[table].anchor or column}
         for run in opened.read_runs(wanted, None):
+            if opened.keep_whole:
+                columns_of_time = {name: times[name].column for name in wanted}
+                run = leave_broken_rows_out(run, columns_of_time, wanted)
             clocks = {name: read_times(table, times[name]) for name, table in run.tables.items()}
             for joint in joints:
                 (one, command), (other, position) = places[joint.command], places[joint.position]
@@ -117,6 +123,7 @@ def measure_logs(
                 )
             clock_s = clocks[places[joints[0].position][0]]
             periods_s.append(float(np.median(np.diff(clock_s))))
+            slowest_s = max(slowest_s, *(float(np.median(np.diff(t_s))) for t_s in clocks.values()))
             seconds += float(clock_s[-1] - clock_s[0])
             num_runs += 1
-    return LogSurvey(found, float(np.median(periods_s)), num_runs, seconds / 60.0)
+    return LogSurvey(found, float(np.median(periods_s)), slowest_s, num_runs, seconds / 60.0)

@@ -22,6 +22,8 @@ SHORTEST_S = 5.0
 """Shortest piece of a log, s: one free run of the diagnosis."""
 GAP_PERIODS = 4
 """Periods without a sample that split a log; loggers without real time skip up to two."""
+UNSURE_SPARE = 0.1
+"""Part of the travel that is added at its ends where the unit of the targets was fitted; by hand."""
 REST_SHARE = 0.05
 """Share of all rows, at rest and with one command, from which it counts as neutral; by hand: a joint
 that turns round passes through rest within 1 % of the rows."""
@@ -137,13 +139,13 @@ def format_map(draft: Draft) -> str:
     lines.append("joints:")
     for joint in draft.joints:
         lines += _format_joint(joint, draft.survey.joints[joint.name], draft.has_targets)
-    period_s = draft.survey.period_s
+    period_s = draft.survey.slowest_period_s
     lines += [
         "optional: {}",
         "overrun: 0.001        # of full command; rounding",
         f"longest_gap_s: {_round_up(GAP_PERIODS * period_s):g}   # s; {GAP_PERIODS} periods of {period_s:.4g} s",
         f"shortest_s: {SHORTEST_S:g}         # s; shorter ones hold no free run worth judging",
-        f"damaged: {draft.damaged}       # skip: leave damaged messages, chunks and frames out",
+        f"damaged: {draft.damaged}       # skip: leave damaged rows, messages, chunks and frames out",
     ]
     if draft.dbc is not None:
         head, body = lines[:3], [f"  {line}" for line in lines[3:]]
@@ -160,12 +162,10 @@ def format_map(draft: Draft) -> str:
 def _format_time(time: TimeGuess) -> str:
     column = MISSING if time.guess.sureness == "unsure" else time.column
     if time.anchor is not None:
-        anchor = (
-            f"{{_target_: {MAP}.Column, column: {_quote(time.anchor)}, scale: 1.0, offset: 0.0}}"
-        )
+        anchor = f"{{_target_: {MAP}.Column, column: {_quote(time.anchor)}, scale: 1.0, offset: {time.offset_s!r}}}"
         text = f"{{_target_: {MAP}.AlignedTime, column: {_quote(column)}, scale: {time.scale!r}, anchor: {anchor}}}"
     else:
-        text = f"{{_target_: {MAP}.Column, column: {_quote(column)}, scale: {time.scale!r}, offset: 0.0}}"
+        text = f"{{_target_: {MAP}.Column, column: {_quote(column)}, scale: {time.scale!r}, offset: {time.offset_s!r}}}"
     return f"{text}   # {_explain(time.guess)}"
 
 
@@ -182,18 +182,19 @@ def _format_joint(joint: JointGuess, survey: JointSurvey, has_targets: bool) -> 
     ]
     if kind.sureness == "unsure":
         lines.append(f"    command: {QUOTED_MISSING}")
-    elif has_targets:
-        lines.append(
-            f"    command: {{_target_: {MAP}.TargetColumn, column: {_quote(command)}, scale: {scale}, full_speed: null}}"
-            f"   # {joint.unit} for one of the log; a target is the command itself"
-        )
     elif joint.kind == "target":
-        speed = (
-            QUOTED_MISSING if scale == QUOTED_MISSING else f"{measure_full_speed(joint, survey):g}"
-        )
+        target_scale = repr(joint.target_scale) if scale != QUOTED_MISSING else scale
+        offset, remark = "", f"{joint.unit} for one of the log; a target is the command itself"
+        if (target := joint.guesses.get("target")) is not None:
+            target_scale, offset = QUOTED_MISSING, f", offset: {QUOTED_MISSING}"
+            remark = f"{_explain(target)}"
+        speed = "null"
+        if not has_targets:
+            speed = f"{measure_full_speed(joint, survey):g}" if target_scale != QUOTED_MISSING else QUOTED_MISSING  # fmt: skip
+            remark += f"; full_speed in {joint.unit}/s is the fastest target of the logs"
         lines.append(
-            f"    command: {{_target_: {MAP}.TargetColumn, column: {_quote(command)}, scale: {scale}, full_speed: {speed}}}"
-            f"   # {joint.unit}/s, the fastest target of the logs"
+            f"    command: {{_target_: {MAP}.TargetColumn, column: {_quote(command)}, scale: {target_scale}, "
+            f"full_speed: {speed}{offset}}}   # {remark}"
         )
     else:
         full = scale_command(joint, survey)
@@ -214,8 +215,9 @@ def _format_joint(joint: JointGuess, survey: JointSurvey, has_targets: bool) -> 
 
 def measure_full_speed(joint: JointGuess, survey: JointSurvey) -> float:
     """Return the speed at full command, rad/s or m/s: of the fastest target, else of the fastest motion."""
-    speed = survey.top_target_speed if joint.kind == "target" else survey.top_speed
-    return _round_up(joint.scale * speed)
+    if joint.kind == "target":
+        return _round_up(abs(joint.target_scale) * survey.top_target_speed)
+    return _round_up(joint.scale * survey.top_speed)
 
 
 def format_machine(draft: Draft) -> str:
@@ -244,18 +246,27 @@ def format_machine(draft: Draft) -> str:
         survey = draft.survey.joints[joint.name]
         low, high = joint.scale * survey.lowest, joint.scale * survey.highest
         if joint.kind == "target":
-            low = min(low, joint.scale * survey.lowest_command)
-            high = max(high, joint.scale * survey.highest_command)
+            for target in (survey.lowest_command, survey.highest_command):
+                position = joint.target_scale * target + joint.target_offset
+                low, high = min(low, position), max(high, position)
+            if "target" in joint.guesses:  # its line is a fit, and the true one may reach further
+                spare = UNSURE_SPARE * (high - low)
+                low, high = low - spare, high + spare
         speed = measure_full_speed(joint, survey)
         unit = f"{joint.unit}/s"
+        is_known = joint.guesses["unit"].sureness != "unsure"
+        home = f"{(low + high) / 2:.3f}" if is_known else QUOTED_MISSING
+        low, high = math.floor(1000 * low) / 1000, math.ceil(1000 * high) / 1000
+        if not is_known:
+            low = high = speed = None
         lines += [
             "  - _target_: brokk_rl.machine.Joint",
             f"    name: {joint.name}",
             "    part: null",
             f"    kind: {'hinge' if joint.unit == 'rad' else 'slide'}",
-            f"    lower: {_format_dimension(math.floor(1000 * low) / 1000, 'smallest position or target in its logs')}",
-            f"    upper: {_format_dimension(math.ceil(1000 * high) / 1000, 'largest position or target in its logs')}",
-            f"    home: {(low + high) / 2:.3f}   # {joint.unit}; middle of the range",
+            f"    lower: {_format_dimension(low, 'smallest position or target in its logs')}",
+            f"    upper: {_format_dimension(high, 'largest position or target in its logs')}",
+            f"    home: {home}   # {joint.unit}; middle of the range",
             f"    max_speed: {_format_dimension(speed, f'fastest target or motion in its logs, {unit}')}",
             "    body: null",
         ]
@@ -273,8 +284,9 @@ def format_machine(draft: Draft) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _format_dimension(value: float, source: str) -> str:
-    return f"{{_target_: brokk_rl.machine.Dimension, value: {value:g}, source: {_quote(source)}, confidence: low}}"
+def _format_dimension(value: float | None, source: str) -> str:
+    shown = QUOTED_MISSING if value is None else f"{value:g}"
+    return f"{{_target_: brokk_rl.machine.Dimension, value: {shown}, source: {_quote(source)}, confidence: low}}"
 
 
 def _explain(guess: Guess) -> str:

@@ -108,6 +108,9 @@ class Diagnose:
             ConfigError: an effect is unknown, or there is neither a reference nor an actuator.
         """
         torch.set_num_threads(1)  # the arrays are small: threads would only wait for each other
+        if not given.reference and self.base is not None:
+            # Refused before the flexible model is fitted, which takes minutes.
+            self.base.build(self.machine, 1, self.session.torch_device())
         with (
             ItemProgress("fitting the simulator", SHARE) as progress,
             use_workers(self.diagnosis.workers),

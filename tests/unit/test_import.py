@@ -47,6 +47,12 @@ def write_servo_log(path: Path, swapped: bool = False) -> None:
     write_table(path, columns)
 
 
+def read_positions(path: Path, joint: str) -> np.ndarray:
+    import pyarrow.parquet as pq
+
+    return pq.read_table(path)[f"q_{joint}_rad"].to_numpy()
+
+
 def read_guesses(folder: str) -> dict[str, dict[str, str]]:
     found = json.loads((Path(folder) / "import.json").read_text())["guesses"]
     return {guess["subject"]: guess for guess in found}
@@ -123,6 +129,10 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[
     )
     brokk("mode=import", "log.input=a.csv", "session.out=one")
     assert read_guesses("one")["joint: unit"]["sureness"] == "unsure"
+    (joint,) = yaml.safe_load(Path("one/machine.yaml").read_text())["joints"]
+    assert {joint[name]["value"] for name in ("lower", "upper", "max_speed")} == {"???"}
+    brokk("mode=import", "log.input=a.csv", "log.position_unit=0.5 cm", "session.out=counts")
+    assert "scale: 0.005," in Path("counts/column_map.yaml").read_text()
     brokk("mode=import", "log.input=a.csv", "log.position_unit=cm", "session.out=two")
     assert read_guesses("two")["joint: unit"]["sureness"] == "sure"
     assert "kind: slide" in Path("two/machine.yaml").read_text()
@@ -261,6 +271,8 @@ def test_a_position_that_does_not_follow_its_command_is_left_to_a_person(
         ("state_motor", "torques[3]", ("measured", "effort", None, "3")),
         ("/joint_states", "position[left_knee]", ("measured", "position", None, "left_knee")),
         ("", "u2", ("command", "unknown", None, "2")),
+        ("", "cmd_left_rad_s", ("command", "velocity", None, "left")),
+        ("", "A3_soll", ("command", "position", None, "a3")),
         ("", "jointVelocity_mm", (None, "velocity", "mm", "")),
     ],
 )
@@ -288,3 +300,92 @@ def test_logs_of_the_model_excavator_give_the_map_that_a_person_wrote(
         assert joint["command"]["column"] == expected.command.column, name
         assert joint["position"]["column"] == expected.position.column
     assert record.name_command_column("q1") in columns
+
+
+def test_rows_that_repeat_a_time_or_lack_a_number_are_refused_or_left_out_and_counted(
+    brokk: Callable[..., Done], caplog: pytest.LogCaptureFixture
+) -> None:
+    targets = make_targets()
+    columns = {"t": np.arange(len(targets)) / RATE_HZ, "hip_cmd": targets[:, 0]}
+    columns["hip_pos_rad"] = delay(targets)[:, 0].copy()
+    columns["t"][40] = columns["t"][39]
+    columns["hip_pos_rad"][[7, 900]] = np.nan
+    write_table(Path("a.csv"), columns)
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert done.code == 2
+    assert "'t' does not increase in 1 of 1500 rows, first in line 42 (row 40); log.damaged=skip" in done.err  # fmt: skip
+    assert not Path("draft").exists()
+    done = brokk("mode=import", "log.input=a.csv", "log.damaged=skip", "session.out=draft")
+    assert done.code == 0, done.err
+    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv")
+    done = brokk("mode=import", *options, "session.out=out")
+    assert done.code == 0, done.err
+    said = "3 of 1500 rows left out: in 1 the time does not increase, 2 lack a number"
+    assert said in caplog.text
+    assert "brokk mode=diagnose machine=@draft/machine.yaml 'diagnosis.field=out/recordings/*'" in done.out  # fmt: skip
+    (path,) = Path("out/recordings").iterdir()
+    np.testing.assert_allclose(read_positions(path, "hip"), delay(targets)[:, 0], atol=2e-3)
+
+
+def test_actions_that_are_scaled_and_added_to_a_pose_are_targets_in_another_unit(
+    brokk: Callable[..., Done],
+) -> None:
+    targets = make_targets()
+    actions = (targets - [0.1, 0.8, -1.5]) / 0.25
+    np.savez("a.npz", time=np.arange(len(targets)) / RATE_HZ, actions=actions, dof_pos=delay(targets))  # fmt: skip
+    done = brokk("mode=import", "log.input=a.npz", "session.out=draft")
+    assert done.code == 0, done.err
+    guesses = read_guesses("draft")
+    assert guesses["joint_1: command"]["value"] == "a target of the position"
+    assert guesses["joint_1: unit of targets"]["value"] == "0.25 × target + 0.8"
+    text = Path("draft/column_map.yaml").read_text()
+    assert text.count('scale: "???", full_speed: null, offset: "???"') == 3
+
+
+def test_a_position_that_leads_its_target_is_left_to_a_person(brokk: Callable[..., Done]) -> None:
+    targets = make_targets()
+    columns = {"t": np.arange(len(targets)) / RATE_HZ}
+    columns |= {"hip_target": delay(targets)[:, 0], "hip_pos_rad": targets[:, 0]}
+    write_table(Path("a.csv"), columns)
+    assert brokk("mode=import", "log.input=a.csv", "session.out=draft").code == 0
+    guess = read_guesses("draft")["hip: columns"]
+    assert guess["sureness"] == "unsure"
+    assert "the position leads it by 0.12 s: columns swapped, or clocks apart?" in guess["reason"]
+
+
+def test_files_of_one_run_in_a_folder_keep_their_clocks_and_a_given_offset(
+    brokk: Callable[..., Done],
+) -> None:
+    targets = make_targets()
+    t_s = np.arange(len(targets)) / RATE_HZ
+    for run in ("one", "two"):
+        goals = {"stamp": t_s[::5], "hip.goal": targets[::5, 0]}  # slower than the states
+        write_table(Path(f"logs/{run}/goals.csv"), goals)
+        write_table(
+            Path(f"logs/{run}/states.csv"),
+            {"stamp": t_s + 3600.0, "hip.pos_rad": delay(targets)[:, 0]},
+        )
+    done = brokk("mode=import", "log.input=logs", "session.out=draft")
+    assert done.code == 2
+    assert "if they began together, give 'log.clock_offset_s={states: -3600}'" in done.err
+    done = brokk(
+        "mode=import", "log.input=logs", "log.clock_offset_s={states: -3600}", "session.out=draft"
+    )
+    assert done.code == 0, done.err
+    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=logs")
+    done = brokk("mode=import", *options, "session.out=out")
+    assert done.code == 0, done.err
+    positions = read_positions(Path("out/recordings/one_00.parquet"), "hip")
+    np.testing.assert_allclose(positions, delay(targets)[: len(positions), 0], atol=1e-5)
+
+
+def test_a_slide_in_millimetres_stands_beside_hinges_in_radians(brokk: Callable[..., Done]) -> None:
+    targets = make_targets()
+    columns = {"t_ms": 1000.0 * np.arange(len(targets)) / RATE_HZ}
+    for j, (name, scale) in enumerate((("hip", 1.0), ("lift_mm", 100.0))):
+        columns[f"cmd_{name}"] = scale * targets[:, j]
+        columns[f"meas_{name}"] = scale * delay(targets)[:, j]
+    write_table(Path("a.csv"), columns)
+    assert brokk("mode=import", "log.input=a.csv", "session.out=draft").code == 0
+    drafted = yaml.safe_load(Path("draft/machine.yaml").read_text())
+    assert {one["name"]: one["kind"] for one in drafted["joints"]} == {"hip": "hinge", "lift": "slide"}  # fmt: skip

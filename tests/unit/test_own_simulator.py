@@ -8,6 +8,7 @@ import runpy
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ from arm import (
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from brokk_rl import open_loop
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
 from brokk_rl.session import Session
@@ -208,6 +209,7 @@ def test_a_file_of_another_machine_is_refused_by_joint_drive_and_time_step(arm: 
         ("def step(state, command): return state[..., :1]", "expected a state of 2 numbers"),
         ("def step(state, command): return state / 0 * 0", "returned NaN or infinity"),
         ("def step(state, command): raise KeyError('arm')", "failed with KeyError: 'arm'"),
+        ("calls = []\ndef step(state, command):\n    calls.append(1)\n    return state + len(calls)", "two answers to one state"),
         ("def step(state, command) return state", "cannot be imported.*SyntaxError.*mend it"),
         ("import nothing_here\nstep = 1", "nothing_here.*mend it"),
         ("def move(state, command): return state", "has no function 'step'"),
@@ -228,6 +230,17 @@ def test_a_function_that_cannot_be_run_is_refused_with_the_reason(
             api._load_simulator("wrong_sim:step").load(make_machine("hinge"))
     finally:
         sys.modules.pop("wrong_sim", None)
+
+
+def test_a_simulator_that_no_name_leads_to_is_refused_with_what_to_write() -> None:
+    for given in (lambda state, command: state, partial(max, 0), [].append):
+        with pytest.raises(ConfigError, match="expected a function at the top of a module"):
+            api._load_simulator(given)
+
+
+def test_a_diagnosis_of_no_recordings_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="expected a recording or more"):
+        api.diagnose(api.RecordingSet((), make_machine("hinge")), tmp_path, "servo")
 
 
 def test_what_cannot_be_asked_about_is_one_line(
