@@ -158,8 +158,12 @@ def measure_sweep(folder: Path) -> dict[str, dict[str, Any]]:
     """Return what the frequency sweep alone says of the delay of each joint.
 
     A line through the phase lag over the frequency has the delay as its slope, s; its value at 0 Hz is
-    the lag that does not depend on the frequency, rad, as play has it. `models` split the delay; see
-    `fit_loop`. All delays hold one control period, after which even an ideal servo answers.
+    the lag that does not depend on the frequency, rad, as play has it. `amplitude_falls_by` is the
+    part that the gain loses from the lowest to the highest frequency.
+
+    `models` split the delay; see `fit_loop`. `misfit_without_lag` is the misfit of a dead time over that
+    of a dead time and a lag. Their dead times hold a control period, after which even an ideal servo
+    answers, or half of one beside a lag.
     """
     log = pq.read_table(folder / "frequency_sweep.parquet")
     period_s = float(np.median(np.diff(log["t_state_s"].to_numpy())))
@@ -172,8 +176,10 @@ def measure_sweep(folder: Path) -> dict[str, dict[str, Any]]:
         slope, at_rest = np.polyfit(2.0 * np.pi * hz, -np.angle(response), 1)
         models = {name: fit_loop(hz, response, order) for name, order in LOOP_ORDERS.items()}
         found[joint] = {"delay_s": float(slope), "lag_at_0_hz_rad": float(at_rest)}
-        ends = (int(np.argmin(hz)), int(np.argmax(hz)))
-        found[joint]["gain"] = {f"{hz[one]:.1f} Hz": float(np.abs(response[one])) for one in ends}
+        gain = np.abs(response[[np.argmin(hz), np.argmax(hz)]])
+        found[joint]["amplitude_falls_by"] = float(1.0 - gain[1] / gain[0])
+        best = models["dead_time_and_lag"]["misfit"]
+        found[joint]["misfit_without_lag"] = models["dead_time"]["misfit"] / best
         found[joint]["models"] = models
     return found
 

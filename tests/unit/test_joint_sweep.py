@@ -48,14 +48,17 @@ def test_a_sweep_tells_a_dead_time_from_a_lag(
 ) -> None:
     hz, response = measure.measure_response(*sweep(dead_time_s, lag_s, 0.01), PERIOD_S)
     found = measure.fit_loop(hz, response, 1)
-    # Positions are read before the command of their row: it holds until the row after.
-    assert found["dead_time_s"] == pytest.approx(dead_time_s + PERIOD_S / 2, abs=0.012)
-    assert found["lag_s"] == pytest.approx(lag_s, abs=0.008)
+    # A position is read at the end of the period that holds a command: a whole period late behind
+    # a dead time, half of one behind a lag much longer than a period.
+    held_s = PERIOD_S / 2 if lag_s else PERIOD_S
+    assert found["dead_time_s"] == pytest.approx(dead_time_s + held_s, abs=0.004)
+    assert found["lag_s"] == pytest.approx(lag_s, abs=0.003)
 
 
 def test_a_dead_time_alone_does_not_explain_an_amplitude_that_falls(measure: Any) -> None:
     hz, response = measure.measure_response(*sweep(0.03, 0.05, 0.01), PERIOD_S)
     alone, both = (measure.fit_loop(hz, response, order) for order in (0, 1))
-    # 2.3 Hz: the gain of a lag of 0.05 s is 1 / sqrt(1 + 0.72^2) = 0.81.
-    assert alone["misfit"] > 0.05 and both["misfit"] < 0.03
+    # At 1.95 Hz the gain of a lag of 0.05 s is 1 / sqrt(1 + 0.61^2) = 0.85.
+    assert np.abs(response[-1] / response[0]) == pytest.approx(0.85 / 0.98, abs=0.02)
+    assert alone["misfit"] > 2.0 * both["misfit"]
     assert "lag_s" not in alone
