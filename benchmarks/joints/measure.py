@@ -189,7 +189,7 @@ def measure_response(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the frequencies of the parts of a sweep within `SWEEP_HZ`, and the complex response at each."""
     target = target - np.median(target)
-    angle = np.unwrap(np.angle(hilbert(target)))
+    angle = np.unwrap(np.angle(np.asarray(hilbert(target))))
     frequency_hz = np.gradient(angle) / (2.0 * np.pi * period_s)
     rows = []
     for first in range(0, len(q) - SWEEP_ROWS, SWEEP_ROWS):
@@ -217,7 +217,7 @@ def fit_loop(hz: np.ndarray, response: np.ndarray, order: int) -> dict[str, floa
 
     def compute_error(x: np.ndarray) -> np.ndarray:
         off = predict(x) - response
-        return np.concatenate([off.real, off.imag])
+        return np.concatenate([np.real(off), np.imag(off)])
 
     found = least_squares(compute_error, [0.9, 0.1, 0.03, 0.03])
     dead_time_s, lag_s = found.x[2:].tolist()
