@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 import torch
+from scipy.optimize import least_squares
 from scipy.signal import hilbert
 
 from brokk_rl import extensions
@@ -48,6 +49,8 @@ SWEEP_ROWS = 300
 """Rows of the frequency sweep that are taken at one frequency: 6 s, within which it rises by a fifth."""
 SWEEP_HZ = (0.3, 3.0)
 """Frequencies of the sweep that are used; below them a part holds fewer than two cycles."""
+LOOP_ORDERS = {"dead_time": 0, "dead_time_and_lag": 1, "dead_time_and_two_lags": 2}
+"""Models of the sweep, by the number of equal lags behind the dead time."""
 
 
 def read_set(name: str, folder: Path, patterns: list[str]) -> api.RecordingSet:
@@ -151,11 +154,16 @@ def measure_row_shifts(folder: Path) -> dict[str, float]:
     return found
 
 
-def measure_sweep(folder: Path) -> dict[str, dict[str, float]]:
-    """Return a line through the phase lag over the frequency of each joint, from the frequency sweep alone.
+def measure_sweep(folder: Path) -> dict[str, dict[str, Any]]:
+    """Return what the frequency sweep alone says of the delay of each joint.
 
-    Its slope is a delay, s; its value at 0 Hz is the lag that does not depend on the frequency, rad,
-    as play has it.
+    A line through the phase lag over the frequency has the delay as its slope, s; its value at 0 Hz is
+    the lag that does not depend on the frequency, rad, as play has it. `amplitude_falls_by` is the
+    part that the gain loses from the lowest to the highest frequency.
+
+    `models` split the delay; see `fit_loop`. `misfit_without_lag` is the misfit of a dead time over that
+    of a dead time and a lag. Their dead times hold a control period, after which even an ideal servo
+    answers, or half of one beside a lag.
     """
     log = pq.read_table(folder / "frequency_sweep.parquet")
     period_s = float(np.median(np.diff(log["t_state_s"].to_numpy())))
@@ -164,20 +172,58 @@ def measure_sweep(folder: Path) -> dict[str, dict[str, float]]:
         target, q = (
             log[f"{name}_{joint}_rad"].to_numpy().astype(float) for name in ("target", "q")
         )
-        target = target - np.median(target)
-        angle = np.unwrap(np.angle(hilbert(target)))
-        frequency_hz = np.gradient(angle) / (2.0 * np.pi * period_s)
-        rows = []
-        for first in range(0, len(q) - SWEEP_ROWS, SWEEP_ROWS):
-            part = slice(first, first + SWEEP_ROWS)
-            wave = np.exp(-1j * angle[part])
-            response = np.mean((q[part] - q[part].mean()) * wave) / np.mean(target[part] * wave)
-            rows.append((np.median(frequency_hz[part]), -np.angle(response)))
-        hz, lag_rad = np.array(rows).T
-        used = (hz > SWEEP_HZ[0]) & (hz < SWEEP_HZ[1])
-        slope, at_rest = np.polyfit(2.0 * np.pi * hz[used], lag_rad[used], 1)
+        hz, response = measure_response(target, q, period_s)
+        slope, at_rest = np.polyfit(2.0 * np.pi * hz, -np.angle(response), 1)
+        models = {name: fit_loop(hz, response, order) for name, order in LOOP_ORDERS.items()}
         found[joint] = {"delay_s": float(slope), "lag_at_0_hz_rad": float(at_rest)}
+        gain = np.abs(response[[np.argmin(hz), np.argmax(hz)]])
+        found[joint]["amplitude_falls_by"] = float(1.0 - gain[1] / gain[0])
+        best = models["dead_time_and_lag"]["misfit"]
+        found[joint]["misfit_without_lag"] = models["dead_time"]["misfit"] / best
+        found[joint]["models"] = models
     return found
+
+
+def measure_response(
+    target: np.ndarray, q: np.ndarray, period_s: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the frequencies of the parts of a sweep within `SWEEP_HZ`, and the complex response at each."""
+    target = target - np.median(target)
+    angle = np.unwrap(np.angle(np.asarray(hilbert(target))))
+    frequency_hz = np.gradient(angle) / (2.0 * np.pi * period_s)
+    rows = []
+    for first in range(0, len(q) - SWEEP_ROWS, SWEEP_ROWS):
+        part = slice(first, first + SWEEP_ROWS)
+        wave = np.exp(-1j * angle[part])
+        response = np.mean((q[part] - q[part].mean()) * wave) / np.mean(target[part] * wave)
+        rows.append((np.median(frequency_hz[part]), response))
+    hz, response = np.array([one for one, _ in rows]), np.array([one for _, one in rows])
+    used = (hz > SWEEP_HZ[0]) & (hz < SWEEP_HZ[1])
+    return hz[used], response[used]
+
+
+def fit_loop(hz: np.ndarray, response: np.ndarray, order: int) -> dict[str, float]:
+    """Return dead time and lag, s, that explain gain and phase of a joint best, and the misfit of the response.
+
+    The response is `gain exp(-i (play + w dead_time)) / (1 + i w lag)^order`. Play takes a part of the
+    amplitude and of the phase that is the same at all frequencies, since the sweep keeps its
+    amplitude. A dead time leaves the amplitude as it is; a lag makes it smaller as well.
+    """
+    w = 2.0 * np.pi * hz
+
+    def predict(x: np.ndarray) -> np.ndarray:
+        gain, play_rad, dead_time_s, lag_s = x
+        return gain * np.exp(-1j * (play_rad + w * dead_time_s)) / (1.0 + 1j * w * lag_s) ** order
+
+    def compute_error(x: np.ndarray) -> np.ndarray:
+        off = predict(x) - response
+        return np.concatenate([np.real(off), np.imag(off)])
+
+    found = least_squares(compute_error, [0.9, 0.1, 0.03, 0.03])
+    dead_time_s, lag_s = found.x[2:].tolist()
+    misfit = float(np.sqrt(2.0 * found.cost / len(hz)))
+    told = {"dead_time_s": dead_time_s, "misfit": misfit}
+    return told | ({"lag_s": lag_s} if order else {})
 
 
 def main() -> None:
