@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from actuators.recordings.column_guess import Guess, JointGuess, TimeGuess
+from actuators.recordings.clock_guess import Guess, TimeGuess
+from actuators.recordings.column_guess import JointGuess
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_survey import JointSurvey, LogSurvey
 from actuators.recordings.text_log import CsvLayout
