@@ -24,6 +24,7 @@ from actuators.recordings.column_names import (
     Role,
     name_joint,
     read_column_name,
+    read_speed_unit,
     read_unit,
     split_words,
 )
@@ -91,6 +92,7 @@ class JointGuess:
         scale: That unit for one of the log.
         target_scale: The same for its targets.
         target_offset: Position at a target of 0, in that unit.
+        speed_scale: Speed, in that unit per s, for one of its commands, where the name has a unit of speed.
         guesses: How sure each part is; `target` where the unit of the targets is in question.
     """
 
@@ -104,6 +106,7 @@ class JointGuess:
     scale: float
     target_scale: float
     target_offset: float
+    speed_scale: float | None
     guesses: dict[str, Guess]
 
 
@@ -424,6 +427,7 @@ def _judge_joint(
         scale,
         target_scale,
         target_offset,
+        read_speed_unit(command.column),
         guesses,
     )
 
