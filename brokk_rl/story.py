@@ -116,13 +116,33 @@ def run_story(
         if stage.needs is not None and not _has_content(folder / stage.needs):
             log.warning("the story ends before '%s': %s holds nothing", name, stage.needs)
             break
-        if (read_record(folder / name) or {}).get("outcome") == "finished":
+        before = read_record(folder / name) or {}
+        if before.get("outcome") == "finished":
+            _refuse_other_command(folder, name, stage, before)
             log.info("%d of %d, %s: done already", number, len(stages), name)
             continue
         log.info("%d of %d, %s: %s", number, len(stages), name, stage.title)
         _play_stage(session, name, stage, folder)
         write_page()
     write_page()
+
+
+def _list_words(stage: StoryStage, folder: Path) -> list[str]:
+    return [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
+
+
+def _refuse_other_command(
+    folder: Path, name: str, stage: StoryStage, before: Mapping[str, Any]
+) -> None:
+    """Raise a `ConfigError` where a finished stage answered another command than is asked for now."""
+    if "overrides" not in before:  # runs from before this field
+        return
+    new = [word for word in _list_words(stage, folder) if word not in before["overrides"]]
+    if new:
+        raise ConfigError(
+            f"{folder}: the stage '{name}' was run without {' '.join(new)}, so it cannot be gone on with; repeat the command "
+            "that began it, or give another session.out"
+        )
 
 
 def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) -> None:
@@ -133,7 +153,7 @@ def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) ->
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         path.symlink_to(folder / target)
-    words = [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
+    words = _list_words(stage, folder)
     for group in stage.takes:
         if group != DEVICE:
             words.append(f"{group}=@{folder / HANDED_ON_FOLDER / group}.yaml")

@@ -326,9 +326,9 @@ def list_changes(result: WhyResult) -> list[tuple[str, str]]:
     machine = f"machine=@{result.folder / HANDED_ON_FOLDER / 'machine.yaml'}"
     effects = f"@{result.folder / DIAGNOSIS / effects_file.EFFECTS_FILE}"
     if asked is not None and asked.is_own:
+        form = "changes of the file and as " if simulator.endswith(".xml") else ""
         changes.append(
-            ("Put the effects into your simulator, and train in it again. This writes them as changes of an MJCF file "
-             "and as ranges for randomisation:",
+            (f"Put the effects into your simulator, and train in it again. This writes them as {form}ranges for randomisation:",
              f"brokk mode=change_simulator {machine} simulator={simulator} changes.diagnosis={result.folder / DIAGNOSIS} "
              f"changes.why={result.folder / WHY_FILE} session.out={result.folder / 'changes'}")
         )  # fmt: skip

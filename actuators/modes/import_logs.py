@@ -12,7 +12,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from actuators.recordings import conversion, log_guess, map_draft
-from actuators.recordings.column_guess import CommandKind, GivenColumns, Guess
+from actuators.recordings.clock_guess import Guess
+from actuators.recordings.column_guess import CommandKind, GivenColumns
 from actuators.recordings.column_names import UNITS, read_unit
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader

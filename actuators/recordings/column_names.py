@@ -94,6 +94,12 @@ class ColumnName:
     joint: str
 
 
+def read_speed_unit(column: str) -> float | None:
+    """Return rad/s or m/s for one of a column whose name ends in a unit of speed, such as `rad_s`; else `None`."""
+    *_, unit, second = ["", "", *split_words(column)]
+    return UNITS[unit][1] if unit in UNITS and second == "s" else None
+
+
 def read_unit(text: str) -> tuple[str, float] | None:
     """Return the unit of the recording and its number for one of the log, of `deg` or `0.00153 rad`; else `None`."""
     number, _, name = text.rpartition(" ")
@@ -123,7 +129,7 @@ def read_column_name(table: str, column: str) -> ColumnName:
     if quantity == "unknown":
         quantity = _find_quantity(outer)
     unit = next((word for word in reversed(words) if word in UNITS), None)
-    if unit is not None and words[-2:] == [unit, "s"]:  # `rad_s` is rad/s
+    if read_speed_unit(column) is not None:  # `rad_s` is rad/s
         words, quantity, unit = words[:-2], "velocity", None
     roles = COMMAND_WORDS | MEASURED_WORDS | set().union(*QUANTITY_WORDS.values())
     known = roles | FILLER_WORDS | set(UNITS)

@@ -10,15 +10,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from actuators.recordings.column_guess import (
-    GivenColumns,
-    JointGuess,
+from actuators.recordings.clock_guess import (
     TimeGuess,
     describe_broken_clocks,
-    guess_joints,
     guess_times,
     read_times,
 )
+from actuators.recordings.column_guess import GivenColumns, JointGuess, guess_joints
 from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import index_columns
 from actuators.recordings.log_survey import measure_logs

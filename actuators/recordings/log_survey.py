@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from actuators.recordings.column_guess import JointGuess, TimeGuess, read_times
+from actuators.recordings.clock_guess import TimeGuess, read_times
+from actuators.recordings.column_guess import JointGuess
 from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import index_columns
 from actuators.recordings.whole_rows import leave_broken_rows_out

@@ -6,7 +6,8 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from actuators.recordings.column_guess import Guess, JointGuess, TimeGuess
+from actuators.recordings.clock_guess import Guess, TimeGuess
+from actuators.recordings.column_guess import JointGuess
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_survey import JointSurvey, LogSurvey
 from actuators.recordings.text_log import CsvLayout
@@ -111,6 +112,11 @@ def scale_command(joint: JointGuess, survey: JointSurvey) -> CommandDraft:
             sureness, reason = "unsure", "no command is frequent at rest, and none is 0"
         elif not is_known:
             reason = "neutral 0: no command is frequent at rest; full commands are the largest of the logs"
+        if neutral == 0.0 and joint.speed_scale is not None:  # a speed counts alike both ways
+            low, high = (
+                (-max(-low, high) if low < 0.0 else low),
+                (max(-low, high) if high > 0.0 else high),
+            )
         guess = Guess(subject, f"{low:.6g} to {high:.6g}, neutral {neutral:.6g}", sureness, reason)
     above = high if high > neutral + 1e-9 * max(1.0, abs(neutral)) else None
     below = low if low < neutral - 1e-9 * max(1.0, abs(neutral)) else None
@@ -217,6 +223,9 @@ def measure_full_speed(joint: JointGuess, survey: JointSurvey) -> float:
     """Return the speed at full command, rad/s or m/s: of the fastest target, else of the fastest motion."""
     if joint.kind == "target":
         return _round_up(abs(joint.target_scale) * survey.top_target_speed)
+    full = scale_command(joint, survey)
+    if joint.kind == "speed" and joint.speed_scale is not None and full.neutral == 0.0:
+        return joint.speed_scale * max(abs(full.full_plus or 0.0), abs(full.full_minus or 0.0))
     return _round_up(joint.scale * survey.top_speed)
 
 

@@ -389,3 +389,19 @@ def test_a_slide_in_millimetres_stands_beside_hinges_in_radians(brokk: Callable[
     assert brokk("mode=import", "log.input=a.csv", "session.out=draft").code == 0
     drafted = yaml.safe_load(Path("draft/machine.yaml").read_text())
     assert {one["name"]: one["kind"] for one in drafted["joints"]} == {"hip": "hinge", "lift": "slide"}  # fmt: skip
+
+
+def test_speeds_in_rad_per_second_count_alike_both_ways(brokk: Callable[..., Done]) -> None:
+    generator = np.random.default_rng(0)
+    speeds = np.repeat(generator.uniform(-3.0, 5.0, 60), 25)
+    columns = {"t_s": np.arange(len(speeds)) / RATE_HZ, "cmd_left_rad_s": speeds}
+    columns["ticks_left"] = np.cumsum(delay(speeds, 4)) / RATE_HZ / 0.00153
+    write_table(Path("a.csv"), columns)
+    unit = "log.position_unit=0.00153 rad"
+    done = brokk("mode=import", "log.input=a.csv", unit, "session.out=draft")
+    assert done.code == 0, done.err
+    full = speeds.max()
+    command = yaml.safe_load(Path("draft/column_map.yaml").read_text())["joints"]["left"]["command"]
+    assert [command["full_plus"], command["full_minus"]] == pytest.approx([full, -full])
+    (joint,) = yaml.safe_load(Path("draft/machine.yaml").read_text())["joints"]
+    assert joint["max_speed"]["value"] == pytest.approx(full, rel=1e-4)

@@ -132,6 +132,17 @@ def test_a_story_goes_on_where_it_failed(
     assert not any(word.startswith("resume=") for word in played.commands["believed"])
 
 
+def test_a_story_that_another_command_began_is_not_gone_on_with(
+    played: Played, brokk: Callable[..., Done], tmp_path: Path
+) -> None:
+    assert brokk("experiment=gap_loop", "session.out=story").code == 0
+    path = tmp_path / "story/reference/session.json"
+    done_before = json.loads(path.read_text())
+    path.write_text(json.dumps({**done_before, "overrides": ["mode=collect"]}))
+    done = brokk("experiment=gap_loop", "session.out=story", "resume=story")
+    assert done.code == 2 and "the stage 'reference' was run without" in done.err
+
+
 def test_without_a_found_effect_nothing_is_retrained(
     played: Played, brokk: Callable[..., Done], tmp_path: Path
 ) -> None:
