@@ -63,11 +63,12 @@ def draw_levels(machine: Machine, seed: int, count: int = 12, hold: int = 15) ->
 
 def test_a_saturated_joint_accelerates_by_its_limit(arm: Machine) -> None:
     """0.02 rad over (0.05 s)^2 are 8 rad/s^2: 14.4 mrad in 60 ms from rest."""
-    servo = make_servo(response_s=0.05, damping=1e-4, limit_rad=0.02)
+    servo = make_servo(response_s=0.05, damping=1e-6, limit_rad=0.02)
     u = np.tile([[0.0, 0.0]], (8, 1))
     u[5:] = 0.5  # 0.75 rad away
     found = run(servo.build(arm, 1, CPU), arm, u)
     np.testing.assert_allclose(found[-1], 0.5 * 8.0 * 0.06**2, rtol=1e-3)
+    np.testing.assert_allclose(found[5], 0.5 * 8.0 * 0.02**2, rtol=1e-3)
 
 
 def test_a_saturated_joint_comes_up_slower_than_down(arm: Machine) -> None:
@@ -200,6 +201,10 @@ def test_the_effect_is_the_limit_of_the_servo(arm: Machine) -> None:
     for own_rad, shortage in ((0.03, 2.0), (0.3, 5.0)):
         both = limit_torque(replace(servo, limit_rad=own_rad).build(arm, 1, CPU), arm, shortage)
         np.testing.assert_allclose(run(both, arm, u), inside, atol=1e-5)
+    # the damping within is that of the limit that counts
+    own = replace(servo, limit_rad=0.03, firmware_damping=0.1)
+    both = limit_torque(own.build(arm, 1, CPU), arm, 2.0)
+    np.testing.assert_allclose(run(both, arm, u), run(own.build(arm, 1, CPU), arm, u), atol=1e-5)
     assert "limit_rad" not in servo.build(arm, 1, CPU).parameters  # no number to be tuned
 
 
