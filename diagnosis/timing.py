@@ -107,6 +107,16 @@ class DelayErrorModel:
         among = np.exp(self.log(seen.value[:, None] - drawn[None], seen.error[:, None])).mean(1)
         return float((np.log(among + 1e-12) - self.log(seen.value, seen.error)).sum())
 
+    def gain_by_shift(self, seen: FrameDelays) -> float:
+        """Return the log likelihood gain of another common delay, without late frames.
+
+        Where the simulated motion is wrong, a few sure delays can pull the mean away from most others.
+        Frames that are late by chance would explain that as well.
+        """
+        shifted = seen.value - np.median(seen.value)
+        away = self.log(seen.value, seen.error)
+        return max(0.0, float((self.log(shifted, seen.error) - away).sum()))
+
 
 @dataclass(frozen=True)
 class CommandChanges:
@@ -291,9 +301,10 @@ def detect_timing_effect(
             share = len(seen.value) / max(1, len(one.value))
             known_gains.append(usual.gain(one, best) * share)
         earned[kind.name] = max(0.0, *known_gains)
-    worth = {}
+    worth, by_shift = {}, usual.gain_by_shift(seen)
     for name, gain in gains.items():
-        worth[name] = float(gain.max()) - price - REFERENCE_PENALTY * earned[name] - name_price
+        own = float(gain.max()) - by_shift
+        worth[name] = own - price - REFERENCE_PENALTY * earned[name] - name_price
     best = max(kinds, key=lambda kind: worth[kind.name])
     if worth[best.name] <= 0:
         return None

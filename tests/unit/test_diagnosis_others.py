@@ -272,6 +272,27 @@ def test_delays_err_as_they_do_where_no_frame_is_late() -> None:
     )
 
 
+def test_delays_beside_their_mean_are_another_common_delay_and_no_lost_frames() -> None:
+    random = np.random.default_rng(4)
+    usual = timing.DelayErrorModel(scale=1.0, freedom=5.0)
+    error, nobody = np.full(500, 0.05), np.zeros(500)
+    width = np.hypot(0.05, timing.TIMING_ERROR)
+    drawn = np.repeat([-0.1, 0.9], [9, 1])  # a frame in ten comes a period late, less the mean
+
+    # a few sure delays pull the mean to 0.2 periods beside most others: no frame is lost
+    wrong = timing.FrameDelays(-0.2 + width * random.standard_t(3.0, 500), error, nobody)
+    assert usual.gain(wrong, drawn) > 30.0  # so lost frames seem to be there
+    assert usual.gain_by_shift(wrong) > usual.gain(wrong, drawn)
+
+    lost = random.choice(drawn, 500) + width * random.standard_t(5.0, 500)
+    lost = timing.FrameDelays(lost - lost.mean(), error, nobody)
+    assert usual.gain(lost, drawn) > usual.gain_by_shift(lost) + 100.0
+
+    # where frames arrive in time and the simulator is right, a shift gains next to nothing
+    right = timing.FrameDelays(width * random.standard_t(5.0, 500), error, nobody)
+    assert 0.0 <= usual.gain_by_shift(right) < 5.0
+
+
 def test_the_mean_of_delays_by_chance_is_what_all_joints_are_late_by(machine: Machine) -> None:
     rows = [held_over(machine, 0.0, 10), held_over(machine, 0.2, 12, (1, 1, 1, 4, 1))]
     held = [baseline.compare_simulator(PLANT, [(one, 0.0)], machine, 0) for one in rows]
