@@ -24,7 +24,6 @@ ONE_WAY = {
     "saturation": -1,
     "rate_limit": 1,
     "backlash": 1,
-    "torque_limit": 1,
 }
 """Effects that exist in one direction only, and the sign of their numbers' change."""
 ALL_JOINTS = ("flow_sharing", "base_tilt")
@@ -47,12 +46,11 @@ TARGETS = {
     "encoder_scale": "measurement.EncoderScale",
     "link_length": "kinematics.LinkLength",
     "base_tilt": "kinematics.BaseTilt",
-    "torque_limit": "drives.TorqueLimit",
 }
 """Effects of the library by name, nearest to the machine last."""
 NOTHING = {"gain": 1.0, "extend_gain": 1.0, "retract_gain": 1.0, "level": 1.0, "scale": 1.0}
 """Values that change nothing; 0 for all others."""
-FIXED = {"sag": {"load_rad": 0.0, "sag_slope": 0.0}, "torque_limit": {"firmware_damping": 0.5}}
+FIXED = {"sag": {"load_rad": 0.0, "sag_slope": 0.0}}
 """Numbers of an effect that no rival fits, at the value that changes nothing."""
 PROBABILITY = 0.9
 """Stated for each name: none of the rivals gives a probability."""

@@ -23,7 +23,6 @@ EFFECTS = {
     "rate_limit": "stroke_s",
     "backlash": "gap_rad",
     "sag": "sag_rad",
-    "torque_limit": "shortage",
 }
 """Effects of the exam that some rival has a number for, and the name of that number."""
 Numbers = dict[str, np.ndarray]

@@ -42,8 +42,6 @@ STARTS = {
     "delay_s": (0.05, 0.0, 0.3),
 }
 """Start and bounds of each number of a joint."""
-FULL_TORQUE_TRAVEL = 0.05
-"""Error over the travel that `torque_limit` of the library counts in."""
 
 
 def build_spec(arm: Arm) -> mujoco.MjSpec:
@@ -133,12 +131,11 @@ class WindowRollout:
         return [residual if x.ndim > 1 else residual[:, 0]], None, None
 
 
-def measure_effects(vector: np.ndarray, arm: Arm) -> Numbers:
+def measure_effects(vector: np.ndarray) -> Numbers:
     """Return the numbers of effects that a parameter vector amounts to.
 
     A lag is that of the target and of the loop. Twice the friction over the stiffness is the width in
-    which a joint stays behind, and a constant torque over the stiffness bends it away. A limit of the
-    torque counts as the library has it: the torque of an error of 5 % of the travel over the limit.
+    which a joint stays behind, and a constant torque over the stiffness bends it away.
     """
     value = dict(zip(STARTS, np.split(vector, len(STARTS)), strict=True))
     return {
@@ -146,17 +143,10 @@ def measure_effects(vector: np.ndarray, arm: Arm) -> Numbers:
         "lag": value["lag_s"] + value["damping"] / value["stiffness"],
         "backlash": 2.0 * value["friction"] / value["stiffness"],
         "sag": -value["pull"] / value["stiffness"],
-        "torque_limit": FULL_TORQUE_TRAVEL
-        * 2.0
-        * arm.half_travel
-        * value["stiffness"]
-        / value["limit"],
     }
 
 
-def measure_errors(
-    vector: np.ndarray, jacobian: np.ndarray, residual: np.ndarray, arm: Arm
-) -> Numbers:
+def measure_errors(vector: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> Numbers:
     """Return standard errors of the numbers of effects, by the covariance at the optimum.
 
     The toolbox states errors of single parameters. Friction and stiffness of a joint without weight
@@ -167,11 +157,11 @@ def measure_errors(
     scaled = information / np.outer(scale, scale) + RIDGE * np.eye(len(scale))
     variance = residual @ residual / (residual.size - len(scale))
     covariance = variance * np.linalg.inv(scaled) / np.outer(scale, scale)
-    slopes: dict[str, list[np.ndarray]] = {name: [] for name in measure_effects(vector, arm)}
+    slopes: dict[str, list[np.ndarray]] = {name: [] for name in measure_effects(vector)}
     for i, number in enumerate(vector):
         step = 1e-4 * abs(number) + 1e-6
         up, down = (vector + sign * step * (np.arange(len(vector)) == i) for sign in (1.0, -1.0))
-        above, below = measure_effects(up, arm), measure_effects(down, arm)
+        above, below = measure_effects(up), measure_effects(down)
         for name in slopes:
             slopes[name].append((above[name] - below[name]) / (2.0 * step))
     errors = {}
@@ -198,7 +188,7 @@ def fit_drives(arm: Arm, windows: Windows, start: np.ndarray | None) -> tuple[np
     )
     vector = found.as_vector()
     residual = runs.compute_residual(vector, found.copy(), spec)[0][0]
-    return vector, measure_errors(vector, result.jac, residual, arm)
+    return vector, measure_errors(vector, result.jac, residual)
 
 
 def find_changes(case: Path, arm: Arm) -> tuple[list[Change], dict[str, list[float]]]:
@@ -208,8 +198,7 @@ def find_changes(case: Path, arm: Arm) -> tuple[list[Change], dict[str, list[flo
     field = read_windows(case / "field", arm, FIELD_STRIDE_S)
     present, present_error = fit_drives(arm, field, nominal)
     errors = {name: np.hypot(nominal_error[name], present_error[name]) for name in nominal_error}
-    was, now = measure_effects(nominal, arm), measure_effects(present, arm)
-    changes = list_changes(arm, was, now, errors)
+    changes = list_changes(arm, measure_effects(nominal), measure_effects(present), errors)
     return changes, {"nominal": nominal.tolist(), "present": present.tolist()}
 
 
