@@ -117,7 +117,7 @@ def test_effects_on_a_drive_are_its_mass_and_friction(drive: Machine) -> None:
 
 
 def test_an_effect_on_a_drive_needs_one(drive: Machine) -> None:
-    with pytest.raises(ConfigError, match="mass or friction of a drive"):
+    with pytest.raises(ConfigError, match="numbers of a drive, and Blind has none"):
         option("effect", "inertia").wrap(Blind(), drive, 1, CPU)
 
 
