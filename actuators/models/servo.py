@@ -323,11 +323,7 @@ class LimitedSolution:
 
     @classmethod
     def build(
-        cls,
-        response_s: torch.Tensor,
-        damping: torch.Tensor,
-        time_s: torch.Tensor,
-        limit: PullLimit,
+        cls, response_s: torch.Tensor, damping: torch.Tensor, time_s: torch.Tensor, limit: PullLimit
     ) -> "LimitedSolution":
         """Return the motion over `time_s`, `(N, J)`, with a limit."""
         step_s, response_s = time_s / SUBSTEPS, response_s.clamp(min=SHORTEST_RESPONSE_S)
