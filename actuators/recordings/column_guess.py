@@ -54,7 +54,7 @@ COMMAND_KINDS: dict[CommandKind, str] = {
 TARGET_SLOPE = (0.5, 1.5)
 """Position over target: outside of it the target is in another unit, or no target."""
 CLEAR_SHARE = 0.3
-"""Of two explanations the better one leaves at most this part of what the other leaves unexplained;
+"""Largest ratio of what the better of two explanations leaves unexplained to what the other leaves;
 by hand: swapped columns leave less than 0.1, servos with play or friction more than 0.5."""
 GRID_ROWS = 20000
 """Rows on which pairs are compared; correlations change by less than 0.01 beyond."""

@@ -98,6 +98,16 @@ def test_late_frames_of_servos_are_named_with_their_size(
     assert compute_loss(better.z) < compute_loss(held[name].z)
 
 
+def test_what_another_common_delay_gains_counts_against_late_frames(
+    arm: Machine, held: dict[str, Residuals], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kinds = effect_library.load_effects(arm, ["frame_loss", "delay_jitter"])
+    changes, reference = timing.CommandChanges(held["lost"]), [held["whole"], held["other"]]
+    monkeypatch.setattr(timing.DelayErrorModel, "gain_by_shift", lambda *_: 1e6)
+    found = timing.detect_timing_effect(changes, held["lost"].error, reference, kinds, 4.0, 12.0)
+    assert found is None
+
+
 def test_frames_that_arrive_in_time_are_not_called_late(
     arm: Machine, held: dict[str, Residuals]
 ) -> None:
