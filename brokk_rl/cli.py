@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import copy
-import errno
 import logging
 import math
 import os
@@ -21,23 +20,16 @@ from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import (
-    ConfigCompositionException,
-    HydraException,
-    InstantiationException,
-    MissingConfigException,
-)
 from hydra.types import RunMode
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 from rich.logging import RichHandler
 
 import brokk_rl
-from brokk_rl import distributed, extensions, extras, gpu_pool, registry
-from brokk_rl.errors import BrokkError, ConfigError, list_choices
+from brokk_rl import distributed, extensions, gpu_pool, registry
+from brokk_rl.errors import BrokkError, ConfigError
+from brokk_rl.explain import compose_choices, explain, explain_missing_value, read_mode_name
 from brokk_rl.mode_help import describe_mode
 from brokk_rl.session import read_earlier_job, remove_empty_folders
 from brokk_rl.sweep import SweepFolder, name_job
@@ -174,7 +166,7 @@ def check_values(cfg: DictConfig) -> None:
         ConfigError: A value is bad, or one that must be given is not.
     """
     if missing := OmegaConf.missing_keys(cfg) - {"session.out"}:
-        raise ConfigError(_explain_missing_value(min(missing)))
+        raise ConfigError(explain_missing_value(min(missing)))
     cfg = copy.deepcopy(cfg)  # a node that takes in another one resolves that one in its place
     for name in CHECKED_FIRST.split():
         node = OmegaConf.select(cfg, name, throw_on_missing=False)
@@ -233,11 +225,7 @@ def _collect_facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
         key, _, value = override.partition("=")
         if value.startswith("["):  # Hydra does not record options that were chosen as a list.
             chosen.setdefault(key, value)
-    facts: dict[str, Any] = {
-        "mode": _read_mode_name(cfg),
-        "choices": chosen,
-        "overrides": overrides,
-    }
+    facts: dict[str, Any] = {"mode": read_mode_name(cfg), "choices": chosen, "overrides": overrides}
     if machine := getattr(mode, "machine", None):
         facts |= {"machine": machine.name, "fingerprint": machine.fingerprint()}
     return facts
@@ -257,7 +245,7 @@ def choose_run_folder(cfg: DictConfig) -> Path:
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
     name = Path(name).stem if name else None  # An option may be a file: experiment=@<path>.
     stem = "_".join(
-        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", _read_mode_name(cfg), name))
+        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", read_mode_name(cfg), name))
     )
     return Path("runs") / stem
 
@@ -281,149 +269,6 @@ def set_up_logging() -> None:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 
-def explain(error: BaseException) -> str | None:
-    """Return the message for the user, `None` for a defect that needs its traceback."""
-    chain = list(_iterate_causes(error))
-    ours = next((e for e in chain if isinstance(e, BrokkError)), None)
-    full = next((e for e in chain if isinstance(e, OSError) and e.errno == errno.ENOSPC), None)
-    missing = next((e for e in chain if isinstance(e, MissingMandatoryValue)), None)
-    if full:
-        where = f" ({full.filename})" if full.filename else ""
-        return f"the disk is full{where}. Free some space, or choose another disk with session.out=<folder>."
-    # The class is torch's; its name is compared so that torch need not be imported.
-    if any(type(e).__name__ == "OutOfMemoryError" for e in chain):
-        return f"the memory of the GPU is full: use fewer environments, or session.device=cpu ({error})"
-    if ours:
-        return f"{ours}{_locate_node(error)}"
-    if missing:
-        return _explain_missing_value(str(missing.full_key or missing))
-    lacking = next((e for e in chain if isinstance(e, ModuleNotFoundError) and e.name), None)
-    if lacking and (text := _explain_missing_module(lacking, chain)):
-        return text
-    if isinstance(error, MissingConfigException):
-        return _explain_missing_option(error)
-    if isinstance(error, InstantiationException):
-        return _explain_bad_node(error)
-    if isinstance(error, ConfigCompositionException):
-        return _explain_bad_override(error)
-    if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith(
-        "Config group override must"
-    ):
-        text = str(error)
-        if "override_grammar" in text:
-            text += '\nQuote words with brackets, braces or colons: \'log.joints={hip: ["tau[0]", "q[0]"]}\''
-        return text
-    return None
-
-
-def _explain_missing_value(key: str) -> str:
-    if "[" in key:  # an item of a list cannot be overridden
-        return f"{key} has no value: fill in ??? in its file"
-    return f"{key} has no default and must be given: {key}=<value>"
-
-
-def _iterate_causes(error: BaseException | None) -> Iterator[BaseException]:
-    while error is not None:
-        yield error
-        error = error.__cause__
-
-
-def _explain_missing_module(lacking: ModuleNotFoundError, chain: list[BaseException]) -> str | None:
-    """Explain a package that is not installed; `None` where no extra brings it."""
-    for error in chain:
-        # Hydra names the target that it could not load, in one of two ways.
-        target = re.search(r"(?:target|loading) '([\w.]+)'", str(error))
-        if target:
-            return extras.explain_missing_module(str(lacking.name), target[1])
-    return extras.explain_missing_module(str(lacking.name), "this run")
-
-
-def _explain_missing_option(error: MissingConfigException) -> str:
-    group, _, name = str(error.missing_cfg_file).rpartition("/")
-    if not group:
-        return str(error).split("\nConfig search path")[0]
-    if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
-        return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
-    # Hydra lists none where a list of options was given.
-    offered = error.options or [
-        option.name for option in registry.list_options() if option.group == group
-    ]
-    if not offered:
-        return f"there is no option '{name}' of '{group}', nor any other; `brokk mode=list` prints what there is"
-    return f"there is no {group}={name}; {list_choices(name, offered)}"
-
-
-def _explain_bad_node(error: InstantiationException) -> str:
-    """Explain a node that cannot be built: an unknown field, a missing field, a missing target."""
-    cause = error.__cause__
-    called = re.search(r"call to target '([\w.]+)'", str(error))
-    if called and isinstance(cause, TypeError):
-        known = list(getattr(get_class(called[1]), "__dataclass_fields__", ()))
-        name = called[1].rpartition(".")[2]
-        if unknown := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
-            place = re.search(r"full_key: (\S+)", str(error))
-            key = f"{place[1]}.{unknown[1]}" if place else unknown[1]
-            if renamed := registry.find_renamed_field(key):
-                return f"{name} has no field '{unknown[1]}': '{renamed[0]}' is now '{renamed[1]}'"
-            return f"{name} has no field '{unknown[1]}'; {list_choices(unknown[1], known)}{_locate_node(error)}"
-        if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", str(cause)):
-            return f"{name} lacks {lacking[1]}{_locate_node(error)}"
-    return str(error)
-
-
-def _locate_node(error: BaseException) -> str:
-    """Return the end of a message: the place in the configuration that could not be built."""
-    found = (
-        re.search(r"full_key: (\S+)", str(error))
-        if isinstance(error, InstantiationException)
-        else None
-    )
-    return f" (in '{found[1]}': change {found[1]}.<field>=… or its file)" if found else ""
-
-
-def _explain_bad_override(error: ConfigCompositionException) -> str:
-    """Explain an override of a key that the configuration does not have."""
-    text = str(error)
-    found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
-    if not found:
-        text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
-        if mixed := re.search(
-            r"override ([\w.]+)=.*Cannot merge (?:Dict|List)Config with (?:Dict|List)Config",
-            text,
-            re.DOTALL,
-        ):
-            return (
-                f"{mixed[1]} holds a list and you gave a table, or the reverse; Hydra puts neither in the place of the other. Take "
-                f"the old value away, '~{mixed[1]}' '+{mixed[1]}=…', or give the option as a file, <group>=@<path>."
-            )
-        return text
-    where, key = found[1], found[2].split("@")[0]
-    source = f"{where} changes" if where and where != "config" else "you gave"
-    if renamed := registry.find_renamed_field(key):
-        return f"{source} '{key}', but '{renamed[0]}' is now '{renamed[1]}'"
-    # The mode itself may not compose; the message is then shorter.
-    with contextlib.suppress(Exception):
-        cfg = _compose_choices()
-        if "No match in the defaults list" in text or key in {
-            option.group for option in registry.list_options()
-        }:
-            groups = []
-            for k in cfg.hydra.runtime.choices:
-                if not str(k).startswith("hydra"):
-                    groups.append(str(k))
-            return f"{source} '{key}', but mode={_read_mode_name(cfg)} does not use such a group; {list_choices(key, groups)}"
-        parent, _, leaf = key.rpartition(".")
-        while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
-            parent, _, leaf = parent.rpartition(".")
-        names = (
-            [str(k) for k in node if str(k) not in ("hydra", "_target_")]
-            if isinstance(node, DictConfig)
-            else []
-        )
-        return f"{source} '{key}', but '{parent or f'mode={_read_mode_name(cfg)}'}' has no '{leaf}'; {list_choices(leaf, names)}"
-    return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --cfg job` shows what it has"
-
-
 def _is_mode_help(arguments: Sequence[str]) -> bool:
     """Return true where the help of one mode is asked for, not that of the command."""
     asked = "--help" in arguments or "-h" in arguments
@@ -432,7 +277,7 @@ def _is_mode_help(arguments: Sequence[str]) -> bool:
 
 def _describe_chosen_mode() -> str:
     """Return the help of the mode of the command line, with the options chosen there."""
-    cfg = _compose_choices()
+    cfg = compose_choices()
     own = OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key != "hydra"])
     choices, node = map(OmegaConf.to_container, (cfg.hydra.runtime.choices, own))
     assert isinstance(choices, dict) and isinstance(node, dict)
@@ -441,35 +286,6 @@ def _describe_chosen_mode() -> str:
         {str(key): value for key, value in node.items()},
         shutil.get_terminal_size().columns,
     )
-
-
-def _compose_choices() -> DictConfig:
-    """Compose the options that the command line chooses, without its values.
-
-    Of a sweep's options the first is taken. Options that do not compose are left out, up to the
-    mode: the message of an error then lists what the mode has by itself.
-    """
-    groups = {option.group for option in registry.list_options()}
-    chosen: list[str] = []
-    for override in OverridesParser.create().parse_overrides(
-        [argument for argument in sys.argv[1:] if "=" in argument and argument[0] != "-"]
-    ):
-        if override.key_or_group not in groups:
-            continue
-        line = str(override.input_line)
-        if override.is_sweep_override():
-            line = f"{line.partition('=')[0]}={next(iter(override.sweep_string_iterator()))}"
-        chosen.append(line)
-    modes = [line for line in chosen if line.startswith("mode=")]
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        try:
-            return hydra.compose("config", overrides=chosen, return_hydra_config=True)
-        except (HydraException, OmegaConfBaseException):
-            return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
-
-
-def _read_mode_name(cfg: DictConfig) -> str:
-    return str(cfg._target_).split(".")[-2]
 
 
 def _format_resolved(cfg: DictConfig) -> str:

@@ -16,6 +16,7 @@ MODE = 4
 """Floor of the modes: `brokk_rl.modes` and `<room>.modes`."""
 FLOORS = (
     ("brokk_rl.cli", 5),
+    ("brokk_rl.explain", 5),
     ("brokk_rl.__main__", 5),
     ("diagnosis.api", 5),
     ("brokk_rl.extensions", 5),
@@ -33,9 +34,17 @@ FLOORS = (
 )
 """Floor of each package, the first that fits: roof, modes, rooms and diagnosis, sim and rl,
 bedrock, and ground for the rest."""
+COMPOSERS = (
+    "brokk_rl.cli",
+    "brokk_rl.explain",
+    "brokk_rl.extensions",
+    "brokk_rl.sweep",
+    "brokk_rl.task_choice",
+)
+"""Modules that compose the configuration or explain why it does not compose."""
 DOORS = {
-    "hydra": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep", "brokk_rl.task_choice"),
-    "omegaconf": ("brokk_rl.cli", "brokk_rl.extensions", "brokk_rl.sweep", "brokk_rl.task_choice"),
+    "hydra": COMPOSERS,
+    "omegaconf": COMPOSERS,
     "mujoco": ("brokk_rl.sim",),
     "mujoco_warp": ("brokk_rl.sim",),
     "warp": ("brokk_rl.sim",),

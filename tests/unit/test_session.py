@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import torch
 
-from brokk_rl.cli import explain
 from brokk_rl.errors import ConfigError, DeviceError, StorageError
+from brokk_rl.explain import explain
 from brokk_rl.session import Session, describe_commit, read_record, write_json
 
 
