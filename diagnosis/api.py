@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl import extensions, open_loop, record
+from actuators import open_loop
+from brokk_rl import extensions, record
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine

@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl import open_loop
+from actuators import open_loop
+from actuators.scales import choose_horizon_s
 from brokk_rl.commands import view_recordings
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
-from brokk_rl.scales import choose_horizon_s
 from diagnosis import residual_model
 from diagnosis.case import GapCase, estimate_running_s, split_recordings
 from diagnosis.effect_library import EffectSimulator

@@ -10,15 +10,16 @@ from pathlib import Path
 
 import numpy as np
 
-from brokk_rl import open_loop, record
+from actuators import open_loop
+from actuators.recordings.split import COMMANDED
+from actuators.scales import choose_horizon_s
+from brokk_rl import record
 from brokk_rl.commands import view_recordings
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.scales import choose_horizon_s
-from brokk_rl.split import COMMANDED
 
-# Chosen by hand, in free runs of `brokk_rl.scales`: 60 s and 150 s where they last 5 s.
+# Chosen by hand, in free runs of `actuators.scales`: 60 s and 150 s where they last 5 s.
 MIN_TOTAL_RUNS = 12
 """Field recordings of fewer free runs in all say nothing that holds beyond them."""
 MIN_TRAVEL_SHARE = 0.01

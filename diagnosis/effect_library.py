@@ -19,12 +19,12 @@ import numpy as np
 import torch
 import yaml
 
+from actuators.open_loop import FreeRunWindows
 from brokk_rl import registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, PlannedRun
 from brokk_rl.errors import BrokkError, ConfigError, group_by_reason, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.parallel import map_parallel
 from diagnosis.answer import Estimate
 from diagnosis.number_faults import list_number_faults

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl import open_loop
+from actuators import open_loop
+from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.scales import choose_horizon_s
 from diagnosis import motion_floor
 from diagnosis.baseline import Baseline
 from diagnosis.bootstrap import draw_weights, summarise_draws

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from brokk_rl.inspection import InspectionThresholds, inspect_recording
+from actuators.recordings.inspection import InspectionThresholds, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis.answer import Ranked

@@ -13,7 +13,7 @@ from itertools import combinations
 
 import numpy as np
 
-from brokk_rl import open_loop
+from actuators import open_loop
 from brokk_rl.contracts.actuator import Actuator, Excitation
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine

@@ -9,12 +9,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from actuators.scales import scale_time
 from brokk_rl.machine import Machine
-from brokk_rl.scales import scale_time
 
 # Chosen by hand; not searched.
 TIME_FAULT_S = 0.004
-"""Error of a time on the reference of `brokk_rl.scales`, s."""
+"""Error of a time on the reference of `actuators.scales`, s."""
 TRAVEL_FAULT = 0.001
 """Error of a length or an angle, over the travel of its joint."""
 NUMBER_FAULT = 0.01

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.contracts.actuator import CurveFit, Excitation
-from brokk_rl.inspection import InspectionThresholds
 from diagnosis import (
     calibration,
     decision,

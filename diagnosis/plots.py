@@ -15,9 +15,9 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatter, NullFormatter
 
+from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, make_joint_panels, remove_frame
-from brokk_rl.split import COMMANDED
 from diagnosis.answer import Answer, Outcome, format_error
 from diagnosis.error_growth import READINGS, compute_rmse_curve
 from diagnosis.free_runs import WindowedRuns

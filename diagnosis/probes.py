@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from actuators.recordings.split import COMMANDED
+from actuators.scales import scale_time
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
-from brokk_rl.scales import scale_time
-from brokk_rl.split import COMMANDED
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.permutation_test import number_parts
 from diagnosis.regimes import CREEP_COMMAND, REGIMES, TRANSIENT_S, label_regimes, shift_by_dead_time
@@ -109,7 +109,7 @@ def _measure_ringing(runs: WindowedRuns, label: list[np.ndarray], joint: int) ->
 
 
 SPAN_S = 0.25
-"""Time over which speeds are taken on the reference of `brokk_rl.scales`, s; chosen by hand: shorter
+"""Time over which speeds are taken on the reference of `actuators.scales`, s; chosen by hand: shorter
 ones are noise, longer ones blur."""
 LARGE_COMMAND = 0.7
 """Smallest of the large commands, of full; chosen by hand."""

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from actuators.recordings.split import COMMANDED
+from actuators.scales import scale_time
 from brokk_rl.gravity import Gravity
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.scales import scale_time
-from brokk_rl.split import COMMANDED
 
 REGIMES = (
     "hold",
@@ -35,7 +35,7 @@ DIRECTIONS = ("not commanded", "extending", "retracting")
 LOADS = ("not commanded", "level", "lifting", "lowering")
 """Against gravity, with it, or with less than `LEVEL` of the joint's largest load."""
 TRANSIENT_S = 0.6
-"""Length of a transient on the reference of `brokk_rl.scales`, s: lag, play and ringing are over after
+"""Length of a transient on the reference of `actuators.scales`, s: lag, play and ringing are over after
 it; chosen by hand."""
 NEAR_STOP = 0.05
 """Share of the travel near an end stop; chosen by hand."""

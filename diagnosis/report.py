@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from actuators.scales import choose_horizon_s
 from brokk_rl.machine import Machine
 from brokk_rl.report import Cell, Report, Tone
-from brokk_rl.scales import choose_horizon_s
 from diagnosis import plots, report_checks
 from diagnosis.answer import Answer, Estimate, Gap, Outcome, Selected, format_error
 from diagnosis.error_growth import READINGS

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from brokk_rl.contracts.preview import PreviewCallback
+from actuators.recordings.preview import PreviewCallback
 from diagnosis.decision import SAME_NATS, SAME_SHARE
 from diagnosis.effect_library import EffectType
 from diagnosis.error_covariance import T_FREEDOM

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.open_loop import FreeRunWindows
+from actuators.open_loop import FreeRunWindows
 from brokk_rl.parallel import map_parallel
 from diagnosis.bootstrap import BLOCK_WINDOWS
 from diagnosis.residuals import INCREMENT_SAMPLES, to_increments

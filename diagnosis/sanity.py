@@ -1,6 +1,6 @@
 """Checks of recordings before any physics: clocks, lost frames, interlocks, sensors, idle joints.
 
-`brokk_rl.inspection` finds single stretches. This module merges stretches of one kind into one
+`actuators.recordings.inspection` finds single stretches. This module merges stretches of one kind into one
 remark a recording, and stretches that share a condition into an interlock. It adds the checks that
 need a whole recording: clock, saturation, excitation.
 Axes: `T` time, `J` joints.
@@ -15,11 +15,15 @@ from typing import Any, Literal
 
 import numpy as np
 
+from actuators.recordings.inspection import (
+    InspectionThresholds,
+    RecordingFinding,
+    inspect_recording,
+)
+from actuators.scales import choose_horizon_s
 from brokk_rl.commands import view_recordings
-from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
-from brokk_rl.scales import choose_horizon_s
 
 MIN_STRETCHES = 5
 """Least number of ignored stretches; chosen by hand: fewer may share a condition by coincidence."""
@@ -285,7 +289,7 @@ FINDING_NAMES = {
     "beyond limit": "beyond limit",
     "exclusive": "exclusive joint",
 }
-"""Name of a remark by kind of finding in `brokk_rl.inspection`."""
+"""Name of a remark by kind of finding in `actuators.recordings.inspection`."""
 
 
 def examine_recordings(

@@ -19,11 +19,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl.inspection import InspectionThresholds
+from actuators.recordings.inspection import InspectionThresholds
+from actuators.scales import scale_time
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.scales import scale_time
 from diagnosis.answer import JointGap, RegimeGap, Stage, Where
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.geometry import TOOL_COLUMNS, ToolPointErrors, compare_tool_points

@@ -16,15 +16,15 @@ from itertools import combinations
 
 import numpy as np
 
-from brokk_rl import open_loop
+from actuators import open_loop
+from actuators.open_loop import FreeRunWindows
+from actuators.recordings.inspection import estimate_step
+from actuators.recordings.preview import EffectLimit, LookalikePair, PreviewCallback, PreviewResult
+from actuators.scales import choose_horizon_s
 from brokk_rl.contracts.actuator import Actuator, Excitation
-from brokk_rl.contracts.preview import EffectLimit, LookalikePair, PreviewCallback, PreviewResult
 from brokk_rl.errors import ConfigError, RecordingError
-from brokk_rl.inspection import estimate_step
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.record import Recording, make_motion
-from brokk_rl.scales import choose_horizon_s
 from brokk_rl.spec import name_spec, spec
 from diagnosis import effect_library
 from diagnosis.case import estimate_running_s
@@ -144,7 +144,7 @@ class TellableEffects:
         tell: PreviewCallback,
         are_measured: bool,
     ) -> PreviewResult:
-        """Return which effects these motions could tell; see `brokk_rl.contracts.preview`."""
+        """Return which effects these motions could tell; see `actuators.recordings.preview`."""
         tell("cutting the motions", 0.0)
         kinds = effect_library.load_effects(machine, self.effects)
         reading = self.error.measure_reading(motions, machine) if are_measured else None

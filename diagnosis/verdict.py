@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.commands import view_speeds
-from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from diagnosis import gates
 from diagnosis.answer import Verdict

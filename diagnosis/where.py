@@ -20,8 +20,8 @@ from typing import Any
 
 import numpy as np
 
+from actuators.scales import scale_time
 from brokk_rl.machine import Machine
-from brokk_rl.scales import scale_time
 from diagnosis.error_growth import ErrorGrowth, measure_growth
 from diagnosis.free_runs import WindowedRuns
 from diagnosis.permutation_test import (
@@ -40,7 +40,7 @@ BANDS_HZ = (0.3, 1.0, 3.0)
 NUM_AGES = 4
 """Number of parts of the running time; chosen by hand."""
 INCREMENT_S = 0.25
-"""Time of the increments that the tests compare on the reference of `brokk_rl.scales`, s; chosen by
+"""Time of the increments that the tests compare on the reference of `actuators.scales`, s; chosen by
 hand: increments are less dependent than the error, which stays."""
 
 

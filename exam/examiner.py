@@ -19,13 +19,14 @@ import numpy as np
 import torch
 import yaml
 
+from actuators import open_loop
 from actuators.effects.composition import ActuatorWithEffects, MeasuredActuatorModel
-from brokk_rl import open_loop, record, registry
+from actuators.open_loop import FreeRunWindows
+from brokk_rl import record, registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.record import Recording
 from diagnosis import effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, read_answer

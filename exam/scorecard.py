@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl import open_loop
+from actuators import open_loop
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.report import MISSING, Cell, Report

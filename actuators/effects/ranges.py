@@ -10,9 +10,9 @@ import torch
 
 from actuators.models import random_draws
 from actuators.models.parameters import OTHER, expand_per_joint
+from actuators.scales import Scale, measure_scale
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.scales import Scale, measure_scale
 
 TypicalRange = tuple[float, float, Literal["typical"]]
 """A range `[low, high, typical]` over the typical size of each joint; see `EffectNumber.scale_to`."""
@@ -37,7 +37,7 @@ class EffectNumber:
         unit: SI unit, `1` for none; `rad` and `rad/s` read m and m/s for a sliding joint.
         none: Value at which the effect changes nothing. `None` for a number that only shapes the
             effect (a time constant), which is off when the others are.
-        typical: Size on a machine that has the effect, on the reference of `brokk_rl.scales`.
+        typical: Size on a machine that has the effect, on the reference of `actuators.scales`.
         bounds: Smallest and largest value that make sense there.
         per_joint: Whether each joint has its own; otherwise one number an environment, `(N, 1)`.
         trials: Values of a number that only shapes the effect which a diagnosis tries; empty for

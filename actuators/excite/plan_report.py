@@ -11,9 +11,9 @@ from matplotlib.patches import Patch
 
 from actuators.excite.player import Sample
 from actuators.excite.schedule import ExcitationPlan
+from actuators.recordings.preview import PreviewResult
 from actuators.recordings.preview_report import draw_preview, measure_picture_height
 from brokk_rl.contracts.actuator import Segment
-from brokk_rl.contracts.preview import PreviewResult
 from brokk_rl.machine import Machine
 
 BEFORE, PLAYING, AWAY, AFTER = range(4)

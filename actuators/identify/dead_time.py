@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from actuators.recordings.split import group_by_run
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import group_by_run
 
 KNOTS = (0.0, 0.05, 0.1, 0.2, 0.4, 0.7)
 """Commands at which the static curve bends, on either side."""

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from scipy import stats
 
-from brokk_rl import open_loop
+from actuators import open_loop
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.intervals import CONFIDENCE

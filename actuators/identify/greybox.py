@@ -15,6 +15,7 @@ import torch
 import yaml
 from scipy.stats import qmc
 
+from actuators import open_loop
 from actuators.identify.gauss_newton import (
     CandidateRuns,
     ParameterUncertainty,
@@ -23,7 +24,7 @@ from actuators.identify.gauss_newton import (
     take_step,
 )
 from actuators.identify.training_data import COMMANDED
-from brokk_rl import open_loop, record
+from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.machine import Machine

@@ -18,20 +18,20 @@ import numpy as np
 import torch
 import yaml
 
+from actuators import open_loop
 from actuators.identify.boosting_fit import BoostingFit
 from actuators.identify.valve_fit import ValveFit
 from actuators.models import checkpoint
 from actuators.models.hybrid import MOVING, HybridActuator, ResidualInputs, compute_residual
 from actuators.models.trees import TENSORS
 from actuators.models.valve import ValveActuator
-from brokk_rl import open_loop
+from actuators.recordings.split import COMMANDED, group_by_run
 from brokk_rl.errors import ConfigError, RecordingError, StorageError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_text
 from brokk_rl.spec import spec
-from brokk_rl.split import COMMANDED, group_by_run
 
 log = logging.getLogger(__name__)
 

@@ -23,13 +23,13 @@ from actuators.identify.training_data import TrainingWindows
 from actuators.models import checkpoint
 from actuators.models.checkpoint import ResumeFile, hash_recordings
 from actuators.models.network import Coupled, JointNetworks, Mlp
+from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
 from brokk_rl.rl.execution import capture_graph
 from brokk_rl.spec import spec
-from brokk_rl.split import COMMANDED
 
 
 class FreeRunOptimizer:

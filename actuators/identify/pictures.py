@@ -12,9 +12,9 @@ from matplotlib.ticker import LogFormatter, NullFormatter
 
 from actuators.identify.dead_time import DeadTimeEstimate
 from actuators.identify.scores import REGIMES, TAILS, FreeRunScores
+from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, add_legend, make_joint_panels, remove_frame
-from brokk_rl.split import COMMANDED
 
 COLOURS = {"hold": GREY, "arx": ORANGE}
 

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from actuators import open_loop
 from actuators.identify import dead_time, pictures
 from actuators.identify.dead_time import RESOLUTION_S
 from actuators.identify.scores import FreeRunScores, average_joints, bound_interval, score_regimes
 from actuators.identify.stages import FitStage, FittedModel, list_recordings
-from brokk_rl import open_loop
+from actuators.recordings.split import measure_commanded_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import measure_commanded_s
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

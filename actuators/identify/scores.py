@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from actuators.open_loop import FreeRunWindows
+from actuators.recordings.split import COMMANDED
 from brokk_rl.intervals import CONFIDENCE
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import FreeRunWindows
-from brokk_rl.split import COMMANDED
 
 RESAMPLED = 1000
 """Bootstrap resamples over runs; the usual number for 95 % intervals."""

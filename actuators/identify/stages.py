@@ -19,7 +19,8 @@ import numpy as np
 import torch
 import yaml
 
-from brokk_rl import open_loop, registry
+from actuators import open_loop
+from brokk_rl import registry
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine

@@ -8,10 +8,10 @@ import torch
 from torch.nn.utils.rnn import pad_sequence
 
 from actuators.models.random_draws import hash_uniform
+from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import COMMANDED
 
 
 class TrainingWindows:

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from actuators import open_loop
 from actuators.models import checkpoint
 from actuators.models.linear import ArxModel
-from brokk_rl import open_loop
 from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording

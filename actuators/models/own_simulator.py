@@ -21,11 +21,11 @@ import numpy as np
 import torch
 
 from actuators.effects.simulator import EFFECTS
+from actuators.open_loop import WARM_UP_S
 from brokk_rl.contracts.actuator import PlannedRun
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import WARM_UP_S
 from brokk_rl.spec import spec
 
 MAX_KEPT = 20_000
@@ -192,7 +192,7 @@ class OwnSimulatorModel:
         """See `brokk_rl.contracts.actuator.PlannedModel`.
 
         `q` holds the positions of the warm-up too. The run begins behind it, where it does in
-        `brokk_rl.open_loop`.
+        `actuators.open_loop`.
         """
         if q is None:
             return None

@@ -20,10 +20,10 @@ from actuators.excite.player import (
 )
 from actuators.excite.schedule import Approach, ExcitationPlan, plan_runs
 from actuators.recordings import preview_report
+from actuators.recordings.preview import EffectPreview, PreviewResult
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.contracts.link import Connection
-from brokk_rl.contracts.preview import EffectPreview, PreviewResult
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress

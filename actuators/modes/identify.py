@@ -12,6 +12,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from actuators import open_loop
 from actuators.identify import page
 from actuators.identify.request import Identification
 from actuators.identify.results import (
@@ -22,14 +23,14 @@ from actuators.identify.results import (
     build_results,
 )
 from actuators.identify.stages import FitStage, FittedModel, fit_or_restore, list_recordings
-from brokk_rl import open_loop, record
+from actuators.recordings.split import check_commanded, group_by_run, split_runs
+from brokk_rl import record
 from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.spec import spec
-from brokk_rl.split import check_commanded, group_by_run, split_runs
 
 log = logging.getLogger(__name__)
 

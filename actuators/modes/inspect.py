@@ -15,11 +15,16 @@ from rich.table import Table
 
 from actuators.identify import dead_time
 from actuators.recordings import inspection_picture, preview_report
+from actuators.recordings.inspection import (
+    KINDS,
+    Inspection,
+    InspectionThresholds,
+    inspect_recording,
+)
+from actuators.recordings.preview import EffectPreview, PreviewResult
 from brokk_rl import record
 from brokk_rl.commands import view_recordings
-from brokk_rl.contracts.preview import EffectPreview, PreviewResult
 from brokk_rl.errors import ConfigError, RecordingError
-from brokk_rl.inspection import KINDS, Inspection, InspectionThresholds, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure
 from brokk_rl.progress import track_items

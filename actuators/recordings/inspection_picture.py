@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from brokk_rl.inspection import KINDS, Inspection, RecordingFinding
+from actuators.recordings.inspection import KINDS, Inspection, RecordingFinding
 from brokk_rl.machine import Machine
 from brokk_rl.record import Breach, Recording
 

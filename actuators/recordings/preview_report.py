@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from brokk_rl.contracts.preview import EffectLimit, EffectPreview, PreviewResult
+from actuators.recordings.preview import EffectLimit, EffectPreview, PreviewResult
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import SHARE, ItemProgress

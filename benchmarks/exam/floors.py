@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from hydra.utils import instantiate
 
-from brokk_rl import open_loop, record
-from brokk_rl.split import group_by_run
+from actuators import open_loop
+from actuators.recordings.split import group_by_run
+from brokk_rl import record
 
 
 def main(exam: Path, fit_name: str, cases: list[str], *overrides: str) -> None:

@@ -14,16 +14,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from brokk_rl import open_loop
+from actuators import open_loop
+from actuators.open_loop import FreeRunWindows
+from actuators.recordings.split import group_by_run
+from actuators.scales import choose_horizon_s
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel, Effect
 from brokk_rl.errors import RecordingError
 from brokk_rl.history import History
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import FreeRunWindows
 from brokk_rl.record import Recording
-from brokk_rl.scales import choose_horizon_s
-from brokk_rl.split import group_by_run
 from diagnosis.deployment.contract import TARGET_COLUMNS
 
 log = logging.getLogger(__name__)

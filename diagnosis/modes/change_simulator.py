@@ -13,11 +13,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from actuators.open_loop import WARM_UP_S
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import WARM_UP_S
 from brokk_rl.record import Recording
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
@@ -114,7 +114,7 @@ class ChangeSimulator:
         self, own: Any, given: Answer, recordings: Sequence[Recording]
     ) -> dict[str, Any]:
         """Write the changed MJCF, the priors and the networks; return what was done."""
-        from brokk_rl.sim import mjcf_changes  # MuJoCo is not in every installation
+        from diagnosis import mjcf_changes  # MuJoCo is not in every installation
 
         folder = self.session.folder
         findings = []

@@ -12,9 +12,9 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.contracts.actuator import Actuator, ActuatorFit, CurveFit, Excitation
 from brokk_rl.errors import ConfigError
-from brokk_rl.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import use_workers
 from brokk_rl.progress import SHARE, ItemProgress

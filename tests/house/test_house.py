@@ -82,6 +82,8 @@ def test_numbers_of_the_configuration_are_explained() -> None:
         ),
         (rules.floors, "brokk_rl.modes.train", "from tasks.reward import Term"),
         (rules.floors, "tasks.reward", "import actuators.models.lag"),
+        (rules.floors, "actuators.models.lag", "import diagnosis.answer"),
+        (rules.doors, "diagnosis.answer", "import mujoco"),
         (rules.floors, "brokk_rl.modes.list", "from brokk_rl import extensions"),
         (rules.doors, "tasks.reward", "import mujoco"),
         (rules.doors, "brokk_rl.modes.list", "from omegaconf import OmegaConf"),
@@ -110,6 +112,7 @@ def test_a_planted_violation_is_found(
     ("rule", "module", "text"),
     [
         (rules.floors, "tasks.reward", "from brokk_rl.sim import scene"),
+        (rules.floors, "diagnosis.answer", "from actuators.models.lag import Lag"),
         (
             rules.floors,
             "brokk_rl.machine",

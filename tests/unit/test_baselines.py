@@ -13,10 +13,10 @@ import torch
 from composed import option
 from sklearn.ensemble import HistGradientBoostingRegressor
 
+from actuators import open_loop
 from actuators.identify.boosting_fit import BoostingFit, tabulate_trees
 from actuators.models.hinge_arx import HingeArx, HingeArxFit, build_hinge_features
 from actuators.models.trees import BoostedTrees, build_tree_features, evaluate_trees
-from brokk_rl import open_loop
 from brokk_rl.checks import check_actuator
 from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
 from brokk_rl.machine import Machine

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from composed import option
 
+from actuators.open_loop import FreeRunWindows
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import FreeRunWindows
 from diagnosis import calibration, decision, residual_model
 from diagnosis.detection import DetectionResult
 from diagnosis.effect_library import EffectSimulator

@@ -12,7 +12,7 @@ import pytest
 from composed import option
 from gaps import reach, recording
 
-from brokk_rl.inspection import InspectionThresholds
+from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from diagnosis import effect_library, gates, report_checks, verdict
 from diagnosis.answer import Answer, Ranked, Selected, Where

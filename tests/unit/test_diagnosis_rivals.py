@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from brokk_rl.open_loop import FreeRunWindows
+from actuators.open_loop import FreeRunWindows
 from diagnosis import rivals
 from diagnosis.rivals import assign_folds, measure_rivals
 

@@ -9,7 +9,7 @@ import pytest
 from composed import option
 from gaps import DELAY, recording
 
-from brokk_rl.inspection import InspectionThresholds
+from actuators.recordings.inspection import InspectionThresholds
 from brokk_rl.machine import Machine
 from diagnosis.sanity import TEXTS, RecordingRemark, examine_recordings
 

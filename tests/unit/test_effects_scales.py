@@ -12,10 +12,10 @@ from composed import names, option
 
 from actuators.effects.load import Creep, LoadDependence
 from actuators.effects.speed import Backlash
+from actuators.scales import choose_horizon_s, measure_time_scale
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.scales import choose_horizon_s, measure_time_scale
 from diagnosis import effect_library
 
 CPU = torch.device("cpu")

@@ -14,11 +14,11 @@ import torch
 import yaml
 from composed import option
 
+from actuators import open_loop
 from actuators.identify import greybox
 from actuators.identify.gauss_newton import CandidateRuns, estimate_uncertainty
 from actuators.identify.greybox import GreyBoxFit
 from actuators.models.lag import FirstOrderLag
-from brokk_rl import open_loop
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

@@ -12,10 +12,10 @@ import yaml
 from composed import option
 from hydra.utils import instantiate
 
+from actuators import open_loop
 from actuators.identify.hybrid_fit import HybridFit, select_shares, select_unlike
 from actuators.models import checkpoint
 from actuators.models.hybrid import BOUND, HybridActuator, ResidualInputs, compute_residual
-from brokk_rl import open_loop
 from brokk_rl.checks import check_actuator
 from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
 from brokk_rl.machine import Machine

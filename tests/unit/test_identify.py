@@ -11,10 +11,11 @@ import pytest
 import torch
 from composed import option
 
+from actuators import open_loop
 from actuators.identify import dead_time
 from actuators.models.lag import FirstOrderLag
 from actuators.models.linear import ArxFit, Hold
-from brokk_rl import open_loop, record
+from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

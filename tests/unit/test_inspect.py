@@ -14,8 +14,12 @@ import pytest
 from composed import option
 from hydra.utils import instantiate
 
+from actuators.recordings.inspection import (
+    InspectionThresholds,
+    RecordingFinding,
+    inspect_recording,
+)
 from brokk_rl import record
-from brokk_rl.inspection import InspectionThresholds, RecordingFinding, inspect_recording
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 

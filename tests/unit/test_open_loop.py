@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
+from actuators import open_loop
 from actuators.identify.scores import FreeRunScores, classify_seconds, score_regimes
 from actuators.models.lag import FirstOrderLag
-from brokk_rl import open_loop
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

@@ -27,7 +27,7 @@ from arm import (
 )
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from brokk_rl import open_loop
+from actuators import open_loop
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion

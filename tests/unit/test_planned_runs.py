@@ -12,10 +12,10 @@ import torch
 from composed import option
 
 from actuators.effects.effect import EffectSpec
+from actuators.open_loop import FreeRunWindows, count_samples_before
 from brokk_rl.gravity import Gravity, build_joint_weight
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.open_loop import FreeRunWindows, count_samples_before
 from diagnosis.effect_library import EffectSimulator, load_effects
 from diagnosis.error_covariance import ErrorCovariance
 from diagnosis.residuals import Residuals, build_rays

@@ -9,10 +9,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from actuators.recordings.split import (
+    check_commanded,
+    group_by_run,
+    measure_commanded_s,
+    split_runs,
+)
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import check_commanded, group_by_run, measure_commanded_s, split_runs
 
 
 def recording(

@@ -16,13 +16,13 @@ from hydra import compose, initialize_config_module
 from hydra.utils import instantiate
 
 from actuators.models.lag import FirstOrderLag
+from actuators.recordings.preview import EffectLimit, PreviewResult
 from actuators.recordings.preview_report import run_preview
+from actuators.scales import choose_horizon_s
 from brokk_rl import record
-from brokk_rl.contracts.preview import EffectLimit, PreviewResult
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.scales import choose_horizon_s
 from diagnosis import effect_library, tellable
 from diagnosis.detection import choose_by_penalties
 from diagnosis.late_frames import compute_divergence

@@ -14,12 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from actuators.recordings.split import group_by_run
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.split import group_by_run
 
 WARM_UP_S = 1.0
 """Before a free run a model sees recorded positions for so long: a model with a state of its own
