@@ -97,17 +97,14 @@ class LoadedWorld(Protocol):
     caller, and kept until written again."""
 
 
-TRACE = ("q", "speed", "acceleration", "reference")
-"""Names of the states from which a world can be played on: joint positions and speeds, the
-solver's first guess of the accelerations, references of the drives."""
+TRACE = ("q", "speed", "reference")
+"""States of a world that can be recorded: joint positions and speeds, references of the drives."""
 
 
 @runtime_checkable
 class TracedWorld(Protocol):
-    """A world whose states can be recorded (`brokk_rl.sim.fault_recorder`); optional."""
+    """A world whose states can be recorded (`brokk_rl.sim.faults`); optional."""
 
-    substeps: int
-    """Physics steps per control period."""
     trace: dict[str, torch.Tensor]
     """States by their names in `TRACE`, each `(N, J)`, of one type; refreshed in place."""
     faults: torch.Tensor

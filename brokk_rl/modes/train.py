@@ -38,8 +38,6 @@ from brokk_rl.rl.training_group import TrainingGroup
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session, read_record
 from brokk_rl.sim.events import Event
-from brokk_rl.sim.fault_recorder import REWARD_ALARM
-from brokk_rl.sim.fault_replay import describe_cause
 from brokk_rl.spec import name_spec, spec
 from brokk_rl.task_description import apply_behaviour, read_description
 
@@ -260,7 +258,7 @@ def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
 
 
 class FaultLog:
-    """Writes the faults of a training with their causes.
+    """Writes the last states of the worlds that diverge in a training.
 
     Args:
         loop: The control loop.
@@ -282,17 +280,15 @@ class FaultLog:
         if self._loop.recorder is None or not self._loop.num_held:
             return statistics
         for fault in self._loop.recorder.fetch(MAX_FAULT_FILES - self._num_written):
-            fault.cause = describe_cause(fault, self._loop.machine)
             self._folder.mkdir(exist_ok=True)
             path = self._folder / f"{self._prefix}{self._num_written}.npz"
             fault.save(path)
             self._num_written += 1
-            command = f"brokk mode=replay machine={fault.machine} replay.fault={path}"
-            log.warning("a world diverged: %s. Play it: %s", fault.cause, command)
-            if REWARD_ALARM in fault.alarms:
+            log.warning("a world diverged: %s; its last states: %s", fault.cause, path)
+            if fault.is_reward:
                 raise SimulationError(
-                    f"{fault.cause}: expected finite rewards. Look at task.reward; the state stands "
-                    f"in {path} ({command}). The newest checkpoint is from before."
+                    f"{fault.cause}: expected finite rewards; change task.reward. The last states "
+                    f"stand in {path}; the newest checkpoint is from before."
                 )
         return statistics
 

@@ -36,7 +36,7 @@ from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_com
 from brokk_rl.rl.settings import NearStarts
 from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
-from brokk_rl.sim.fault_recorder import FaultRecorder
+from brokk_rl.sim.faults import FaultRecorder
 from brokk_rl.sim.objects import list_objects
 from brokk_rl.task_description import TaskDescription, describe_task
 
@@ -406,12 +406,10 @@ class ControlLoop(VecEnv):
     def _advance(self) -> None:
         """Run one control step on the device."""
         increment = self._command()
-        if self.recorder:
-            self.recorder.record(increment)
         self.world.step(increment)
         start = self._judge()
         if self.recorder:
-            self.recorder.close(self.reward)
+            self.recorder.record(increment, self.reward)
         self._reset_worlds(start)
         self._perceive(start)
 

@@ -102,7 +102,7 @@ class EventWorld:
             self.joint_load = world.joint_load
         if isinstance(world, TracedWorld):
             self.trace, self.alarm_names = world.trace, world.alarm_names
-            self.substeps, self.read_alarms = world.substeps, world.read_alarms
+            self.read_alarms = world.read_alarms
         self._left_s = torch.zeros(len(events), world.num_worlds, device=world.device)
         everywhere = torch.ones_like(world.faults)
         for event in events:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import ClassVar
 
 import mujoco
@@ -87,12 +87,7 @@ class NativeWorld:
         self._properties = (
             WorldProperties(self.model, machine, self._drive, fields, varied) if varied else None
         )
-        self.trace = {
-            "q": self._qpos,
-            "speed": self._qvel,
-            "acceleration": torch.from_numpy(self._batch.bind("qacc_warmstart")),
-            "reference": self._drive.reference,
-        }
+        self.trace = {"q": self._qpos, "speed": self._qvel, "reference": self._drive.reference}
         # touch sensors measure in every substep; recording them all catches a peak between two
         # control steps
         self._recorded = self._batch.rollout(substeps, record=("sensordata",))
@@ -120,20 +115,6 @@ class NativeWorld:
     def read_alarms(self) -> torch.Tensor:
         """Return bits of MuJoCo's warnings; see `brokk_rl.contracts.world.TracedWorld`."""
         return (self._warning[:, :, 1] > 0).long() @ torch.tensor(list(self.alarm_names))
-
-    def watch_step(self, increment: torch.Tensor) -> Iterator[tuple[mujoco.MjModel, mujoco.MjData]]:
-        """Yield a copy of the first world after each substep of one control period.
-
-        The worlds themselves stay, but their drives move on.
-
-        Args:
-            increment: As in `step`.
-        """
-        self._drive.step(self._qpos, increment, self._act, self._ctrl)
-        model, data = self._batch.get_model(0), self._batch.get_data(0)
-        for _ in range(self.substeps):
-            mujoco.mj_step(model, data)
-            yield model, data
 
     @property
     def properties(self) -> dict[str, torch.Tensor]:

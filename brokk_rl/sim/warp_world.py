@@ -211,7 +211,6 @@ class WarpWorld:
         self.trace = {
             "q": self._views["qpos"],
             "speed": self._views["qvel"],
-            "acceleration": self._views["qacc_warmstart"],
             "reference": self._drive.reference,
         }
         self.q = torch.zeros(num_worlds, machine.num_joints, device=device)

@@ -79,7 +79,6 @@ BAD = {
     ("mode=check", "subject.model=nowhere.urdf"): "subject.model=nowhere.urdf: there is no such",
     ("mode=check", "subject.num_starts=0"): "expected num_poses and num_starts of 1 or more",
     ("mode=export",): "checkpoint has no default and must be given",
-    ("mode=replay",): "replay.fault has no default and must be given",
     ("mode=compare", "compare.runs=[1]"): "RunSelection.runs",
     ("mode=convert",): "convert.input has no default and must be given",
     ("mode=inspect", "inspect.recordings=3"): "inspect",
