@@ -1,68 +1,91 @@
-"""Tables for the terminal: one that is wider than the terminal is split, not wrapped."""
+"""Tables and lines of text for the terminal: the one place that decides how results look there."""
 
 from __future__ import annotations
 
-import os
+import re
+from collections.abc import Iterable, Sequence
 
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
-FILE_WIDTH = 120
-"""Columns of a printed table where the output is a file or a pipe."""
+MISSING = "–"
+"""Text of a missing value."""
+NUMBER = re.compile(r"\s*[<>±≈]?\s*[-+−]?\d")
+"""Start of a text that counts as a number."""
+UNBOUNDED = 10_000
+"""Columns of a file or a pipe, where a table has its natural width."""
+LONGEST_WORD = 20
+"""Characters of the longest word that is never broken: numbers are shorter, paths are not."""
+
+TableCell = str | float | Text | None
+"""Text, a number, text with a style, or `None` for a missing value."""
 
 
-def print_table(table: Table, num_keys: int = 1) -> None:
-    """Print a table; one that is too wide is split into parts that stand below one another.
+def print_table(
+    headings: Sequence[str],
+    rows: Iterable[Sequence[TableCell]],
+    title: str | None = None,
+    caption: str | None = None,
+) -> None:
+    """Print one whole table to stdout.
+
+    A table that is wider than the terminal wraps its cells between words. In a file or a pipe it is as wide as
+    its cells ask for.
 
     Args:
-        table: The table.
-        num_keys: Leading columns that say what a row is; each part repeats them.
+        headings: Heading of each column; empty for a table without headings.
+        rows: One cell a column; the first cell says what the row is. Columns of numbers are
+            aligned at the right.
+        title: Text above the table.
+        caption: Text below it.
     """
-    console = Console()
-    if not (console.is_terminal or os.environ.get("COLUMNS")):
-        console.width = FILE_WIDTH
-    for part in split_table(table, num_keys, console):
-        console.print(part)
-
-
-def split_table(table: Table, num_keys: int, console: Console) -> list[Table]:
-    """Return parts of a table, each with the leading columns and as many others as fit."""
-    num_columns = len(table.columns)
-    parts, first = [], num_keys
-    while first < num_columns:
-        last = first + 1
-        while last < num_columns and _is_narrow(_take(table, num_keys, first, last + 1), console):
-            last += 1
-        parts.append(_take(table, num_keys, first, last))
-        first = last
-    return parts or [table]
-
-
-def _take(table: Table, num_keys: int, first: int, last: int) -> Table:
-    """Return a table of the leading columns and those from `first` to before `last`."""
-    part = Table(
-        title=table.title if first == num_keys else None,
-        title_justify=table.title_justify,
-        box=table.box,
-        padding=table.padding,
-        header_style=table.header_style,
-        show_header=table.show_header,
+    texts = [[_format_cell(cell) for cell in row] for row in rows]
+    table = Table(
+        title=None if title is None else Text(title),
+        title_justify="left",
+        caption=None if caption is None else Text(caption),
+        caption_justify="left",
+        box=None,
+        padding=(0, 2, 0, 0),
+        show_header=bool(headings),
     )
-    columns = [*table.columns[:num_keys], *table.columns[first:last]]
-    for column in columns:
-        part.add_column(
-            column.header,
-            justify=column.justify,
-            style=column.style,
-            no_wrap=column.no_wrap,
-            overflow=column.overflow,
-            min_width=column.min_width,
+    num_columns = len(headings) or max(map(len, texts), default=0)
+    for column in range(num_columns):
+        heading = Text(headings[column] if headings else "")
+        cells = [row[column].plain for row in texts]
+        is_right = column > 0 and is_numeric(cells)
+        table.add_column(
+            heading,
+            justify="right" if is_right else "left",
+            overflow="fold",
+            min_width=min(LONGEST_WORD, _measure_longest_word(cells)),
         )
-    for cells in zip(*(column.cells for column in columns), strict=True):
-        part.add_row(*cells)
-    return part
+    for row in texts:
+        table.add_row(*row)
+    console = Console()
+    if not console.is_terminal:
+        console.width = UNBOUNDED
+    console.print(table)
 
 
-def _is_narrow(table: Table, console: Console) -> bool:
-    unlimited = console.options.update(width=10_000)
-    return table.__rich_measure__(console, unlimited).maximum <= console.width
+def print_text(text: str, style: str = "") -> None:
+    """Print a line of text to stdout as it is: not wrapped, nothing in it taken as markup."""
+    Console().print(text, style=style, markup=False, highlight=False, soft_wrap=True)
+
+
+def is_numeric(values: Sequence[str | float | None]) -> bool:
+    """Return whether a column holds numbers, or texts that begin like one."""
+    given = [value for value in values if value not in (None, MISSING, "")]
+    return bool(given) and all(not isinstance(value, str) or NUMBER.match(value) for value in given)
+
+
+def _measure_longest_word(texts: Sequence[str]) -> int:
+    words = " ".join(texts).split()
+    return max(map(len, words), default=0)
+
+
+def _format_cell(cell: TableCell) -> Text:
+    if isinstance(cell, Text):
+        return cell
+    return Text(MISSING if cell is None else str(cell))

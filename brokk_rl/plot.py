@@ -1,10 +1,15 @@
-"""The one plot style of all reports: colour-blind-safe palette, figure sizes, legends, frames."""
+"""The one plot style of all pictures: colour-blind-safe palette, figures, legends, files."""
 
 from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Literal
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 
 BLUE, ORANGE, GREEN, RED, GREY = "#0072b2", "#e69f00", "#009e73", "#d55e00", "#8c8c8c"
@@ -13,6 +18,8 @@ OTHERS = (GREEN, PURPLE, RED, "#56b4e9", "#5b4a9e")
 """Colour-blind-safe palette. Source: Okabe and Ito, Color Universal Design (2008), with a grey."""
 PANEL_INCHES = (3.9, 2.9)
 """Width and height of a panel, inches; chosen by hand: three panels fill a page."""
+DPI = 150
+"""Resolution of pictures, dots an inch: sharp in print at page width; chosen by hand."""
 
 
 def make_figure(width_inches: float, height_inches: float) -> Figure:
@@ -47,3 +54,31 @@ def add_legend(figure: Figure, axis: Axes) -> None:
 def remove_frame(axis: Axes) -> None:
     """Remove the frame at the top and at the right."""
     axis.spines[["top", "right"]].set_visible(False)
+
+
+def draw_grid(axis: Axes, direction: Literal["x", "y", "both"] = "both") -> None:
+    """Draw thin lines at the ticks, and no frame at the top and at the right."""
+    axis.grid(axis=direction, linewidth=0.4)
+    remove_frame(axis)
+
+
+def draw_png(figure: Figure) -> bytes:
+    """Return a figure as the bytes of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=DPI)
+    return buffer.getvalue()
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a figure as a PNG file, in one step.
+
+    Raises:
+        StorageError: It could not be written; nothing was left behind.
+    """
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        temporary.write_bytes(draw_png(figure))
+        temporary.replace(path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error

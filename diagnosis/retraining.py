@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, remove_frame
 from brokk_rl.report import Cell, Report, Tone
+from brokk_rl.statistics import compute_wilson_interval
 
 COMPARISON_FILE = "close_gap.json"
 PLANTS = ("simulator", "repaired", "machine")

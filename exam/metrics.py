@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.intervals import CONFIDENCE, compute_wilson_interval
+from brokk_rl.statistics import CONFIDENCE, compute_wilson_interval
 from exam.case_distribution import KINDS
 from exam.score import QUIET_KINDS, CaseScore, Claim, ParameterScore
 

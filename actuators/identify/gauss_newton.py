@@ -22,8 +22,8 @@ from scipy import stats
 from actuators import open_loop
 from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.intervals import CONFIDENCE
 from brokk_rl.machine import Machine
+from brokk_rl.statistics import CONFIDENCE
 
 WORLDS = 2048
 """Free runs simulated at once: enough to keep a core busy, few enough to stay in its cache."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from actuators.open_loop import FreeRunWindows
 from actuators.recordings.split import COMMANDED
-from brokk_rl.intervals import CONFIDENCE
 from brokk_rl.machine import Machine
+from brokk_rl.statistics import CONFIDENCE
 
 RESAMPLED = 1000
 """Bootstrap resamples over runs; the usual number for 95 % intervals."""

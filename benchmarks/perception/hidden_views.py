@@ -23,7 +23,7 @@ import numpy as np
 
 from brokk_rl.errors import FrameError
 from brokk_rl.extensions import load_option
-from brokk_rl.intervals import compute_wilson_interval
+from brokk_rl.statistics import compute_wilson_interval
 from perception.mount.mounts import MountError
 from perception.mount.next_view import HoleBelief
 from perception.mount.occlusion import Capsules

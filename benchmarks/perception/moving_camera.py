@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from brokk_rl.cli import main as run_command
-from brokk_rl.intervals import compute_wilson_interval
+from brokk_rl.statistics import compute_wilson_interval
 
 TRUE_HOLE = ("target=drawn", "task.noise.target_sample_m=0", "task.noise.target_bias_m=0")
 

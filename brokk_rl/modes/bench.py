@@ -11,7 +11,6 @@ from statistics import median
 from typing import Any, ClassVar
 
 import torch
-from rich.table import Table
 
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
@@ -286,7 +285,7 @@ def _print(rows: list[dict[str, Any]]) -> None:
             strict=True,
         )
     )
-    table = Table("environments", *(heads[name] for name in names), "CUDA graph")
+    cells = []
     for row in rows:
         texts = []
         for name in names:
@@ -295,7 +294,7 @@ def _print(rows: list[dict[str, Any]]) -> None:
                 if name in row.get(kind, {}):
                     shares.append(row[kind][name])
             texts.append(" ".join([f"{row[name]:,.0f}", *(f"({share:.2f})" for share in shares)]))
-        table.add_row(f"{row['num_envs']:,}", *texts, "yes" if row["graph"] else "no")
+        cells.append([f"{row['num_envs']:,}", *texts, "yes" if row["graph"] else "no"])
     notes = {
         "of_batch": "of mujoco.batch alone",
         "weak_scaling": "of one process times their number",
@@ -304,5 +303,6 @@ def _print(rows: list[dict[str, Any]]) -> None:
     for kind, text in notes.items():
         if kind in rows[0]:
             told.append(text)
-    table.caption = f"In brackets: rate {'; '.join(told)}." if told else None
-    print_table(table)
+    headings = ["environments", *(heads[name] for name in names), "CUDA graph"]
+    caption = f"In brackets: rate {'; '.join(told)}." if told else None
+    print_table(headings, cells, caption=caption)

@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
-from rich.table import Table
 
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
@@ -214,13 +213,13 @@ def _print_table(table: dict[str, dict[str, Any]]) -> None:
         ("peak force", lambda row: f"{row['peak_force_n']:.0f} N"),
         ("valve travel", lambda row: f"{row['valve_travel']:.2f} /s"),
     )
-    view = Table("policy", *(title for title, _ in columns))
+    rows = []
     for name, row in table.items():
         cells = []
         for _, write in columns:
             try:
                 cells.append(write(row))
             except (KeyError, TypeError):  # not recorded, or no episode with success
-                cells.append("-")
-        view.add_row(name, *cells)
-    print_table(view)
+                cells.append(None)
+        rows.append([name, *cells])
+    print_table(["policy", *(title for title, _ in columns)], rows)

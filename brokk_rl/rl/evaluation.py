@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from brokk_rl.contracts.task import REWARD, SUCCESS, Policy
-from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.rl.vec_env import ControlLoop, Starts
+from brokk_rl.statistics import compute_wilson_interval
 
 SHARES = (SUCCESS, "success_paper")
 """Figures of an episode that are 0 or 1: reported as a share with its interval."""

@@ -16,8 +16,6 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from rich.table import Table
-
 from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
 from brokk_rl.plot import BLUE, ORANGE, make_figure, remove_frame
@@ -178,13 +176,14 @@ def report_sweep(rows: Sequence[Mapping[str, Any]], folder: Path, facts: dict[st
         facts | {"window_episodes": WINDOW, "sizes": lines, "rows": list(rows)},
     )
     heads = [f"seconds to {level:.2f}" for level in LEVELS]
-    table = Table("environments", "epochs", "mini-batches", *heads, "training /s", "seeds")
+    cells = []
     for line in lines:
         times = [_describe_time(line, level) for level in LEVELS]
         sizes = [f"{line[name]:,}" for name in KEYS[:-1]]
-        table.add_row(*sizes, *times, f"{line['env_steps_per_s']:,}", str(line["seeds"]))
-    table.caption = f"Median over seeds; success over the newest {WINDOW:,} episodes of training."
-    print_table(table, num_keys=3)
+        cells.append([*sizes, *times, f"{line['env_steps_per_s']:,}", str(line["seeds"])])
+    headings = ["environments", "epochs", "mini-batches", *heads, "training /s", "seeds"]
+    caption = f"Median over seeds; success over the newest {WINDOW:,} episodes of training."
+    print_table(headings, cells, caption=caption)
     draw_sweep(lines, folder / "success_sweep.png")
 
 

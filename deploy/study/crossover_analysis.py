@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from brokk_rl.intervals import CONFIDENCE
+from brokk_rl.statistics import CONFIDENCE
 from deploy.study import permutation_tests
 
 Interval = tuple[float, float]

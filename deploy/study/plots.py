@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from brokk_rl.intervals import compute_student_interval
 from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, remove_frame
+from brokk_rl.statistics import compute_student_interval
 from deploy.study import tlx
 from deploy.study.analysis import Analysis, MeasuredTrial
 from deploy.study.crossover_analysis import GuidanceEffect

@@ -14,8 +14,8 @@ import numpy as np
 from scipy import optimize
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.spec import spec
+from brokk_rl.statistics import compute_wilson_interval
 from deploy.study import permutation_tests
 
 LARGE = 20_000

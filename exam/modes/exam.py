@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import numpy as np
 import yaml
-from rich.table import Table
 
 from actuators.excite.schedule import Approach
 from brokk_rl.console_table import print_table
@@ -445,7 +444,7 @@ class Exam:
 
 
 def _show(tables: dict[str, dict[str, Any]]) -> None:
-    shown = Table("", *tables)
+    rows = []
     for label, *cells in report.build_rows(tables):
-        shown.add_row(str(label), *map(report.format_cell, cells))
-    print_table(shown)
+        rows.append([str(label), *map(report.format_cell, cells)])
+    print_table(["", *tables], rows)

@@ -9,11 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from brokk_rl import record
-from brokk_rl.console_table import print_table
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.record import Recording
 from brokk_rl.report import Cell
@@ -181,9 +178,7 @@ def _diagnose(work: CaseRun) -> dict[str, Any]:
 def _print_table(results: dict[str, dict[str, Any]], folder: Path) -> None:
     """Print the columns of scores; the files have all columns and the notes."""
     shown = [k for k, name in enumerate(scorecard.COLUMNS) if name in PRINTED]
-    table = Table(box=None)
-    for k in shown:
-        table.add_column(scorecard.COLUMNS[k], overflow="fold")
+    rows = []
     for row in scorecard.build_rows(results):
         cells = []
         for k in shown:
@@ -191,6 +186,6 @@ def _print_table(results: dict[str, dict[str, Any]], folder: Path) -> None:
             if isinstance(cell, Cell) and not PRINTED[scorecard.COLUMNS[k]]:
                 cell = Cell(cell.value)
             cells.append(scorecard.format_cell(cell))
-        table.add_row(*cells)
-    print_table(table)
-    Console().print(f"report: {folder / scorecard.REPORT_FILE}", highlight=False)
+        rows.append(cells)
+    print_table([scorecard.COLUMNS[k] for k in shown], rows)
+    print_text(f"report: {folder / scorecard.REPORT_FILE}")

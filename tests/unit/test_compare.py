@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from brokk_rl.comparison import (
     describe_differences,
@@ -17,16 +18,14 @@ from brokk_rl.comparison import (
     find_runs,
     group_results,
     load_run,
+    summarise_methods,
 )
 from brokk_rl.errors import ConfigError
-from brokk_rl.intervals import compute_student_interval, compute_wilson_interval
-from brokk_rl.seed_statistics import (
-    Method,
-    choose_baseline,
-    compute_differences,
+from brokk_rl.modes.compare import build_seed_table, format_latex
+from brokk_rl.statistics import (
     compute_interquartile_mean,
-    format_latex,
-    summarise_methods,
+    compute_student_interval,
+    compute_wilson_interval,
 )
 
 
@@ -63,19 +62,32 @@ def sweep(tmp_path: Path) -> Path:
     return tmp_path / "sweep"
 
 
-def test_wilson_is_that_of_the_books() -> None:
-    # 8 of 10: centre (0.8 + 1.96²/20) / (1 + 1.96²/10) = 0.7167, half width 0.2266
-    assert compute_wilson_interval(8, 10) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert compute_wilson_interval(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+@pytest.mark.parametrize(("successes", "trials"), [(8, 10), (0, 10), (10, 10), (1010, 1024)])
+def test_wilson_is_that_of_the_books(successes: int, trials: int) -> None:
+    # (p + z²/2n ± z √(p (1 - p)/n + z²/4n²)) / (1 + z²/n)
+    z, rate = stats.norm.ppf(0.975), successes / trials
+    middle = rate + z**2 / (2 * trials)
+    half = z * np.sqrt(rate * (1 - rate) / trials + z**2 / (4 * trials**2))
+    expected = ((middle - half) / (1 + z**2 / trials), (middle + half) / (1 + z**2 / trials))
+    assert compute_wilson_interval(successes, trials) == pytest.approx(expected, abs=1e-12)
     assert compute_wilson_interval(0, 0) == (0.0, 1.0)
 
 
 def test_student_is_that_of_the_books() -> None:
     # two values 0.2 and 0.4: mean 0.3, standard error 0.1, t(0.975, 1) = 12.706
-    assert compute_student_interval([0.2, 0.4]) == pytest.approx(
-        (0.3 - 1.2706, 0.3 + 1.2706), abs=1e-4
-    )
+    expected = (0.3 - 1.2706, 0.3 + 1.2706)
+    assert compute_student_interval([0.2, 0.4]) == pytest.approx(expected, abs=1e-4)
+    assert compute_student_interval([0.9, 0.9]) == pytest.approx((0.9, 0.9))
     assert compute_student_interval([0.2]) is None
+
+
+def test_a_task_without_the_figures_of_an_insertion_has_its_own(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    write_run(folder, "ideal", 0, 0.5)
+    hover = {"episodes": 10, "success_strict": {"mean": 0.5}, "height_m": 0.2, "actuator": "ideal"}
+    (folder / "evaluation.json").write_text(json.dumps(hover))
+    (group,) = group_results(load_run(folder).list_results([]))
+    assert list(group)[4:] == ["success_strict", "height_m"]
 
 
 def test_runs_are_found_in_their_order_below_a_sweep(sweep: Path) -> None:
@@ -102,7 +114,7 @@ def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
     results = [
         result
         for folder in find_runs([str(sweep)])
-        for result in load_run(folder).results(["actuator"])
+        for result in load_run(folder).list_results(["actuator"])
     ]
     ideal, mlp = group_results(results)
     assert ideal["variation"] == {"actuator": "ideal"}
@@ -113,7 +125,7 @@ def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
 
 
 def test_a_single_run_has_the_interval_of_its_episodes(sweep: Path) -> None:
-    (single,) = group_results(load_run(sweep / "2_mlp").results([]))
+    (single,) = group_results(load_run(sweep / "2_mlp").list_results([]))
     assert single["success_strict"]["ci95"] == compute_wilson_interval(90, 100)
 
 
@@ -125,7 +137,7 @@ def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
         "time_to_insert_s": {"median": None},
     }
     write_run(tmp_path / "run", "mlp", 0, 0.9, policies={"trained": figures, "classical": figures})
-    rows = group_results(load_run(tmp_path / "run").results([]))
+    rows = group_results(load_run(tmp_path / "run").list_results([]))
     assert [row["policy"] for row in rows] == ["trained", "classical"]
     assert rows[0]["success_paper"] == {"mean": None, "ci95": None}
 
@@ -133,7 +145,7 @@ def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
 def test_a_broken_evaluation_is_named(sweep: Path) -> None:
     (sweep / "0_ideal" / "evaluation.json").write_text("{}")
     with pytest.raises(ConfigError, match=r"0_ideal.*episodes"):
-        load_run(sweep / "0_ideal").results([])
+        load_run(sweep / "0_ideal").list_results([])
     (sweep / "0_ideal" / "evaluation.json").write_text("{")
     with pytest.raises(ConfigError, match="cannot be read"):
         load_run(sweep / "0_ideal")
@@ -166,7 +178,7 @@ def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path)
     runs = [load_run(folder) for folder in find_runs([str(tmp_path / "*_there")])]
     columns = find_differences(runs)
     assert columns == ["actuator", "evaluated on"]
-    ideal, mlp = group_results([result for run in runs for result in run.results(columns)])
+    ideal, mlp = group_results([result for run in runs for result in run.list_results(columns)])
     assert (ideal["variation"], ideal["seeds"]) == (
         {"actuator": "ideal", "evaluated on": "hydraulic"},
         [0, 1],
@@ -208,10 +220,11 @@ def test_a_row_says_only_what_most_others_do_not_share() -> None:
         {"task.noise.a": 1, "rl.a": 3},
         {"task.noise.a": 4, "rl.a": 2},
     ]
-    assert describe_differences([{"variation": row} for row in rows]) == ["", "rl.a 3", "noise.a 4"]
-    assert describe_differences(
-        [{"variation": {"task.memory": 13}}, {"variation": {"task.memory": 1}}]
-    ) == ["memory 13", "memory 1"]
+    assert describe_differences(rows) == ["", "rl.a 3", "task.noise.a 4"]
+    assert describe_differences([{"task.memory": 13}, {"task.memory": 1}]) == [
+        "memory 13",
+        "memory 1",
+    ]
 
 
 def test_the_interquartile_mean_drops_the_outer_quarters() -> None:
@@ -246,28 +259,42 @@ def test_interquartile_means_are_those_of_rliable(
     assert bounds == pytest.approx(interval, abs=0.006)
 
 
+def results_of(actuator: str, scores: dict[str, dict[int, float]]) -> list[dict[str, Any]]:
+    results = []
+    for condition, rates in scores.items():
+        for seed, rate in rates.items():
+            variation = {"actuator": actuator, "evaluated on": condition}
+            success = {"mean": rate, "ci95": None}
+            about = {"policy": "trained", "seed": seed, "variation": variation}
+            results.append(about | {"success_strict": success})
+    return results
+
+
 def test_differences_are_those_of_the_same_seed_and_condition() -> None:
-    base = Method("trained", {"actuator": "lag"}, {"ideal": {0: 0.5, 1: 0.9}, "mlp": {0: 0.3}})
-    other = Method(
-        "trained", {"actuator": "mlp"}, {"ideal": {1: 1.0, 0: 0.7, 2: 0.0}, "mlp": {0: 0.7}}
-    )
-    assert compute_differences(other, base) == pytest.approx({0: 0.3, 1: 0.1})
-    summary = summarise_methods([base, other], base, np.random.default_rng(0))
-    assert summary[0]["difference"] is None
+    results = [
+        *results_of("lag", {"ideal": {0: 0.5, 1: 0.9}, "mlp": {0: 0.3}}),
+        *results_of("mlp", {"ideal": {1: 1.0, 0: 0.7, 2: 0.0}, "mlp": {0: 0.7}}),
+    ]
+    base, other = summarise_methods(results, None, np.random.default_rng(0))
+    assert base["difference"] is None
+    assert other["difference"]["by_seed"] == pytest.approx({0: 0.3, 1: 0.1})
+    assert other["conditions"] == ["ideal", "mlp"]
     # mean 0.2, standard error 0.1, t(0.975, 1) = 12.706
-    assert summary[1]["difference"]["ci95"] == pytest.approx((0.2 - 1.2706, 0.2 + 1.2706), abs=1e-4)
-    assert choose_baseline([base, other], {"actuator": "mlp"}) is other
+    assert other["difference"]["ci95"] == pytest.approx((0.2 - 1.2706, 0.2 + 1.2706), abs=1e-4)
+    chosen = summarise_methods(results, {"actuator": "mlp"}, np.random.default_rng(0))
+    assert [method["is_baseline"] for method in chosen] == [False, True]
     with pytest.raises(ConfigError, match=r"0 rows have them.*'actuator': 'lag'"):
-        choose_baseline([base, other], {"actuator": "lagg"})
+        summarise_methods(results, {"actuator": "lagg"}, np.random.default_rng(0))
 
 
 def test_the_latex_table_holds_names_that_tex_would_misread() -> None:
-    methods = [
-        Method("trained", {"actuator": name}, {"": {0: 0.5, 1: 0.7}})
-        for name in ("load_sensing", "50%")
-    ]
-    text = format_latex(summarise_methods(methods, methods[0], np.random.default_rng(0)))
+    results = []
+    for name in ("load_sensing", "50%"):
+        results += results_of(name, {"": {0: 0.5, 1: 0.7}})
+    methods = summarise_methods(results, None, np.random.default_rng(0))
+    text = format_latex(build_seed_table(methods))
     assert r"load\_sensing & 2 & 0.600" in text and r"50\% & 2" in text
+    assert "$+0.000$" in text
     assert text.startswith(r"\begin{tabular}") and r"\bottomrule" in text
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert {row.count("&") - row.count(r"\&") for row in rows} == {5}

@@ -1,49 +1,42 @@
-"""A table that is wider than the terminal is split; no cell is wrapped or lost."""
+"""One whole table: in a file as wide as it is, on a terminal wrapped between words."""
 
 from __future__ import annotations
 
-import io
-
 import pytest
-from rich.console import Console
-from rich.table import Table
+from rich.text import Text
 
-from brokk_rl.console_table import print_table, split_table
+from brokk_rl.console_table import print_table, print_text
 
-HEADINGS = ("policy", *(f"quantity {k}" for k in range(8)))
-
-
-def table() -> Table:
-    made = Table(*HEADINGS)
-    for name in ("trained", "classical"):
-        made.add_row(name, *(f"{name} {k}" for k in range(8)))
-    return made
+HEADINGS = ["policy", *(f"quantity {k}" for k in range(20))]
 
 
-def rendered(width: int) -> str:
-    out = io.StringIO()
-    console = Console(file=out, width=width)
-    for part in split_table(table(), 1, console):
-        console.print(part)
-    return out.getvalue()
-
-
-def test_a_wide_table_is_split_and_no_line_is_wider_than_the_terminal() -> None:
-    text = rendered(80)
-    assert max(map(len, text.splitlines())) <= 80
-    for k in range(8):
-        for words in (f"quantity {k}", f"trained {k}", f"classical {k}"):
-            assert text.count(words) == 1
-    assert text.count("policy") == 2, "each part repeats what a row is"
-
-
-def test_a_table_that_fits_stays_one() -> None:
-    assert len(split_table(table(), 1, Console(width=200))) == 1
-
-
-def test_a_pipe_has_120_columns(
+def test_a_file_gets_every_row_in_one_line(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.delenv("COLUMNS", raising=False)
-    print_table(table())
-    assert 80 < max(map(len, capsys.readouterr().out.splitlines())) <= 120
+    monkeypatch.setenv("COLUMNS", "80")
+    print_table(HEADINGS, [[name, *(f"{k}.5" for k in range(20))] for name in ("a[b]", "c")])
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["policy", "a[b]", "c"]
+    assert lines[1].split()[1:] == [f"{k}.5" for k in range(20)]
+
+
+def test_a_narrow_terminal_breaks_no_number(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes this for a terminal
+    rows = [["classical", *("0.12345" for _ in range(5))]]
+    print_table(HEADINGS[:6], rows)
+    shown = Text.from_ansi(capsys.readouterr().out).plain
+    assert shown.count("0.12345") == 5 and "classical" in shown
+    assert max(map(len, shown.splitlines())) <= 60
+
+
+def test_missing_values_are_dashes_and_text_is_no_markup(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    print_table([], [["a", None], ["b", 1.5]], title="[bold]")
+    print_text("position[foot] " * 20)
+    out = capsys.readouterr().out
+    assert "–" in out and "1.5" in out and "[bold]" in out
+    assert "position[foot] " * 20 in out

@@ -23,9 +23,9 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.contracts.task import Policy
-from brokk_rl.intervals import compute_wilson_interval
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
+from brokk_rl.statistics import compute_wilson_interval
 
 PLANTS = "mlp,hydraulic,load_sensing,post_compensated,open_center"
 EPISODES, SEED, LIMITS_S = 1024, 1024, (20.0, 40.0, 60.0)
