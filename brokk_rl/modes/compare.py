@@ -28,7 +28,16 @@ from brokk_rl.comparison import (
 )
 from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
-from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, draw_grid, make_figure, save_figure
+from brokk_rl.plot import (
+    BLUE,
+    GREY,
+    ORANGE,
+    OTHERS,
+    add_legend,
+    draw_grid,
+    make_figure,
+    save_figure,
+)
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 
@@ -195,7 +204,7 @@ def draw_comparison(groups: Sequence[Mapping[str, Any]], figures: Sequence[str])
         _draw_rows(success, [group[name] for group in groups], COLORS[index], heading, 0.2 * index)
     success.set_xlabel("success rate, 95 % interval")
     success.set_xlim(right=1.005)
-    success.legend(loc="lower left", frameon=False)
+    add_legend(figure, success)
     for axis, name in zip(axes[1:], others, strict=True):
         heading, factor = _name_figure(name)
         _draw_rows(axis, [group[name] for group in groups], GREY, None, factor=factor)
@@ -239,13 +248,13 @@ def _draw_rows(
         if figure["ci95"]:
             axis.plot(factor * np.array(figure["ci95"]), [row + shift] * 2, color=color)
     draw_grid(axis, "x")
+    axis.tick_params(axis="y", length=0)
 
 
 def _name_rows(axis: Axes, labels: Sequence[str]) -> None:
     """Write labels beside rows, the first row at the top."""
     axis.set_yticks(range(len(labels)), [fill(label, LABEL_WIDTH) for label in labels])
     axis.set_ylim(len(labels) - 0.4, -0.6)
-    axis.tick_params(axis="y", length=0)
 
 
 def _write_learning(runs: Sequence[EvaluatedRun], columns: Sequence[str], folder: Path) -> None:
