@@ -7,7 +7,7 @@ import torch
 
 from actuators.effects.ranges import CHANCE
 from actuators.models import random_draws
-from brokk_rl.gravity import JointWeight, build_joint_weight
+from actuators.models.joint_weight import JointWeight, build_joint_weight
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine

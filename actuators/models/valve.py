@@ -21,10 +21,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from actuators.models.joint_weight import build_joint_weight
 from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
 from actuators.models.transport import select_commands_in_force, split_run_commands
 from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import build_joint_weight
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec

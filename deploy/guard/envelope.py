@@ -17,6 +17,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from brokk_rl.kinematics import LinkChain
 from brokk_rl.machine import Machine
 from deploy.guard.limits import EnvelopeLimits, Numbers
 from deploy.guard.shapes import BASE, MachineShapes, RoundedBox
@@ -40,10 +41,7 @@ class Envelope:
     """
 
     def __init__(self, limits: EnvelopeLimits, machine: Machine, shapes: MachineShapes) -> None:
-        self._limits, bodies = limits, machine.bodies
-        self._origins_m = np.array([[one.value for one in body.origin_m] for body in bodies])
-        self._axes = np.array([body.axis for body in bodies])
-        self._is_hinge = [joint.kind == "hinge" for joint in machine.joints]
+        self._limits, self._chain = limits, LinkChain(machine.joints)
         self._tip_m, self._max_speed = machine.tip_m, machine.max_speed
         self._lower, self._upper = machine.lower, machine.upper
         boxes = [*shapes.body, *_build_obstacles(limits)]
@@ -141,18 +139,10 @@ class Envelope:
 
     def _place_links(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return rotations and origins of base and links, `(B, 1 + J, 3, 3)` and `(B, 1 + J, 3)`."""
-        rotations = [np.broadcast_to(np.eye(3), (len(q), 3, 3))]
-        places_m = [np.zeros((len(q), 3))]
-        for j, axis in enumerate(self._axes):
-            rotation = rotations[-1]
-            at_m = places_m[-1] + rotation @ self._origins_m[j]
-            if self._is_hinge[j]:
-                rotation = rotation @ _rotate_about(axis, q[:, j])
-            else:
-                at_m = at_m + (rotation @ axis) * q[:, j, None]
-            rotations.append(rotation)
-            places_m.append(at_m)
-        return np.stack(rotations, 1), np.stack(places_m, 1)
+        links = self._chain.place(q)
+        base = np.broadcast_to(np.eye(3), (len(q), 1, 3, 3))
+        rotation = np.concatenate((base, links.rotation), 1)
+        return rotation, np.concatenate((np.zeros((len(q), 1, 3)), links.place_m), 1)
 
     def _integrate_sent(self, now_s: float) -> np.ndarray:
         """Return the time integral of the commands that are still under way, `(J,)`, in s."""
@@ -234,11 +224,3 @@ def _build_obstacles(limits: EnvelopeLimits) -> Sequence[RoundedBox]:
         low, high = np.array(lower), np.array(upper)
         boxes.append(RoundedBox(BASE, (low + high) / 2, np.eye(3), (high - low) / 2, 0.0))
     return boxes
-
-
-def _rotate_about(axis: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-    """Return rotations about a unit axis, `(B, 3, 3)`, by Rodrigues' formula."""
-    x, y, z = axis
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angle = angle_rad[:, None, None]
-    return np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * (cross @ cross)

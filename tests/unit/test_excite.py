@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from composed import option
 
-from actuators.excite.poses import compute_load, draw_start_poses
+from actuators.excite.poses import draw_start_poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
@@ -36,22 +35,14 @@ def by_joints_only(machine: Machine) -> Machine:
     )
 
 
-def test_the_weight_is_that_of_the_plant(machine: Machine) -> None:
-    q = np.random.default_rng(0).uniform(machine.lower, machine.upper, (50, 5))
-    expected = (
-        Gravity(machine, torch.device("cpu")).load(torch.as_tensor(q, dtype=torch.float32)).numpy()
-    )
-    np.testing.assert_allclose(compute_load(machine, q), expected, rtol=1e-3, atol=0.5)
-
-
 def test_start_poses_load_each_joint_from_both_sides_where_gravity_can(machine: Machine) -> None:
     generator = np.random.default_rng(0)
     anywhere = np.sign(
-        np.round(compute_load(machine, generator.uniform(machine.lower, machine.upper, (500, 5))))
+        np.round(Gravity(machine).load(generator.uniform(machine.lower, machine.upper, (500, 5))))
     )
     chosen = draw_start_poses(machine, 0.06, generator)
     for _ in range(5):
-        four = np.sign(np.round(compute_load(machine, np.stack([next(chosen) for _ in range(4)]))))
+        four = np.sign(np.round(Gravity(machine).load(np.stack([next(chosen) for _ in range(4)]))))
         for joint in range(5):
             assert set(np.unique(anywhere[:, joint])) == set(np.unique(four[:, joint])), (
                 "four poses show every sign there is"

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.sim.model import compile_model
@@ -49,7 +50,9 @@ def _mujoco_chain(machine: Machine) -> mujoco.MjModel:
     spec = mujoco.MjSpec()
     body = spec.worldbody
     for joint, link in zip(machine.joints, machine.bodies, strict=True):
-        body = body.add_body(pos=[d.value for d in link.origin_m], mass=1.0, inertia=(1, 1, 1))
+        body = body.add_body(pos=[d.value for d in link.origin_m])
+        body.mass, body.ipos, body.inertia = link.mass_kg.value, link.com_m, (1.0, 1.0, 1.0)
+        body.explicitinertial = True
         kind = mujoco.mjtJoint.mjJNT_HINGE if joint.kind == "hinge" else mujoco.mjtJoint.mjJNT_SLIDE
         body.add_joint(type=kind, axis=link.axis)
     body.add_site(name="tip", pos=machine.tip_m)
@@ -147,3 +150,16 @@ def test_leading_dimensions_are_kept(machine):
     )
     assert jacobian.tip.shape == (2, 3, 3, 5) and jacobian.pitch.shape == (2, 3, 5)
     torch.testing.assert_close(pose.tip_in_base_m[1, 2], kinematics.pose(q[5]).tip_in_base_m)
+
+
+def test_the_weight_on_each_joint_is_mujocos_in_both_libraries(machine):
+    model = _mujoco_chain(machine)
+    data = mujoco.MjData(model)
+    q = _random_positions(machine, 20).double().numpy()
+    load = Gravity(machine).load(q)
+    for i, row in enumerate(q):
+        data.qpos[:] = row
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(load[i], -data.qfrc_bias, rtol=1e-6, atol=1e-3)
+    tensors = Gravity(machine, torch.device("cpu")).load(torch.tensor(q).float())
+    np.testing.assert_allclose(tensors, load, rtol=1e-4, atol=0.1)

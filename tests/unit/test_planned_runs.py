@@ -12,8 +12,9 @@ import torch
 from composed import option
 
 from actuators.effects.effect import EffectSpec
+from actuators.models.joint_weight import build_joint_weight
 from actuators.open_loop import FreeRunWindows, count_samples_before
-from brokk_rl.gravity import Gravity, build_joint_weight
+from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from diagnosis.effect_library import EffectSimulator, load_effects
