@@ -1,6 +1,6 @@
 """Baselines that a learned actuator must beat: a machine that stands still, and a linear model."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +84,7 @@ class Arx:
         expected = (machine.num_joints, 3 * machine.num_history - 1)
         if "weight" not in tensors or tuple(tensors["weight"].shape) != expected:
             raise CheckpointError(f"{path}: expected a tensor 'weight' of shape {expected}")
-        return ArxModel(tensors["weight"].to(device), build_arx_features, machine, device)
+        return ArxModel(tensors["weight"].to(device), machine, device)
 
 
 def build_arx_features(u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
@@ -97,19 +97,12 @@ class ArxModel:
 
     Args:
         weight: `(J, F)`.
-        build_features: Features of histories `u` and `q` `(N, H, J)`, `(N, F, J)`.
         machine: The machine.
         device: Where the tensors live.
     """
 
-    def __init__(
-        self,
-        weight: torch.Tensor,
-        build_features: Callable[[torch.Tensor, torch.Tensor], torch.Tensor],
-        machine: Machine,
-        device: torch.device,
-    ) -> None:
-        self._weight, self._build_features = weight, build_features
+    def __init__(self, weight: torch.Tensor, machine: Machine, device: torch.device) -> None:
+        self._weight = weight
         self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
         self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
 
@@ -123,7 +116,7 @@ class ArxModel:
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        inputs = self._build_features(history.u, history.q)
+        inputs = build_arx_features(history.u, history.q)
         moved = torch.einsum("nij,ji->nj", inputs, self._weight)
         return (history.q[:, -1] + moved).clamp(self._lower, self._upper)
 

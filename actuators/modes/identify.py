@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
 import torch
 from rich.console import Console
@@ -41,19 +40,6 @@ TONES = {"good": "green", "bad": "red", "warn": "yellow", "plain": "default"}
 Runs = Mapping[str, Sequence[Recording]]
 
 
-@runtime_checkable
-class OptionalFit(Protocol):
-    """A fit that needs a package which the installation may lack."""
-
-    def require(self) -> None:
-        """Check that the package is there.
-
-        Raises:
-            ConfigError: it is not; says how to install it.
-        """
-        ...
-
-
 @spec
 class Identify:
     """Fits an actuator model to recordings; compares free runs with baselines and rivals.
@@ -62,8 +48,8 @@ class Identify:
         session: Folder, seed, device.
         machine: The machine that was recorded.
         fit: The model that is kept.
-        baselines: Models to compare with, by name: `hold`, `arx`, `hinge_arx`, `boosting`, and any
-            more (`+fit@baselines.<name>=<fit>`).
+        baselines: Models to compare with, by name: `hold`, `arx`, and any more
+            (`+fit@baselines.<name>=<fit>`).
         identify: Recordings to fit to and to judge by.
         resume: Run folder of an interrupted identification to go on with; the same as
             `session.out`.
@@ -107,10 +93,7 @@ class Identify:
             if h <= open_loop.find_longest_horizon_s(judged, self.machine) + 1e-9:
                 horizons_s.append(h)
         cuts = [self._cut(stage, horizons_s) for stage in stages]
-        left_out = self._find_unavailable()
         models = {self.fit.name: self.fit, **self.baselines}
-        for name in left_out:
-            models.pop(name)
         done: list[dict[str, FittedModel]] = []
         device = self.session.torch_device()
         with _limit_threads(self.identify.threads):
@@ -129,30 +112,11 @@ class Identify:
             identified, self.session.generator("resample"), self.session.generator("delay")
         )
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
-        result["left_out"] = left_out
         folder = self.session.folder
         write_json(folder / "identification.json", result)
         page.write_page(folder, result, findings, drawings, self.machine)
         _print_results(result, findings, folder)
         return result["overall"][self.fit.name][f"{horizons_s[-1]:g}"]["percent"]
-
-    def _find_unavailable(self) -> dict[str, str]:
-        """Return the baselines whose package is not installed, with the reason.
-
-        Raises:
-            ConfigError: that of the fit itself is not.
-        """
-        if isinstance(self.fit, OptionalFit):
-            self.fit.require()
-        found = {}
-        for name, fit in self.baselines.items():
-            try:
-                if isinstance(fit, OptionalFit):
-                    fit.require()
-            except ConfigError as error:
-                log.warning("baseline %s is left out: %s", name, error)
-                found[name] = str(error)
-        return found
 
     def _check_resume(self) -> None:
         if self.resume is None:

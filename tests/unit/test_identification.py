@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -145,19 +143,6 @@ def test_each_run_is_judged_once_by_a_model_that_has_not_seen_it(
         < 0.1
         < result["joints"]["q1"]["hold"]["10"]["percent"]
     )
-
-
-@pytest.mark.usefixtures("undrawn")
-def test_a_baseline_without_its_package_is_left_out_and_named(
-    machine: Machine, recordings: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    mode = identify(machine, tmp_path / "out", recordings, Fit())
-    names = ("hinge_arx", "boosting")
-    more = {name: option("fit", name) for name in names}
-    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    result = run(dataclasses.replace(mode, baselines={**mode.baselines, **more}))  # pyright: ignore
-    assert set(result["overall"]) == {"plant", "hold", "arx", "hinge_arx"}
-    assert "scikit-learn" in result["left_out"]["boosting"]
 
 
 @pytest.mark.usefixtures("undrawn")

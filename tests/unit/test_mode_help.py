@@ -13,7 +13,7 @@ from brokk_rl import registry
 def test_a_mode_has_a_help_of_its_own(brokk: Callable[..., Any]) -> None:
     done = brokk("mode=identify", "fit=lag", "--help")
     assert done.code == 0
-    assert "fit=lag" in done.out and "hinge_arx" in done.out
+    assert "fit=lag" in done.out and "arx" in done.out
     assert "identify.recordings=???" in done.out
     text = " ".join(done.out.split())
     assert "identify.folds=null Cross-validation: each run is judged once" in text
