@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,7 +12,6 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from actuators.open_loop import WARM_UP_S
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
@@ -21,18 +19,12 @@ from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
-from diagnosis import answer, baseline, drive_networks, effect_library, simulator_changes
+from diagnosis import answer, baseline, effect_library, simulator_changes
 from diagnosis.answer import Answer
 
-log = logging.getLogger(__name__)
-
 MJCF_FILE, SYSID_FILE = "changed.xml", "sysid_parameters.py"
-RANGES_FILE, TABLE_FILE, NETWORKS = "randomisation.yaml", "randomisation.json", "networks"
+RANGES_FILE, TABLE_FILE = "randomisation.yaml", "randomisation.json"
 CHANGES_FILE = "changes.json"
-NUM_TARGET_RUNS, TARGET_RUN_S = 3, 20.0
-"""Drawn motions that a network is fitted to beside the recorded ones. Chosen by hand."""
-MAX_NETWORK_SHARE = 0.3
-"""Error of a network over that of the unchanged file from which a warning says so. Chosen by hand."""
 
 
 @spec
@@ -43,13 +35,11 @@ class ChangeRequest:
         diagnosis: Run folder of `mode=diagnose`.
         recordings: Glob or globs of recordings that the changed file is replayed on.
         why: `why.json`, with the success that each effect costs.
-        networks: Fit networks of the drives.
     """
 
     diagnosis: str
     recordings: str | tuple[str, ...] | None
     why: str | None
-    networks: bool
 
 
 @spec
@@ -82,7 +72,7 @@ class ChangeSimulator:
             StorageError: A file could not be written.
         """
         self.session.seed_all()
-        torch.set_num_threads(1)  # small networks: threads would only wait for each other
+        torch.set_num_threads(1)  # small tensors: threads would only wait for each other
         folder = self.session.folder
         given = answer.read_answer(Path(self.changes.diagnosis) / answer.ANSWER_FILE)
         if not given.selected:
@@ -99,7 +89,7 @@ class ChangeSimulator:
         ranges = simulator_changes.list_ranges(given, kinds, costs)
         simulator_changes.write_randomisation(given, kinds, ranges, folder / RANGES_FILE)
         write_json(folder / TABLE_FILE, [asdict(one) for one in ranges])
-        told: dict[str, Any] = {"changes": [], "not_in_the_file": {}, "replay": {}, "networks": []}
+        told: dict[str, Any] = {"changes": [], "not_in_the_file": {}, "replay": {}}
         if own.path is not None:
             told = self._change_file(own, given, recordings)
         write_json(folder / CHANGES_FILE, told)
@@ -113,7 +103,7 @@ class ChangeSimulator:
     def _change_file(
         self, own: Any, given: Answer, recordings: Sequence[Recording]
     ) -> dict[str, Any]:
-        """Write the changed MJCF, the priors and the networks; return what was done."""
+        """Write the changed MJCF and the priors; return what was done."""
         from diagnosis import mjcf_changes  # MuJoCo is not in every installation
 
         folder = self.session.folder
@@ -140,15 +130,12 @@ class ChangeSimulator:
             "changes": [asdict(one) for one in changes],
             "not_in_the_file": left,
             "replay": {},
-            "networks": [],
         }
         if recordings:
             told["replay"] = {
                 "before": self._replay(own, recordings),
                 "after": self._replay(replace(own, source=str(changed)), recordings),
             }
-        if self.changes.networks and self.machine.interface == "position":
-            told["networks"] = self._fit_networks(own.path, changed, given, recordings)
         return told
 
     def _replay(self, simulator: Actuator, recordings: Sequence[Recording]) -> dict[str, float]:
@@ -158,92 +145,6 @@ class ChangeSimulator:
         error = runs.cut.measured - runs.plain_runs
         rmse = np.sqrt(np.square(error).mean((0, 1)))
         return dict(zip(self.machine.joint_names, rmse.tolist(), strict=True))
-
-    def _fit_networks(
-        self, source: Path, changed: Path, given: Answer, recordings: Sequence[Recording]
-    ) -> list[dict[str, Any]]:
-        """Write the networks of all drives; return their contracts, with their errors in a roll-out."""
-        from brokk_rl.sim import drive_torques
-
-        machine, seed = self.machine, self.session.stream("networks")
-        generator = np.random.default_rng(seed)
-        targets = [draw_targets(machine, generator) for _ in range(NUM_TARGET_RUNS)]
-        middle = 0.5 * (machine.upper + machine.lower)
-        half = 0.5 * (machine.upper - machine.lower)
-        targets = [middle + half * one.u.astype(float) for one in recordings[:-1]] + targets
-        withheld = targets[-1]
-        if recordings:
-            withheld = middle + half * recordings[-1].u.astype(float)
-        samples = drive_torques.sample_drives(changed, machine, targets, seed)
-        delay_s = find_longest_delay_s(given)
-        history = drive_networks.choose_history(delay_s, samples.step_s)
-        drives = []
-        for place, name in enumerate(machine.joint_names):
-            drives.append(
-                drive_networks.fit_network(
-                    name,
-                    samples.error[:, place],
-                    samples.speed[:, place],
-                    samples.torque[:, place],
-                    samples.start,
-                    samples.step_s,
-                    history,
-                    seed,
-                )
-            )
-        for network, contract in drives:
-            drive_networks.write_network(network, contract, self.session.folder / NETWORKS)
-        begin = recordings[-1].q[0].astype(float) if recordings else withheld[0]
-        with_networks = drive_torques.roll_out_torques(
-            changed, machine, withheld, begin, drive_networks.DriveStack(drives)
-        )
-        expected = drive_torques.roll_out_targets(changed, machine, withheld, begin)
-        unchanged = drive_torques.roll_out_targets(source, machine, withheld, begin)
-        found = []
-        warm = round(WARM_UP_S / machine.period_s)  # histories are filled by then
-        for place, (_, contract) in enumerate(drives):
-            pairs = {"network": with_networks, "unchanged_file": unchanged}
-            errors = {}
-            for name, path in pairs.items():
-                error = path[warm:, place] - expected[warm:, place]
-                errors[name] = float(np.sqrt(np.square(error).mean()))
-            found.append(asdict(contract) | {"rmse_to_changed_file": errors})
-            if errors["network"] > MAX_NETWORK_SHARE * errors["unchanged_file"]:
-                log.warning(
-                    "the network of %s errs nearly as much as the file without the findings; "
-                    "a smaller time step of the file, or an armature, makes an explicit torque stable",
-                    contract.joint,
-                )
-        return found
-
-
-def find_longest_delay_s(given: Answer) -> float:
-    """Return the longest time that a network has to look back, s: dead times and three time constants."""
-    longest_s = 0.0
-    for one in given.selected:
-        for name, scale in (("dead_time_s", 1.0), ("time_constant_s", 3.0)):
-            values = one.parameters.get(name, {}).values()
-            longest_s = max([longest_s, *(scale * value.mean for value in values)])
-    return longest_s
-
-
-def draw_targets(machine: Machine, generator: np.random.Generator) -> np.ndarray:
-    """Return targets that step and ramp over three fifths of the travel, `(T, J)`, rad or m."""
-    count = round(TARGET_RUN_S / machine.period_s)
-    found = np.empty((count, machine.num_joints))
-    middle, travel = 0.5 * (machine.lower + machine.upper), machine.upper - machine.lower
-    for j in range(machine.num_joints):
-        at, k = middle[j], 0
-        while k < count:
-            goal = middle[j] + 0.3 * travel[j] * generator.uniform(-1.0, 1.0)
-            way = machine.max_speed[j] * machine.period_s * generator.uniform(0.1, 2.0)
-            held = int(generator.uniform(0.3, 1.5) / machine.period_s)
-            end = min(count, k + max(1, held))
-            for row in range(k, end):
-                at += float(np.clip(goal - at, -way, way))
-                found[row, j] = at
-            k = end
-    return found
 
 
 def _print(
@@ -266,13 +167,6 @@ def _print(
     for joint, before in told["replay"].get("before", {}).items():
         after = told["replay"]["after"][joint]
         console.print(f"{joint}: error {before:.4g}, with the changes {after:.4g}", highlight=False)
-    for one in told["networks"]:
-        errors = one["rmse_to_changed_file"]
-        console.print(
-            f"network of {one['joint']}: {errors['network']:.4g} off {MJCF_FILE}, "
-            f"the file as it was {errors['unchanged_file']:.4g}",
-            highlight=False,
-        )
     for name in dict.fromkeys(one.effect for one in ranges):
         first = next(one for one in ranges if one.effect == name)
         console.print(f"{name}: {simulator_changes.describe_cost(first)}", highlight=False)

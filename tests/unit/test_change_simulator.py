@@ -1,4 +1,4 @@
-"""Findings of a diagnosis as changes of an MJCF file, priors, networks and ranges."""
+"""Findings of a diagnosis as changes of an MJCF file, priors and ranges."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
-import torch
 import yaml
 from arm import ARM, NOISE_RAD, make_machine, record_arm, rub
 
@@ -70,7 +69,7 @@ def name_effects() -> Answer:
     )
 
 
-def change_arm(folder: Path, networks: bool) -> dict[str, Any]:
+def change_arm(folder: Path) -> dict[str, Any]:
     """Returns `changes.json` of the arm with delay and friction, replayed on two recordings."""
     machine = make_machine("shoulder", "elbow")
     for seed in range(2):
@@ -98,14 +97,13 @@ def change_arm(folder: Path, networks: bool) -> dict[str, Any]:
             diagnosis=str(folder),
             recordings=str(folder / "*.parquet"),
             why=str(folder / "why.json"),
-            networks=networks,
         ),
     ).run()
     return json.loads((folder / "out" / "changes.json").read_text())
 
 
 def test_the_changed_file_is_the_faulty_machine(tmp_path: Path) -> None:
-    told = change_arm(tmp_path, networks=False)
+    told = change_arm(tmp_path)
     text = (tmp_path / "out" / "changed.xml").read_text()
     assert "<!-- joint_friction: frictionloss 0 to 0.5 [" in text
     assert "Not in this file: backlash: MJCF has no play on a target" in text
@@ -166,7 +164,7 @@ def test_priors_write_themselves_into_a_spec(
     sysid = pytest.importorskip("mujoco.sysid")
     if not hasattr(sysid, "Parameter"):
         pytest.skip("needs mujoco[sysid]")
-    change_arm(tmp_path, networks=False)
+    change_arm(tmp_path)
     found = importlib.util.spec_from_file_location(
         "sysid_parameters", tmp_path / "out" / "sysid_parameters.py"
     )
@@ -184,33 +182,6 @@ def test_priors_write_themselves_into_a_spec(
     assert model.actuator_delay.tolist() == pytest.approx(changed.actuator_delay.tolist())
     lower, upper = parameters.get_bounds()
     assert (np.asarray(lower) < np.asarray(upper)).all()
-
-
-@pytest.mark.slow
-# mjlab and Isaac Lab load TorchScript, which torch deprecates.
-@pytest.mark.filterwarnings("ignore:.torch.jit.load. is deprecated:FutureWarning")
-def test_networks_drive_the_file_as_its_drives_do(tmp_path: Path) -> None:
-    told = change_arm(tmp_path, networks=True)
-    for one in told["networks"]:
-        errors = one["rmse_to_changed_file"]
-        assert errors["network"] < 0.05 * errors["unchanged_file"]
-    folder = tmp_path / "out" / "networks"
-    contract = json.loads((folder / "elbow.json").read_text())
-    files: dict[str, Any] = {"contract.json": ""}
-    network = torch.jit.load(str(folder / "elbow.pt"), _extra_files=files)
-    assert json.loads(files["contract.json"]) == contract
-    # A target 0.01 rad ahead for as long as the history reaches: kp 30 Nm/rad holds it.
-    length = contract["history_length"]
-    row = np.concatenate([np.full(length, 0.01 * contract["pos_scale"]), np.zeros(length)])
-    given = torch.as_tensor(row, dtype=torch.float32)[None]
-    torque_nm = network(given).item() * contract["torque_scale"]
-    assert torque_nm == pytest.approx(0.3, abs=0.05)
-    onnxruntime = pytest.importorskip("onnxruntime")
-    session = onnxruntime.InferenceSession(str(folder / "elbow.onnx"))
-    (answer,) = session.run(None, {"input": given.numpy()})
-    assert float(answer[0, 0]) == pytest.approx(network(given).item(), abs=1e-5)
-    properties = session.get_modelmeta().custom_metadata_map
-    assert json.loads(properties["metadata"]) == contract
 
 
 def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
@@ -231,7 +202,7 @@ def test_nothing_found_changes_nothing(tmp_path: Path) -> None:
         machine=make_machine("shoulder", "elbow"),
         simulator=str(tmp_path / "arm.xml"),
         own=api._load_option("actuator", "own"),
-        changes=ChangeRequest(diagnosis=str(tmp_path), recordings=None, why=None, networks=False),
+        changes=ChangeRequest(diagnosis=str(tmp_path), recordings=None, why=None),
     )
     with pytest.raises(ConfigError, match="its verdict is 'none', so there is nothing to change"):
         mode.run()
