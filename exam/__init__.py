@@ -4,7 +4,6 @@ case_distribution  kinds, effects, joints, sizes of cases; the protocol of a pla
 generate           plans and recordings of reference and field
 dataset            cases on disk, labels, seal
 held_out           a make of plants for sealed exams only
-registration       engine and labels are committed before anyone sits; the ledger
 run_cases          one process a case
 examiner           the repair of an answer, simulated on withheld recordings
 score              one answer against one label
@@ -12,6 +11,6 @@ answer_scoring     all answers of some candidates
 metrics            rates with intervals, calibration, confusion
 report             table, figures
 oracle             share of the gap that the true effects close
-baselines, residual_forest   candidates to compare with
+constant_answer    a candidate to compare with
 calibration        penalties and probabilities from development exams
 """

@@ -16,7 +16,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json, write_text
 from diagnosis import answer
-from exam import dataset, registration, run_cases, score
+from exam import dataset, run_cases, score
 from exam.dataset import end_on_interrupt
 from exam.examiner import examine_case
 from exam.metrics import compute_metrics
@@ -27,7 +27,7 @@ BULK = ("weighed", "curves", "location", "evidence", "probes")
 """Parts of an answer that fill pictures and calibration, nine in ten of its bytes, and no score."""
 
 RUN_FILE = "run.json"
-"""File beside answers: the engine, and whether it was registered."""
+"""File beside answers: who gave them, at which commit, to which labels."""
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class AnswerScoring:
         return found
 
     def build_table(self, folder: Path, examined: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the figures of the answers in `folder`, their engines, and warnings about them.
+        """Return the figures of the answers in `folder`, and the commit that gave them.
 
         Args:
             folder: The answers.
@@ -111,7 +111,6 @@ class AnswerScoring:
             log.warning(
                 "%s: %d of %d cases sat; the others are left out", folder, len(begun), len(labels)
             )
-        engines = set()
         for label in begun:
             place = folder / label["case"]
             said = (
@@ -119,7 +118,6 @@ class AnswerScoring:
                 if (place / answer.ANSWER_FILE).is_file()
                 else None
             )
-            engines.add(run_cases.read_note(place).get("engine"))
             marks.append(
                 score.score_answer(
                     label,
@@ -135,15 +133,11 @@ class AnswerScoring:
             raise RecordingError(
                 f"exam.answers: {folder} holds no answer to any case of {self.exam}"
             )
-        known = sorted(filter(None, engines))
-        warnings = registration.list_warnings(folder / RUN_FILE, known)
-        for text in warnings:
-            log.warning("%s: %s", folder, text)
         table = compute_metrics(marks, len(labels) - len(begun))
-        return {**table, "engines": known, "warnings": warnings}
+        return {**table, "commit": _read_commit(folder)}
 
     def publish(self, folder: Path, path: Path) -> None:
-        """Write all answers in `folder` into one file, a line a case, with time and engine."""
+        """Write all answers in `folder` into one file, a line a case, with its time."""
         lines = []
         for label in self.labels:
             place = folder / label["case"]
@@ -157,3 +151,11 @@ class AnswerScoring:
             note = run_cases.read_note(place)
             lines.append(json.dumps({"case": label["case"], "note": note, "answer": said}) + "\n")
         write_text(path, "".join(lines))
+
+
+def _read_commit(folder: Path) -> str | None:
+    """Return the commit that `exam.do=run` noted beside answers; `None` where nothing is noted."""
+    try:
+        return json.loads((folder / RUN_FILE).read_text())["commit"]
+    except (OSError, ValueError, KeyError):
+        return None

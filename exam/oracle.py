@@ -1,7 +1,6 @@
 """The oracle: it knows the effects and joints of a case, fits only their sizes, and closes the gap.
 
-Its share of the gap is an upper bound for candidates. `CaseEvidence` holds the inputs of the
-diagnosis for one case; textbook baselines use it too.
+Its share of the gap is an upper bound for candidates.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from brokk_rl.machine import Machine
 from diagnosis import baseline, case, effect_library
 from diagnosis.baseline import Baseline
 from diagnosis.gap import GapClosure
-from diagnosis.refine import drop_windows, fit_set
+from diagnosis.refine import fit_set
 from diagnosis.residuals import ParameterRay, Residuals, build_rays
 from diagnosis.responses import Response, fit_sizes
 
@@ -36,12 +35,10 @@ class JointErrors:
         z: Errors over their noise, `(E,)`.
         shapes: Response to each effect, one shape a ray; effects without a response
             to the joint are absent.
-        fold: Half of the recordings of each entry.
     """
 
     z: np.ndarray
     shapes: dict[str, list[Response]]
-    fold: np.ndarray
 
     def rays(self, names: frozenset[str]) -> list[Response]:
         """Return the shapes of several effects, in the order of their names."""
@@ -59,36 +56,23 @@ class CaseEvidence:
         base: The simulator, against field and reference.
         rays: Ways in which each effect grows.
         errors: Of each joint.
-        repeats: The same of repeats: parts of the reference against simulators that were fitted to
-            the rest of it. Nothing changed there.
     """
 
     base: Baseline
     rays: dict[str, Sequence[ParameterRay]]
     errors: list[JointErrors]
-    repeats: list[list[JointErrors]]
-
-
-REPEAT_WINDOWS = 3
-"""One of so many stretches of the reference is a repeat: as long as the field, which is a third of
-it."""
 
 
 def load_case_evidence(
-    folder: Path,
-    fit: ActuatorFit,
-    machine: Machine,
-    names: Sequence[str] | None = None,
-    with_repeats: bool = False,
+    folder: Path, fit: ActuatorFit, machine: Machine, names: Sequence[str]
 ) -> CaseEvidence:
-    """Return the residuals of a case, for the effects `names`, or for all that a free run can show.
+    """Return the residuals of a case, for the effects `names` that a free run can show.
 
     Args:
         folder: The case.
         fit: How the simulator is made from the reference.
         machine: The machine.
-        names: The effects; `None`: all.
-        with_repeats: Whether the repeats are simulated too.
+        names: The effects.
 
     Raises:
         RecordingError: the simulator cannot be fitted.
@@ -98,13 +82,10 @@ def load_case_evidence(
             case.load_case(folder, machine), fit, Path(scratch), 0, torch.device("cpu")
         )
     grown: dict[str, Sequence[ParameterRay]] = {}
-    for kind in effect_library.load_effects(machine, None if names is None else tuple(names)):
+    for kind in effect_library.load_effects(machine, tuple(names)):
         if not kind.target.stochastic and kind.target.side != "kinematics":
             grown[kind.name] = build_rays(kind)
-    repeats = []
-    for one in base.left_out if with_repeats else ():
-        repeats.append(collect_errors(drop_windows(one.residuals, REPEAT_WINDOWS), grown))
-    return CaseEvidence(base, grown, collect_errors(base.field.residuals, grown), repeats)
+    return CaseEvidence(base, grown, collect_errors(base.field.residuals, grown))
 
 
 def collect_errors(
@@ -123,7 +104,7 @@ def collect_errors(
                 mine[name] = own
     errors = []
     for z, mine in zip(residuals.z, shapes, strict=True):
-        errors.append(JointErrors(z, mine, residuals.fold))
+        errors.append(JointErrors(z, mine))
     return errors
 
 

@@ -1,4 +1,4 @@
-"""The report of an exam: table of all candidates, confusion, reliability, detection; the ledger."""
+"""The report of an exam: table of all candidates, confusion, reliability, detection."""
 
 from __future__ import annotations
 
@@ -13,12 +13,6 @@ from brokk_rl.plot import BLUE, GREY, ORANGE, add_legend, make_figure
 from brokk_rl.report import DPI, MISSING, Cell, Report
 from brokk_rl.session import write_text
 
-HEADLINES = (
-    "top1", "top1_strictly", "macro_f1", "joints", "exact_set", "set_f1", "false_alarms",
-    "unknown_recall", "unknown_auroc", "ece", "parameter_error", "cover_90", "closed_of_oracle",
-    "closed_examined", "closed_differs", "closed_missing", "predicted_off",
-)  # fmt: skip
-"""Metrics of a line of the ledger."""
 REPORT_FILE = "exam.html"
 TABLE_FILE = "exam.md"
 ROWS = {
@@ -54,22 +48,6 @@ CAPTIONS = {
     "size": "One effect: share of right names and of the verdict none, over its size (of typical) "
     "and over its change of the motion.",
 }
-
-
-def collect_headlines(name: str, table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the headlines of one candidate for a line of the ledger.
-
-    Args:
-        name: The candidate.
-        table: Its metrics; see `metrics.compute_metrics`.
-    """
-    figures = {key: _round_float(table[key]["value"]) for key in HEADLINES}
-    figures["seconds"] = _round_float(table["seconds"]["median"])
-    return {"candidate": name, **figures, "sat": table["sat"]["value"], "failed": table["failed"]}
-
-
-def _round_float(value: Any) -> Any:
-    return round(value, 4) if isinstance(value, float) else value
 
 
 def build_rows(tables: Mapping[str, Mapping[str, Any]]) -> list[list[str | Cell]]:
@@ -141,9 +119,6 @@ def write_report(
             page.add_text(
                 f"{name} sat {sat['value']} of {sat['of']} cases; the others are left out.", "warn"
             )
-    for name, table in tables.items():
-        for warning in table["warnings"]:
-            page.add_text(f"{name}: {warning}", "warn")
     if not exam["sealed"]:
         page.add_text(
             "A development seed: the authors of the candidates may have looked at its cases.",
@@ -159,7 +134,7 @@ def write_report(
         _add_candidate(page, folder, name, table)
     facts = {"labels, SHA-256": exam["labels_sha256"]}
     for name, table in tables.items():
-        facts[f"engine of {name}"] = ", ".join(table["engines"]) or MISSING
+        facts[f"commit of {name}"] = table["commit"] or MISSING
     page.add_facts(facts)
     page.write(folder / REPORT_FILE)
     write_text(folder / TABLE_FILE, format_markdown(tables))

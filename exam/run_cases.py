@@ -112,7 +112,6 @@ def answer_cases(
     machine: Machine,
     workers: int,
     progress: ItemProgress,
-    engine: str | None = None,
 ) -> int:
     """Have every case answered that is not yet; returns how many have no answer in the end.
 
@@ -127,7 +126,6 @@ def answer_cases(
         machine: The machine.
         workers: Cases answered at once.
         progress: Told when a case is done.
-        engine: Identity of the engine, noted beside each answer.
     """
     todo = [case for case in cases if not (folder / case.name / ANSWER_FILE).is_file()]
     progress.skip(len(cases) - len(todo))
@@ -138,7 +136,7 @@ def answer_cases(
         pending = []
         for case in todo:
             place = folder / case.name
-            pending.append(pool.submit(_answer_case, candidate, case, place, machine, engine))
+            pending.append(pool.submit(_answer_case, candidate, case, place, machine))
         try:
             for done in as_completed(pending):
                 done.result()
@@ -150,9 +148,7 @@ def answer_cases(
     return sum(not (folder / case.name / ANSWER_FILE).is_file() for case in cases)
 
 
-def _answer_case(
-    candidate: Candidate, case: Path, out: Path, machine: Machine, engine: str | None
-) -> None:
+def _answer_case(candidate: Candidate, case: Path, out: Path, machine: Machine) -> None:
     """Answer one case from a copy under a neutral name: no path leads from there to the labels.
 
     Raises:
@@ -176,7 +172,7 @@ def _answer_case(
         else:
             out.mkdir(parents=True, exist_ok=True)
             log.warning("case %s: no answer: %s", case.name, error.splitlines()[-1])
-    note = {"seconds": round(seconds, 2), "error": error, "engine": engine}
+    note = {"seconds": round(seconds, 2), "error": error}
     write_json(out / NOTE_FILE, note)
 
 

@@ -6,7 +6,6 @@ import dataclasses
 import json
 import logging
 import secrets
-from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -21,11 +20,11 @@ from brokk_rl.contracts.actuator import ActuatorFit, Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
-from brokk_rl.session import Session, write_json, write_text
+from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import effect_library
 from diagnosis.request import Penalties, ProbabilityModel
-from exam import dataset, oracle, registration, report, run_cases
+from exam import dataset, oracle, report, run_cases
 from exam.answer_scoring import RUN_FILE, AnswerScoring
 from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family
 from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
@@ -44,12 +43,10 @@ class ExamSettings:
     """The step to do, and the cases.
 
     Attributes:
-        do: `make` cases into the run folder, `register` the present engine for them, `run` a
-            candidate on them, ask the `oracle`, `score` the answers of one or several, run and
-            score all `baselines`, `calibrate` prices by the answers to development exams.
+        do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score`
+            the answers of one or several, `calibrate` prices by the answers to development exams.
         folder: The exam that all but `make` are about: the folder that `make` left.
         candidate: Who answers.
-        baselines: Who answers for comparison, by name.
         workers: Cases answered, recorded or weighed at once.
         answers: Of `score`: a name for each candidate, and the run folder with its
             answers. `calibrate`: answers of the diagnosis to one or several exams.
@@ -58,8 +55,6 @@ class ExamSettings:
         trials: Of `calibrate`: other prices that it tries.
         oracle: Fit of the simulator whose gap the oracle closes; that of the candidate.
         oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
-        ledger: File that grows by a line for each exam that is made, registered or opened, and for
-            each candidate that is scored.
         mix: Which cases there are.
         plants: Machines, written apart from the library.
         roughness: How much of a machine no tidy model has: a name of the family's, `mild` or
@@ -77,15 +72,13 @@ class ExamSettings:
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
     """
 
-    do: Literal["make", "register", "run", "oracle", "baselines", "score", "calibrate"]
+    do: Literal["make", "run", "oracle", "score", "calibrate"]
     folder: str | None
     candidate: Candidate
-    baselines: dict[str, Candidate]
     workers: int
     answers: dict[str, str]
     oracle: ActuatorFit
     oracles: str | None
-    ledger: str
     prices: Penalties
     certainty: ProbabilityModel
     trials: int
@@ -134,8 +127,8 @@ class Exam:
         machine: The machine of all cases.
         excitation: Excitations by name; `exam.reference` and `exam.field` give the file.
         exam: The step and the cases.
-        resume: Run folder of an interrupted `exam.do=make`, `run`, `oracle`, `baselines` or `score` to
-            go on with; the same as `session.out`.
+        resume: Run folder of an interrupted `exam.do=make`, `run`, `oracle` or `score` to go on
+            with; the same as `session.out`.
     """
 
     session: Session
@@ -151,11 +144,10 @@ class Exam:
             "make",
             "run",
             "oracle",
-            "baselines",
             "score",
         ):
             raise ConfigError(
-                f"resume={self.resume}: exam.do=make, run, oracle, baselines or score goes on in its own folder; add "
+                f"resume={self.resume}: exam.do=make, run, oracle or score goes on in its own folder; add "
                 f"session.out={self.resume} and give exam.do as before"
             )
 
@@ -202,14 +194,8 @@ class Exam:
         found = dataset.seal_labels(folder, {**facts, "cases": labels}, salt)
         facts["labels_sha256"] = found
         write_json(folder / "exam.json", facts)
-        registration.append_event(folder, "made", facts, settings.ledger)
-        log.info(
-            "%d cases in %s, labels sealed: sha256 %s; engine %s is registered",
-            len(labels),
-            folder / dataset.CASES_FOLDER,
-            found,
-            registration.compute_engine_id()[:12],
-        )
+        place = folder / dataset.CASES_FOLDER
+        log.info("%d cases in %s, labels sealed: sha256 %s", len(labels), place, found)
 
     def questions(self, salt: str) -> list[CaseDesign]:
         """Return the cases; those of a sealed exam depend on the secret salt too."""
@@ -225,25 +211,16 @@ class Exam:
             settings.plants.outside_not_on,
         )
 
-    def _register(self) -> None:
-        """Commit to the present engine: a line in the registration of the exam and in the ledger."""
-        state = registration.read_state(self._folder)
-        registration.append_event(self._folder, "registered", self._facts, self.exam.ledger)
-        write_json(self.session.folder / "registered.json", {"engine": state.engine})
-        if state.is_opened:
-            log.warning(
-                "the labels of %s are open already: a score of this engine is marked so",
-                self._folder,
-            )
-        log.info("engine %s is registered for %s", state.engine[:12], self._folder)
-
     def _run(self) -> None:
         """Write `<case>/diagnosis.json` and `<case>/sitting.json` for each case, and `run.json`."""
         settings = self.exam
         cases = self._cases()
-        state = registration.check_engine(self._folder, self._facts["sealed"])
-        facts = {**state.describe(), "labels_sha256": self._facts["labels_sha256"]}
-        write_json(self.session.folder / RUN_FILE, {**facts, "candidate": repr(settings.candidate)})
+        facts = {
+            "commit": describe_commit(),
+            "labels_sha256": self._facts["labels_sha256"],
+            "candidate": repr(settings.candidate),
+        }
+        write_json(self.session.folder / RUN_FILE, facts)
         with ItemProgress("cases answered", len(cases)) as progress:
             failed = run_cases.answer_cases(
                 settings.candidate,
@@ -252,7 +229,6 @@ class Exam:
                 self._known,
                 settings.workers,
                 progress,
-                state.engine,
             )
         if failed:
             log.warning(
@@ -295,15 +271,9 @@ class Exam:
         """The machine as the candidates of the exam in `exam.folder` know it."""
         return restrict_machine(self.machine, self._facts.get("known", "full"))
 
-    def _open_labels(self) -> list[dict[str, Any]]:
-        """Open the labels, and note that for later runs."""
-        cases = dataset.open_labels(self._folder)["cases"]
-        registration.note_opening(self._folder, self._facts, self.exam.ledger)
-        return cases
-
     def _oracle(self) -> None:
         """Open the labels; write `oracle.json`: shares of the gap that true effects close."""
-        cases = self._open_labels()
+        cases = dataset.open_labels(self._folder)["cases"]
         # only these have effects that a simulator could repair
         labels = [label for label in cases if label["kind"] in ("one", "several")]
         place, found = self.session.folder / ORACLE_FILE, {}
@@ -331,29 +301,6 @@ class Exam:
             np.median(shares or [0.0]),
             len(shares),
         )
-
-    def _baselines(self) -> None:
-        """Have every baseline answer every case, then score them beside `exam.answers`."""
-        cases, settings = self._cases(), self.exam
-        usable = {}
-        for name, one in settings.baselines.items():
-            if getattr(one, "exam", "") is not None:
-                usable[name] = one
-                continue
-            log.warning(
-                "%s is left out: it learns from another exam, exam.baselines.%s.exam=<development exam>",
-                name,
-                name,
-            )
-        state = registration.check_engine(self._folder, self._facts["sealed"])
-        for name, candidate in usable.items():
-            folder = self.session.folder / name
-            with ItemProgress(name, len(cases)) as progress:
-                run_cases.answer_cases(
-                    candidate, cases, folder, self._known, settings.workers, progress, state.engine
-                )
-            write_json(folder / RUN_FILE, {**state.describe(), "candidate": repr(candidate)})
-        self._scored(settings.answers | {name: str(self.session.folder / name) for name in usable})
 
     def _calibrate(self) -> None:
         """Open development labels; write `prices.yaml` and `certainty.yaml`; print the change."""
@@ -407,12 +354,9 @@ class Exam:
         return shared
 
     def _score(self) -> None:
-        self._scored(self.exam.answers)
-
-    def _scored(self, answers: Mapping[str, str]) -> None:
-        """Open the labels; write marks, answers, labels, report and ledger; print the table."""
-        labels, facts = self._open_labels(), self._facts
-        folders = {name: Path(folder) for name, folder in answers.items()}
+        """Open the labels; write marks, answers, labels and report; print the table."""
+        labels, facts = dataset.open_labels(self._folder)["cases"], self._facts
+        folders = {name: Path(folder) for name, folder in self.exam.answers.items()}
         out = self.session.folder
         marking = AnswerScoring(
             exam=self._folder,
@@ -433,12 +377,6 @@ class Exam:
         write_text(out / "labels.json", (self._folder / dataset.LABELS_FILE).read_text())
         for name, folder in folders.items():
             marking.publish(folder, out / f"answers_{name}.jsonl")
-            line = {**facts, **report.collect_headlines(name, tables[name])}
-            engines = tables[name]["engines"]
-            # the engine that sat, not the one that scores
-            line["engine"] = engines[0] if len(engines) == 1 else None
-            line |= {"engines": engines, "warnings": tables[name]["warnings"]}
-            registration.append_event(self._folder, "scored", line, self.exam.ledger)
         _show(tables)
         log.info("report: %s", out / report.REPORT_FILE)
 

@@ -7,7 +7,6 @@ import json
 import shutil
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +19,13 @@ from hydra.utils import instantiate
 from small_exam import SMALL
 
 from brokk_rl import record
-from brokk_rl.errors import ConfigError, RecordingError, StorageError
+from brokk_rl.errors import RecordingError, StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
-from diagnosis import answer
 from diagnosis.answer import ANSWER_FILE
-from exam import dataset, registration, run_cases
-from exam.baselines import ConstantAnswer
+from exam import dataset, run_cases
 from exam.case_distribution import KINDS, CaseDesign, CaseDistribution
-from exam.residual_forest import ResidualForest
+from exam.constant_answer import ConstantAnswer
 
 
 def questions(mix: CaseDistribution, machine: Machine, seed: int) -> list[CaseDesign]:
@@ -142,7 +139,7 @@ def test_labels_that_were_changed_are_not_scored(tmp_path: Path) -> None:
 def test_an_exam_is_made_sat_and_scored_from_the_command_line(
     exam: Path, brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
-    answers, marks, ledger = tmp_path / "answers", tmp_path / "marks", tmp_path / "ledger.jsonl"
+    answers, marks = tmp_path / "answers", tmp_path / "marks"
     about = ("mode=exam", f"exam.folder={exam}")
     assert (
         brokk(*about, "exam.do=run", "exam_candidate=always_none", f"session.out={answers}").code
@@ -156,13 +153,7 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
         f"resume={answers}",
     )
     assert again.code == 0 and brokk(*about, "exam.do=run", f"session.out={answers}").code != 0
-    done = brokk(
-        *about,
-        "exam.do=score",
-        f"+exam.answers.none={answers}",
-        f"exam.ledger={ledger}",
-        f"session.out={marks}",
-    )
+    done = brokk(*about, "exam.do=score", f"+exam.answers.none={answers}", f"session.out={marks}")
     assert done.code == 0, done.err
     found = json.loads((marks / "marks.json").read_text())["candidates"]["none"]
     assert (
@@ -173,13 +164,6 @@ def test_an_exam_is_made_sat_and_scored_from_the_command_line(
     assert (marks / "exam.html").stat().st_size > 10_000 and (
         marks / "confusion_none.png"
     ).is_file()
-    opened, line = [json.loads(text) for text in ledger.read_text().splitlines()]
-    assert opened["event"] == "opened" and line["event"] == "scored"
-    assert line["candidate"] == "none" and line["num_cases"] == 2 and line["seed"] == 0
-    assert line["labels_sha256"] == (exam / dataset.HASH_FILE).read_text().split()[0]
-    assert line["engine"] == registration.compute_engine_id() and line["engines"] == [
-        line["engine"]
-    ]
     # labels and answers are published beside the score
     assert (marks / "labels.json").read_bytes() == (exam / dataset.LABELS_FILE).read_bytes()
     said = [json.loads(text) for text in (marks / "answers_none.jsonl").read_text().splitlines()]
@@ -222,34 +206,6 @@ def test_cases_that_nobody_began_are_left_out_and_those_that_broke_are_not(
         shutil.rmtree(answers / first.name, ignore_errors=True)  # from then on nobody has begun it
 
 
-def test_baselines_sit_and_are_scored_by_one_command(
-    exam: Path, brokk: Callable[..., Any], tmp_path: Path
-) -> None:
-    about = (
-        "mode=exam",
-        "exam.do=baselines",
-        f"exam.folder={exam}",
-        "~exam.baselines.greedy",
-        "~exam.baselines.bic",
-    )
-    done = brokk(
-        *about,
-        f"exam.baselines.trees.exam={exam}",
-        "exam.baselines.trees.trees=20",
-        f"session.out={tmp_path / 'b'}",
-    )
-    assert done.code == 0, done.err
-    marks = json.loads((tmp_path / "b" / "marks.json").read_text())["candidates"]
-    assert (
-        (tmp_path / "b" / "exam.md")
-        .read_text()
-        .startswith("|  | most_frequent | trees |\n| --- | --- | --- |\n| one effect: ")
-    )
-    assert set(marks) == {"most_frequent", "trees"} and not any(
-        table["failed"] for table in marks.values()
-    )
-
-
 def test_seeds_of_exams_need_to_be_sealed_and_those_of_development_not(
     brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
@@ -279,26 +235,6 @@ def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_
 
     assert drawn(1000, "a") == drawn(1000, "a") != drawn(1000, "b")
     assert drawn(1, "a") == drawn(1, "b")
-
-
-def test_a_forest_learns_from_development_cases_only_and_answers(
-    exam: Path, machine: Machine, tmp_path: Path
-) -> None:
-    trees = ResidualForest(exam=str(exam), trees=20, seed=0)
-    trees.answer(exam / dataset.CASES_FOLDER / "0000", tmp_path / "out", machine)
-    found = answer.read_answer(tmp_path / "out" / ANSWER_FILE)
-    assert all(0 <= one.probability <= 1 for one in found.ranking) and found.verdict in (
-        "effects",
-        "none",
-        "unknown",
-    )
-    sealed = tmp_path / "sealed"
-    sealed.mkdir()
-    (sealed / "exam.json").write_text('{"sealed": true}')
-    with pytest.raises(ConfigError, match="development seeds only"):
-        replace(trees, exam=str(sealed)).answer(
-            exam / dataset.CASES_FOLDER / "0000", tmp_path / "out", machine
-        )
 
 
 class Recorder:

@@ -25,7 +25,6 @@ from exam.held_out.parameters import ArmParameters, change_machine, draw_machine
 from exam.held_out.readings import SteppedEncoders, draw_bursts
 from exam.plants import out_of_library_faults
 from exam.plants.linkage import Arm
-from exam.residual_forest import ResidualForest
 
 Q1, Q3, Q4 = 0, 2, 3
 
@@ -112,17 +111,13 @@ def test_what_the_held_out_make_has_no_other_make_has() -> None:
     assert not set(out_of_library_faults.KINDS) & set(causes.CAUSES)
 
 
-def test_calibration_and_forest_refuse_a_sealed_exam_whatever_its_facts_say(
-    machine: Machine, tmp_path: Path
-) -> None:
+def test_calibration_refuses_a_sealed_exam_whatever_its_facts_say(tmp_path: Path) -> None:
     exam, answers = tmp_path / "exam", tmp_path / "exam" / "answers"
     answers.mkdir(parents=True)
     dataset.seal_labels(exam, {"sealed": True, "held_out": True, "cases": []}, "salt")
     (exam / "exam.json").write_text(json.dumps({"sealed": False}))  # as somebody might edit it
     with pytest.raises(ConfigError, match="development exams only"):
         load_weighed_cases([answers])
-    with pytest.raises(ConfigError, match="development seeds only"):
-        ResidualForest(exam=str(exam), trees=5, seed=0).answer(tmp_path, tmp_path / "o", machine)
 
 
 def test_a_clean_machine_goes_at_full_speed_and_by_its_notches_below(machine: Machine) -> None:

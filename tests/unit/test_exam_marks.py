@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numpy as np
 import pytest
 
 from diagnosis.answer import Answer, Estimate, Gap, Ranked, Selected, Where
-from diagnosis.responses import Response
-from exam import baselines, metrics, score
-from exam.oracle import JointErrors
+from exam import metrics, score
 from exam.score import CaseScore, Claim, score_answer
 
 CLASSES = (("dead_time", "clock_offset"), ("flow_gain", "encoder_scale"))
@@ -213,25 +210,6 @@ def test_intervals_hold_their_figure_and_shrink_with_the_number_of_cases(
         assert low <= few[key]["value"] <= high
         assert many[key]["ci95"][1] - many[key]["ci95"][0] <= high - low + 1e-9
     assert math.isclose(few["top1"]["ci95"][0], 0.2077, abs_tol=1e-3)  # Wilson, 2 of 3
-
-
-def test_forward_selection_takes_what_is_there_and_bic_leaves_what_does_not_pay() -> None:
-    generator, fold = np.random.default_rng(0), np.arange(600) // 100 % 2
-    form, other = generator.standard_normal((2, 600))
-    sizes = np.array([0.0, 1.0, 2.0])
-    shapes = {
-        name: [Response(sizes, np.outer(sizes, ray))]
-        for name, ray in (("lag", form), ("creep", other))
-    }
-    errors = JointErrors(1.2 * form + 0.5 * generator.standard_normal(600), shapes, fold)
-    assert set(baselines.select_forward(errors, baselines.score_bic, 0.0)) == {"lag"}
-    assert next(iter(baselines.select_forward(errors, baselines.score_held_out, 0.0))) == "lag"
-    assert (
-        baselines.select_forward(
-            JointErrors(generator.standard_normal(600), shapes, fold), baselines.score_bic, 0.0
-        )
-        == {}
-    )
 
 
 def test_a_number_that_all_joints_share_counts_once() -> None:

@@ -1,4 +1,4 @@
-"""Registration, interruption and scoring of an exam, the examiner's simulation, and the baselines."""
+"""Interruption and scoring of an exam, and the examiner's simulation."""
 
 from __future__ import annotations
 
@@ -16,96 +16,31 @@ import pytest
 from composed import option
 from small_exam import SMALL
 
-from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from diagnosis.answer import Answer, Estimate, Gap, Where
-from diagnosis.responses import Response
-from exam import baselines, dataset, examiner, registration, run_cases
+from exam import dataset, examiner, run_cases
 from exam.examiner import ExaminerSimulator, compute_closed, read_effects
 from exam.generate import UNCHANGED_FOLDER, restrict_machine
-from exam.oracle import JointErrors
 
 
-def test_the_engine_is_its_source_its_weights_and_its_calibration(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    files = registration._list_engine_files()
-    for name in (
-        "diagnosis/search.py", "conf:certainty/default", "conf:prices/default", "conf:fit/valve", "conf:effect/lag",
-        "conf:mode/diagnose", "brokk_rl/open_loop.py",
-    ):  # fmt: skip
-        assert name in files, name
-    assert not any(name.startswith(("exam/", "deploy/", "conf:mode/exam")) for name in files)
-    before = registration.compute_engine_id()
-    assert before == registration.compute_engine_id() and len(before) == 64
-    for name in ("diagnosis/search.py", "conf:certainty/default"):
-        changed = tmp_path / "changed"
-        changed.write_bytes(files[name].read_bytes() + b"\n")
-        with monkeypatch.context() as patch:
-            patch.setattr(
-                registration, "_list_engine_files", lambda n=name, c=changed: {**files, n: c}
-            )
-            assert registration.compute_engine_id() != before
-
-
-def test_a_sealed_exam_refuses_an_engine_that_was_not_registered(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    ledger = str(tmp_path / "kept" / "ledger.jsonl")
-    facts = {"seed": 1000, "num_cases": 3, "labels_sha256": "abc"}
-    with pytest.raises(ConfigError, match="no engine registered"):
-        registration.check_engine(tmp_path, is_sealed=True)
-    registration.append_event(tmp_path, "made", facts, ledger)
-    mine = registration.compute_engine_id()
-    assert registration.check_engine(tmp_path, is_sealed=True).describe() == {
-        "engine": mine, "registered": True, "after_opening": False
-    }  # fmt: skip
-    monkeypatch.setattr(registration, "compute_engine_id", lambda: "other" * 12)
-    with pytest.raises(ConfigError, match=r"commit to this engine first, exam.do=register"):
-        registration.check_engine(tmp_path, is_sealed=True)
-    # a development exam may be sat by any engine, and the answers are marked
-    state = registration.check_engine(tmp_path, is_sealed=False)
-    assert not state.describe()["registered"]
-    registration.note_opening(tmp_path, facts, ledger)
-    registration.note_opening(tmp_path, facts, ledger)
-    registration.append_event(tmp_path, "registered", facts, ledger)
-    late = registration.check_engine(tmp_path, is_sealed=True)
-    (tmp_path / "run.json").write_text(json.dumps(late.describe()))
-    assert registration.list_warnings(tmp_path / "run.json", ["a", "b"]) == [
-        "2 engines gave these answers",
-        "the labels were open before these answers were given",
-    ]
-    lines = [json.loads(text) for text in Path(ledger).read_text().splitlines()]
-    assert [line["event"] for line in lines] == ["made", "opened", "registered"]
-    assert lines[0]["engine"] == mine and {"when", "commit", "versions", *facts} <= set(lines[0])
-
-
-def test_a_sealed_exam_is_registered_where_it_is_made_and_run_says_so(
+def test_a_run_notes_the_hash_of_the_labels_of_a_sealed_exam(
     brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
     exam, answers = tmp_path / "exam", tmp_path / "answers"
-    ledger = f"exam.ledger={tmp_path / 'ledger.jsonl'}"
-    sealed = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234", ledger)
+    sealed = ("exam_protocol=sealed", "exam.mix.num_cases=2", "session.seed=1234")
     made = brokk(*SMALL, *sealed, f"session.out={exam}")
     assert made.code == 0, made.err
     facts = json.loads((exam / "exam.json").read_text())
     assert facts["sealed"] and facts["held_out"] and facts["num_cases"] == 2
     withheld = sorted((exam / dataset.WITHHELD_FOLDER).rglob("*.parquet"))
     assert {path.parent.name for path in withheld} == {"0000", "0001", UNCHANGED_FOLDER}
-    about = ("mode=exam", f"exam.folder={exam}", ledger, "exam_candidate=always_none")
-    registered = (exam / registration.REGISTRATION_FILE).read_text()
-    line = json.loads(registered)
-    other = json.dumps(line | {"engine": "0" * 64}) + "\n"
-    (exam / registration.REGISTRATION_FILE).write_text(other)
-    refused = brokk(*about, "exam.do=run", f"session.out={answers}")
-    assert refused.code != 0 and "exam.do=register" in refused.err and not answers.exists()
-    assert brokk(*about, "exam.do=register", f"session.out={tmp_path / 'again'}").code == 0
+    about = ("mode=exam", f"exam.folder={exam}", "exam_candidate=always_none")
     done = brokk(*about, "exam.do=run", f"session.out={answers}")
     assert done.code == 0, done.err
-    assert json.loads((answers / "run.json").read_text())["registered"]
-    note = json.loads((answers / "0000" / "sitting.json").read_text())
-    assert note["engine"] == line["engine"]
+    noted = json.loads((answers / "run.json").read_text())
+    assert noted["labels_sha256"] == facts["labels_sha256"]
 
 
 def test_a_make_that_was_interrupted_goes_on_and_gives_the_same_cases(
@@ -183,7 +118,7 @@ def slow_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "exam.mix.sizes=[1.0,1.0]", "~exam.mix.troubles", f"+exam.mix.troubles={gain}",
         "exam.reference.programs=[[levels],[levels]]",
         "exam.reference.file_s=60", "exam.field.programs=[[levels]]", "exam.field.file_s=20", "exam.withheld.programs=[[levels]]",
-        "exam.withheld.file_s=40", f"exam.ledger={out.parent / 'ledger.jsonl'}", f"session.out={out}",
+        "exam.withheld.file_s=40", f"session.out={out}",
     ]  # fmt: skip
     with initialize_config_module("conf", version_base="1.3"):
         mode = instantiate(compose("config", words), _convert_="all")
@@ -252,24 +187,6 @@ def test_the_closed_share_is_that_worked_by_hand() -> None:
     assert interval == pytest.approx((0.75 + 0.025 * 0.25, 1.0 - 0.025 * 0.25))  # of 1 and 0.75
     assert compute_closed(1.04 * floor, floor, floor) == (None, None)
     assert examiner.MAX_DIFFERENCE == 0.2
-
-
-def test_forward_selection_takes_nothing_that_a_repeat_of_the_reference_shows_too() -> None:
-    generator, fold = np.random.default_rng(1), np.arange(600) // 100 % 2
-    ray, sizes = generator.standard_normal(600), np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
-    shapes = {"lag": [Response(sizes, np.outer(sizes, ray))]}
-
-    def build(strength: float) -> JointErrors:
-        return JointErrors(strength * ray + generator.standard_normal(600), shapes, fold)
-
-    for score in (baselines.score_held_out, baselines.score_bic):
-        # repeats differ by half as much as the field: a fixed threshold would name that
-        field, repeats = build(0.5), [build(0.45), build(-0.6)]
-        assert set(baselines.select_forward(field, score, 0.0)) == {"lag"}
-        least = baselines.learn_threshold(repeats, score)
-        assert least > 0 and not baselines.select_forward(field, score, least)
-        assert set(baselines.select_forward(build(1.5), score, least)) == {"lag"}
-    assert baselines.learn_threshold([], baselines.score_bic) == 0.0
 
 
 def test_progress_tells_the_time_left_by_the_items_of_this_run() -> None:

@@ -76,7 +76,6 @@ def main(args: argparse.Namespace) -> None:
     choose_rules(sitting, args)
     if args.sitting == "held_out" and not (args.exam / "exam.json").is_file():
         call(HERE / "remake.py", args.marks, HELD_OUT_CASES, args.exam, args.workers)
-        call_exam("exam.do=register", f"exam.folder={args.exam}", folder=args.work / "registered")
     for rival in sitting.rivals:
         sit_exam(rival, args.exam, sitting, args.work / rival, args)
     if args.until == "answers":
