@@ -1,29 +1,115 @@
-"""Specs: the typed, frozen data that every config node becomes."""
+"""Specs: the typed, frozen data that every config node becomes.
 
+A spec is a pydantic dataclass. The annotation of a field holds its type and its bounds (`Positive`,
+`Count`, `Annotated[float, Interval(ge=0.1, le=10)]`); rules between fields stand in `check`, whose
+messages begin with the field: `ConfigError("num_bins: expected …, got …")`.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
 import math
+import operator
+import reprlib
 import types
 import typing
-from collections.abc import Mapping
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
-from typing import Any, TypeVar, Union, dataclass_transform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, Union, dataclass_transform
 
-from brokk_rl.errors import ConfigError
+from annotated_types import Ge, Gt, Interval, MinLen
+from pydantic import (
+    AfterValidator,
+    AllowInfNan,
+    BeforeValidator,
+    ConfigDict,
+    Strict,
+    ValidationError,
+)
+from pydantic import dataclasses as pydantic_dataclasses
+from pydantic_core import ArgsKwargs, CoreSchema, PydanticCustomError, core_schema
+
+from brokk_rl.errors import ConfigError, list_choices
 
 T = TypeVar("T")
 
 
+@dataclass(frozen=True)
+class Ordered:
+    """Constraint of a range: its first value is not above its second."""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self.check, handler(source))
+
+    def check(self, value: tuple[float, float]) -> tuple[float, float]:
+        """Return the range; raise an error of pydantic where it is reversed."""
+        if value[0] > value[1]:
+            raise PydanticCustomError("order", "reversed")
+        return value
+
+
+Finite = Annotated[float, AllowInfNan(False)]
+Positive = Annotated[float, Gt(0), AllowInfNan(False)]
+NonNegative = Annotated[float, Ge(0), AllowInfNan(False)]
+Share = Annotated[float, Interval(ge=0, le=1)]
+"""A part of a whole, 0 to 1."""
+Count = Annotated[int, Ge(1)]
+Index = Annotated[int, Ge(0)]
+"""A whole number of 0 or more: an index, a seed, a count that may be none."""
+Range = Annotated[tuple[Finite, Finite], Ordered()]
+"""Lowest and highest value."""
+PositiveRange = Annotated[tuple[Positive, Positive], Ordered()]
+NonNegativeRange = Annotated[tuple[NonNegative, NonNegative], Ordered()]
+
+
+class SpecError(ConfigError):
+    """Fields of a spec were refused.
+
+    Attributes:
+        problems: Key below the spec, and its fault in words, of each refused field.
+    """
+
+    def __init__(self, place: str, problems: Sequence[tuple[str, str]]) -> None:
+        self.problems = tuple(problems)
+        lines = []
+        for key, text in problems:
+            lines.append(f"{place}.{key}: {text}" if key else f"{place}: {text}")
+        super().__init__("\n".join(lines))
+
+
 @dataclass_transform(frozen_default=True, kw_only_default=True)
 def spec(cls: type[T]) -> type[T]:
-    """Turn `cls` into a spec: a frozen, keyword-only dataclass that checks its field types.
+    """Turn `cls` into a spec: a frozen, keyword-only dataclass that checks its fields.
 
     A YAML list becomes a tuple. An integer given for a float becomes a float, and a whole number
-    such as 48e6 given for an integer becomes an integer. NaN and any other mismatch raise a
-    `ConfigError` that names the field, the expected type and the value. A spec may define
-    `check(self)` for rules between fields. Specs are pure data: a number lives in one YAML file, so fields have no
-    defaults here, but for what files from before a field existed mean.
+    such as 48e6 given for an integer becomes an integer. A table becomes the spec that the
+    annotation names. Any other mismatch, and NaN, raise a `SpecError` that names the field, the
+    expected value and the given one. Of a field annotated with a protocol the members are compared.
+    A spec may define `check(self)` for rules between fields. Specs are pure data: a number lives in
+    one YAML file, so fields have no defaults here.
     """
-    cls.__post_init__ = _post_init  # type: ignore[attr-defined]
-    return dataclass(frozen=True, kw_only=True)(cls)
+    hints = typing.get_type_hints(cls, include_extras=True)
+    for name in inspect.get_annotations(cls):
+        cls.__annotations__[name] = _tighten(hints[name])
+    if "__post_init__" not in cls.__dict__:
+        cls.__post_init__ = _check  # type: ignore[attr-defined]
+    config = ConfigDict(arbitrary_types_allowed=True, extra="forbid", defer_build=True)
+    made: Any = pydantic_dataclasses.dataclass(frozen=True, kw_only=True, config=config)(cls)
+
+    def initialise(self: Any, **values: Any) -> None:
+        if not made.__pydantic_complete__:
+            pydantic_dataclasses.rebuild_dataclass(made)
+            made.__init__ = initialise  # pydantic has put its own there
+        try:
+            made.__pydantic_validator__.validate_python(ArgsKwargs((), values), self_instance=self)
+        except ValidationError as error:
+            raise _explain(made, error) from None
+
+    made.__init__ = initialise
+    return made
 
 
 def name_spec(value: object) -> str:
@@ -41,109 +127,214 @@ def restore_spec(kind: type[T], values: Mapping[str, Any]) -> T:
     can choose numbers, but no code.
 
     Raises:
-        ConfigError: A field is unknown, missing, or of another type.
+        SpecError: A field is unknown, missing, or of another type.
     """
-    hints = typing.get_type_hints(kind)
-    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    needed = {field.name for field in fields(kind) if _is_needed(field)}  # type: ignore[arg-type]
-    if wrong := (values.keys() - names) | (needed - values.keys()):
-        odd = ", ".join(sorted(wrong))
-        raise ConfigError(f"{kind.__name__}: unknown or missing fields: {odd}")
-    return kind(**{name: restore_value(hints[name], value) for name, value in values.items()})
+    return kind(**values)
 
 
-def _is_needed(field: Field[Any]) -> bool:
-    return field.default is MISSING and field.default_factory is MISSING
-
-
-def restore_value(hint: Any, value: Any) -> Any:
-    """Return a plain value as the annotation `hint` has it; see `restore_spec`."""
-    if isinstance(value, Mapping):
-        if typing.get_origin(hint) is dict:
-            inner = typing.get_args(hint)[1]
-            return {name: restore_value(inner, item) for name, item in value.items()}
-        for kind in (hint, *typing.get_args(hint)):
-            if isinstance(kind, type) and is_dataclass(kind):
-                return restore_spec(kind, value)
-    if isinstance(value, (list, tuple)):
-        for kind in (hint, *typing.get_args(hint)):
-            if typing.get_origin(kind) is tuple:
-                return tuple(restore_value(typing.get_args(kind)[0], item) for item in value)
-    return value
-
-
-def _post_init(self: Any) -> None:
-    hints = typing.get_type_hints(type(self))
-    for field in fields(self):
-        where = f"{type(self).__name__}.{field.name}"
-        object.__setattr__(
-            self, field.name, _convert(getattr(self, field.name), hints[field.name], where)
-        )
+def _check(self: Any) -> None:
     if check := getattr(self, "check", None):
         check()
 
 
-def _convert(value: Any, hint: Any, where: str) -> Any:
-    """Return `value` converted to the annotated type, or raise a `ConfigError`."""
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if hint is Any:
+@dataclass(frozen=True)
+class _InstanceOf:
+    """Constraint of a field that holds an object: its class, or the members of a protocol."""
+
+    kind: type
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(self.check)
+
+    def check(self, value: Any) -> Any:
+        protocol = getattr(self.kind, "_is_protocol", False)
+        if protocol and (lacking := _list_lacking_members(self.kind, value)):
+            raise PydanticCustomError("members", "lacking", {"lacking": ", ".join(lacking)})
+        if not protocol and not isinstance(value, self.kind):
+            raise PydanticCustomError("instance", "another class")
         return value
+
+
+def _list_lacking_members(protocol: type, value: object) -> list[str]:
+    """Return the members of a protocol that `value` does not have."""
+    lacking = []
+    for kind in protocol.__mro__:
+        if not getattr(kind, "_is_protocol", False) or kind is typing.Protocol:
+            continue
+        for name in {**vars(kind), **inspect.get_annotations(kind)}:
+            if not name.startswith("_") and not _has_member(value, name):
+                lacking.append(name)
+    return lacking
+
+
+def _has_member(value: object, name: str) -> bool:
+    # A property is not read: it may compute something.
+    return name in getattr(value, "__dict__", ()) or hasattr(type(value), name)
+
+
+def _tighten(hint: Any) -> Any:
+    """Return an annotation with the constraints that pydantic does not set by itself.
+
+    Numbers, words and truth values are not converted into each other, NaN is no number, and every
+    other class is compared by `isinstance` or, for a protocol, by its members.
+    """
+    arguments = typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    if origin is Annotated:
+        return Annotated[(_tighten(arguments[0]), *hint.__metadata__)]  # type: ignore[return-value]
     if origin in (Union, types.UnionType):
-        return _convert_union(value, args, where)
-    if origin is typing.Literal:
-        if value not in args:
-            raise ConfigError(
-                f"{where}: expected one of {', '.join(map(repr, args))}, got {value!r}"
-            )
-        return value
-    if origin is tuple and isinstance(value, (list, tuple)):
-        inner = [args[0]] * len(value) if args[-1] is Ellipsis else list(args)
-        if len(inner) != len(value):
-            raise ConfigError(
-                f"{where}: expected {len(inner)} values, got {len(value)}: {list(value)}"
-            )
-        items = []
-        for i, (v, h) in enumerate(zip(value, inner, strict=True)):
-            items.append(_convert(v, h, f"{where}[{i}]"))
-        return tuple(items)
-    if origin is dict and isinstance(value, dict):
-        table = {}
-        for k, v in value.items():
-            table[_convert(k, args[0], where)] = _convert(v, args[1], f"{where}.{k}")
-        return table
-    plain = origin or hint
-    if plain is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if plain is int and isinstance(value, float) and value.is_integer():
-        return int(value)
-    if plain is float and isinstance(value, float) and math.isnan(value):
-        raise ConfigError(f"{where}: expected a number, got nan")
-    protocol = getattr(plain, "_is_protocol", False)
-    wrong_bool = isinstance(value, bool) and plain in (int, float)
-    if not protocol and (wrong_bool or not isinstance(value, plain)):
-        name = getattr(hint, "__name__", hint)
-        raise ConfigError(f"{where}: expected {name}, got {type(value).__name__} {value!r}")
+        return functools.reduce(operator.or_, map(_tighten, arguments))
+    if origin in (tuple, dict, list):
+        return origin[tuple(item if item is ... else _tighten(item) for item in arguments)]
+    if hint is int:
+        return Annotated[int, Strict(), BeforeValidator(_read_whole)]
+    if hint is float:
+        return Annotated[float, Strict(), AfterValidator(_refuse_nan)]
+    if hint in (bool, str):
+        return Annotated[hint, Strict()]
+    kind = origin or hint
+    plain = (
+        hint in (Any, None, type(None), Path) or origin is Literal or kind in (tuple, dict, list)
+    )
+    if plain or not isinstance(kind, type) or hasattr(kind, "__pydantic_fields__"):
+        return hint
+    return Annotated[hint, _InstanceOf(kind)]
+
+
+def _read_whole(value: Any) -> Any:
+    return int(value) if isinstance(value, float) and value.is_integer() else value
+
+
+def _refuse_nan(value: float) -> float:
+    if math.isnan(value):
+        raise PydanticCustomError("nan", "nan")
     return value
 
 
-def _convert_union(value: Any, hints: tuple[Any, ...], where: str) -> Any:
-    for hint in hints:
-        if hint is type(None):
-            if value is None:
-                return None
-            continue
-        try:
-            return _convert(value, hint, where)
-        except ConfigError:
-            continue
-    expected = " or ".join(map(_name_hint, hints))
-    raise ConfigError(f"{where}: expected {expected}, got {type(value).__name__} {value!r}")
+def _explain(kind: type, error: ValidationError) -> SpecError:
+    """Return the error of a spec in the words of its annotations."""
+    problems: dict[str, str] = {}
+    lacking: dict[str, list[str]] = {}
+    for problem in error.errors(include_url=False):
+        *above, last = problem["loc"]
+        if problem["type"] == "missing" and isinstance(last, str):
+            lacking.setdefault(_follow(kind, above)[0], []).append(last)
+        elif problem["type"] == "unexpected_keyword_argument":
+            key, hint = _follow(kind, above)
+            names = [field.name for field in fields(_strip(hint))]
+            problems[key] = f"has no field '{last}'; {list_choices(str(last), names)}"
+        else:
+            place = above if problem["type"] == "missing" else problem["loc"]
+            key, hint = _follow(kind, place)
+            problems.setdefault(key, _describe_problem(problem, hint))
+    for key, names in lacking.items():
+        problems[key] = f"lacks {', '.join(names)}"
+    return SpecError(kind.__name__, list(problems.items()))
 
 
-def _name_hint(hint: Any) -> str:
-    """Return a type as a message names it: the values of a literal, `null` for none."""
-    if hint is type(None):
+def _follow(kind: type, place: Sequence[int | str]) -> tuple[str, Any]:
+    """Return the key of a place below a spec, and its annotation.
+
+    In a union the key ends at the union: pydantic has one error for each of its members.
+    """
+    key, hint = "", kind
+    for part in place:
+        inner = _strip(hint)
+        arguments = typing.get_args(inner)
+        if typing.get_origin(inner) in (Union, types.UnionType):
+            break
+        if isinstance(inner, type) and is_dataclass(inner):
+            hints = typing.get_type_hints(inner, include_extras=True)
+            key, hint = f"{key}.{part}", hints.get(str(part), Any)
+        elif typing.get_origin(inner) is dict:
+            key, hint = f"{key}.{part}", arguments[1]
+        elif isinstance(part, int) and arguments:
+            repeated = arguments[-1] is ... or typing.get_origin(inner) is list
+            key, hint = f"{key}[{part}]", arguments[0 if repeated else part]
+    return key.lstrip("."), hint
+
+
+def _strip(hint: Any) -> Any:
+    """Return an annotation without its constraints and without `None`."""
+    while typing.get_origin(hint) is Annotated:
+        hint = typing.get_args(hint)[0]
+    if typing.get_origin(hint) in (Union, types.UnionType):
+        others = [item for item in typing.get_args(hint) if item is not type(None)]
+        if len(others) == 1:
+            return _strip(others[0])
+    return hint
+
+
+def _describe_problem(problem: Any, hint: Any) -> str:
+    value = problem["input"]
+    end = ""
+    if problem["type"] == "members":
+        end = f" without {problem['ctx']['lacking']}"
+    near = get_close_matches(str(value), _list_words(hint), n=1)
+    if near:
+        end = f"; did you mean '{near[0]}'?"
+    return f"expected {describe_hint(hint)}, got {_show(value)}{end}"
+
+
+def _list_words(hint: Any) -> list[str]:
+    """Return the words that an annotation allows by `Literal`."""
+    if typing.get_origin(hint) is Literal:
+        return [str(word) for word in typing.get_args(hint)]
+    words = []
+    for item in typing.get_args(hint):
+        words += _list_words(item)
+    return words
+
+
+def _show(value: Any) -> str:
+    if value is None:
         return "null"
-    if typing.get_origin(hint) is typing.Literal:
-        return " or ".join(map(repr, typing.get_args(hint)))
-    return str(hint) if typing.get_args(hint) else getattr(hint, "__name__", str(hint))
+    if isinstance(value, (bool, int, float)):
+        return str(value).lower()
+    if isinstance(value, (str, list, tuple, dict)):
+        return reprlib.repr(value)
+    return type(value).__name__
+
+
+def describe_hint(hint: Any) -> str:
+    """Return in words which values an annotation allows: `a finite number above 0 or null`."""
+    arguments = typing.get_args(hint)
+    origin = typing.get_origin(hint)
+    if origin is Annotated:
+        return _describe_constrained(arguments[0], hint.__metadata__)
+    if origin in (Union, types.UnionType):
+        return " or ".join(map(describe_hint, arguments))
+    if origin is Literal:
+        return "one of " + ", ".join(map(repr, arguments))
+    if origin in (tuple, list) and arguments:
+        one = describe_hint(arguments[0])
+        if origin is list or arguments[-1] is ...:
+            return f"a list, each item {one}"
+        return f"a list of {len(arguments)}, each {one}"
+    if origin is dict:
+        return f"a table, each value {describe_hint(arguments[1])}"
+    words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
+    words |= {type(None): "null", Any: "a value", tuple: "a list", list: "a list", dict: "a table"}
+    return words.get(origin or hint) or getattr(hint, "__name__", str(hint))
+
+
+def _describe_constrained(inner: Any, constraints: Sequence[Any]) -> str:
+    text = describe_hint(inner)
+    bounds: dict[str, Any] = {}
+    for constraint in constraints:
+        for name in ("gt", "ge", "lt", "le"):
+            bound = getattr(constraint, name, None)
+            if bound is not None:
+                bounds[name] = bound
+        if isinstance(constraint, AllowInfNan):
+            text = text.replace("a number", "a finite number")
+        if isinstance(constraint, Ordered):
+            text = f"(lowest, highest), {text}"
+        if isinstance(constraint, MinLen):
+            text = f"{text}, {constraint.min_length} or more"
+    if {"ge", "le"} <= bounds.keys():
+        return f"{text} from {bounds['ge']:g} to {bounds['le']:g}"
+    words = {"gt": "above {:g}", "ge": "of {:g} or more", "lt": "below {:g}", "le": "up to {:g}"}
+    for name, bound in bounds.items():
+        text = f"{text} {words[name].format(bound)}"
+    return text

@@ -18,14 +18,13 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar
 
 import yaml
 
 from brokk_rl import registry
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.session import RESOLVED
-from brokk_rl.spec import restore_value
 
 log = logging.getLogger(__name__)
 
@@ -261,8 +260,6 @@ def _replace_at(spec: Any, path: list[str], value: Any) -> Any:
     first, rest = path[0], path[1:]
     if rest:
         value = _replace_at(getattr(spec, first), rest, value)
-    else:
-        value = restore_value(get_type_hints(type(spec))[first], value)
     return replace(spec, **{first: value})
 
 
