@@ -93,7 +93,7 @@ def spec(cls: type[T]) -> type[T]:
     """
     hints = typing.get_type_hints(cls, include_extras=True)
     for name in inspect.get_annotations(cls):
-        cls.__annotations__[name] = _tighten(hints[name])
+        cls.__annotations__[name] = _constrain(hints[name])
     if "__post_init__" not in cls.__dict__:
         cls.__post_init__ = _check  # type: ignore[attr-defined]
     config = ConfigDict(arbitrary_types_allowed=True, extra="forbid", defer_build=True)
@@ -172,7 +172,7 @@ def _has_member(value: object, name: str) -> bool:
     return name in getattr(value, "__dict__", ()) or hasattr(type(value), name)
 
 
-def _tighten(hint: Any) -> Any:
+def _constrain(hint: Any) -> Any:
     """Return an annotation with the constraints that pydantic does not set by itself.
 
     Numbers, words and truth values are not converted into each other, NaN is no number, and every
@@ -181,11 +181,11 @@ def _tighten(hint: Any) -> Any:
     arguments = typing.get_args(hint)
     origin = typing.get_origin(hint)
     if origin is Annotated:
-        return Annotated[(_tighten(arguments[0]), *hint.__metadata__)]  # type: ignore[return-value]
+        return Annotated[(_constrain(arguments[0]), *hint.__metadata__)]  # type: ignore[return-value]
     if origin in (Union, types.UnionType):
-        return functools.reduce(operator.or_, map(_tighten, arguments))
+        return functools.reduce(operator.or_, map(_constrain, arguments))
     if origin in (tuple, dict, list):
-        return origin[tuple(item if item is ... else _tighten(item) for item in arguments)]
+        return origin[tuple(item if item is ... else _constrain(item) for item in arguments)]
     if hint is int:
         return Annotated[int, Strict(), BeforeValidator(_read_whole)]
     if hint is float:
@@ -214,6 +214,7 @@ def _refuse_nan(value: float) -> float:
 def _explain(kind: type, error: ValidationError) -> SpecError:
     """Return the error of a spec in the words of its annotations."""
     problems: dict[str, str] = {}
+    unknown: dict[str, str] = {}
     lacking: dict[str, list[str]] = {}
     for problem in error.errors(include_url=False):
         *above, last = problem["loc"]
@@ -222,14 +223,15 @@ def _explain(kind: type, error: ValidationError) -> SpecError:
         elif problem["type"] == "unexpected_keyword_argument":
             key, hint = _follow(kind, above)
             names = [field.name for field in fields(_strip(hint))]
-            problems[key] = f"has no field '{last}'; {list_choices(str(last), names)}"
+            unknown.setdefault(key, f"has no field '{last}'; {list_choices(str(last), names)}")
         else:
             place = above if problem["type"] == "missing" else problem["loc"]
             key, hint = _follow(kind, place)
             problems.setdefault(key, _describe_problem(problem, hint))
     for key, names in lacking.items():
-        problems[key] = f"lacks {', '.join(names)}"
-    return SpecError(kind.__name__, list(problems.items()))
+        if key not in unknown:  # a misspelt field is lacking too
+            problems[key] = f"lacks {', '.join(names)}"
+    return SpecError(kind.__name__, list({**unknown, **problems}.items()))
 
 
 def _follow(kind: type, place: Sequence[int | str]) -> tuple[str, Any]:

@@ -38,7 +38,7 @@ contact force does not tilt the machine (the actuator does not know it).
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, get_type_hints
 
 import numpy as np
 import torch
@@ -180,7 +180,7 @@ class HydraulicCircuit:
 
 
 PER_JOINT = tuple(
-    name for name, hint in HydraulicCircuit.__annotations__.items() if hint == "PerJoint"
+    name for name, hint in get_type_hints(HydraulicCircuit).items() if hint == PerJoint
 )
 STATES = ("pilot", "spool", "spool_rate", "speed", "bore", "rod", "poppet", "promised", "pressed")
 """State of each joint: `speed` over full speed, pressures over relief, `poppet` opening of the

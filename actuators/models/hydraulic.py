@@ -22,6 +22,7 @@ pushing, and the simulator's drive yields.
 """
 
 import math
+from typing import get_type_hints
 
 import numpy as np
 import torch
@@ -124,7 +125,7 @@ class Hydraulic:
         return HydraulicModel(self, machine, num_envs, device)
 
 
-PER_JOINT = tuple(name for name, hint in Hydraulic.__annotations__.items() if hint is PerJoint)
+PER_JOINT = tuple(name for name, hint in get_type_hints(Hydraulic).items() if hint == PerJoint)
 
 
 class HydraulicModel:

@@ -66,7 +66,7 @@ BAD = {
     ("mode=identify",): "identify.recordings has no default and must be given",
     ("mode=identify", "identify.recordings=x", "identify.folds=1"): "identify.folds: expected 2",
     ("mode=collect", "collect.num_runs=0"): "collect.num_runs: expected 1 or more",
-    ("mode=collect", "excitation.sine.share=[2.0,1.0]"): "Sine.share: expected float",
+    ("mode=collect", "excitation.sine.share=[2.0,1.0]"): "Sine.share: expected a number",
     ("mode=play", "play.port=0"): "play.port",
     ("mode=bench", "bench.num_envs=[0]"): "bench.num_envs: expected one or more positive numbers",
     ("mode=bench", "bench.seconds=0"): "bench.seconds: expected a finite number above 0",
