@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import torch
 
-from brokk_rl.contracts.task import REWARD, Transition
+from brokk_rl.contracts.task import REWARD, TaskProcess, Transition
 from brokk_rl.contracts.world import World
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -70,8 +70,8 @@ class ToolPoseGoal(Protocol):
         ...
 
 
-class ToolPoseProcess:
-    """Episodes in `N` environments; fulfils `TaskProcess`, `ClassicalTask` and `DeployableTask`.
+class ToolPoseProcess(TaskProcess):
+    """Episodes in `N` environments.
 
     Args:
         goal: Targets and criteria.
@@ -152,7 +152,7 @@ class ToolPoseProcess:
         return self._judge_starts(self.goal.starts(count, seed))
 
     def count_starts(self, count: int, seed: int) -> dict[str, float]:
-        """Return shares of drawn candidates; see `brokk_rl.contracts.task.CountedStarts`."""
+        """Return shares of drawn candidates; see `TaskProcess.count_starts`."""
         tally = DrawTally("", count)
         with contextlib.suppress(ConfigError):  # nearly none can be done, as the shares say
             self.goal.starts(count, seed, tally)
@@ -208,7 +208,7 @@ class ToolPoseProcess:
             value.masked_fill_(mask, 0.0)
 
     def move_target(self, mask: torch.Tensor, shift_m: torch.Tensor) -> None:
-        """Shift targets and what was estimated of them; see `MovableTask.move_target`."""
+        """Shift targets and what was estimated of them; see `TaskProcess.move_target`."""
         state = self.state
         shift_m = torch.where(mask[:, None], shift_m, 0.0)
         state["start.target_m"] += shift_m
@@ -293,12 +293,12 @@ class ToolPoseProcess:
         }
 
     def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
-        """Return the classical controller's action; see `ClassicalTask.classical_action`."""
+        """Return the classical controller's action; see `TaskProcess.classical_action`."""
         command, action = groups["guide"][:, : self.num_actions], self.options.action
         return torch.zeros_like(command) if action.kind == "residual" else command / action.scale
 
     def describe(self) -> dict[str, Any]:
-        """Return the contract of the `policy` group; see `DeployableTask.describe`."""
+        """Return the contract of the `policy` group; see `TaskProcess.describe`."""
         options = self.options
         description = self.control.encoder.describe()
         description |= {"target_filter": options.noise.filter, "switch": asdict(options.switch)}
@@ -314,7 +314,7 @@ class ToolPoseProcess:
         return description
 
     def mirror(self) -> Mirror:
-        """Return the mirror of observations and actions; see `MirroredTask.mirror`."""
+        """Return the mirror of observations and actions; see `TaskProcess.mirror`."""
         policy, privileged = self.state["policy"], self.state["privileged"]
         signs = policy.new_tensor(compute_joint_signs(self._machine))
         encoder = self.control.encoder
@@ -329,18 +329,18 @@ class ToolPoseProcess:
         return Mirror({"policy": (factor, shift)} | groups, signs)
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
-        """Return the policy as one module; see `DeployableTask.deployable`."""
+        """Return the policy as one module; see `TaskProcess.deployable`."""
         pitch_rad = float(self.starts(1, 0)["target_pitch_rad"][0])
         return DeployedPolicy(self.control, network, pitch_rad)
 
     def take_estimate(self, target_m: torch.Tensor) -> None:
-        """Take estimated targets; see `LookingTask.take_estimate`."""
+        """Take estimated targets; see `TaskProcess.take_estimate`."""
         self._sensed_m = target_m
 
     def plan(
         self, q: torch.Tensor, target_m: torch.Tensor, num_times: int, step_s: float
     ) -> torch.Tensor:
-        """Return the controller's plan, `(N, T, J)`; see `LookingTask.plan`."""
+        """Return the controller's plan, `(N, T, J)`; see `TaskProcess.plan`."""
         pitch_rad = self.state["start.target_pitch_rad"]
         return self.control.plan(q, target_m, pitch_rad, num_times, step_s)
 

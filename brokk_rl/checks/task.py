@@ -20,16 +20,7 @@ from brokk_rl.checks.exercise import (
     require_rows,
     view_tensors,
 )
-from brokk_rl.contracts.task import (
-    FAULT,
-    STEPS,
-    SUCCESS,
-    DeployableTask,
-    Task,
-    TaskProcess,
-    supports_classical_control,
-    supports_deployment,
-)
+from brokk_rl.contracts.task import FAULT, STEPS, SUCCESS, Task, TaskProcess
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 
@@ -151,28 +142,20 @@ def _check_commands(process: TaskProcess, machine: Machine, device: torch.device
 def _check_optional(
     process: TaskProcess, groups: dict[str, torch.Tensor], machine: Machine
 ) -> None:
-    """Check `ClassicalTask` and `DeployableTask` where the task offers them."""
+    """Check the optional methods that the task offers."""
     num_actions = process.num_actions
-    if supports_classical_control(process):
+    if "classical_action" in process.offers:
         action = process.classical_action(groups)
         require(
             tuple(action.shape) == (NUM_ENVS, num_actions),
             f"classical_action: got shape {tuple(action.shape)}",
         )
-    half = []
-    for name in ("describe", "deployable"):
-        if hasattr(process, name):
-            half.append(name)
-    require(
-        len(half) != 1,
-        f"{half}: a task that can be deployed has both methods, describe and deployable",
-    )
-    if supports_deployment(process):
+    if "deployable" in process.offers:
         _check_deployment(process, groups["policy"], machine, num_actions)
 
 
 def _check_deployment(
-    process: DeployableTask, vector: torch.Tensor, machine: Machine, num_actions: int
+    process: TaskProcess, vector: torch.Tensor, machine: Machine, num_actions: int
 ) -> None:
     description = process.describe()
     json.dumps(description)

@@ -1,16 +1,8 @@
 """Contract of a task, and of the policies that act in it.
 
 A task is a spec in `conf/task` with one method, `build`. It returns a `TaskProcess`: the episodes
-of `N` environments at once. That contract is all that training and evaluation need. Five more are
-optional:
-
-* `ClassicalTask`: the task knows a classical controller. It is evaluated beside the trained policy,
-  and `policy=classical` works.
-* `MovableTask`: the target may be moved during an episode, as `mode=play` does.
-* `DeployableTask`: the task can write its policy as one module from observation to command. Then
-  `mode=export` and the end of `mode=train` write `policy.onnx`.
-* `MirroredTask`: episodes have a mirror image, as `rl.symmetry` needs.
-* `LookingTask`: a sensor may estimate the target, as `target=perceived` does.
+of `N` environments at once. Its abstract methods are all that training and evaluation need. The
+others are optional: a subclass that has one overrides it, and `TaskProcess.offers` names it.
 
 `brokk_rl.checks.check_task` exercises a task against all of this, for our own options and for those
 of extensions.
@@ -23,8 +15,10 @@ Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `S` c
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeGuard, runtime_checkable
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from brokk_rl.contracts.world import World
 from brokk_rl.errors import ConfigError
@@ -45,6 +39,48 @@ REWARD = "reward/"
 """Begins the figures of `TaskProcess.episode` that add up one term of the reward each."""
 SUCCESS = "success_strict"
 """Figure of `TaskProcess.episode` by which policies are compared: 1 after success, else 0."""
+OPTIONAL = {
+    "classical_action": "classical controller",
+    "move_target": "target that can be moved",
+    "count_starts": "count of the starts that can be done",
+    "bring_near": "starts near its target",
+    "describe": "description of its observation",
+    "deployable": "policy that can leave the trainer",
+    "mirror": "mirror image",
+    "take_estimate": "target that a sensor estimates",
+    "plan": "planned motion",
+}
+"""Optional methods of `TaskProcess`, and what a task without one lacks."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Summary of a figure over episodes, and its words in tables and films.
+
+    Attributes:
+        title: Its name in words.
+        unit: Unit in which it is shown; `share` for a figure of 0 or 1, of which the share is
+            reported with its interval.
+        factor: Factor from the unit of the figure to the one shown.
+        digits: Decimals shown.
+        of_success: Whether it counts in episodes with success only; median and 95 % quantile are
+            reported.
+    """
+
+    title: str
+    unit: str
+    factor: float
+    digits: int
+    of_success: bool
+
+    def word(self, value: float) -> str:
+        """Return a value with the shown unit."""
+        unit = "" if self.unit == "share" else f" {self.unit}"
+        return f"{self.factor * value:.{self.digits}f}{unit}"
+
+
+SUCCESS_FIGURE = Figure("success", "share", 1.0, 3, of_success=False)
+"""Words for `SUCCESS` in a task that has none of its own."""
 
 
 @dataclass
@@ -64,7 +100,7 @@ class Transition:
     reason: torch.Tensor
 
 
-class TaskProcess(Protocol):
+class TaskProcess(ABC):
     """Episodes of a task in `N` environments.
 
     No method synchronises with the host, and all shapes are fixed: a GPU captures the control step
@@ -83,7 +119,19 @@ class TaskProcess(Protocol):
     episode: dict[str, torch.Tensor]
     """Figures of the running episode, by name, each `(N,)`; written in place. `SUCCESS` is one of
     them; evaluation reports the others too."""
+    figures: Mapping[str, Figure] = {SUCCESS: SUCCESS_FIGURE}
+    """Words for figures of `episode`, in the order of tables; the others are reported as means and
+    stand in no table."""
 
+    @property
+    def offers(self) -> frozenset[str]:
+        """Names of the optional methods that this task has; see `OPTIONAL`."""
+        own = type(self)
+        return frozenset(
+            name for name in OPTIONAL if getattr(own, name) is not getattr(TaskProcess, name)
+        )
+
+    @abstractmethod
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draw `count` valid starts; the same seed gives the same starts.
 
@@ -91,23 +139,23 @@ class TaskProcess(Protocol):
             `q` `(count, J)`, `scene` `(count, S)` (`brokk_rl.sim.scene`), and whatever else `reset`
             needs.
         """
-        ...
 
+    @abstractmethod
     def reset(self, mask: torch.Tensor, start: dict[str, torch.Tensor]) -> None:
         """Begin new episodes in the environments of `mask`, `(N,)` bool, from `start`, `(N, …)`."""
-        ...
 
+    @abstractmethod
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """Return valve commands `(N, J)` in [-1, 1] for the policy's action, `(N, num_actions)`.
 
         The action is not clipped. Joints that the machine forbids to move together are masked here.
         """
-        ...
 
+    @abstractmethod
     def step(self, history: History, world: World) -> Transition:
         """Judge the control step that has just been simulated."""
-        ...
 
+    @abstractmethod
     def observe(
         self, history: History, shift_m: torch.Tensor | None = None
     ) -> dict[str, torch.Tensor]:
@@ -121,21 +169,10 @@ class TaskProcess(Protocol):
             shift_m: Error of the target's believed place, `(N, 3)`
                 (`SensingModel.misplacement`); `None` for no such error.
         """
-        ...
-
-
-@runtime_checkable
-class ClassicalTask(Protocol):
-    """A task process with a classical controller; optional."""
 
     def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
         """Return the classical controller's action, `(N, num_actions)`, for observation groups."""
-        ...
-
-
-@runtime_checkable
-class MovableTask(Protocol):
-    """A task process whose target somebody may move during an episode; optional."""
+        self.refuse("classical_action")
 
     def move_target(self, mask: torch.Tensor, shift_m: torch.Tensor) -> None:
         """Shift the target in the environments of `mask`, `(N,)` bool, by `shift_m`, `(N, 3)`.
@@ -143,21 +180,24 @@ class MovableTask(Protocol):
         The estimate of the target shifts with it, and the entry `start.scene` of `state`. The block
         itself is the world's (`brokk_rl.contracts.world.World.place`).
         """
-        ...
-
-
-@runtime_checkable
-class CountedStarts(Protocol):
-    """A task process that says how many of its random starts can be done; optional."""
+        self.refuse("move_target")
 
     def count_starts(self, count: int, seed: int) -> dict[str, float]:
         """Return shares of the candidates drawn for `count` starts, by condition, the last one all."""
-        ...
+        self.refuse("count_starts")
 
+    def bring_near(
+        self, start: dict[str, torch.Tensor], share: float, height_m: tuple[float, float], seed: int
+    ) -> dict[str, torch.Tensor]:
+        """Return starts of which the first part begins upright above its target, on the CPU.
 
-@runtime_checkable
-class DeployableTask(Protocol):
-    """A task process whose policy can leave the trainer; optional."""
+        Args:
+            start: Starts, as `starts` returns them.
+            share: Part of the starts that are brought near.
+            height_m: Heights of the tool point above the target, (lowest, highest).
+            seed: The same seed gives the same heights.
+        """
+        self.refuse("bring_near")
 
     def describe(self) -> dict[str, Any]:
         """Return `size`, order, scale and filters of the `policy` group, as plain JSON data.
@@ -167,39 +207,15 @@ class DeployableTask(Protocol):
         elsewhere in that file: `stop`, when an episode ends, and `masked`, `False` where commands
         may move exclusive and other joints at once.
         """
-        ...
+        self.refuse("describe")
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
         """Return the whole policy: from the `policy` group, `(B, O)`, to masked commands `(B, J)`.
 
-        `network` takes a dictionary of observation groups and returns the action.
+        `network` takes a dictionary of observation groups and returns the action. A task with this
+        method also has `describe`.
         """
-        ...
-
-
-def supports_classical_control(process: object) -> TypeGuard[ClassicalTask]:
-    """Return whether a task process has a classical controller."""
-    return isinstance(process, ClassicalTask)
-
-
-def can_move_target(process: object) -> TypeGuard[MovableTask]:
-    """Return whether the target of a task process can be moved."""
-    return isinstance(process, MovableTask)
-
-
-def can_count_starts(process: object) -> TypeGuard[CountedStarts]:
-    """Return whether a task process says how many of its starts can be done."""
-    return isinstance(process, CountedStarts)
-
-
-def supports_deployment(process: object) -> TypeGuard[DeployableTask]:
-    """Return whether the policy of a task process can be exported to ONNX."""
-    return isinstance(process, DeployableTask)
-
-
-@runtime_checkable
-class MirroredTask(Protocol):
-    """A task process whose episodes have a mirror image; optional, for `rl.symmetry`."""
+        self.refuse("deployable")
 
     def mirror(self) -> Mirror:
         """Return the mirror of all observation groups and of the action.
@@ -207,16 +223,11 @@ class MirroredTask(Protocol):
         Raises:
             ConfigError: The machine is not left-right symmetric.
         """
-        ...
-
-
-@runtime_checkable
-class LookingTask(Protocol):
-    """A task process whose target a sensor estimates (`brokk_rl.contracts.target`); optional."""
+        self.refuse("mirror")
 
     def take_estimate(self, target_m: torch.Tensor) -> None:
         """Take estimated targets, `(N, 3)`, in the place of drawn errors, from now on."""
-        ...
+        self.refuse("take_estimate")
 
     def plan(
         self, q: torch.Tensor, target_m: torch.Tensor, num_times: int, step_s: float
@@ -229,21 +240,23 @@ class LookingTask(Protocol):
             num_times: `T`; the first time is now.
             step_s: Time between two of them.
         """
-        ...
+        self.refuse("plan")
 
+    def require(self, method: str, advice: str) -> None:
+        """Refuse a task without an optional method; `advice` says what to change.
 
-def find_looking_task(process: object) -> LookingTask:
-    """Return a task process as one whose target a sensor estimates.
+        Raises:
+            ConfigError: The task does not offer it.
+        """
+        if method not in self.offers:
+            self.refuse(method, advice)
 
-    Raises:
-        ConfigError: it is none.
-    """
-    if not isinstance(process, LookingTask):
+    def refuse(self, method: str, advice: str = "choose another task") -> NoReturn:
+        """Raise a `ConfigError` that names an optional method which this task does not offer."""
         raise ConfigError(
-            f"target: the task ({type(process).__name__}) draws the errors of its target itself; "
-            "give target=drawn, or a task with take_estimate and plan"
+            f"the task ({type(self).__name__}) has no {OPTIONAL[method]}: expected the method "
+            f"`{method}` (brokk_rl.contracts.task); {advice}"
         )
-    return process
 
 
 class Task(Protocol):

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.contracts.task import Task, can_count_starts
+from brokk_rl.contracts.task import Task
 from brokk_rl.errors import BrokkError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
@@ -104,9 +104,8 @@ class Check:
         shares: dict[str, float] = {}
         try:
             process = self.task.build(machine, 1, torch.device("cpu"))
-            counted: object = process
-            if can_count_starts(counted):
-                shares = counted.count_starts(count, seed)
+            if "count_starts" in process.offers:
+                shares = process.count_starts(count, seed)
             drawn = process.starts(count, seed)
         except BrokkError as error:
             found.problems.append(str(error))

@@ -12,7 +12,7 @@ import torch
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.target import TargetSensorSpec
-from brokk_rl.contracts.task import Policy, Task, supports_classical_control
+from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -142,8 +142,7 @@ def evaluate_policies(
             loops[key] = loop, loop.state_dict()
         loop, fresh = loops[key]
         is_rival = evaluated and isinstance(policy, ClassicalPolicy)
-        process: object = loop.task
-        if is_rival and not supports_classical_control(process):
+        if is_rival and "classical_action" not in loop.task.offers:
             log.info(
                 "the task (%s) has no classical controller to compare with", descriptions[name].name
             )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-from brokk_rl.contracts.task import Task, supports_deployment
+from brokk_rl.contracts.task import Task
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import find_checkpoint, read_follower
@@ -61,8 +61,7 @@ class Export:
         own = TaskDescription.from_json(content["task"], str(path))
         spec_of_task = apply_behaviour(self.task, own, self.asked, f"the policy in {path}")
         task = spec_of_task.build(self.machine, 1, cpu)
-        deployable: object = task
-        if not supports_deployment(deployable):
+        if "deployable" not in task.offers:
             raise ConfigError(
                 f"mode=export: {NOT_DEPLOYABLE.format(task=type(self.task).__name__)}"
             )
@@ -79,7 +78,7 @@ class Export:
         folder, description = self.session.folder, describe_task(spec_of_task)
         contract = write_bundle(folder, actor, network, task, description, self.machine, facts)
         answers = content["answers"]
-        largest = export_onnx(folder, actor, deployable, self.machine, contract, answers)
+        largest = export_onnx(folder, actor, task, self.machine, contract, answers)
         log.info(
             "%s: onnxruntime and the training run differ by at most %.1e over %d observations",
             folder,

@@ -11,7 +11,7 @@ from typing import Protocol
 import torch
 
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
-from brokk_rl.contracts.task import Policy, Task, supports_classical_control
+from brokk_rl.contracts.task import Policy, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
@@ -174,7 +174,7 @@ def _gather_policies(
     else:
         policies = {POLICY: policy.build(loop, seed)}
         note = f"policy={name_spec(policy)} {getattr(policy, 'folder', '')}".rstrip()
-    if supports_classical_control(loop.task):
+    if "classical_action" in loop.task.offers:
         classical = ClassicalPolicy().build(loop, seed)
         if type(policies[POLICY]) is type(classical):
             return _Found({CLASSICAL: classical}, "the task's classical controller")

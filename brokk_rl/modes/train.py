@@ -13,7 +13,7 @@ import yaml
 
 from brokk_rl import distributed
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
-from brokk_rl.contracts.task import Task, supports_classical_control, supports_deployment
+from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import CheckpointError, SimulationError
 from brokk_rl.machine import Machine
@@ -215,7 +215,7 @@ class Train:
         answers = runner.record_answers()
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
         policies: dict[str, PolicySpec] = {"trained": TrainedPolicy(folder=str(folder))}
-        if supports_classical_control(loop.task):
+        if "classical_action" in loop.task.offers:
             policies["classical"] = ClassicalPolicy()
         else:
             log.info(
@@ -225,7 +225,7 @@ class Train:
         policies["untrained"] = UntrainedPolicy(training=self.rl)
         results = evaluate_policies(config, self.evaluation, self.session, policies)
         task = config.task.build(self.machine, 1, torch.device("cpu"))
-        if supports_deployment(task):
+        if "deployable" in task.offers:
             export_onnx(folder, actor, task, self.machine, contract, answers)
         else:
             log.warning(NOT_DEPLOYABLE.format(task=type(self.task).__name__))

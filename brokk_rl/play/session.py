@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from brokk_rl.contracts.task import STEPS, SUCCESS, Policy, can_move_target
+from brokk_rl.contracts.task import STEPS, SUCCESS, Policy
 from brokk_rl.contracts.world import LoadedWorld
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.kinematics import Kinematics
@@ -162,7 +162,7 @@ class PlaySession:
     @property
     def can_move_target(self) -> bool:
         """True where the task lets its target be moved."""
-        return can_move_target(self.loop.task)
+        return "move_target" in self.loop.task.offers
 
     def choose_driver(self, name: str) -> None:
         """Let a policy drive all machines, or the person the selected one.
@@ -404,7 +404,6 @@ class PlaySession:
     def _put_target(self, world: int, place: torch.Tensor) -> None:
         """Move target and block of a world to `place`, `(3,)`."""
         task = self.loop.task
-        assert can_move_target(task)
         mask = torch.zeros(self.loop.num_envs, dtype=torch.bool, device=self.loop.device)
         mask[world] = True
         task.move_target(mask, place - self.loop.task.state["start.target_m"])

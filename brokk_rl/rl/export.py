@@ -16,7 +16,7 @@ import onnxruntime
 import torch
 from rsl_rl.models import MLPModel
 
-from brokk_rl.contracts.task import DeployableTask
+from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
@@ -34,7 +34,7 @@ NUM_GOLDEN = 16
 NOT_DEPLOYABLE = (
     "the task ({task}) cannot be deployed, so there is no policy.onnx: it has no methods "
     "`describe` "
-    "and `deployable` (brokk_rl.contracts.task.DeployableTask); policy=trained can evaluate the "
+    "and `deployable` (brokk_rl.contracts.task); policy=trained can evaluate the "
     "policy of a run folder without them"
 )
 
@@ -42,7 +42,7 @@ NOT_DEPLOYABLE = (
 def export_onnx(
     folder: Path,
     actor: MLPModel,
-    task: DeployableTask,
+    task: TaskProcess,
     machine: Machine,
     contract: dict[str, Any],
     answers: tuple[torch.Tensor, torch.Tensor],

@@ -24,14 +24,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file, save_file
 from tensordict import TensorDict
 
-from brokk_rl.contracts.task import (
-    ClassicalTask,
-    Policy,
-    Task,
-    TaskProcess,
-    supports_classical_control,
-    supports_deployment,
-)
+from brokk_rl.contracts.task import Policy, Task, TaskProcess
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -76,12 +69,7 @@ class ClassicalPolicy:
         Raises:
             ConfigError: The task has no classical controller.
         """
-        if not supports_classical_control(loop.task):
-            raise ConfigError(
-                f"policy=classical: the task ({type(loop.task).__name__}) has no classical "
-                "controller; choose another policy=…, or give the task the method "
-                "`classical_action` (brokk_rl.contracts.task.ClassicalTask)"
-            )
+        loop.task.require("classical_action", "choose another policy=…")
         return _ClassicalActor(loop.task)
 
 
@@ -202,7 +190,7 @@ class ShippedPolicy:
 
 
 class _ClassicalActor:
-    def __init__(self, task: ClassicalTask) -> None:
+    def __init__(self, task: TaskProcess) -> None:
         self._task = task
 
     def act(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
@@ -318,8 +306,7 @@ def _make_contract(
 ) -> dict[str, Any]:
     """Return all that a stranger needs to run the policy, as plain JSON data."""
     names = list(machine.joint_names)
-    process: object = task
-    observation = process.describe() if supports_deployment(process) else None
+    observation = task.describe() if "describe" in task.offers else None
     stop = (observation or {}).pop("stop", {})
     masked = (observation or {}).pop("masked", True)
     contract = {
@@ -446,7 +433,7 @@ def _check_assumption(actor: MLPModel, loop: ControlLoop, folder: Path) -> None:
         log.warning("%s; assumed: %s", lacks, ", ".join(values))
         return
     path = folder / GOLDEN
-    if not path.exists() or not supports_deployment(loop.task):
+    if not path.exists() or "deployable" not in loop.task.offers:
         raise CheckpointError(
             f"{lacks}, and there is no {GOLDEN} to find it out; export it again from a checkpoint"
         )

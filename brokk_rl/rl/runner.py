@@ -14,7 +14,6 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.contracts.task import MirroredTask
 from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.rl.exploration import CappedGaussian
 from brokk_rl.rl.learning_curve import find_plateau
@@ -79,11 +78,7 @@ class TrainingRunner(OnPolicyRunner):
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
         if training.symmetry and isinstance(self.alg, DevicePPO):
-            if not isinstance(env.task, MirroredTask):
-                raise ConfigError(
-                    f"rl.symmetry: the task ({type(env.task).__name__}) has no method mirror; give "
-                    "rl.symmetry=false"
-                )
+            env.task.require("mirror", "give rl.symmetry=false")
             self.alg.use_mirror(env.task.mirror())
         self._levelled_at: int | None = None
         """Control steps after which success no longer grew; found anew after a resume."""

@@ -27,9 +27,8 @@ from brokk_rl.contracts.actuator import (
     SensingModel,
 )
 from brokk_rl.contracts.target import TargetSensor, TargetSensorSpec
-from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess, find_looking_task
+from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, TracedWorld, World
-from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
@@ -142,7 +141,8 @@ class ControlLoop(VecEnv):
     ) -> None:
         self.machine, self.world, self.task = machine, world, task
         self.sensor = sensor
-        self._looking = find_looking_task(task) if sensor else None
+        if sensor:
+            task.require("take_estimate", "give target=drawn")
         self.description = description
         self.actuator, self.follower = actuator, follower
         self.num_envs = world.num_worlds
@@ -249,13 +249,8 @@ class ControlLoop(VecEnv):
         Raises:
             ConfigError: The task cannot do that.
         """
-        move = getattr(self.task, "bring_near", None)
-        if move is None:
-            raise ConfigError(
-                f"rl.near_starts: the task ({type(self.task).__name__}) has no method bring_near; "
-                "give rl.near_starts=null"
-            )
-        moved = move(self.starts, near.share, near.height_m, seed)
+        self.task.require("bring_near", "give rl.near_starts=null")
+        moved = self.task.bring_near(self.starts, near.share, near.height_m, seed)
         self.starts = {name: value.to(self.device) for name, value in moved.items()}
         self.begin()
 
@@ -471,8 +466,7 @@ class ControlLoop(VecEnv):
 
     def _sense(self, sensor: TargetSensor, start: Starts) -> None:
         """Give the task the targets that the sensor estimates."""
-        assert self._looking is not None
-        task = self._looking
+        task = self.task
 
         def plan(target_m: np.ndarray, num_times: int, step_s: float) -> np.ndarray:
             wanted = torch.as_tensor(target_m, dtype=torch.float32, device=self.device)

@@ -60,7 +60,7 @@ class PolicyBundle:
         if observation is None:
             raise CheckpointError(
                 f"{folder}: the policy's task cannot be deployed, so there is no {ONNX}; see "
-                "brokk_rl.contracts.task.DeployableTask"
+                "brokk_rl.contracts.task"
             )
         encoder = restore_encoder(machine, observation)
         if not isinstance(encoder, ObservationEncoder):

@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from brokk_rl.contracts.task import REWARD, STEPS, SUCCESS, Transition
+from brokk_rl.contracts.task import REWARD, STEPS, SUCCESS, TaskProcess, Transition
 from brokk_rl.contracts.world import World
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
@@ -31,8 +31,8 @@ GROUPS = {"policy": "observation", "privileged": "privileged"}
 """Field of the spec that holds the terms of each observation group."""
 
 
-class TermProcess:
-    """Episodes in `N` environments; fulfils `TaskProcess` and `DeployableTask`.
+class TermProcess(TaskProcess):
+    """Episodes in `N` environments.
 
     Args:
         task: The spec.
@@ -188,7 +188,7 @@ class TermProcess:
         return {group: self.state[group] for group in self._encoders}
 
     def describe(self) -> dict[str, Any]:
-        """Return the contract of the `policy` group; see `DeployableTask.describe`."""
+        """Return the contract of the `policy` group; see `TaskProcess.describe`."""
         description = self._encoders["policy"].describe()
         for part in description["parts"]:
             part["function"] = self._terms["policy"][part["name"]].function
@@ -202,7 +202,7 @@ class TermProcess:
         return description | {"masked": self.task.action.mask, "stop": stop}
 
     def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
-        """Return the policy as one module; see `DeployableTask.deployable`."""
+        """Return the policy as one module; see `TaskProcess.deployable`."""
         return TermPolicy(network, self.task.action, self._exclusive)
 
     def _measure(self, group: str, name: str, term: ObservedTerm, seen: TermState) -> torch.Tensor:

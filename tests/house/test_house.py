@@ -46,8 +46,8 @@ def test_the_sources_keep(rule: Callable[[Mapping[str, str]], list[str]]) -> Non
     assert rule(SOURCES) == []
 
 
-NOUNS = ("spec", "supports_classical_control", "supports_deployment")
-"""Functions that are no verbs: the decorator of specs, and two questions about a task."""
+NOUNS = ("spec",)
+"""Functions that are no verbs: the decorator of specs."""
 QUANTITIES = ("tasks.reward", "tasks.observations")
 """Modules of terms, which are named by their quantity: users type these names."""
 

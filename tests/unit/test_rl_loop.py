@@ -289,10 +289,12 @@ def test_part_of_the_starts_of_a_training_lies_above_the_target(machine: Machine
     assert (loop.world.q[:, None] == start["q"]).all(2).any(1).all(), "the episodes begin there"
 
 
-def test_a_task_that_cannot_bring_its_starts_near_says_so(machine: Machine) -> None:
+def test_a_task_that_cannot_bring_its_starts_near_says_so(
+    machine: Machine, monkeypatch: pytest.MonkeyPatch
+) -> None:
     loop = make(machine)
-    loop.task = object()  # type: ignore[assignment]
-    with pytest.raises(ConfigError, match=r"rl\.near_starts: the task \(object\) has no method"):
+    monkeypatch.setattr(type(loop.task), "offers", frozenset())
+    with pytest.raises(ConfigError, match=r"no starts near its target.*rl\.near_starts=null"):
         loop.bring_near(NearStarts(share=0.5, height_m=(0.05, 0.3)), 1)
 
 

@@ -147,7 +147,7 @@ def test_it_learns_the_same_as_rsl_rls_own_augmentation() -> None:
 
 
 def test_rsl_rls_own_symmetry_and_a_task_without_a_mirror_are_refused(
-    machine: Machine, tmp_path
+    machine: Machine, tmp_path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     training = runs.small(max_env_steps=1)
     runner = dict(training.runner) | {
@@ -156,7 +156,7 @@ def test_rsl_rls_own_symmetry_and_a_task_without_a_mirror_are_refused(
     with pytest.raises(ConfigError, match=r"rl\.symmetry=true"):
         replace(training, runner=runner)
     loop = runs.plant(machine).build(runs.CPU, 16, 64, 0)
-    loop.task = type("Blind", (), {"num_actions": 5, "mirror": None})()
+    monkeypatch.setattr(type(loop.task), "offers", frozenset())
     with pytest.raises(ConfigError, match=r"rl\.symmetry"):
         runs.make(machine, tmp_path, replace(training, symmetry=True), loop)
 
