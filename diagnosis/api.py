@@ -23,8 +23,9 @@ import numpy as np
 import torch
 
 from actuators import open_loop
+from actuators.contracts import ActuatorFit
 from brokk_rl import extensions, record
-from brokk_rl.contracts.actuator import Actuator, ActuatorFit
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording

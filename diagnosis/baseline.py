@@ -19,9 +19,10 @@ import numpy as np
 import torch
 
 from actuators import open_loop
+from actuators.contracts import ActuatorFit
 from actuators.scales import choose_horizon_s
 from brokk_rl.commands import view_recordings
-from brokk_rl.contracts.actuator import Actuator, ActuatorFit
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel

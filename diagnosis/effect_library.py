@@ -19,9 +19,10 @@ import numpy as np
 import torch
 import yaml
 
+from actuators.contracts import PlannedRun
 from actuators.open_loop import FreeRunWindows
 from brokk_rl import registry
-from brokk_rl.contracts.actuator import Actuator, ActuatorModel, PlannedRun
+from brokk_rl.contracts.actuator import Actuator, ActuatorModel
 from brokk_rl.errors import BrokkError, ConfigError, group_by_reason, list_choices
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

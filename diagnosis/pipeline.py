@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from actuators.identify.curve_fit import ValveCurveFit
 from actuators.recordings.inspection import InspectionThresholds
-from brokk_rl.contracts.actuator import CurveFit, Excitation
+from brokk_rl.contracts.actuator import Excitation
 from diagnosis import (
     calibration,
     decision,
@@ -82,7 +83,7 @@ class DiagnosisPipeline:
     calibration: ProbabilityModel
     thresholds: InspectionThresholds
     excitations: Mapping[str, Excitation]
-    curve_fit: CurveFit
+    curve_fit: ValveCurveFit
     generator: np.random.Generator
 
     def run(self, tell: ProgressCallback) -> Outcome:

@@ -266,7 +266,7 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
     ),
     "clock rate": (
         "note",
-        "the clock find_stretches faster or slower than the stated rate",
+        "the clock runs faster or slower than the stated rate",
         "state the true rate, or discipline the clock",
     ),
     "saturated sensor": (
@@ -277,7 +277,7 @@ TEXTS: dict[str, tuple[Severity, str, str]] = {
     "joint at rest": (
         "note",
         "hardly commanded here: nothing can be said about this joint",
-        "record find_stretches that move it",
+        "record runs that move it",
     ),
 }
 """Severity, meaning and advice of each remark."""

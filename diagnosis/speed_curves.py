@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from brokk_rl.contracts.actuator import CurveFit, FittedCurve
+from actuators.identify.curve_fit import FittedCurve, ValveCurveFit
 from brokk_rl.machine import Machine
 from diagnosis.baseline import SimulatorComparison
 from diagnosis.closure import Estimate, serialize_estimate
@@ -95,7 +95,7 @@ def measure_curves(
     field: SimulatorComparison,
     others: Sequence[SimulatorComparison],
     machine: Machine,
-    fit: CurveFit,
+    fit: ValveCurveFit,
     generator: np.random.Generator,
 ) -> SpeedCurves:
     """Fit the curves of the machine and of the simulator, and read their difference.

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from brokk_rl.contracts.actuator import ActuatorFit
+from actuators.contracts import ActuatorFit
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress

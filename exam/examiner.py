@@ -20,10 +20,11 @@ import torch
 import yaml
 
 from actuators import open_loop
+from actuators.contracts import ActuatorFit
 from actuators.effects.composition import ActuatorWithEffects, MeasuredActuatorModel
 from actuators.open_loop import FreeRunWindows
 from brokk_rl import record, registry
-from brokk_rl.contracts.actuator import Actuator, ActuatorFit
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

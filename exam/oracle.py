@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from brokk_rl.contracts.actuator import ActuatorFit
+from actuators.contracts import ActuatorFit
 from brokk_rl.machine import Machine
 from diagnosis import baseline, case, effect_library
 from diagnosis.baseline import Baseline

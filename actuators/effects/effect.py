@@ -14,11 +14,12 @@ from typing import Any, ClassVar, Literal
 
 import torch
 
+from actuators.contracts import PlannedRun
 from actuators.effects.planned_run import ChainRun
 from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
 from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
 from actuators.models.force_drive import change_drive
-from brokk_rl.contracts.actuator import ActuatorModel, PlannedRun
+from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -285,7 +286,7 @@ class EffectChain:
     def plan_run(
         self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
     ) -> PlannedRun | None:
-        """See `brokk_rl.contracts.actuator.PlannedModel`."""
+        """See `actuators.contracts.PlannedModel`."""
         self._change_drives()
         return ChainRun.plan(self, u, first, q)
 
@@ -301,7 +302,7 @@ class EffectChain:
 
     @property
     def delay_s(self) -> torch.Tensor:
-        """See `brokk_rl.contracts.actuator.PlannedModel`."""
+        """See `actuators.contracts.PlannedModel`."""
         own_s = [value for name in self._delays for value in self.get_values(name).values()]
         return (self.inner.delay_s + sum(own_s)).clamp(min=0.0)
 

@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 import torch
 
+from actuators.contracts import PlannedRun
 from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
-from brokk_rl.contracts.actuator import PlannedRun
 from brokk_rl.history import History
 
 
@@ -83,7 +83,7 @@ class ChainRun:
         return cls(chain, inner, u, first)
 
     def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
-        """See `brokk_rl.contracts.actuator.PlannedRun`."""
+        """See `actuators.contracts.PlannedRun`."""
         chain, plant, newest = self._chain, self._chain.plant, q[k - 1]
         predicted = moved_to = self._inner.step(k, q)
         past = slice(k - self._first, k)

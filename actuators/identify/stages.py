@@ -20,8 +20,9 @@ import torch
 import yaml
 
 from actuators import open_loop
+from actuators.contracts import ActuatorFit
 from brokk_rl import registry
-from brokk_rl.contracts.actuator import Actuator, ActuatorFit
+from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording

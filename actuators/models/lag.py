@@ -190,7 +190,7 @@ class FirstOrderLagModel:
         q: torch.Tensor | None = None,
         drive: "LagDrive | None" = None,
     ) -> "LagRun":
-        """See `brokk_rl.contracts.actuator.PlannedModel`; `drive`: that of the commands, if known."""
+        """See `actuators.contracts.PlannedModel`; `drive`: that of the commands, if known."""
         return LagRun(self, self.drive(u, first) if drive is None else drive, first)
 
     def drive(self, u: torch.Tensor, first: int) -> "LagDrive":
@@ -233,7 +233,7 @@ class LagDrive:
 
 
 class LagRun:
-    """A run of a `FirstOrderLagModel`; see `brokk_rl.contracts.actuator.PlannedRun`.
+    """A run of a `FirstOrderLagModel`; see `actuators.contracts.PlannedRun`.
 
     The solution of a period is linear in the speed at its beginning: motion and speed after it are
     a constant of the commands plus a factor times that speed.

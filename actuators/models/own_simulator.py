@@ -20,9 +20,9 @@ from weakref import WeakKeyDictionary
 import numpy as np
 import torch
 
+from actuators.contracts import PlannedRun
 from actuators.effects.simulator import EFFECTS
 from actuators.open_loop import WARM_UP_S
-from brokk_rl.contracts.actuator import PlannedRun
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -189,7 +189,7 @@ class OwnSimulatorModel:
     def plan_run(
         self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
     ) -> PlannedRun | None:
-        """See `brokk_rl.contracts.actuator.PlannedModel`.
+        """See `actuators.contracts.PlannedModel`.
 
         `q` holds the positions of the warm-up too. The run begins behind it, where it does in
         `actuators.open_loop`.
@@ -220,7 +220,7 @@ class _RolledRun:
         self._path, self._begin = path, begin
 
     def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
-        """Return positions `k`, `(N, J)`; see `brokk_rl.contracts.actuator.PlannedRun`."""
+        """Return positions `k`, `(N, J)`; see `actuators.contracts.PlannedRun`."""
         if k < self._begin:
             return self._path[k]
         return q[k - 1] + (self._path[k] - self._path[k - 1])

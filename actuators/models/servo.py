@@ -172,7 +172,7 @@ class ServoModel:
         return self.parameters["dead_time_s"]
 
     def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> "ServoRun":
-        """See `brokk_rl.contracts.actuator.PlannedModel`."""
+        """See `actuators.contracts.PlannedModel`."""
         return ServoRun(self, u, first)
 
     @property
@@ -396,7 +396,7 @@ class PartSolution:
 
 
 class ServoRun:
-    """A run of a `ServoModel`; see `brokk_rl.contracts.actuator.PlannedRun`.
+    """A run of a `ServoModel`; see `actuators.contracts.PlannedRun`.
 
     Targets behind the play depend on commands alone: they are computed beforehand.
     """

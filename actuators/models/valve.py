@@ -293,7 +293,7 @@ class ValveModel:
         q: torch.Tensor | None = None,
         drive: "ValveDrive | None" = None,
     ) -> "ValveRun":
-        """See `brokk_rl.contracts.actuator.PlannedModel`; `drive`: that of the commands, if known."""
+        """See `actuators.contracts.PlannedModel`; `drive`: that of the commands, if known."""
         kept = _compute_decay(self._period_s, self.parameters["speed_s"])
         return ValveRun(self, self.drive(u, first) if drive is None else drive, kept, first)
 
@@ -370,7 +370,7 @@ class ValveDrive:
 
 
 class ValveRun:
-    """A run of a `ValveModel`; see `brokk_rl.contracts.actuator.PlannedRun`."""
+    """A run of a `ValveModel`; see `actuators.contracts.PlannedRun`."""
 
     def __init__(
         self, model: ValveModel, drive: ValveDrive, kept: torch.Tensor, first: int

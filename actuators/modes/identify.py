@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from actuators import open_loop
+from actuators.contracts import ActuatorFit
 from actuators.identify import page
 from actuators.identify.request import Identification
 from actuators.identify.results import (
@@ -24,7 +25,6 @@ from actuators.identify.results import (
 from actuators.identify.stages import FitStage, FittedModel, fit_or_restore, list_recordings
 from actuators.recordings.split import check_commanded, group_by_run, split_runs
 from brokk_rl import record
-from brokk_rl.contracts.actuator import ActuatorFit
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording

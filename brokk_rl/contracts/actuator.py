@@ -1,4 +1,4 @@
-"""Contracts of actuator models, their fits and excitations, effects and followers.
+"""Contracts of actuator models, excitations, effects and followers.
 
 `brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
 extensions.
@@ -13,14 +13,12 @@ from typing import TYPE_CHECKING, Literal, Protocol
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from pathlib import Path
 
     import numpy as np
     import torch
 
     from brokk_rl.history import History
     from brokk_rl.machine import Machine
-    from brokk_rl.record import Recording
 
 
 class ActuatorModel(Protocol):
@@ -45,44 +43,6 @@ class ActuatorModel(Protocol):
 
         `history.u[:, -1]` is the command that has just come into force, `history.q[:, -1]` the
         position at this moment.
-        """
-        ...
-
-
-class PlannedRun(Protocol):
-    """A run of a model whose commands are all known beforehand."""
-
-    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
-        """Return positions `k`, `(N, J)`, from those before in `q`, `(T + 1, N, J)`.
-
-        It is called once for each `k`, rising from `first` of `PlannedModel.plan_run` on.
-        """
-        ...
-
-
-class PlannedModel(ActuatorModel, Protocol):
-    """An actuator model that computes what depends on commands alone for a whole run at once.
-
-    It looks at the newest position only, and at the two newest in its first step.
-    """
-
-    @property
-    def delay_s(self) -> torch.Tensor:
-        """Time until a command begins to act, `(N, J)`, s."""
-        ...
-
-    def plan_run(
-        self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
-    ) -> PlannedRun | None:
-        """Return the run that begins after a `reset` of all environments; `None`: `step` through it.
-
-        The positions are those of `step`. The state stays as it was.
-
-        Args:
-            u: Commands of the run, `(T, N, J)`; position `k` follows command `k - 1`.
-            first: Number of the first position that is asked for: the length of the history.
-            q: Positions up to there, `(first, N, J)` or more, for effects that begin where a joint is;
-                `None`: a model with such an effect has to be stepped.
         """
         ...
 
@@ -175,79 +135,6 @@ class Excitation(Protocol):
 
         Raises:
             ConfigError: not a single segment fits into `duration_s`.
-        """
-        ...
-
-
-class ActuatorFit(Protocol):
-    """A spec in `conf/fit`: learns an actuator model from recordings."""
-
-    name: str
-    """Name of the model in tables and files."""
-
-    def fit(
-        self,
-        machine: Machine,
-        train: Sequence[Recording],
-        validation: Sequence[Recording],
-        folder: Path,
-        seed: int,
-        device: torch.device,
-    ) -> Actuator:
-        """Fit to `train`, choose by `validation`, write results into `folder`.
-
-        Returns the fitted actuator.
-        """
-        ...
-
-
-@dataclass(frozen=True, eq=False)
-class FittedCurve:
-    """Speed over the stroke of the valve of one joint, with its bootstrap.
-
-    Attributes:
-        curve: Speed at each knot but 0, positive side first, over the machine's full speed, `(C,)`.
-        dynamics: Dead time (s), play (of full command), lag of the valve and lag of the speed (s).
-        draws: Bootstrap of both, `(1 + B, C + 4)`; the first row is the fit itself.
-        information: Information of the recordings on the curve, `(C, C)`.
-        points: Stroke and speed of single increments, `(I, 2)`.
-        sides: Whether each side, positive first, was commanded often enough for its numbers.
-    """
-
-    curve: np.ndarray
-    dynamics: np.ndarray
-    draws: np.ndarray
-    information: np.ndarray
-    points: np.ndarray
-    sides: tuple[bool, bool]
-
-
-class CurveFit(Protocol):
-    """A spec in `conf/curve_fit`: reads speed curves off motions under the same commands."""
-
-    knots: tuple[float, ...]
-    """Strokes at which the curves are given, rising from 0 to 1."""
-
-    def fit_curves(
-        self,
-        machine: Machine,
-        recordings: Sequence[Recording],
-        motions: Sequence[Sequence[np.ndarray]],
-        further: Sequence[Sequence[np.ndarray]],
-        generator: np.random.Generator,
-    ) -> list[list[FittedCurve]]:
-        """Return the curves of each joint, those of `motions` first; empty for a joint at rest.
-
-        Args:
-            machine: The machine.
-            recordings: Commands and poses.
-            motions: Each: motion from every sample to the next, by recording `(T, J)`, rad or m;
-                NaN where it is not known.
-            further: More motions, fitted with the dynamics, pose and pump of the last of `motions`.
-            generator: Draws the blocks of the bootstrap, the same for all.
-
-        Raises:
-            RecordingError: no recording is long enough.
         """
         ...
 

@@ -12,8 +12,10 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from actuators.contracts import ActuatorFit
+from actuators.identify.curve_fit import ValveCurveFit
 from actuators.recordings.inspection import InspectionThresholds
-from brokk_rl.contracts.actuator import Actuator, ActuatorFit, CurveFit, Excitation
+from brokk_rl.contracts.actuator import Actuator, Excitation
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import use_workers
@@ -65,7 +67,7 @@ class Diagnose:
     actuator: Actuator | None
     simulator: str | None
     own: Actuator
-    curve_fit: CurveFit
+    curve_fit: ValveCurveFit
     thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
     diagnosis: DiagnosisSubject

@@ -14,9 +14,10 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
+from actuators.contracts import ActuatorFit
 from actuators.excite.schedule import Approach
 from brokk_rl.console_table import print_table
-from brokk_rl.contracts.actuator import ActuatorFit, Excitation
+from brokk_rl.contracts.actuator import Excitation
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
