@@ -11,21 +11,17 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from brokk_rl.contracts.vision import (
-    Ellipse,
-    EllipseDetectorSpec,
-    FrameDetections,
-    HolePose,
-    HoleProposerSpec,
-    Masks,
-    PoseEstimatorSpec,
-    Rejection,
-    SegmenterSpec,
-)
+from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
 from perception import rectification, search
+from perception.contracts import (
+    EllipseDetectorSpec,
+    HoleProposerSpec,
+    PoseEstimatorSpec,
+    SegmenterSpec,
+)
 from perception.face_depth import FaceDepth, FaceMatcher
 from perception.pose.plane_conic import convert_to_gray
 from perception.pose.wall_light import IN_DUST

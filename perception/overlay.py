@@ -47,7 +47,7 @@ class OverlayDrawing:
             )
 
     def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
-        """Write the picture in one step; see `brokk_rl.contracts.vision.Overlay`."""
+        """Write the picture in one step; see `perception.contracts.Overlay`."""
         done, data = cv2.imencode(".png", self.draw(frame, detections))
         part = path.with_name(f".{path.name}.{os.getpid()}")
         try:

@@ -93,7 +93,7 @@ class FaceRegions:
 
 
 class FaceRegionProposer:
-    """Proposer of regions with the settings `FaceRegions`; a `brokk_rl.contracts.vision.HoleProposer`."""
+    """Proposer of regions with the settings `FaceRegions`; a `perception.contracts.HoleProposer`."""
 
     def __init__(self, settings: FaceRegions) -> None:
         self.settings = settings

@@ -8,8 +8,9 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from brokk_rl.contracts.vision import Ellipse, EllipseDetector, SizePrior
+from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
+from perception.contracts import EllipseDetector, SizePrior
 
 # Chosen by hand on rendered scenes (benchmarks/perception/table.py), unless a comment says
 # otherwise.

@@ -21,7 +21,6 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from brokk_rl.contracts.vision import EllipseDetector
 from perception.benchmark.calibration_patterns import (
     CONDITIONS,
     NEGATIVES,
@@ -32,6 +31,7 @@ from perception.benchmark.calibration_patterns import (
 from perception.benchmark.occluded_ellipses import SHAPES, draw_lookalikes, draw_occluded_ellipses
 from perception.benchmark.occluded_ellipses import STYLES as HIDDEN
 from perception.benchmark.photographs import STYLES, draw_photograph
+from perception.contracts import EllipseDetector
 
 NONE = np.empty((0, 5))
 

@@ -30,7 +30,7 @@ from rich.progress import track
 from rich.table import Table
 from speed import processor
 
-from brokk_rl.contracts.vision import Ellipse, EllipseDetector, SizePrior
+from brokk_rl.contracts.vision import Ellipse
 from perception.benchmark.calibration_patterns import (
     CONDITIONS,
     NEGATIVES,
@@ -41,6 +41,7 @@ from perception.benchmark.calibration_patterns import (
 from perception.benchmark.occluded_ellipses import SHAPES, draw_lookalikes, draw_occluded_ellipses
 from perception.benchmark.occluded_ellipses import STYLES as OCCLUDED
 from perception.benchmark.photographs import STYLES, draw_photograph
+from perception.contracts import EllipseDetector, SizePrior
 from perception.ellipse import support
 
 SIZE_PX = (512, 384)

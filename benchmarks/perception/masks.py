@@ -22,8 +22,9 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from brokk_rl.contracts.vision import FrameSource, Segmenter
+from brokk_rl.contracts.vision import FrameSource
 from perception import dataset
+from perception.contracts import Segmenter
 from perception.segment.network import THRESHOLD
 from perception.train.evaluation import match_pieces
 

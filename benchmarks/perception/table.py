@@ -40,10 +40,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from brokk_rl.contracts.vision import FrameDetections, Overlay
+from brokk_rl.contracts.vision import FrameDetections
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception.benchmark.scoring import FinderScore, score_frame
+from perception.contracts import Overlay
 from perception.finder import StagedFinder
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.scene_ranges import SceneRanges

@@ -1,10 +1,9 @@
-"""Contracts of perception: frame sources, segmenters, ellipse detectors, pose estimators, finders.
+"""Contracts of perception: frame sources, finders, trackers, and what they return.
 
 A finder is an option of `conf/perception`: a spec whose `build()` returns a `BoreholeFinder`. Its
 one method is `find(frame) -> FrameDetections`. `mode=perceive` and the camera process call nothing
-else; both hand the holes of each frame to one `HoleTracker`. The shipped finder
-(`perception.finder`) is built from a segmenter, an ellipse detector and a pose estimator, which are
-options of `conf/perception/{segmenter,ellipse,pose}`.
+else; both hand the holes of each frame to one `HoleTracker`. The parts of the shipped finder
+(`perception.finder`) have contracts of their own in `perception.contracts`.
 
 Pictures are `(h, w)` or `(h, w, 3)`, RGB, uint8; pixel centres lie at whole numbers. Camera
 coordinates follow the optical convention (x right, y down, z forward). Depth is z in m, `NaN` where
@@ -15,14 +14,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from brokk_rl.signals import Frame
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -62,14 +58,6 @@ class Ellipse:
     rms_px: float
     coverage: float
     score: float
-
-
-@dataclass(frozen=True)
-class SizePrior:
-    """Range of the major semi-axis of the ellipses to look for, px."""
-
-    lowest_px: float
-    highest_px: float
 
 
 @dataclass(frozen=True)
@@ -280,24 +268,6 @@ class FinderSpec(Protocol):
         ...
 
 
-@runtime_checkable
-class WholePictureFinder(Protocol):
-    """Optional ability of a finder, for `perceive.until=ellipses`."""
-
-    def find_ellipses(self, frame: Frame) -> list[Ellipse]:
-        """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
-        ...
-
-
-@runtime_checkable
-class RejectionExplainer(Protocol):
-    """Optional ability of a finder, for `explain.txt` of `mode=perceive`."""
-
-    def explain(self, rejection: Rejection) -> str:
-        """Return a sentence: the refused candidate, the reason, and a remedy."""
-        ...
-
-
 class HoleTracker(Protocol):
     """Associates the holes of successive frames."""
 
@@ -359,88 +329,4 @@ class FrameSourceSpec(Protocol):
 
     def build(self) -> FrameSource:
         """Return a source, not yet opened."""
-        ...
-
-
-class Segmenter(Protocol):
-    """Marks the pixels of the block and of its holes."""
-
-    def segment(self, frame: Frame) -> Masks:
-        """Return masks of the size of the frame."""
-        ...
-
-
-class SegmenterSpec(Protocol):
-    """A spec in `conf/perception/segmenter`."""
-
-    def build(self) -> Segmenter:
-        """Return a segmenter."""
-        ...
-
-
-class EllipseDetector(Protocol):
-    """Finds ellipses in a grey picture."""
-
-    def detect(
-        self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
-    ) -> list[Ellipse]:
-        """Return ellipses, the best first.
-
-        Args:
-            gray: Picture, `(h, w)` uint8.
-            roi: Region to search, `(h, w)` bool; `None` for everywhere.
-            prior: Range of their size; `None` for any size.
-        """
-        ...
-
-
-class EllipseDetectorSpec(Protocol):
-    """A spec in `conf/perception/ellipse`."""
-
-    def build(self) -> EllipseDetector:
-        """Return a detector."""
-        ...
-
-
-class HoleProposer(Protocol):
-    """Proposes places that may be holes by other signs than the edges of a rim."""
-
-    def propose(self, frame: Frame, masks: Masks) -> list[Ellipse]:
-        """Return ellipses of about the place and size of a rim, the likeliest first."""
-        ...
-
-
-class HoleProposerSpec(Protocol):
-    """A spec in `conf/perception/proposer`."""
-
-    def build(self) -> HoleProposer:
-        """Return a proposer."""
-        ...
-
-
-class PoseEstimator(Protocol):
-    """Turns an ellipse of a picture into a hole in space."""
-
-    def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
-        """Return the hole in camera coordinates, or why it is refused; `frame` has no distortion."""
-        ...
-
-
-class PoseEstimatorSpec(Protocol):
-    """A spec in `conf/perception/pose`."""
-
-    def build(self) -> PoseEstimator:
-        """Return an estimator."""
-        ...
-
-
-class Overlay(Protocol):
-    """Draws detections into their picture."""
-
-    def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
-        """Write a picture file.
-
-        Raises:
-            StorageError: it could not be written.
-        """
         ...

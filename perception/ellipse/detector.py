@@ -7,9 +7,10 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from brokk_rl.contracts.vision import Ellipse, SizePrior
+from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+from perception.contracts import SizePrior
 from perception.ellipse import conic
 from perception.ellipse import edges as ellipse_edges
 from perception.ellipse import support as ellipse_support

@@ -14,7 +14,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.spec import spec
 from perception.calibrate.board import BoardCalibration
-from perception.calibrate.pose_logs import PoseLogCalibration
 from perception.calibrate.touched_points import TouchCalibration
 from perception.calibrate.verdict import GOOD
 
@@ -37,7 +36,7 @@ class Calibrate:
 
     session: Session
     machine: Machine
-    calibration: BoardCalibration | PoseLogCalibration | TouchCalibration
+    calibration: BoardCalibration | TouchCalibration
 
     def run(self) -> float:
         """Write `calibration.yaml`, which sources of frames take as `base_from_camera`.
@@ -62,17 +61,15 @@ class Calibrate:
                 f"calibration: {verdict['status']}: {'; '.join(verdict['reasons'])}. "
                 f"{path} holds the residuals"
             )
-        if "T_base_cam" in content:
-            log.info("perception/source=zed source.base_from_camera=%s", path)
+        log.info("perception/source=zed source.base_from_camera=%s", path)
         return float(content["point_std_m"]["std_m"])
 
 
 def _show(content: dict[str, Any]) -> None:
     table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
-    frame = "base" if "T_base_cam" in content else "link"
-    place = ", ".join(f"{row[3]:.4f}" for row in content[f"T_{frame}_cam"][:3])
+    place = ", ".join(f"{row[3]:.4f}" for row in content["T_base_cam"][:3])
     table.add_row("verdict", content["verdict"]["status"])
-    table.add_row(f"camera in the {frame} frame", f"({place}) m")
+    table.add_row("camera in the base frame", f"({place}) m")
     work = content["point_std_m"]
     table.add_row(f"uncertainty at {work['at_m']:g} m", f"±{1000 * work['std_m']:.1f} mm")
     residual = content["residual"]

@@ -25,18 +25,16 @@ from brokk_rl.contracts.vision import (
     FrameSourceSpec,
     HolePose,
     HoleTracker,
-    Overlay,
     Rejection,
-    RejectionExplainer,
     TrackedHole,
     TrackerSpec,
-    WholePictureFinder,
 )
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
+from perception.contracts import Overlay, RejectionExplainer, WholePictureFinder
 
 log = logging.getLogger(__name__)
 

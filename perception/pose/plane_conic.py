@@ -7,17 +7,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from brokk_rl.contracts.vision import (
-    Ellipse,
-    HolePose,
-    Masks,
-    PoseEstimator,
-    PoseEstimatorSpec,
-    Rejection,
-)
+from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, Rejection
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import spec
+from perception.contracts import PoseEstimator, PoseEstimatorSpec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, plane, rim
 from perception.pose.appearance import Interior

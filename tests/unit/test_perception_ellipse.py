@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.contracts.vision import Ellipse, SizePrior
+from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.errors import ConfigError
 from perception.benchmark import calibration_patterns, occluded_ellipses, photographs
+from perception.contracts import SizePrior
 from perception.ellipse import conic, edge_drawing
 
 K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])

@@ -10,9 +10,10 @@ import pytest
 from composed import option
 from drawn import AXIS, CENTER, drawn
 
-from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, SizePrior
+from brokk_rl.contracts.vision import Ellipse, HolePose, Masks
 from perception import dataset, search
 from perception.benchmark.scoring import FinderScore, match_holes, score_frame
+from perception.contracts import SizePrior
 from perception.finder import StagedFinder, rectify
 
 

@@ -1,0 +1,126 @@
+"""Contracts of the parts of the shipped finder: segmenters, ellipse detectors, proposers, pose estimators.
+
+Each is an option of `conf/perception/<part>`: a spec whose `build()` returns the part. Pictures and
+camera coordinates are those of `brokk_rl.contracts.vision`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
+from brokk_rl.signals import Frame
+
+
+@dataclass(frozen=True)
+class SizePrior:
+    """Range of the major semi-axis of the ellipses to look for, px."""
+
+    lowest_px: float
+    highest_px: float
+
+
+class Segmenter(Protocol):
+    """Marks the pixels of the block and of its holes."""
+
+    def segment(self, frame: Frame) -> Masks:
+        """Return masks of the size of the frame."""
+        ...
+
+
+class SegmenterSpec(Protocol):
+    """A spec in `conf/perception/segmenter`."""
+
+    def build(self) -> Segmenter:
+        """Return a segmenter."""
+        ...
+
+
+class EllipseDetector(Protocol):
+    """Finds ellipses in a grey picture."""
+
+    def detect(
+        self, gray: np.ndarray, roi: np.ndarray | None, prior: SizePrior | None
+    ) -> list[Ellipse]:
+        """Return ellipses, the best first.
+
+        Args:
+            gray: Picture, `(h, w)` uint8.
+            roi: Region to search, `(h, w)` bool; `None` for everywhere.
+            prior: Range of their size; `None` for any size.
+        """
+        ...
+
+
+class EllipseDetectorSpec(Protocol):
+    """A spec in `conf/perception/ellipse`."""
+
+    def build(self) -> EllipseDetector:
+        """Return a detector."""
+        ...
+
+
+class HoleProposer(Protocol):
+    """Proposes places that may be holes by other signs than the edges of a rim."""
+
+    def propose(self, frame: Frame, masks: Masks) -> list[Ellipse]:
+        """Return ellipses of about the place and size of a rim, the likeliest first."""
+        ...
+
+
+class HoleProposerSpec(Protocol):
+    """A spec in `conf/perception/proposer`."""
+
+    def build(self) -> HoleProposer:
+        """Return a proposer."""
+        ...
+
+
+class PoseEstimator(Protocol):
+    """Turns an ellipse of a picture into a hole in space."""
+
+    def estimate(self, frame: Frame, masks: Masks, ellipse: Ellipse) -> HolePose | Rejection:
+        """Return the hole in camera coordinates, or why it is refused; `frame` has no distortion."""
+        ...
+
+
+class PoseEstimatorSpec(Protocol):
+    """A spec in `conf/perception/pose`."""
+
+    def build(self) -> PoseEstimator:
+        """Return an estimator."""
+        ...
+
+
+class Overlay(Protocol):
+    """Draws detections into their picture."""
+
+    def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
+        """Write a picture file.
+
+        Raises:
+            StorageError: it could not be written.
+        """
+        ...
+
+
+@runtime_checkable
+class WholePictureFinder(Protocol):
+    """Optional ability of a finder, for `perceive.until=ellipses`."""
+
+    def find_ellipses(self, frame: Frame) -> list[Ellipse]:
+        """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
+        ...
+
+
+@runtime_checkable
+class RejectionExplainer(Protocol):
+    """Optional ability of a finder, for `explain.txt` of `mode=perceive`."""
+
+    def explain(self, rejection: Rejection) -> str:
+        """Return a sentence: the refused candidate, the reason, and a remedy."""
+        ...
