@@ -17,6 +17,7 @@ from brokk_rl.machine import Machine
 
 if TYPE_CHECKING:
     import torch
+    from tensordict import TensorDict
 
 TOLERANCE = 1e-6
 """Up to which lengths (m) and angles (rad) of both sides are alike: rounding of a YAML's numbers."""
@@ -38,6 +39,21 @@ class Mirror:
         """Return the values of a group, `(…, O)`, as the mirrored machine observes them."""
         factor, shift = self.groups[group]
         return values * factor + shift
+
+    def augment(
+        self, env: object, obs: TensorDict | None, actions: torch.Tensor | None
+    ) -> tuple[TensorDict | None, torch.Tensor | None]:
+        """Return steps and then their mirror images, as rsl-rl's `data_augmentation_func` does."""
+        import torch
+
+        if obs is not None:
+            seen = obs.clone()
+            for name, value in obs.items():
+                seen[name] = self.apply(name, value)
+            obs = torch.cat((obs, seen))
+        if actions is not None:
+            actions = torch.cat((actions, actions * self.action))
+        return obs, actions
 
 
 def compute_joint_signs(machine: Machine) -> np.ndarray:

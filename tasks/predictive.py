@@ -33,7 +33,7 @@ from brokk_rl.contracts.task import Policy
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import mask_exclusive_joints
-from brokk_rl.rl.vec_env import ControlLoop
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.spec import spec
 from tasks.process import ToolPoseProcess
 

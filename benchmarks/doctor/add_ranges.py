@@ -18,8 +18,8 @@ import torch
 
 from brokk_rl import extensions
 from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
+from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
-from brokk_rl.rl.vec_env import ControlLoopConfig
 
 NUM_ENVS, NUM_MOMENTS, APART = 256, 8, 40
 """Environments, moments, and control periods between two of them: 16 s in all."""

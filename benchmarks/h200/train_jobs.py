@@ -39,11 +39,10 @@ from brokk_rl.contracts.task import Policy
 from brokk_rl.modes.train import Train
 from brokk_rl.rl.evaluation import evaluate_policy
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger
+from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, NetworkPolicy, write_bundle
-from brokk_rl.rl.runner import TrainingRunner
+from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.tracking import NoTracking
-from brokk_rl.rl.training_group import TrainingGroup
-from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 
 log = logging.getLogger("train_jobs")
 COLUMNS = {

@@ -18,9 +18,9 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
+from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, ShippedPolicy, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation
-from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.events import Event
 from brokk_rl.sim.objects import list_objects

@@ -21,8 +21,8 @@ from brokk_rl.play.checkpoint_watch import CheckpointWatch, find_newest, read_ta
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
+from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.policy import ClassicalPolicy
-from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import Session
 from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec

@@ -19,8 +19,8 @@ from brokk_rl.errors import CheckpointError, SimulationError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
-from brokk_rl.rl.learning_curve import find_passing
-from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves
+from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves, find_passing
+from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.policy import (
     ClassicalPolicy,
     TrainedPolicy,
@@ -30,12 +30,10 @@ from brokk_rl.rl.policy import (
     read_bundle,
     write_bundle,
 )
-from brokk_rl.rl.runner import TrainingRunner, list_checkpoints
+from brokk_rl.rl.runner import TrainingGroup, TrainingRunner, list_checkpoints
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.success_sweep import LEVELS
 from brokk_rl.rl.tracking import NoTracking, Tracker, Tracking
-from brokk_rl.rl.training_group import TrainingGroup
-from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
 from brokk_rl.session import RESOLVED, Session, read_record
 from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec

@@ -7,9 +7,9 @@ import time
 from pathlib import Path
 
 from brokk_rl.errors import CheckpointError
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import NetworkPolicy, make_actor
 from brokk_rl.rl.runner import list_checkpoints, read_checkpoint
-from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.task_description import TaskDescription
 
 log = logging.getLogger(__name__)

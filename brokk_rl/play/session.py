@@ -18,7 +18,7 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.play.dials import EffectDial, list_dials
 from brokk_rl.play.levers import PersonAtLevers
 from brokk_rl.play.settings import SPEEDS
-from brokk_rl.rl.vec_env import ControlLoop
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.scene import FAR_M
 
 PERSON = "person"

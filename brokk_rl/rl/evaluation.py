@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from brokk_rl.contracts.task import REWARD, SUCCESS, Policy
-from brokk_rl.rl.vec_env import ControlLoop, Starts
+from brokk_rl.rl.loop import ControlLoop, Starts
 from brokk_rl.statistics import compute_wilson_interval
 
 SHARES = (SUCCESS, "success_paper")

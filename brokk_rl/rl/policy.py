@@ -29,8 +29,8 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.settings import TrainingConfig
-from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import write_json
 from brokk_rl.spec import spec
 from brokk_rl.task_description import (

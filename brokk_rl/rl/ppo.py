@@ -14,8 +14,10 @@ processes takes a single buffer: every gradient and the divergence.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any
 
 import torch
@@ -25,10 +27,10 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
+from torch.distributions import Normal
 
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.rollout import CapturedRollout, pad_columns, run_network
-from brokk_rl.symmetry import Mirror
 
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds and step of the adaptive learning rate, as in rsl-rl."""
@@ -42,7 +44,7 @@ CLIP_MARGIN = 1e-6
 class DevicePPO(PPO):
     """PPO for feed-forward networks.
 
-    On a CPU, without teacher and mirror, it is rsl-rl's own, which acts on one thread.
+    On a CPU, without a teacher, it is rsl-rl's own, which acts on one thread.
 
     It may follow a teacher: the loss then holds the squared distance of the mean action from the
     teacher's, in the states that the student itself meets (Ross et al. 2011; Schmitt et al. 2018).
@@ -63,7 +65,6 @@ class DevicePPO(PPO):
     """`desired_kl`, which may change from update to update."""
     _sums: torch.Tensor
     _teacher: MLPModel | None = None
-    _mirror: Mirror | None = None
     _imitation: torch.Tensor
     """Weight of the distance from the teacher."""
 
@@ -71,14 +72,6 @@ class DevicePPO(PPO):
         """Follow a teacher, with weight 0 until `set_imitation`; call it before the first step."""
         self._teacher = teacher.requires_grad_(False)
         self._imitation = torch.zeros((), device=self.device)
-
-    def use_mirror(self, mirror: Mirror) -> None:
-        """Learn from each step and its mirror image; call it before the first step.
-
-        As rsl-rl's data augmentation (Mittal et al. 2024): advantage, return and old probability are
-        those of the step itself; divergence and entropy count the steps alone.
-        """
-        self._mirror = mirror
 
     def set_imitation(self, weight: float) -> None:
         """Set the weight of the mean squared distance between the actions of both."""
@@ -146,10 +139,8 @@ class DevicePPO(PPO):
         saved = super().save()
         optimizer = saved["optimizer_state_dict"]
         plain = {"lr": self.learning_rate, "capturable": False, "fused": None}
-        return saved | {
-            "optimizer_state_dict": optimizer
-            | {"param_groups": [g | plain for g in optimizer["param_groups"]]}
-        }
+        groups = [group | plain for group in optimizer["param_groups"]]
+        return saved | {"optimizer_state_dict": optimizer | {"param_groups": groups}}
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Load a state; the next update captures new graphs for the optimiser's new tensors."""
@@ -158,12 +149,8 @@ class DevicePPO(PPO):
 
     @property
     def _on_device(self) -> bool:
-        plain = not (
-            self.rnd or self.symmetry or self.actor.is_recurrent or self.critic.is_recurrent
-        )
-        # rsl-rl's own loss knows neither
-        own = self._teacher is not None or self._mirror is not None
-        return plain and (torch.device(self.device).type == "cuda" or own)
+        # rsl-rl's own loss knows no teacher
+        return torch.device(self.device).type == "cuda" or self._teacher is not None
 
     def _batch_size(self) -> int:
         return self.storage.num_envs * self.storage.num_transitions_per_env // self.num_mini_batches
@@ -208,12 +195,8 @@ class DevicePPO(PPO):
                 parts += [partial(self._differentiate, first)]
                 parts += [self._sum_up, self._descend] if self.is_multi_gpu else [self._descend]
             return parts
-        kept = [(p, p.detach().clone()) for p in self._trained] + [(self._rate, self._rate.clone())]
-        moments = [
-            (value, value.clone())
-            for state in self.optimizer.state.values()
-            for value in state.values()
-        ]
+        kept = [(value, value.detach().clone()) for value in (*self._trained, self._rate)]
+        moments = [(value, value.clone()) for value in self._list_moments()]
         captured: list[Callable[[], None]] = []
         if self.is_multi_gpu:
             # the sum stays outside: it is the one part whose length others decide
@@ -234,25 +217,25 @@ class DevicePPO(PPO):
             for value, before in kept + moments:
                 value.copy_(before)
             if not moments:  # a fresh optimiser made them meanwhile
-                for state in self.optimizer.state.values():
-                    for value in state.values():
-                        value.zero_()
+                for value in self._list_moments():
+                    value.zero_()
         return captured
+
+    def _list_moments(self) -> list[torch.Tensor]:
+        states = self.optimizer.state.values()
+        return list(chain.from_iterable(state.values() for state in states))
 
     def _normalise(self, model: nn.Module) -> None:
         """Update a model's normalisation in place.
 
         rsl-rl binds a new tensor, which the graph would not see.
         """
-        held = [
-            (module, name, value)
-            for module in model.modules()
-            for name, value in module._buffers.items()
-        ]
+        before = dict(model.named_buffers())
         model.update_normalization(self.storage.observations.flatten(0, 1))  # type: ignore[operator]
-        for module, name, value in held:
-            if value is not None and module._buffers[name] is not value:
-                module._buffers[name] = value.copy_(module._buffers[name])  # type: ignore[arg-type]
+        for path, value in list(model.named_buffers()):
+            owner, _, name = path.rpartition(".")
+            module = model.get_submodule(owner)
+            module._buffers[name] = before[path].copy_(value)
 
     @torch.no_grad()
     def shuffle(self, order: torch.Tensor) -> None:
@@ -261,21 +244,17 @@ class DevicePPO(PPO):
         Normalisers and teacher do not change while a rollout is learned. Inputs, actions and the
         teacher's wishes have a leading axis: the steps, and with a mirror their images.
         """
-        storage = self.storage
-        observations = {}
-        for name, value in storage.observations.items():
-            observations[name] = value.flatten(0, 1)[order]
-        sides, actions = [observations], storage.actions.flatten(0, 1)[order][None]
-        if self._mirror is not None:
-            mirrored = {}
-            for name, value in observations.items():
-                mirrored[name] = self._mirror.apply(name, value)
-            sides.append(mirrored)
-            actions = torch.cat((actions, actions * self._mirror.action))
-        samples = {"actions": actions}
+        storage, num = self.storage, len(order)
+        observations: Any = storage.observations.flatten(0, 1)[order]
+        actions: Any = storage.actions.flatten(0, 1)[order]
+        if self.symmetry:
+            observations, actions = self.symmetry.data_augmentation_func(
+                env=self.symmetry.env, obs=observations, actions=actions
+            )
+        samples = {"actions": actions.unflatten(0, (-1, num))}
         if (teacher := self._teacher) is not None:
-            wanted = [teacher.mlp(teacher.get_latent(side)) for side in sides]  # type: ignore[arg-type]
-            samples["wanted"] = torch.stack(wanted).clamp(-1.0, 1.0)
+            wanted = teacher.mlp(teacher.get_latent(observations)).clamp(-1.0, 1.0)
+            samples["wanted"] = wanted.unflatten(0, (-1, num))
         stored = {name: getattr(storage, name) for name in ("values", "returns", "advantages")}
         stored["log_prob"] = storage.actions_log_prob
         for index, value in enumerate(storage.distribution_params or ()):
@@ -285,16 +264,15 @@ class DevicePPO(PPO):
         models = {"actor": self.actor, "critic": self.critic}
         if self._samples is None:
             kind = torch.bfloat16 if self.use_mixed_precision else torch.float32
-            shapes = {
-                name: (len(sides), len(order), model.obs_dim) for name, model in models.items()
-            }
-            inputs = {name: order.new_zeros(shape, dtype=kind) for name, shape in shapes.items()}
-            self._samples = samples | {name: pad_columns(value) for name, value in inputs.items()}
+            self._samples = dict(samples)
+            for name, model in models.items():
+                shape = (len(samples["actions"]), num, model.obs_dim)
+                self._samples[name] = pad_columns(order.new_zeros(shape, dtype=kind))
         for name, value in samples.items():
             self._samples[name].copy_(value)
         for name, model in models.items():
-            for side, values in zip(self._samples[name], sides, strict=True):
-                side[:, : model.obs_dim].copy_(model.get_latent(values))  # type: ignore[operator, arg-type]
+            latent = model.get_latent(observations).unflatten(0, (-1, num))
+            self._samples[name][..., : model.obs_dim].copy_(latent)
 
     def _differentiate(self, first: int) -> None:
         """Differentiate the loss of the mini-batch that begins at row `first` of the samples."""
@@ -385,12 +363,35 @@ class DevicePPO(PPO):
 
         `desired_kl` is the divergence of an update to aim at.
         """
-        lower, higher = (
-            (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE),
-            (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE),
-        )
+        lower = (self._rate / RATE_FACTOR).clamp(min=LOWEST_RATE)
+        higher = (self._rate * RATE_FACTOR).clamp(max=HIGHEST_RATE)
         too_near = (divergence < self._wanted / 2.0) & (divergence > 0.0)
-        rate = torch.where(
-            divergence > self._wanted * 2.0, lower, torch.where(too_near, higher, self._rate)
-        )
-        self._rate.copy_(rate)
+        rate = torch.where(too_near, higher, self._rate)
+        self._rate.copy_(torch.where(divergence > self._wanted * 2.0, lower, rate))
+
+
+class CappedGaussian(GaussianDistribution):
+    """Gaussian whose largest standard deviation can be moved while CUDA graphs use it.
+
+    rsl-rl holds the bounds of the spread as numbers, which a captured graph keeps for ever. Here
+    the cap is a tensor. It belongs to the weights, so that a resumed training goes on with it.
+
+    Args:
+        output_dim: Number of actions.
+        init_std: Standard deviation at the beginning.
+        std_range: Smallest standard deviation, and the cap at the beginning.
+    """
+
+    def __init__(self, output_dim: int, init_std: float, std_range: tuple[float, float]) -> None:
+        super().__init__(output_dim, init_std, std_range, std_type="log")
+        self.log_cap: torch.Tensor
+        self.register_buffer("log_cap", torch.tensor(self.log_std_range[1]))
+
+    def set_cap(self, std: float) -> None:
+        """Move the cap; it stays above the smallest standard deviation."""
+        self.log_cap.fill_(max(math.log(std), self.log_std_range[0]))
+
+    def update(self, mlp_output: torch.Tensor) -> None:
+        """Update the distribution; see `rsl_rl.modules.distribution.GaussianDistribution`."""
+        log_std = self.log_std_param.minimum(self.log_cap).clamp(min=self.log_std_range[0])
+        self._distribution = Normal(mlp_output, log_std.exp())

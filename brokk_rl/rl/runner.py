@@ -1,40 +1,43 @@
-"""rsl-rl's on-policy runner with exact resume, atomic checkpoints and a budget."""
+"""rsl-rl's on-policy runner with exact resume, atomic checkpoints and a budget.
+
+Several processes, one for each GPU, may train one policy. rsl-rl averages gradients and normalisers
+over them. `TrainingGroup` adds the process group itself, decisions that the first process makes for
+all, statistics over all environments, and a check that all still hold the same policy.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import logging
-import math
 import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+import torch.distributed as dist
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl.errors import CheckpointError, ConfigError, StorageError
-from brokk_rl.rl.exploration import CappedGaussian
-from brokk_rl.rl.learning_curve import find_plateau
+from brokk_rl import distributed
+from brokk_rl.errors import CheckpointError, ConfigError, DistributedError, StorageError
 from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import TrainedPolicy, scale_output
-from brokk_rl.rl.ppo import DevicePPO
+from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
-from brokk_rl.rl.training_group import TrainingGroup
-from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.task_description import TaskDescription
 
 log = logging.getLogger(__name__)
 
 ITERATIONS_PER_ROUND = 10
 """Iterations between two changes of the desired divergence, at most."""
-ROUNDS_OF_ANNEAL = 10
-"""Changes over the end that a plateau begins, at least: a short end is followed too."""
-
 NUM_ANSWERS = 256
 """Observations at most, of as many environments, that a checkpoint holds with the network's own
 commands. Chosen by hand: many phases of an episode, and 150 kB."""
+LOST_CONNECTION = ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer")
+"""Words of a RuntimeError that is a lost connection: gloo has no class of its own for it."""
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -55,6 +58,7 @@ class TrainingRunner(OnPolicyRunner):
     """
 
     env: ControlLoop
+    logger: TrainingLogger  # type: ignore[assignment]
 
     def __init__(
         self,
@@ -65,26 +69,23 @@ class TrainingRunner(OnPolicyRunner):
         logger: TrainingLogger,
         group: TrainingGroup | None = None,
     ) -> None:
+        self.training, self.folder = training, folder
         self.group = group or TrainingGroup(device)
-        _require_groups(
-            training.runner["obs_groups"], list(map(str, env.get_observations().keys()))
-        )
+        offered = list(map(str, env.get_observations().keys()))
+        _require_groups(training.runner["obs_groups"], offered)
+        config = training.runner_config()
+        if training.symmetry:
+            config["algorithm"]["symmetry_cfg"] = _mirror_steps(env)
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
-            super().__init__(env, training.runner_config(), log_dir=None, device=str(device))
+            super().__init__(env, config, log_dir=None, device=str(device))
         log.debug(printed.getvalue())
-        self.training, self.folder = training, folder
-        self.logger = logger  # type: ignore[assignment]
+        self.logger = logger
+        scale_output(self.alg.actor, training.output_gain)
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
-        if training.symmetry and isinstance(self.alg, DevicePPO):
-            env.task.require("mirror", "give rl.symmetry=false")
-            self.alg.use_mirror(env.task.mirror())
-        self._levelled_at: int | None = None
-        """Control steps after which success no longer grew; found anew after a resume."""
-        scale_output(self.alg.actor, training.output_gain)
-        if training.teacher and isinstance(self.alg, DevicePPO):
-            self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)
+            if training.teacher:
+                self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Train until the budget is spent; save a checkpoint every `save_interval`.
@@ -92,14 +93,10 @@ class TrainingRunner(OnPolicyRunner):
         Args:
             until: Asked after each round; training ends early where it returns true.
         """
-        steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         first = self.current_learning_iteration == 0
-        while num := self.group.broadcast_first(self._count_iterations(steps)):
-            begins_round = self.current_learning_iteration % self._count_round(steps) == 0
-            if self.group.broadcast_first(begins_round):
-                share = self.group.broadcast_first(self._measure_share())
-                self.alg.desired_kl = self.training.divergence(share)  # type: ignore[assignment]
-                self._follow_schedules(share)
+        while num := self.group.broadcast_first(self._count_iterations()):
+            if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
+                self._follow_schedules(self.group.broadcast_first(self.logger.share_done))
             with contextlib.redirect_stdout(io.StringIO()):
                 self.learn(
                     num, init_at_random_ep_len=first and self.training.random_episode_lengths
@@ -108,7 +105,7 @@ class TrainingRunner(OnPolicyRunner):
             # `learn` leaves the index of the last iteration; the next one is another
             self.current_learning_iteration += 1
             enough = self.group.broadcast_first(until())
-            over = enough or self.group.broadcast_first(self._count_iterations(steps)) == 0
+            over = enough or self.group.broadcast_first(self._count_iterations()) == 0
             if over or self.current_learning_iteration % self.training.save_interval == 0:
                 self.group.check_same(self._policy_state())
                 self.checkpoint()
@@ -116,83 +113,39 @@ class TrainingRunner(OnPolicyRunner):
                 break
 
     def _follow_schedules(self, share_spent: float) -> None:
-        """Set the cap of the exploration noise and the teacher's weight, where there are any."""
+        """Set the divergence to aim at, the cap of the noise and the teacher's weight."""
+        self.alg.desired_kl = self.training.divergence(share_spent)  # type: ignore[assignment]
         distribution, teacher = self.alg.actor.distribution, self.training.teacher
         if self.training.exploration and isinstance(distribution, CappedGaussian):
             distribution.set_cap(self.training.exploration.cap_at(share_spent))
         if teacher and isinstance(self.alg, DevicePPO):
             self.alg.set_imitation(teacher.weight_at(share_spent))
 
-    def _count_round(self, steps: int) -> int:
-        """Return the iterations between two changes of `desired_kl`: fewer in a short end.
-
-        Args:
-            steps: Control steps of one iteration.
-        """
-        if self.training.plateau is None or self._levelled_at is None:
-            return ITERATIONS_PER_ROUND
-        anneal = self._levelled_at * self.training.plateau.anneal / steps
-        return min(ITERATIONS_PER_ROUND, max(1, int(anneal / ROUNDS_OF_ANNEAL)))
-
-    def _measure_share(self) -> float:
-        """Return the spent share of the training; its end begins with a plateau."""
-        training, book = self.training, self._book
-        share = training.budget.share_spent(book.env_steps, book.seconds)
-        if training.plateau and self._levelled_at is None:
-            # rows of whole rounds: how often a checkpoint is written must not change training
-            whole = len(book.rows) - len(book.rows) % ITERATIONS_PER_ROUND
-            row = find_plateau(book.rows[:whole], training.plateau)
-            if row is not None:
-                self._levelled_at = int(float(row["env_steps"]))
-                log.info("success no longer grows after %d control steps", self._levelled_at)
-        if training.plateau is None or self._levelled_at is None:
-            return share
-        done = (book.env_steps / self._levelled_at - 1.0) / training.plateau.anneal
-        return max(share, 1.0 - training.settling * (1.0 - done))
-
-    @property
-    def _book(self) -> TrainingLogger:
-        return self.logger  # type: ignore[return-value]
-
-    def _count_iterations(self, steps: int) -> int:
-        """Return the number of iterations until the next checkpoint or change of `desired_kl`.
+    def _count_iterations(self) -> int:
+        """Return the number of iterations until the next checkpoint or change of the schedules.
 
         0 when the budget is spent.
-
-        Args:
-            steps: Control steps of one iteration.
         """
-        book = self._book
-        budget, interval = self.training.budget, self.training.save_interval
-        if self._measure_share() >= 1.0:
+        book, budget = self.logger, self.training.budget
+        if book.share_done >= 1.0:
             return 0
-        num = min(
-            part - self.current_learning_iteration % part
-            for part in (self._count_round(steps), interval)
-        )
-        ends = [budget.max_env_steps] if budget.max_env_steps else []
-        if self.training.plateau and self._levelled_at is not None:
-            ends.append(math.ceil(self._levelled_at * (1.0 + self.training.plateau.anneal)))
-        for end in ends:
-            num = min(num, max(1, -(-(end - book.env_steps) // steps)))
+        left = []
+        for part in (ITERATIONS_PER_ROUND, self.training.save_interval):
+            left.append(part - self.current_learning_iteration % part)
+        if budget.max_env_steps:
+            left.append(-(-(budget.max_env_steps - book.env_steps) // book.steps_per_iteration))
         if budget.max_seconds:
             # the first round is short and shows how long one takes
-            left = (
-                (budget.max_seconds - book.seconds) * book.env_steps / book.seconds / steps
-                if book.env_steps
-                else 1
-            )
-            num = min(num, max(1, round(left)))
-        return num
+            steps_left = 1
+            if book.env_steps:
+                steps_left = (budget.max_seconds - book.seconds) * book.env_steps / book.seconds
+            left.append(round(steps_left / book.steps_per_iteration))
+        return max(1, min(left))
 
     def _policy_state(self) -> dict[str, torch.Tensor]:
         """Return parameters and normalisers of actor and critic by name."""
-        models = {"actor": self.alg.actor, "critic": self.alg.critic}
-        state = {}
-        for part, model in models.items():
-            for name, value in model.state_dict().items():
-                state[f"{part}.{name}"] = value
-        return state
+        both = torch.nn.ModuleDict({"actor": self.alg.actor, "critic": self.alg.critic})
+        return both.state_dict()
 
     def _configure_multi_gpu(self) -> None:
         """Tell rsl-rl of the processes of `group`.
@@ -200,11 +153,9 @@ class TrainingRunner(OnPolicyRunner):
         rsl-rl's own way knows NCCL only and never ends the process group.
         """
         rank = self.group.rank
-        self.gpu_world_size, self.gpu_global_rank, self.gpu_local_rank = (
-            rank.count,
-            rank.index,
-            rank.local,
-        )
+        self.gpu_world_size = rank.count
+        self.gpu_global_rank = rank.index
+        self.gpu_local_rank = rank.local
         self.is_distributed = self.group.together
         numbers = {"global_rank": rank.index, "local_rank": rank.local, "world_size": rank.count}
         self.cfg["multi_gpu"] = numbers if self.is_distributed else None
@@ -227,14 +178,14 @@ class TrainingRunner(OnPolicyRunner):
         parts = self.group.gather_on_first(own)
         if not self.group.rank.first:
             return
-        self._book.flush()
+        self.logger.flush()
         content = self.alg.save() | {
             "iter": self.current_learning_iteration,
             "learning_rate": self.alg.learning_rate,
             "desired_kl": self.alg.desired_kl,
             **own,
             "others": parts[1:],
-            "book": self._book.state_dict(),
+            "book": self.logger.state_dict(),
             "fingerprint": self.env.machine.fingerprint(),
             "task": self.env.description.to_json(),
             "network": self.training.describe_network(),
@@ -247,10 +198,8 @@ class TrainingRunner(OnPolicyRunner):
             with part.open("rb") as file:
                 os.fsync(file.fileno())
             part.replace(path)
-        except (
-            OSError,
-            RuntimeError,
-        ) as error:  # torch's writer reports a full disk as a RuntimeError
+        # torch's writer reports a full disk as a RuntimeError
+        except (OSError, RuntimeError) as error:
             part.unlink(missing_ok=True)
             raise StorageError(
                 f"cannot write the checkpoint {path}: {error}. The checkpoint before it is "
@@ -295,7 +244,7 @@ class TrainingRunner(OnPolicyRunner):
             self.alg.learning_rate = content["learning_rate"]
             self.alg.desired_kl = content["desired_kl"]
             self.current_learning_iteration = content["iter"]
-            self._book.load_state_dict(content["book"])  # last: it rewrites progress.csv
+            self.logger.load_state_dict(content["book"])  # last: it rewrites progress.csv
         except (KeyError, RuntimeError) as error:
             raise CheckpointError(
                 f"{path} does not fit this configuration: {str(error).splitlines()[0]}. "
@@ -322,6 +271,137 @@ class TrainingRunner(OnPolicyRunner):
                 "the run's own resolved.yaml: brokk --config-dir <run> --config-name resolved "
                 "resume=<run> session.out=<run>"
             )
+
+
+class TrainingGroup:
+    """Process group of a training, a context manager; without effect for a single process.
+
+    Args:
+        device: Where this process computes: NCCL between GPUs, gloo between CPUs and for data
+            on the host.
+    """
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.rank = device, distributed.read_rank()
+
+    @property
+    def together(self) -> bool:
+        """True when there is more than one process."""
+        return self.rank.count > 1
+
+    def __enter__(self) -> TrainingGroup:
+        if self.device.type == "cuda":
+            torch.cuda.set_device(self.device)
+        if self.together:
+            backend = "cpu:gloo,cuda:nccl" if self.device.type == "cuda" else "gloo"
+            dist.init_process_group(backend, rank=self.rank.index, world_size=self.rank.count)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
+    ) -> None:
+        if not self.together:
+            return
+        if error is None:
+            dist.barrier()
+            dist.destroy_process_group()
+            return
+        # gloo's threads must end before the interpreter does, or it aborts. Between GPUs nothing is
+        # destroyed after an error: NCCL would wait for processes that have ended.
+        if self.device.type == "cpu":
+            dist.destroy_process_group()
+        if isinstance(error, dist.DistError) or (
+            isinstance(error, RuntimeError) and any(word in str(error) for word in LOST_CONNECTION)
+        ):
+            raise DistributedError(
+                f"rank {self.rank.index}: another process of this training has ended; its own "
+                f"message says why ({str(error).splitlines()[0]})"
+            ) from error
+
+    def wait(self) -> None:
+        """Wait until all processes have called this."""
+        if self.together:
+            dist.barrier()
+
+    def broadcast_first(self, value: Any) -> Any:
+        """Return the `value` of the first process, so that all act by the same clock."""
+        if not self.together:
+            return value
+        box = [value]
+        dist.broadcast_object_list(box, src=0)
+        return box[0]
+
+    def gather(self, value: Any) -> list[Any]:
+        """Return the `value` (plain numbers and text) of all processes, in the order of ranks."""
+        if not self.together:
+            return [value]
+        found: list[Any] = [None] * self.rank.count
+        dist.all_gather_object(found, value)
+        return found
+
+    def gather_on_first(self, state: Any) -> list[Any]:
+        """Return the `state` of all processes to the first one, an empty list to the others.
+
+        A state is a mapping of tensors; they are copied to the host.
+        """
+        if not self.together:
+            return [state]
+        found: list[Any] = [None] * self.rank.count
+        dist.gather_object(_copy_to_host(state), found if self.rank.first else None, dst=0)
+        return found if self.rank.first else []
+
+    def pool_statistics(self, figures: Mapping[str, float]) -> dict[str, float]:
+        """Return the figures of all environments of all processes; see `ControlLoop.statistics`.
+
+        Means over episodes weigh by the number of episodes; the fault rate by control steps, which
+        are as many everywhere.
+        """
+        parts = self.gather(dict(figures))
+        episodes = sum(part["episodes"] for part in parts)
+        pooled = {}
+        for name in figures:
+            pooled[name] = sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
+        return pooled | {
+            "episodes": episodes,
+            "fault_rate": sum(part["fault_rate"] for part in parts) / len(parts),
+        }
+
+    def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
+        """Compare the numbers of all processes, bit for bit.
+
+        Raises:
+            DistributedError: They differ; the message names the ranks that differ from the first.
+        """
+        if not self.together:
+            return
+        first, *others = self.gather(hash_tensors(state))
+        differing = [str(rank) for rank, value in enumerate(others, 1) if value != first]
+        if differing:
+            raise DistributedError(
+                f"the policy of rank {', '.join(differing)} is no longer that of rank 0: "
+                "parameters or normalisers differ. "
+                "Look for randomness or data-dependent code that runs on some ranks only, and "
+                "for GPUs of different kinds."
+            )
+
+
+def hash_tensors(state: Mapping[str, torch.Tensor]) -> str:
+    """Return the SHA-256 of names and bytes of tensors."""
+    digest = hashlib.sha256()
+    for name, value in state.items():
+        digest.update(name.encode())
+        digest.update(
+            value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
+        )
+    return digest.hexdigest()
+
+
+def _copy_to_host(state: Any) -> Any:
+    if isinstance(state, torch.Tensor):
+        return state.detach().cpu()
+    if isinstance(state, Mapping):
+        return {name: _copy_to_host(value) for name, value in state.items()}
+    return state
 
 
 @contextlib.contextmanager
@@ -397,3 +477,12 @@ def _require_groups(asked: Mapping[str, Sequence[str]], offered: Collection[str]
                 f"rl.runner.obs_groups.{network}: the task gives no group {', '.join(missing)}; "
                 f"it gives {', '.join(sorted(offered))}: rl.runner.obs_groups.{network}=[policy]"
             )
+
+
+def _mirror_steps(env: ControlLoop) -> dict[str, Any]:
+    """Return what rsl-rl needs to learn from each step and its mirror image.
+
+    Advantage, return and old probability are those of the step itself (Mittal et al. 2024).
+    """
+    env.task.require("mirror", "give rl.symmetry=false")
+    return {"use_data_augmentation": True, "data_augmentation_func": env.task.mirror().augment}

@@ -15,7 +15,7 @@ from brokk_rl.spec import spec
 SETTLED_PART = 0.9
 """Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
 `TrainingConfig.settling`."""
-CAPPED = "brokk_rl.rl.exploration:CappedGaussian"
+CAPPED = "brokk_rl.rl.ppo:CappedGaussian"
 """The distribution whose cap `Exploration` moves."""
 RUNNER_BOUNDS: dict[str, dict[str, Any]] = {
     "num_steps_per_env": {"least": 1, "whole": True},
@@ -72,32 +72,6 @@ class TrainingBudget:
             env_steps / (self.max_env_steps or float("inf")),
             seconds / (self.max_seconds or float("inf")),
         )
-
-
-@spec
-class Plateau:
-    """End of a training whose success no longer grows: what follows is the end of its schedules.
-
-    Over that time `desired_kl` falls as over the last part of a budget (`settling`), and so does the
-    cap of the noise (`exploration`). Steps are counted, not seconds: a training repeats.
-
-    Attributes:
-        above: Strict success, exploration included, below which a training goes on anyway.
-        episodes: Newest finished episodes that are compared with as many before them.
-        least_gain: Gain in success between both that counts as learning.
-        anneal: Control steps of the end, as a share of those before it; none with `settling=0`.
-    """
-
-    above: float
-    episodes: int
-    least_gain: float
-    anneal: float
-
-    def check(self) -> None:
-        require_number("rl.plateau.above", self.above, least=0, most=1)
-        require_number("rl.plateau.episodes", self.episodes, least=1)
-        require_number("rl.plateau.least_gain", self.least_gain, least=0, most=1)
-        require_number("rl.plateau.anneal", self.anneal, above=0)
 
 
 @spec
@@ -183,7 +157,6 @@ class TrainingConfig:
             of the simulator's configuration.
         num_starts: Number of valid starts from which resets draw.
         budget: When training ends.
-        plateau: When it ends earlier, because success no longer grows; `null`: never.
         save_interval: Iterations between checkpoints; a killed run loses no more. As often several
             processes prove that they agree.
         keep_checkpoints: Newest checkpoints kept.
@@ -193,7 +166,7 @@ class TrainingConfig:
             small one a residual policy begins as the classical controller.
         exploration: Schedule of the cap of the exploration noise; `null` for that of the
             distribution. The actor's distribution must be
-            `brokk_rl.rl.exploration:CappedGaussian`.
+            `brokk_rl.rl.ppo:CappedGaussian`.
         symmetry: Learn from each step and its left-right mirror image, at twice the arithmetic of an
             update. The machine has to be symmetric.
         teacher: Policy to follow at the beginning; `null` to learn from rewards alone.
@@ -217,7 +190,6 @@ class TrainingConfig:
     num_envs: int | None
     num_starts: int
     budget: TrainingBudget
-    plateau: Plateau | None
     save_interval: int
     keep_checkpoints: int
     settling: float

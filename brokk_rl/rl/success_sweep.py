@@ -20,13 +20,11 @@ from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
 from brokk_rl.plot import BLUE, ORANGE, make_figure, remove_frame
 from brokk_rl.rl.benchmark_sizes import KEYS, SuccessSweep
-from brokk_rl.rl.learning_curve import WINDOW, find_passing
-from brokk_rl.rl.logger import PROGRESS, TrainingLogger
-from brokk_rl.rl.runner import TrainingRunner
+from brokk_rl.rl.logger import PROGRESS, WINDOW, TrainingLogger, find_passing
+from brokk_rl.rl.loop import ControlLoop
+from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
 from brokk_rl.rl.tracking import NoTracking
-from brokk_rl.rl.training_group import TrainingGroup
-from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import Session, write_json
 
 log = logging.getLogger(__name__)
@@ -87,8 +85,7 @@ def _train(
     runner_config["algorithm"]["num_learning_epochs"] = point["epochs"]
     runner_config["algorithm"]["num_mini_batches"] = point["mini_batches"]
     budget = TrainingBudget(max_env_steps=None, max_seconds=sweep.max_seconds)
-    # one that stops learning trains on: the time to a level is asked for
-    training = replace(training, runner=runner_config, budget=budget, plateau=None)
+    training = replace(training, runner=runner_config, budget=budget)
     replace(session, seed=point["seed"]).seed_all()
     loop.begin()
     loop.statistics()  # forget the episodes of the point before

@@ -14,20 +14,17 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
 
 
-class Tracker(Protocol):
-    """An open tracking run."""
+class Tracker:
+    """An open tracking run; this one stores nothing."""
 
     def log(self, figures: dict[str, float], step: int) -> None:
         """Store the figures of one iteration."""
-        ...
 
     def report(self, evaluation: dict[str, float], files: Sequence[Path]) -> None:
         """Store the figures of the evaluation, and files of the run: policy, pictures, video."""
-        ...
 
     def close(self) -> None:
         """End the tracking run; called on success, failure and interruption alike."""
-        ...
 
 
 class Tracking(Protocol):
@@ -44,7 +41,7 @@ class NoTracking:
 
     def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
         """Return a tracker that does nothing."""
-        return _NoTracker()
+        return Tracker()
 
 
 @spec
@@ -79,18 +76,7 @@ class WandbTracking:
         return _WandbTracker(self, folder, config)
 
 
-class _NoTracker:
-    def log(self, figures: dict[str, float], step: int) -> None:
-        pass
-
-    def report(self, evaluation: dict[str, float], files: Sequence[Path]) -> None:
-        pass
-
-    def close(self) -> None:
-        pass
-
-
-class _TensorBoardTracker:
+class _TensorBoardTracker(Tracker):
     def __init__(self, folder: Path, config: dict[str, Any]) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
@@ -117,7 +103,7 @@ class _TensorBoardTracker:
         self._writer.close()
 
 
-class _WandbTracker:
+class _WandbTracker(Tracker):
     def __init__(self, config: WandbTracking, folder: Path, run_config: dict[str, Any]) -> None:
         os.environ.setdefault("WANDB_SILENT", "true")
         for name in [name for name in os.environ if name.startswith("WANDB_")]:

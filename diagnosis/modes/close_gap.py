@@ -20,10 +20,10 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
 from brokk_rl.modes.train import Train
+from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.tracking import Tracking
-from brokk_rl.rl.vec_env import ControlLoopConfig
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import name_spec, spec
 from brokk_rl.task_description import CONTRACT

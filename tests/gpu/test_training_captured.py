@@ -17,8 +17,8 @@ from brokk_rl.contracts.task import REWARD
 from brokk_rl.contracts.world import TracedWorld
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import FaultLog
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.ppo import DevicePPO
-from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
 
 pytestmark = [

@@ -17,7 +17,7 @@ from brokk_rl.checks import check_task
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.observation import ObservationEncoder
-from brokk_rl.rl.vec_env import ControlLoop
+from brokk_rl.rl.loop import ControlLoop
 from tasks.advice import LeverAdviser
 from tasks.settings import AdviceConfig
 

@@ -15,7 +15,7 @@ from composed import option
 from brokk_rl.errors import SimulationError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.train import FaultLog
-from brokk_rl.rl.vec_env import ControlLoop
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.faults import Fault, FaultRecorder
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator

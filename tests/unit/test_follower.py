@@ -21,9 +21,9 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.train import read_follower
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
-from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.session import RESOLVED, Session
 
 CPU = torch.device("cpu")

@@ -18,8 +18,8 @@ from brokk_rl.play.checkpoint_watch import find_newest
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
 from brokk_rl.play.settings import PlaySettings
+from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import ClassicalPolicy
-from brokk_rl.rl.vec_env import ControlLoopConfig
 
 NUM = 2
 PERIOD_S = 0.05

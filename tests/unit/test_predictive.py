@@ -14,7 +14,7 @@ from training import CPU, plant
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.rl.vec_env import ControlLoop
+from brokk_rl.rl.loop import ControlLoop
 from tasks.predictive import PredictivePlanner, PredictivePolicy, _make_hat_functions
 from tasks.settings import AdviceConfig
 

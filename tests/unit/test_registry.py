@@ -197,7 +197,7 @@ def test_fields_of_earlier_versions_become_the_current_ones() -> None:
 
 def test_a_training_of_an_earlier_version_acts_as_it_did() -> None:
     config = yaml.safe_load((Path(conf.__file__).parent / "rl/ppo.yaml").read_text())
-    for name in ("tf32", "plateau", "symmetry", "fault_steps"):
+    for name in ("tf32", "symmetry", "fault_steps"):
         del config[name]
     registry.upgrade_fields(config)
     found = instantiate(config, _convert_="all")

@@ -19,6 +19,7 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder
 from brokk_rl.rl import export
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import (
     NetworkPolicy,
     TrainedPolicy,
@@ -27,7 +28,6 @@ from brokk_rl.rl.policy import (
     read_bundle,
     write_bundle,
 )
-from brokk_rl.rl.vec_env import ControlLoop
 
 CPU = torch.device("cpu")
 TRAINING = runs.small(max_seconds=1.0)

@@ -16,7 +16,7 @@ from training import make, small, train
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.exploration import CappedGaussian
+from brokk_rl.rl.ppo import CappedGaussian
 from brokk_rl.rl.settings import CAPPED, Exploration, Teacher, TrainingConfig
 
 

@@ -20,9 +20,9 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.rl.evaluation import evaluate_policy
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import ClassicalPolicy, UntrainedPolicy
 from brokk_rl.rl.settings import NearStarts
-from brokk_rl.rl.vec_env import ControlLoop
 
 CPU = torch.device("cpu")
 

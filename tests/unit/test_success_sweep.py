@@ -13,10 +13,9 @@ import training as runs
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.benchmark_sizes import SuccessSweep
-from brokk_rl.rl.learning_curve import find_passing, find_plateau
-from brokk_rl.rl.settings import Plateau
+from brokk_rl.rl.logger import find_passing
+from brokk_rl.rl.runner import TrainingGroup
 from brokk_rl.rl.success_sweep import TABLE, report_sweep, run_sweep, summarise
-from brokk_rl.rl.training_group import TrainingGroup
 from brokk_rl.session import Session
 
 SWEEP = SuccessSweep(
@@ -46,43 +45,6 @@ def test_a_level_is_passed_by_the_newest_episodes_and_not_by_few_of_them() -> No
     assert find_passing(early, 0.95, after=100, window=20)["seconds"] == 3.0
     # an iteration without an episode repeats older figures, which count for nothing
     assert find_passing(rows((10, 0.0), (0, 1.0), (10, 0.0)), 0.5, window=20) is None
-
-
-PLATEAU = Plateau(above=0.5, episodes=20, least_gain=0.05, anneal=0.5)
-
-
-def test_success_that_no_longer_grows_is_a_plateau() -> None:
-    learning = rows((20, 0.0), (20, 0.3), (20, 0.6), (10, 0.8), (10, 0.9), (10, 0.9), (10, 0.8))
-    # newest 20 and those before: 0.6 and 0.3, then 0.85 and 0.6, 0.9 and 0.7, then 0.85 twice
-    found = find_plateau(learning, PLATEAU)
-    assert found is not None and found["seconds"] == 6.0
-    assert find_plateau(learning[:6], PLATEAU) is None
-    assert find_plateau(rows(*[(20, 0.4)] * 9), PLATEAU) is None  # too low to stop
-    assert find_plateau(rows((20, 0.9), (19, 0.9)), PLATEAU) is None  # too few
-    assert find_plateau([], PLATEAU) is None
-    with pytest.raises(ConfigError, match=r"rl\.plateau: the task does not report"):
-        find_plateau([{"episodes": 1.0}], PLATEAU)
-
-
-def test_a_training_ends_with_an_anneal_after_a_plateau_and_repeats(
-    machine: Machine, tmp_path: Path
-) -> None:
-    steps = 16 * runs.STEPS
-    plateau = Plateau(above=0.0, episodes=2, least_gain=1.0, anneal=0.5)
-    training = runs.small(
-        max_env_steps=900 * steps, plateau=plateau, settling=0.5, keep_checkpoints=1
-    )
-    wanted = training.runner["algorithm"]["desired_kl"]
-    ends = []
-    for name, interval in (("one", 99), ("two", 7)):  # checkpoints change nothing
-        runner = runs.train(machine, tmp_path / name, replace(training, save_interval=interval))
-        found = find_plateau(runs.progress(tmp_path / name), plateau)
-        assert found is not None
-        ends.append([float(found["env_steps"]), runner._book.env_steps, runner.alg.desired_kl])
-        # a tenth of the divergence is the end, and the last of ten changes or more comes near it
-        assert wanted * 0.1 <= runner.alg.desired_kl < wanted * 0.3
-    assert ends[0] == ends[1]
-    assert ends[0][0] * 1.5 <= ends[0][1] < ends[0][0] * 1.5 + 11 * steps < 900 * steps
 
 
 def test_a_sweep_trains_each_point_once_and_goes_on(machine: Machine, tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from tensordict import TensorDict
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.ppo import DevicePPO
-from brokk_rl.rl.vec_env import ControlLoop
 from brokk_rl.sim.scene import COLUMNS
 from brokk_rl.sim.simulator import NativeSimulator
 from brokk_rl.symmetry import Mirror, compute_joint_signs
@@ -95,17 +95,7 @@ def test_a_machine_that_is_not_symmetric_is_refused(machine: Machine) -> None:
         compute_joint_signs(replace(machine, joints=(aside, *machine.joints[1:])))
 
 
-def augment(env: Mirror, obs: TensorDict | None, actions: torch.Tensor | None) -> tuple:
-    """The mirror as rsl-rl's own extension wants it."""
-    if obs is not None:
-        seen = torch.cat((obs["policy"], env.apply("policy", obs["policy"])))
-        obs = TensorDict({"policy": seen}, batch_size=[len(seen)])
-    if actions is not None:
-        actions = torch.cat((actions, actions * env.action))
-    return obs, actions
-
-
-def algorithm(kind: type[PPO], mirror: Mirror, **changes: object) -> PPO:
+def algorithm(kind: type[PPO], **changes: object) -> PPO:
     torch.manual_seed(0)
     obs = TensorDict({"policy": torch.randn(16, 7)}, batch_size=[16])
     groups = {"actor": ["policy"], "critic": ["policy"]}
@@ -122,10 +112,11 @@ def algorithm(kind: type[PPO], mirror: Mirror, **changes: object) -> PPO:
 def test_it_learns_the_same_as_rsl_rls_own_augmentation() -> None:
     factor = torch.tensor([1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0])
     mirror = Mirror({"policy": (factor, 0.1 * (1 - factor))}, torch.tensor([-1.0, 1.0, 1.0]))
-    ours = algorithm(DevicePPO, mirror)
-    ours.use_mirror(mirror)
-    settings = {"env": mirror, "data_augmentation_func": augment, "use_data_augmentation": True}
-    theirs, alone = algorithm(PPO, mirror, symmetry_cfg=settings), algorithm(DevicePPO, mirror)
+    settings = {
+        "env": None, "data_augmentation_func": mirror.augment, "use_data_augmentation": True,
+    }  # fmt: skip
+    ours = algorithm(DevicePPO, symmetry_cfg=settings)
+    theirs, alone = algorithm(PPO, symmetry_cfg=settings), algorithm(DevicePPO)
     for learner in (ours, theirs, alone):
         draws = torch.Generator().manual_seed(2)
         torch.manual_seed(3)
@@ -137,7 +128,7 @@ def test_it_learns_the_same_as_rsl_rls_own_augmentation() -> None:
                 learner.process_env_step(seen, reward, done > 1.5, {"time_outs": done > 2.0})
             learner.compute_returns(seen)
         torch.manual_seed(4)
-        learner.update()
+        learner.update_on_device() if learner is ours else learner.update()
     weights = [
         torch.cat([p.flatten() for p in one.actor.parameters()]) for one in (ours, theirs, alone)
     ]

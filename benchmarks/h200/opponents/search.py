@@ -24,7 +24,7 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
-from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig
+from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from tasks.classical import ClassicalController, ControllerGuidance
 from tasks.process import ToolPoseProcess
 

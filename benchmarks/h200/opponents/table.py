@@ -23,8 +23,8 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.contracts.task import Policy
+from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
-from brokk_rl.rl.vec_env import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.statistics import compute_wilson_interval
 
 PLANTS = "mlp,hydraulic,load_sensing,post_compensated,open_center"

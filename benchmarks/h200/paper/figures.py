@@ -23,8 +23,8 @@ from matplotlib.figure import Figure
 
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
+from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
-from brokk_rl.rl.vec_env import ControlLoopConfig
 
 NUM_PATHS = 8
 """Episodes whose path is shown."""

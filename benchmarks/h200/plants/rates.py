@@ -15,8 +15,8 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.rl.evaluation import evaluate_policy
+from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
-from brokk_rl.rl.vec_env import ControlLoopConfig
 
 ACTUATORS = ("mlp", "hydraulic", "load_sensing", "post_compensated", "open_center")
 STEPS = 200

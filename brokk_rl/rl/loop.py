@@ -271,9 +271,8 @@ class ControlLoop(VecEnv):
         graphs = self.device.type == "cuda" and self.world.supports_graphs
         if fuse := fuse and (graphs or self.device.type == "cpu"):
             for name in ("_command", "_judge", "_perceive"):
-                setattr(
-                    self, name, torch.compile(getattr(self, name), fullgraph=True, dynamic=False)
-                )
+                compiled = torch.compile(getattr(self, name), fullgraph=True, dynamic=False)
+                setattr(self, name, compiled)
         with report_compile_errors():
             if graphs:
                 self._graph = capture_graph(self._advance, self.device)
@@ -314,13 +313,12 @@ class ControlLoop(VecEnv):
             count: Number of environments at most.
         """
         with self._always_alike():
-            parts = (self.task.state, self.task.episode)
-            kept = [{name: value.clone() for name, value in part.items()} for part in parts]
+            tensors = [*self.task.state.values(), *self.task.episode.values()]
+            kept = [(tensor, tensor.clone()) for tensor in tensors]
             groups = self.get_observations()
             command = self.task.command(act(groups)).clone()
-            for part, values in zip(parts, kept, strict=True):
-                for name, value in values.items():
-                    part[name].copy_(value)
+            for tensor, before in kept:
+                tensor.copy_(before)
         return groups["policy"][:count].cpu(), command[:count].cpu()
 
     def statistics(self) -> dict[str, float]:
@@ -328,65 +326,49 @@ class ControlLoop(VecEnv):
 
         Reads back from the device once.
         """
-        held = [self.recorder.is_held.sum()[None].float()] if self.recorder else []
-        totals = torch.cat((self._totals, *held)).tolist()  # one read-back
-        self.num_held = int(totals[-1]) if held else 0
-        values = dict(zip(self._total_names, totals, strict=False))
-        endings = {}
-        for name, value in values.items():
-            if name.startswith("end/"):
-                endings[name] = value
-        episodes = sum(endings.values())
+        num_held = self.recorder.is_held.sum() if self.recorder else self._totals.new_zeros(())
+        *totals, held = torch.cat((self._totals, num_held[None].float())).tolist()  # one read-back
+        self.num_held = int(held)
+        values = dict(zip(self._total_names, totals, strict=True))
+        episodes = sum(totals[len(self.task.episode) :])
         fault_rate = values[f"end/{FAULT}"] / max(1, self._steps * self.num_envs)
         self._totals.zero_()
         self._steps = 0
-        return {name: value / max(1.0, episodes) for name, value in values.items()} | {
-            "episodes": episodes,
-            "fault_rate": fault_rate,
-        }
+        means = {name: value / max(1.0, episodes) for name, value in values.items()}
+        return means | {"episodes": episodes, "fault_rate": fault_rate}
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all that is needed to go on exactly, but for random generators."""
-        state: dict[str, torch.Tensor] = {
-            "history.q": self.history.q,
-            "history.u": self.history.u,
-            "truth.q": self.truth.q,
-        }
-        state |= {f"task.{name}": value for name, value in self.task.state.items()}
-        state |= {f"episode.{name}": value for name, value in self.task.episode.items()}
-        state |= {f"actuator.{name}": value for name, value in self.actuator.state.items()}
-        state |= {f"follower.{name}": value for name, value in self.follower.state.items()}
-        state |= {f"group.{name}": value for name, value in self._groups.items()}
-        if self.recorder:
-            state["recorder.scene"] = self.recorder.scene
-        return {
-            "tensors": {name: value.clone() for name, value in state.items()},
-            "world": self.world.state_dict(),
-        }
+        tensors = {}
+        for part, values in self._list_parts().items():
+            for name, value in values.items():
+                tensors[f"{part}.{name}"] = value.clone()
+        return {"tensors": tensors, "world": self.world.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore a copy that `state_dict` returned."""
-        tensors = state["tensors"]
-        self.history.q.copy_(tensors["history.q"])
-        self.history.u.copy_(tensors["history.u"])
-        self.truth.q.copy_(tensors["truth.q"])
-        self.truth.u.copy_(tensors["history.u"])
-        parts = {
+        tensors = dict(state["tensors"])
+        if self.recorder:  # perhaps of a run on a GPU, which records nothing
+            tensors.setdefault("recorder.scene", self.recorder.scene)
+        for part, values in self._list_parts().items():
+            for name, value in values.items():
+                value.copy_(tensors[f"{part}.{name}"])
+        self.world.load_state_dict(state["world"])
+        if self.recorder:  # steps before are unknown
+            self.recorder.begin(torch.ones_like(self.done), self.recorder.scene)
+
+    def _list_parts(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Return all tensors that are needed to go on exactly, by part and name."""
+        return {
+            "history": {"q": self.history.q, "u": self.history.u},
+            "truth": {"q": self.truth.q, "u": self.truth.u},
             "task": self.task.state,
             "episode": self.task.episode,
             "actuator": self.actuator.state,
+            "follower": self.follower.state,
+            "group": self._groups,
+            "recorder": {"scene": self.recorder.scene} if self.recorder else {},
         }
-        parts |= {"follower": self.follower.state, "group": self._groups}
-        for prefix, part in parts.items():
-            for name, value in part.items():
-                if prefix == "episode" and f"{prefix}.{name}" not in tensors:
-                    value.zero_()  # a figure that the version of the checkpoint did not have
-                    continue
-                value.copy_(tensors[f"{prefix}.{name}"])
-        self.world.load_state_dict(state["world"])
-        if self.recorder:  # steps before are unknown; older checkpoints hold no scenes
-            scene = tensors.get("recorder.scene", self.recorder.scene)
-            self.recorder.begin(torch.ones_like(self.done), scene)
 
     @contextlib.contextmanager
     def _always_alike(self) -> Iterator[None]:
@@ -442,9 +424,8 @@ class ControlLoop(VecEnv):
         self.end_force_n.copy_(self.world.contact_force_n)
         finished = torch.stack(tuple(self.task.episode.values()))
         self._finished.copy_(finished)
-        ending = (
-            torch.arange(len(self.task.reasons), device=self.device)[:, None] == transition.reason
-        )
+        reasons = torch.arange(len(self.task.reasons), device=self.device)
+        ending = reasons[:, None] == transition.reason
         self._totals.add_((torch.cat((finished, ending)) * done).sum(1))
         return self._draw()
 
