@@ -28,6 +28,7 @@ from rich.logging import RichHandler
 
 import brokk_rl
 from brokk_rl import distributed, extensions, gpu_pool, registry
+from brokk_rl.arguments import read_arguments
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.explain import compose_choices, explain, explain_missing_value, read_mode_name
 from brokk_rl.mode_help import describe_mode
@@ -80,6 +81,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _make_hydra_raise():
+            sys.argv[1:] = read_arguments(sys.argv[1:])
             extensions.register_options(sys.argv[1:])
             if _is_mode_help(sys.argv[1:]):
                 sys.stdout.write(_describe_chosen_mode())

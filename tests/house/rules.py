@@ -18,6 +18,7 @@ MODE = 4
 """Floor of the modes: `brokk_rl.modes` and `<room>.modes`."""
 FLOORS = (
     ("brokk_rl.cli", 5),
+    ("brokk_rl.arguments", 5),
     ("brokk_rl.explain", 5),
     ("brokk_rl.__main__", 5),
     ("diagnosis.api", 5),
@@ -37,6 +38,7 @@ FLOORS = (
 """Floor of each package, the first that fits: roof, modes, rooms and diagnosis, sim and rl,
 bedrock, and ground for the rest."""
 COMPOSERS = (
+    "brokk_rl.arguments",
     "brokk_rl.cli",
     "brokk_rl.explain",
     "brokk_rl.extensions",

@@ -1,0 +1,200 @@
+"""Words of the command line: read before Hydra sees them, and refused with the way to write them."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.errors import HydraException
+
+from brokk_rl import registry
+from brokk_rl.errors import ConfigError, list_choices
+
+SWITCHES = {"--help", "--hydra-help", "--version", "--resolve", "--run", "--multirun"}
+SWITCHES |= {"-h", "-r", "-m", "--shell-completion", "-sc"}
+"""Words with dashes that stand alone."""
+SETTINGS = {"--cfg", "--package", "--config-path", "--config-name", "--config-dir", "--info"}
+SETTINGS |= {"-c", "-p", "-cp", "-cn", "-cd", "-i"}
+"""Words with dashes that a value follows."""
+SWEEP = {"--multirun", "-m"}
+ROBOT_FILES = (".urdf", ".xml", ".mjcf", ".xacro")
+KEY = r"\+{0,2}[\w/]+(?:[.@:][\w:]+)*"
+"""A key as Hydra takes it: `+group@package`, `task.hole.radius_m`."""
+MEANINGFUL = frozenset(",[](){}'\"$\\")
+"""Characters that may be meant as Hydra reads them: lists, tables, functions, quotes."""
+
+
+def read_arguments(words: Sequence[str]) -> list[str]:
+    """Return the words of a command in the order that Hydra takes: first those with dashes.
+
+    A value that Hydra cannot read, but that has one meaning only, is quoted: `policy=runs/a=b`.
+
+    Raises:
+        ConfigError: A word cannot be read; the message says how to write what was meant.
+    """
+    groups: dict[str, list[str]] = {}
+    for option in registry.list_options():
+        groups.setdefault(option.group, []).append(option.name)
+    options, values = _split(words, groups)
+    sweep = not SWEEP.isdisjoint(options)
+    read = []
+    for place, word in enumerate(values):
+        if word[:1] == "~":
+            read.append(word)
+            continue
+        if "=" not in word or word == "=":
+            raise ConfigError(_explain_word(word, values[place + 1 :], groups))
+        read.append(_read_value(word, sweep, groups))
+    return options + read
+
+
+def _split(words: Sequence[str], groups: Mapping[str, list[str]]) -> tuple[list[str], list[str]]:
+    """Return the words with dashes and their values, and the other words."""
+    options: list[str] = []
+    values: list[str] = []
+    rest = list(words)
+    while rest:
+        word = rest.pop(0)
+        if not word.startswith("-"):
+            values.append(word)
+            continue
+        name, given, _ = word.partition("=")
+        if name not in SWITCHES | SETTINGS:
+            raise ConfigError(_explain_option(word, groups))
+        options.append(word)
+        if name in SETTINGS and not given:
+            if not rest:
+                raise ConfigError(f"{name} needs a value: brokk mode=train --cfg job")
+            options.append(rest.pop(0))
+    return options, values
+
+
+def _explain_option(word: str, groups: Mapping[str, list[str]]) -> str:
+    """Explain a word with dashes that is none of the command's."""
+    plain = word.lstrip("-")
+    if "=" in plain:
+        return f"{word}: values have no dashes: {plain}"
+    names = sorted(name for name in SWITCHES | SETTINGS if name.startswith("--"))
+    if plain in groups:
+        return f"{word}: values have no dashes, and a '=': {plain}=<option>"
+    if plain in groups["mode"]:
+        return f"{word}: values have no dashes: mode={plain}"
+    return f"there is no {word}; {list_choices(word, names)}. Values have no dashes: session.seed=3"
+
+
+def _explain_word(word: str, following: Sequence[str], groups: Mapping[str, list[str]]) -> str:
+    """Explain a word that is no `key=value`."""
+    modes = groups["mode"]
+    key, colon, value = word.partition(":")
+    if following[:1] == ["="] or word == "=":
+        return "a value is written without spaces around '=': mode=train"
+    if word.endswith(ROBOT_FILES):
+        return f"a robot is read by mode=check: brokk mode=check subject.model={shlex.quote(word)}"
+    if word in modes:
+        return f"'{word}' is a mode: brokk mode={word}"
+    if word in groups:
+        value = following[0] if following and "=" not in following[0] else "<option>"
+        return f"'{word}' has no value: {word}={value}"
+    if colon and key.strip():
+        return f"a value is written with '=': {key.strip()}={value.strip()}"
+    if Path(word).exists():
+        return f"expected key=value, got the path {word}: which key takes it? For a policy: policy={word}"
+    near = get_close_matches(word, modes, n=1)
+    hint = f"did you mean mode={near[0]}?" if near else "`brokk --help` says how to begin"
+    return f"expected key=value, got '{word}'; {hint}"
+
+
+def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
+    """Return an override as Hydra can read it."""
+    key, _, value = word.partition("=")
+    if not re.fullmatch(KEY, key):
+        hint = "it is written without spaces" if " " in key else "it is names with dots between"
+        raise ConfigError(f"'{key}' in '{word}' is no key; {hint}, as in session.seed=3")
+    if not value.strip():
+        offered = groups.get(key)
+        end = list_choices("", offered) if offered else f"{key}=<value>, or {key}=null for none"
+        raise ConfigError(f"'{word}' has no value: {end}")
+    if key in groups and value.endswith(ROBOT_FILES):
+        model = shlex.quote(value.lstrip("@"))
+        raise ConfigError(
+            f"{word}: expected an option or a YAML file, got a robot's model; mode=check makes the "
+            f"one from the other: brokk mode=check subject.model={model}"
+        )
+    try:
+        override = OverridesParser.create().parse_override(word)
+    except HydraException as error:
+        if MEANINGFUL.isdisjoint(value) and not sweep:
+            return f"{key}={_quote(value)}"
+        if re.match(r"(choice|glob|interval|range|shuffle|sort|tag)\(", value):
+            reason = str(error).partition("while evaluating ")[2].splitlines()
+            raise ConfigError(f"{word}: {reason[0] if reason else 'cannot be read'}") from error
+        raise ConfigError(_explain_characters(key, value)) from error
+    if override.is_sweep_override() and not sweep:
+        raise ConfigError(_explain_several(key, value, key in groups))
+    return word
+
+
+def _explain_several(key: str, value: str, is_group: bool) -> str:
+    """Explain a value with commas, which is a sweep where one was meant."""
+    ways = []
+    if re.fullmatch(r"-?\d+,\d+", value):
+        ways.append(f"one number: {key}={value.replace(',', '.')}")
+    elif not is_group:
+        ways.append(f"one text: {_show(key, _quote(value))}")
+    if "(" not in value:
+        ways.append(f"a list: {_show(key, f'[{value}]')}")
+    ways.append(f"one run for each: brokk -m … {_show(key, value)}")
+    return f"{key}={value} holds several values. If you mean {'; '.join(ways)}"
+
+
+def _explain_characters(key: str, value: str) -> str:
+    """Explain a value with characters that Hydra reads as something else, and how to write it."""
+    repaired = [value.strip(), value.rstrip(", ")]
+    if value.startswith("("):
+        repaired.append(f"[{value.strip('()')}]")
+    for candidate in repaired:
+        if _is_readable(f"x={candidate}"):
+            return f"{key}={value} cannot be read. Write {_show(key, candidate)}"
+    reason = ""
+    ways = []
+    if value.startswith("["):
+        inner = value.strip("[]") if value.count("[") != value.count("]") else value[1:-1]
+        items = [item if _is_readable(f"x={item}") else _quote(item) for item in inner.split(",")]
+        listed = ",".join(items)
+        ways.append(f"a list: {_show(key, f'[{listed}]')}")
+    for opening, closing in ("[]", "()", "{}"):
+        if value.count(opening) != value.count(closing):
+            reason = f": '{opening}' and '{closing}' do not match"
+    if reason or not ways:
+        ways.append(f"one text: {_show(key, _quote(value))}")
+    odd = []
+    for character in dict.fromkeys(value[1:-1] if value.startswith("[") else value):
+        if not _is_readable(f"x=a{character}b"):
+            odd.append(character)
+    if odd and not reason:
+        reason = f": {' '.join(odd)} must be quoted"
+    return f"{key}={value} cannot be read{reason}. If you mean {', or '.join(ways)}"
+
+
+def _quote(value: str) -> str:
+    """Return a text in quotes from which Hydra reads the same text."""
+    escaped = re.sub(r'(\\*)"', r'\1\1\\"', value)
+    escaped = re.sub(r"(\\+)$", r"\1\1", escaped)
+    return '"' + escaped.replace("${", r"\${") + '"'
+
+
+def _show(key: str, value: str) -> str:
+    """Return an override as it is typed into a shell."""
+    return shlex.quote(f"{key}={value}")
+
+
+def _is_readable(word: str) -> bool:
+    try:
+        OverridesParser.create().parse_override(word)
+    except HydraException:
+        return False
+    return True
