@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import os
 import re
 import sys
-from collections.abc import Iterator
+import traceback
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -18,7 +22,11 @@ from hydra.errors import (
 )
 from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import (
+    InterpolationResolutionError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
 
 from brokk_rl import extras, registry
 from brokk_rl.errors import BrokkError, list_choices
@@ -46,16 +54,15 @@ def explain(error: BaseException) -> str | None:
     if isinstance(error, MissingConfigException):
         return _explain_missing_option(error)
     if isinstance(error, InstantiationException):
-        return _explain_bad_node(error)
+        return _explain_bad_node(error, chain[-1])
     if isinstance(error, ConfigCompositionException):
         return _explain_bad_override(error)
-    if isinstance(error, (HydraException, OmegaConfBaseException)) or str(error).startswith(
-        "Config group override must"
-    ):
-        text = str(error)
-        if "override_grammar" in text:
-            text += '\nQuote words with brackets, braces or colons: \'log.joints={hip: ["tau[0]", "q[0]"]}\''
-        return text
+    if isinstance(error, InterpolationResolutionError):
+        return _explain_interpolation(error)
+    if str(error).startswith("Config group override must"):
+        return _explain_bad_choice(error)
+    if isinstance(error, (HydraException, OmegaConfBaseException)):
+        return str(error)
     return None
 
 
@@ -83,9 +90,12 @@ def _explain_missing_module(lacking: ModuleNotFoundError, chain: list[BaseExcept
 
 
 def _explain_missing_option(error: MissingConfigException) -> str:
-    group, _, name = str(error.missing_cfg_file).rpartition("/")
+    typed = _find_typed(str(error.missing_cfg_file))
+    group, _, name = typed or str(error.missing_cfg_file).rpartition("/")
     if not group:
         return str(error).split("\nConfig search path")[0]
+    if Path(name).suffix in (".yaml", ".yml") or Path(name).is_file():
+        return f"there is no {group}={name}; a file is given by its path after @: {group}=@{name}"
     if group in ("hydra/sweeper", "hydra/sweeper/sampler"):
         return f"{group}={name} is not installed; Optuna comes with the extra: pip install 'brokk-rl[optuna]'"
     # Hydra lists none where a list of options was given.
@@ -97,22 +107,93 @@ def _explain_missing_option(error: MissingConfigException) -> str:
     return f"there is no {group}={name}; {list_choices(name, offered)}"
 
 
-def _explain_bad_node(error: InstantiationException) -> str:
-    """Explain a node that cannot be built: an unknown field, a missing field, a missing target."""
-    cause = error.__cause__
+def _find_typed(place: str) -> tuple[str, str, str] | None:
+    """Return group, `=` and option as typed, of which Hydra made the place of a file."""
+    for argument in sys.argv[1:]:
+        group, equals, value = argument.partition("=")
+        for name in value.strip("[]").split(","):
+            if f"{group}/{name}" == place:
+                return group, equals, name
+    return None
+
+
+def _explain_bad_choice(error: BaseException) -> str:
+    """Explain a number, `true` or `null` in the place of an option."""
+    options = registry.list_options()
+    for argument in sys.argv[1:]:
+        group, _, value = argument.partition("=")
+        names = [option.name for option in options if option.group == group]
+        if names and (value in ("null", "true", "false") or re.fullmatch(r"[\d.eE+-]+", value)):
+            keys = [key for key in _find_keys(compose_choices(), group) if "." in key]
+            if keys:
+                return (
+                    f"{group}=<option> chooses one of {', '.join(names)}; {_suggest(keys, value)}"
+                )
+            return f"there is no {group}={value}; {list_choices(value, names)}"
+    return str(error)
+
+
+def _explain_interpolation(error: InterpolationResolutionError) -> str:
+    key = error.full_key or error.key
+    reason = str(error).splitlines()[0]
+    return f"{key}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
+
+
+def _explain_bad_node(error: InstantiationException, cause: BaseException) -> str | None:
+    """Explain a node that cannot be built: an unknown or missing field, an import that fails.
+
+    An import that fails in this package is a defect and gives `None`.
+    """
+    if located := re.search(r"locating target '([\w.]+)'", str(error)):
+        return _explain_import(located[1], cause, _locate_node(error))
     called = re.search(r"call to target '([\w.]+)'", str(error))
-    if called and isinstance(cause, TypeError):
+    if called and isinstance(error.__cause__, TypeError):
         known = list(getattr(get_class(called[1]), "__dataclass_fields__", ()))
         name = called[1].rpartition(".")[2]
-        if unknown := re.search(r"unexpected keyword argument '(\w+)'", str(cause)):
+        text = str(error.__cause__)
+        if unknown := re.search(r"unexpected keyword argument '(\w+)'", text):
             place = re.search(r"full_key: (\S+)", str(error))
             key = f"{place[1]}.{unknown[1]}" if place else unknown[1]
             if renamed := registry.find_renamed_field(key):
                 return f"{name} has no field '{unknown[1]}': '{renamed[0]}' is now '{renamed[1]}'"
-            return f"{name} has no field '{unknown[1]}'; {list_choices(unknown[1], known)}{_locate_node(error)}"
-        if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", str(cause)):
+            choices = list_choices(unknown[1], known)
+            return f"{name} has no field '{unknown[1]}'; {choices}{_locate_node(error)}"
+        if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", text):
             return f"{name} lacks {lacking[1]}{_locate_node(error)}"
     return str(error)
+
+
+def _explain_import(target: str, cause: BaseException, node: str) -> str | None:
+    """Explain a class that cannot be imported: file, line and error of the module that fails."""
+    module, _, name = target.rpartition(".")
+    place = _find_line(cause)
+    if place is None:
+        if isinstance(cause, ModuleNotFoundError):
+            return (
+                f"{target}: there is no module '{cause.name}' (seen from {Path.cwd()}); install its "
+                f"package, or add its folder to PYTHONPATH{node}"
+            )
+        return f"{target}: the module '{module}' has no '{name}'{node}"
+    file, line = place
+    if Path(file).is_relative_to(Path(__file__).parents[1]) and "site-packages" not in file:
+        return None
+    return (
+        f"{target} cannot be imported: {file}, line {line}: {type(cause).__name__}: {cause}{node}"
+    )
+
+
+def _find_line(error: BaseException) -> tuple[str, int] | None:
+    """Return file and line that raised an error, `None` where only the import itself did."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return error.filename, error.lineno or 1
+    frames = []
+    for frame in traceback.extract_tb(error.__traceback__):
+        if (
+            not frame.filename.startswith("<frozen")
+            and f"{os.sep}hydra{os.sep}" not in frame.filename
+        ):
+            frames.append(frame)
+    return (frames[-1].filename, frames[-1].lineno or 1) if frames else None
 
 
 def _locate_node(error: BaseException) -> str:
@@ -148,24 +229,54 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
     # The mode itself may not compose; the message is then shorter.
     with contextlib.suppress(Exception):
         cfg = compose_choices()
-        if "No match in the defaults list" in text or key in {
-            option.group for option in registry.list_options()
-        }:
-            groups = []
-            for k in cfg.hydra.runtime.choices:
-                if not str(k).startswith("hydra"):
-                    groups.append(str(k))
-            return f"{source} '{key}', but mode={read_mode_name(cfg)} does not use such a group; {list_choices(key, groups)}"
-        parent, _, leaf = key.rpartition(".")
-        while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
-            parent, _, leaf = parent.rpartition(".")
-        names = (
-            [str(k) for k in node if str(k) not in ("hydra", "_target_")]
-            if isinstance(node, DictConfig)
-            else []
-        )
-        return f"{source} '{key}', but '{parent or f'mode={read_mode_name(cfg)}'}' has no '{leaf}'; {list_choices(leaf, names)}"
-    return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --cfg job` shows what it has"
+        return f"{source} '{key}', but {_explain_absence(cfg, key, _find_value(key), text)}"
+    return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --help` lists what it has"
+
+
+def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
+    """Return what a configuration has in the place of a key that it does not have."""
+    mode = f"mode={read_mode_name(cfg)}"
+    parent, _, leaf = key.rpartition(".")
+    keys = _find_keys(cfg, leaf)
+    groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
+    if key in {option.group for option in registry.list_options()} and not (keys and value):
+        return f"{mode} does not use such a group; {list_choices(key, groups)}"
+    while (node := OmegaConf.select(cfg, parent, default=None) if parent else cfg) is None:
+        parent, _, leaf = parent.rpartition(".")
+    names = []
+    if isinstance(node, DictConfig):
+        names = [str(k) for k in node if str(k) not in ("hydra", "_target_")]
+    if keys:
+        return f"'{parent or mode}' has no '{leaf}'; {_suggest(keys, value)}"
+    for option in registry.list_options():
+        if option.name == key and option.group in groups:
+            return f"'{key}' is an option: {option.group}={key}"
+    return f"'{parent or mode}' has no '{leaf}'; {list_choices(leaf, names if parent else {*names, *groups})}"
+
+
+def _suggest(keys: Sequence[str], value: str) -> str:
+    return f"did you mean {' or '.join(f'{key}={value}' for key in keys[:3])}?"
+
+
+def _find_value(key: str) -> str:
+    """Return the value that was typed for a key."""
+    for argument in sys.argv[1:]:
+        name, _, value = argument.lstrip("+").partition("=")
+        if name == key:
+            return value
+    return "<value>"
+
+
+def _find_keys(node: Any, name: str, above: str = "") -> list[str]:
+    """Return the keys of a configuration that end with `name`, the shortest first."""
+    found = []
+    for key in node if isinstance(node, DictConfig) else ():
+        inside = None if OmegaConf.is_missing(node, key) else node._get_node(key)
+        if key == name:
+            found.append(f"{above}{key}")
+        if f"{above}{key}" != "hydra":
+            found += _find_keys(inside, name, f"{above}{key}.")
+    return sorted(found, key=lambda key: key.count("."))
 
 
 def compose_choices() -> DictConfig:
@@ -179,7 +290,8 @@ def compose_choices() -> DictConfig:
     for override in OverridesParser.create().parse_overrides(
         [argument for argument in sys.argv[1:] if "=" in argument and argument[0] != "-"]
     ):
-        if override.key_or_group not in groups:
+        plain = override.is_sweep_override() or isinstance(override.value(), (str, list))
+        if override.key_or_group not in groups or not plain:
             continue
         line = str(override.input_line)
         if override.is_sweep_override():
