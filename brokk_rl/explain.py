@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import os
 import re
 import sys
 import traceback
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import hydra
+import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import (
     ConfigCompositionException,
@@ -59,6 +59,9 @@ def explain(error: BaseException) -> str | None:
         return _explain_bad_override(error)
     if isinstance(error, InterpolationResolutionError):
         return _explain_interpolation(error)
+    if isinstance(error, yaml.MarkedYAMLError) and error.problem_mark:
+        mark = error.problem_mark
+        return f"{mark.name}, line {mark.line + 1}: no valid YAML ({error.problem})"
     if str(error).startswith("Config group override must"):
         return _explain_bad_choice(error)
     if isinstance(error, (HydraException, OmegaConfBaseException)):
@@ -168,7 +171,7 @@ def _explain_import(target: str, cause: BaseException, node: str) -> str | None:
     module, _, name = target.rpartition(".")
     place = _find_line(cause)
     if place is None:
-        if isinstance(cause, ModuleNotFoundError):
+        if isinstance(cause, ModuleNotFoundError) and "is not a package" not in str(cause):
             return (
                 f"{target}: there is no module '{cause.name}' (seen from {Path.cwd()}); install its "
                 f"package, or add its folder to PYTHONPATH{node}"
@@ -186,14 +189,12 @@ def _find_line(error: BaseException) -> tuple[str, int] | None:
     """Return file and line that raised an error, `None` where only the import itself did."""
     if isinstance(error, SyntaxError) and error.filename:
         return error.filename, error.lineno or 1
-    frames = []
+    found = None
     for frame in traceback.extract_tb(error.__traceback__):
-        if (
-            not frame.filename.startswith("<frozen")
-            and f"{os.sep}hydra{os.sep}" not in frame.filename
-        ):
-            frames.append(frame)
-    return (frames[-1].filename, frames[-1].lineno or 1) if frames else None
+        importing = Path(frame.filename).parts
+        if not frame.filename.startswith("<") and not {"hydra", "importlib"} & set(importing):
+            found = frame.filename, frame.lineno or 1
+    return found
 
 
 def _locate_node(error: BaseException) -> str:

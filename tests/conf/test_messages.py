@@ -1,82 +1,152 @@
-"""Bad input gets a message that says what to change, exit code 2, and leaves nothing behind."""
+"""Wrong commands of a newcomer: each ends with 2, says what to write, and leaves nothing behind."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
+from invoked import Refusal, refuse_all
 
+LONGEST_S = 2.0
+"""CPU time of a refusal that needs no torch."""
 COMPARE = ("mode=compare", "compare.runs=nowhere")
+FILES = {
+    "arm.urdf": "<robot name='a'><link name='b'/></robot>",
+    "arm.xml": "<mujoco/>",
+    "bad.yaml": "_target_: brokk_rl.machine.Machine\nname: [1, 2\nfoo: 3\n",
+    "tabs.yaml": "_target_: brokk_rl.machine.Machine\n\tname: a\n",
+    "foreign.yaml": "_target_: os.system\ncommand: ls\n",
+    "list.yaml": "- 1\n- 2\n",
+    "own/mode/broken.yaml": "# @package _global_\nname: [1, 2\n",
+    "own/actuator/typo.yaml": "_target_: actuators.models.lag.FirstOrderLags\n",
+    "own/actuator/lost.yaml": "_target_: nowhere.parts.Arm\n",
+    "own/actuator/fails.yaml": "_target_: fails.Arm\n",
+    "own/actuator/slip.yaml": "_target_: slip.Arm\n",
+    "fails.py": "import math\nfrom math import squareroot\n",
+    "slip.py": "x = 1\ndef f(:\n",
+}
+"""What lies on the newcomer's desk."""
+WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
+    # words
+    ("evaluate",): ("brokk mode=evaluate",),
+    ("play", "policy=runs/x"): ("brokk mode=play",),
+    ("mode", "train"): ("mode=train",),
+    ("mode", "=", "train"): ("without spaces", "mode=train"),
+    ("mode = train",): ("'mode '", "without spaces"),
+    ("mode:train",): ("mode=train",),
+    ("--mode=train",): ("no dashes: mode=train",),
+    ("--mode", "train"): ("mode=<option>",),
+    ("--train",): ("mode=train",),
+    ("--verbose",): ("there is no --verbose",),
+    ("mode=train", "--seed=3"): ("seed=3",),
+    ("mode=train", "--cfg"): ("--cfg needs a value",),
+    ("evaluat",): ("did you mean mode=evaluate?",),
+    ("arm.urdf",): ("brokk mode=check subject.model=arm.urdf",),
+    ("mode=trian", "--help"): ("there is no mode=trian", "'train'"),
+    ("mode=evaluate", "--cfg", "job", "task=tunnel"): ("there is no task=tunnel",),
+    ("--config-dir", "nowhere", "mode=list"): ("nowhere",),
+    # modes, groups, options
+    ("mode=lst",): ("there is no mode=lst", "did you mean 'list'?", "doctor"),
+    ("mode=",): ("has no value", "choices: "),
+    ("mode=null",): ("there is no mode=null", "choices"),
+    ("mode=../train",): ("there is no mode=../train",),
+    ("mode=list,doctor",): ("several values", "brokk -m"),
+    ("-m", "mode=lst,list"): ("there is no mode=lst",),
+    ("mode=list", "task=borehole_insertion"): ("'task'", "mode=list does not use"),
+    ("mode=list", "list.group=actuatr"): ("did you mean 'actuator'?",),
+    ("mode=list", "session.seed=1"): ("'mode=list' has no 'session'",),
+    ("mode=list", "experiment=nothing"): ("there is no", "experiment"),
+    (*COMPARE, "session=other"): ("there is no session=other", "default"),
+    ("effect=[backlash",): ("do not match", "'effect=[backlash]'"),
+    ("effect=backlash,lag",): ("a list: 'effect=[backlash,lag]'",),
+    ("tracking=wandb,",): ("Write tracking=wandb",),
+    ("wandb=true",): ("tracking=wandb",),
+    # keys
+    ("mod=train",): ("did you mean 'mode'?",),
+    ("mode=list", "list.groop=task"): ("'list.groop'", "did you mean 'group'?"),
+    ("seed=3",): ("did you mean session.seed=3",),
+    ("hidden_dims=256",): ("rl.runner.actor.hidden_dims=256",),
+    ("video=false",): ("evaluation.video=false",),
+    ("mode=play", "session.seed=3"): ("play.seed=3",),
+    ("task..memory=3",): ("'task..memory'", "is no key"),
+    ("=3",): ("is no key",),
+    (*COMPARE, "+session.sed=1"): ("no field 'sed'", "did you mean 'seed'?"),
+    ("effect=[backlash]", "effect.backlash.width=1"): ("'effect.backlash' has no", "gap_rad"),
+    ("task=goal_pose", "task.hole.radius_m=1"): ("'task' has no 'hole'", "tolerance"),
+    ("mode=perceive", "perception/segmenter=onnx", "perception.segmenter.wrong=1"): (
+        "'perception.segmenter' has no 'wrong'",
+        "choices: gate, margin, threads, weights",
+    ),
+    ("-m", "effect=[backlash],[lag]", "effect.backlash.width=1"): ("has no 'width'",),
+    # characters, quotes, shapes
+    ("mode=list", "mode.x=["): ("do not match", """'mode.x="["'"""),
+    ("mode=compare", "compare.runs=[a#b]"): ("#", """'compare.runs=["a#b"]'"""),
+    ("mode=compare", "compare.runs=[v{1}[2]]"): ("""'compare.runs=["v{1}[2]"]'""",),
+    ("mode=compare", "compare.runs=[my run]"): ("'my run'",),
+    ("mode=compare", "compare.runs=[${x}]"): ("compare.runs[0]", "'x' not found", r"\${"),
+    ("session.out=x/epoch=3,step=4",): ("= must be quoted", """'session.out="x/epoch=3,step=4"'"""),
+    ("session.out=v{1}[2]",): ("""'session.out="v{1}[2]"'""",),
+    ("session.out=it's",): ("'", r"""'session.out="it'"'"'s"'"""),
+    ("session.out=a,b",): ("""one text: 'session.out="a,b"'""",),
+    ("session.out=a(b)",): ("""'session.out="a(b)"'""",),
+    ("session.seed=",): ("session.seed=<value>",),
+    ("rl.runner.actor.hidden_dims=(64,64)",): ("'rl.runner.actor.hidden_dims=[64,64]'",),
+    ("rl.runner.algorithm.learning_rate=1,5",): ("learning_rate=1.5",),
+    ("-m", "mode=list", "list.group=range(a,b)"): ("list.group", "start: str"),
+    # files
+    ("machine=@arm.xml",): ("brokk mode=check subject.model=arm.xml",),
+    ("machine=bad.yaml",): ("machine=@bad.yaml",),
+    ("machine=@bad.yaml",): ("machine=@bad.yaml: line 3: no valid YAML",),
+    ("machine=@tabs.yaml",): ("line 2", "'\\t'"),
+    ("machine=@foreign.yaml",): ("os.system' is no machine",),
+    ("machine=@list.yaml",): ("expected a mapping",),
+    ("machine=@nowhere.yaml",): ("there is no such file",),
+    ("--config-dir", "own", "mode=broken"): ("broken.yaml", "line"),
+    COMPARE: ("compare.runs", "nowhere"),
+    ("-m", "mode=compare", "compare.runs=a,b"): ("compare.runs", "'a'"),
+    # values
+    ("mode=compare",): ("compare.runs=<value>",),
+    (*COMPARE, "session.seed=abc"): ("Session.seed", "expected a whole number", "'abc'"),
+    (*COMPARE, "session.seed=-1"): ("session.seed", "0 or more"),
+    (*COMPARE, "session.device=gpu"): ("session.device", "cpu", "'gpu'"),
+    ("mode=board", "board.rows=0"): ("expected 2 or more columns and rows, got",),
+}
+"""A command, and parts of its message."""
+OWN_MODULES = {
+    ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
+    ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
+    ("--config-dir", "own", "actuator=fails"): ("fails.py, line 2", "squareroot"),
+    ("--config-dir", "own", "actuator=slip"): ("slip.py, line 2", "SyntaxError"),
+}
+"""The same for a class of one's own, whose module is imported after torch."""
 
 
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (("mode=lst",), ("there is no mode=lst", "did you mean 'list'?", "doctor")),
-        (("mode=list", "task=borehole_insertion"), ("'task'", "mode=list does not use")),
-        (("mode=list", "list.groop=task"), ("'list.groop'", "did you mean 'group'?")),
-        (("mode=list", "list.group=actuatr"), ("did you mean 'actuator'?",)),
-        (("mode=list", "session.seed=1"), ("'mode=list' has no 'session'",)),
-        (("mode=list", "mode.x=["), ("input",)),
-        (("mode=list", "list.group=a,b"), ("--multirun",)),
-        (("mode=list", "experiment=nothing"), ("there is no", "experiment")),
-        (
-            (*COMPARE, "session.seed=abc"),
-            ("Session.seed", "expected a whole number", "'abc'", "session.<field>="),
-        ),
-        ((*COMPARE, "session.seed=-1"), ("session.seed", "0 or more")),
-        ((*COMPARE, "session.device=gpu"), ("session.device", "cpu", "'gpu'")),
-        ((*COMPARE, "+session.sed=1"), ("no field 'sed'", "did you mean 'seed'?")),
-        ((*COMPARE, "session=other"), ("there is no session=other", "default")),
-        (COMPARE, ("compare.runs", "nowhere")),
-        (("mode=compare",), ("compare.runs=<value>",)),
-        (("-m", "mode=lst,list"), ("there is no mode=lst",)),
-        (("-m", "mode=compare", "compare.runs=a,b"), ("compare.runs", "'a'")),
-        (
-            ("mode=perceive", "perception.filter.forget_s=3"),
-            ("'perception.filter.forget_s' is now 'tracker.forget_s'",),
-        ),
-        (("mode=perceive", "perception.filter.gate=3"), ("'perception.filter' is now 'tracker'",)),
-        (
-            ("mode=perceive", "perception/filter=fusion"),
-            ("'perception/filter' is now 'perception/tracker@tracker'",),
-        ),
-        (
-            ("mode=deploy", "camera=pictures", "deploy.camera.forget_s=3"),
-            ("'deploy.camera.forget_s' is now 'deploy.camera.tracker.forget_s'",),
-        ),
-        (
-            ("effect=[backlash]", "effect.backlash.width=1"),
-            ("'effect.backlash' has no 'width'", "gap_rad"),
-        ),
-        (("task=goal_pose", "task.hole.radius_m=1"), ("'task' has no 'hole'", "tolerance")),
-        (
-            ("mode=perceive", "perception/segmenter=onnx", "perception.segmenter.wrong=1"),
-            ("'perception.segmenter' has no 'wrong'", "choices: gate, margin, threads, weights"),
-        ),
-        (
-            ("-m", "effect=[backlash],[lag]", "effect.backlash.width=1"),
-            ("'effect.backlash' has no 'width'",),
-        ),
-        (("mode=null",), ("must be a string",)),
-        (("mode=study", "study.do=report", "study.folder=x"), ("x holds no study",)),
-        (("mode=board", "board.rows=0"), ("expected 2 or more columns and rows, got",)),
-        (("--config-dir", "nowhere", "mode=list"), ("nowhere",)),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, tuple) else None,
-)
-def test_the_message_says_what_to_change(
-    arguments: tuple[str, ...], told: tuple[str, ...], brokk: Callable[..., Any], tmp_path: Path
+@pytest.fixture(scope="module")
+def refusals(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], Refusal]:
+    desk = tmp_path_factory.mktemp("desk")
+    for name, text in FILES.items():
+        (desk / name).parent.mkdir(parents=True, exist_ok=True)
+        (desk / name).write_text(text)
+    before = sorted(desk.iterdir())
+    found = refuse_all([*WRONG, *OWN_MODULES], desk)
+    assert sorted(desk.iterdir()) == before, "a refused command leaves nothing behind"
+    return found
+
+
+@pytest.mark.parametrize("words", [*WRONG, *OWN_MODULES], ids=" ".join)
+def test_the_message_says_what_to_write(
+    words: tuple[str, ...], refusals: dict[tuple[str, ...], Refusal]
 ) -> None:
-    done = brokk(*arguments)
-    assert done.code == 2
-    assert sum(line.startswith("error: ") for line in done.err.splitlines()) == 1
-    for part in told:
-        assert part in done.err
-    assert "Traceback" not in done.err
-    assert list(tmp_path.iterdir()) == []
+    refusal = refusals[words]
+    assert refusal.code == 2
+    assert sum(line.startswith("error: ") for line in refusal.told.splitlines()) == 1
+    assert "Traceback" not in refusal.told
+    for part in (WRONG | OWN_MODULES)[words]:
+        assert part in refusal.told
+    if words in WRONG:
+        assert not refusal.torch
+        assert refusal.cpu_s < LONGEST_S
 
 
 def test_the_traceback_comes_on_request(

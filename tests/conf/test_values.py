@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
+from invoked import Refusal, refuse_all
+
+LONGEST_S = 2.0
+"""CPU time of a refusal that needs no torch."""
 
 BAD = {
     ("rl.num_envs=0",): "rl.num_envs: expected a finite number of 1 or more, got 0",
@@ -85,43 +83,22 @@ BAD = {
     ("mode=render", "render.count=0"): "render: expected count of 1 or more",
 }
 """Words of a command, and what its message must say."""
-PROGRAM = """
-import contextlib, io, json, sys
-from brokk_rl import cli
-found = []
-for words in json.loads(sys.stdin.read()):
-    sys.argv = ["brokk", *words]
-    told = io.StringIO()
-    with contextlib.redirect_stderr(told):
-        code = cli.main()
-    found.append([code, told.getvalue(), "torch" in sys.modules])
-print(json.dumps(found))
-"""
 
 
 @pytest.fixture(scope="module")
-def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], list]:
-    """All commands in one process that has not imported torch."""
+def refusals(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], Refusal]:
     folder = tmp_path_factory.mktemp("values")
-    root = str(Path(__file__).parents[2])
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM],
-        input=json.dumps(list(BAD)),
-        capture_output=True,
-        text=True,
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": root},
-    )
-    assert done.returncode == 0, done.stderr
+    found = refuse_all(list(BAD), folder)
     assert not list(folder.iterdir()), "a refused command leaves nothing behind"
-    return dict(zip(BAD, json.loads(done.stdout.splitlines()[-1]), strict=True))
+    return found
 
 
 @pytest.mark.parametrize("words", BAD, ids=" ".join)
-def test_a_bad_number_is_refused_by_name_before_torch_is_loaded(
-    words: tuple[str, ...], outcomes: dict[tuple[str, ...], list]
+def test_a_bad_value_is_refused_by_name_before_torch_is_loaded(
+    words: tuple[str, ...], refusals: dict[tuple[str, ...], Refusal]
 ) -> None:
-    code, told, torch_loaded = outcomes[words]
-    assert code == 2 and "Traceback" not in told
-    assert BAD[words] in " ".join(told.split())
-    assert not torch_loaded
+    refusal = refusals[words]
+    assert refusal.code == 2 and "Traceback" not in refusal.told
+    assert BAD[words] in " ".join(refusal.told.split())
+    assert not refusal.torch
+    assert refusal.cpu_s < LONGEST_S
