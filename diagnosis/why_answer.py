@@ -15,11 +15,11 @@ import yaml
 
 from brokk_rl.errors import RecordingError
 from brokk_rl.report import Tone
-from brokk_rl.story import HANDED_ON_FOLDER
 from diagnosis import answer, effects_file, report
 from diagnosis.answer import Answer
 from diagnosis.deployment.page import REMEDIES
 from diagnosis.retraining import SuccessRate, subtract_rates
+from diagnosis.story import HANDED_ON_FOLDER
 
 WHY_FILE = "why.json"
 DOCTOR, DIAGNOSIS = "doctor", "diagnosis"

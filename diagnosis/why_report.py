@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,7 +16,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, remove_frame
 from brokk_rl.report import Cell, Report
 from brokk_rl.session import read_record
-from brokk_rl.story import add_stages
 from diagnosis import answer, report
 from diagnosis.deployment.page import EVIDENCE_FILE, PAGE_FILE
 from diagnosis.retraining import format_rate
@@ -72,7 +73,7 @@ def write_why_page(
         )
     page.add_links(links)
     with page.add_details("Stages and their commands"):
-        add_stages(page, folder, titles)
+        _add_stages(page, folder, titles)
     page.write(folder / WHY_PAGE)
 
 
@@ -237,3 +238,38 @@ def draw_costs(result: WhyResult, titles: Mapping[str, str]) -> Figure:
     axis.set_xlabel("strict success, %")
     remove_frame(axis)
     return figure
+
+
+def _add_stages(page: Report, folder: Path, titles: Mapping[str, str]) -> None:
+    """Add purpose, outcome, minutes and commands of the stages, whose purposes are `titles`."""
+    page.add_heading("Stages")
+    rows, whole_s = [], 0.0
+    for name, title in titles.items():
+        record = read_record(folder / name)
+        if record is None:
+            rows.append([name, title, None])
+            continue
+        seconds = _measure_seconds(record)
+        whole_s += seconds or 0.0
+        rows.append(
+            [
+                name,
+                Cell(title, f"{record['outcome']}; {record['mode']}"),
+                None if seconds is None else f"{seconds / 60:.1f}",
+            ]
+        )
+    rows.append(["", "all", f"{whole_s / 60:.1f}"])
+    page.add_table(["stage", "purpose", "minutes"], rows)
+    with page.add_details("The commands"):
+        records = (read_record(folder / name) for name in titles)
+        page.add_code(
+            "\n\n".join(f"brokk {' '.join(record['command'][1:])}" for record in records if record)
+        )
+
+
+def _measure_seconds(record: Mapping[str, Any]) -> float | None:
+    """Return the duration of a stage by its `session.json`; `None` where it has not ended."""
+    if not record.get("ended"):
+        return None
+    begun, ended = (datetime.fromisoformat(record[key]) for key in ("started", "ended"))
+    return (ended - begun).total_seconds()

@@ -24,10 +24,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
-from brokk_rl.story import HANDED_ON_FOLDER, StoryStage, run_story, write_groups
 from diagnosis import report, why_answer, why_report
 from diagnosis.deployment.contract import load_policy
 from diagnosis.request import FITS
+from diagnosis.story import HANDED_ON_FOLDER, StoryStage, run_story, write_groups
 from diagnosis.why_answer import (
     ALL_EFFECTS,
     BEFORE,
@@ -203,9 +203,7 @@ class Why:
 
 
 def _make_stage(title: str, command: list[str], takes: tuple[str, ...]) -> StoryStage:
-    return StoryStage(
-        title=title, command=tuple(command), takes=takes, links={}, needs=None, resumes=False
-    )
+    return StoryStage(title=title, command=tuple(command), takes=takes, links={}, needs=None)
 
 
 def _quote(patterns: str | tuple[str, ...]) -> str:

@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from brokk_rl.errors import FrameError
-from perception import dataset
-
 NEAR_M = 0.05
 """A found hole belongs to the true one whose centre lies this near: a hole's radius."""
-LARGEST_HIDDEN = 0.5
-"""A true hole of which more is hidden counts neither as found nor as missed."""
 
 
 @dataclass(frozen=True)
@@ -66,38 +59,6 @@ class SessionScore:
     def count_inside(self, sigmas: float) -> int:
         """Return how many errors lie inside so many stated standard deviations."""
         return sum(one.sigmas <= sigmas for one in self.errors)
-
-
-def score_session(holes: Path, frames: Path) -> SessionScore:
-    """Return the score of a `holes.json` by the truth files beside its frames.
-
-    Raises:
-        FrameError: `holes.json` cannot be read, or a frame has no truth.
-    """
-    scores = []
-    for entry in read_holes(holes):
-        truth = dataset.read_truth(frames / entry["name"])
-        true = []
-        for hole in truth.holes:
-            if hole.in_view and hole.hidden <= LARGEST_HIDDEN:
-                distance_m = float(np.linalg.norm(hole.center_m))
-                true.append((hole.center_in_base_m, hole.axis_in_base, distance_m))
-        scores.append(score_holes(entry["name"], entry.get("holes", ()), true))
-    return merge_scores(scores)
-
-
-def read_holes(path: Path) -> list[dict[str, Any]]:
-    """Return the frames of a `holes.json`.
-
-    Raises:
-        FrameError: it cannot be read.
-    """
-    try:
-        return list(json.loads(path.read_text())["frames"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FrameError(
-            f"{path}: expected holes.json of `brokk mode=perceive` ({error})"
-        ) from error
 
 
 def score_holes(

@@ -1,1 +1,1 @@
-"""Modes of perception: `perceive`, `render`, `train_perception`, `label`, `calibrate`, `board`, `camera_day`."""
+"""Modes of perception: `perceive`, `render`, `train_perception`, `label`, `calibrate`, `board`."""

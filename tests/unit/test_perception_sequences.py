@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,7 @@ import pytest
 import yaml
 from composed import option
 
-from brokk_rl import record, story
+from brokk_rl import record
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
@@ -133,42 +132,3 @@ def test_a_score_counts_each_hole_once() -> None:
     assert score.errors[0].sigmas == pytest.approx(1.5)
     assert score.compute_position_m(50) == pytest.approx(0.003)
     assert json.dumps(score.count_inside(1.0)) == "0"
-
-
-def test_a_camera_day_runs_its_stages_once_and_goes_on(
-    brokk: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    played: list[list[str]] = []
-
-    class Stage:
-        def __init__(self, words: list[str], env: dict[str, str]) -> None:
-            out = Path(words[-1].partition("=")[2])
-            played.append([out.name, *words[words.index("brokk_rl") + 1 :]])
-            self._code = int(out.name == "labels" and len(played) < 5)
-            out.mkdir(exist_ok=True)
-            end = "failed" if self._code else "finished"
-            times = {"started": "2024-05-01T08:00:00+00:00", "ended": "2024-05-01T08:01:00+00:00"}
-            record = {"outcome": end, "mode": "render", "command": words, **times}
-            (out / "session.json").write_text(json.dumps(record))
-
-        def __enter__(self) -> Stage:
-            return self
-
-        def __exit__(self, *exc: Any) -> None:
-            pass
-
-        def wait(self) -> int:
-            return self._code
-
-    monkeypatch.setattr(story, "subprocess", SimpleNamespace(Popen=Stage))
-    failed = brokk("experiment=camera_day", "session.out=day")
-    assert failed.code == 2 and "resume=day session.out=day" in failed.err
-    assert [one[0] for one in played] == ["board", "calibration", "footage", "labels"]
-    assert f"rig=@{tmp_path}/day/given/rig.yaml" in played[0]
-    assert brokk("experiment=camera_day", "session.out=day", "resume=day").code == 0
-    assert [one[0] for one in played[4:]] == [
-        "labels", "network", "site", "uncalibrated", "perceived", "own_network",
-    ]  # fmt: skip
-    assert "The day goes on." in (tmp_path / "day/camera_day.html").read_text()
-    figures = json.loads((tmp_path / "day/camera_day.json").read_text())
-    assert figures["stage_s"]["board"] == 60.0 and figures["perceived"] == {}

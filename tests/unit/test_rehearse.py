@@ -1,4 +1,4 @@
-"""A story: its stages in order, each once, what they take from it, where it goes on, where it ends; and the page that tells it."""
+"""A story: its stages in order, each once, what they take from it, where it goes on and where it ends."""
 
 from __future__ import annotations
 
@@ -12,19 +12,7 @@ import pytest
 import yaml
 from conftest import Done
 
-from brokk_rl import story
-from diagnosis import retraining
-from diagnosis.answer import Answer, Estimate, Gap, Selected, Where
-from diagnosis.modes import rehearse as story_page
-
-SHARE = {"mean": 0.5, "ci95": [0.4, 0.6]}
-WITHHELD = {
-    "asymmetry": {
-        "joints": ["q3", "q4"],
-        "extend_gain": 0.5,
-        "retract_gain": {"q3": 0.9, "other": 1.0},
-    }
-}
+from diagnosis import story
 
 
 class Played:
@@ -114,7 +102,6 @@ def test_each_stage_is_a_command_with_what_it_takes_from_the_story(
     ]
     assert blind == ["reference", "simulator", "policy", "believed", "diagnosis"]
     assert (folder / "case/field").readlink() == folder / "field/recordings"
-    assert "3.0" in (folder / story_page.STORY_FILE).read_text(), "each stage took three minutes"
 
 
 def test_a_story_goes_on_where_it_failed(
@@ -126,10 +113,6 @@ def test_a_story_goes_on_where_it_failed(
     played.failing, played.commands = "", {}
     assert brokk("experiment=gap_loop", "session.out=story", "resume=story").code == 0
     assert next(iter(played.commands)) == "policy"
-    assert f"resume={tmp_path}/story/policy" in played.commands["policy"], (
-        "training goes on from its checkpoint"
-    )
-    assert not any(word.startswith("resume=") for word in played.commands["believed"])
 
 
 def test_a_story_that_another_command_began_is_not_gone_on_with(
@@ -162,66 +145,3 @@ def test_a_stage_takes_only_what_a_story_has(brokk: Callable[..., Done]) -> None
 def test_a_mode_without_a_story_says_so(brokk: Callable[..., Done]) -> None:
     done = brokk("mode=rehearse")
     assert done.code == 2 and "experiment=gap_loop" in done.err
-
-
-@pytest.mark.parametrize(
-    ("effect", "same_as", "told"),
-    [
-        ("asymmetry", (), "as it is"),
-        ("flow_gain", ("asymmetry",), "as it is"),
-        ("lag", (), "but the machine has asymmetry on q3 and q4"),
-    ],
-)
-def test_the_page_says_whether_the_diagnosis_was_right(
-    tmp_path: Path, effect: str, same_as: tuple[str, ...], told: str
-) -> None:
-    one = Selected(
-        effect=effect, joints=("q3", "q4"), probability=0.9, same_as=same_as, gap_closed=Estimate(0.9, (0.8, 1.0)),
-        parameters={"extend_gain": {"q3": Estimate(0.52, (0.5, 0.55))}}, decided_by=None,
-    )  # fmt: skip
-    answer = Answer(
-        verdict="effects", selected=(one,), ranking=(), where=Where({}, (), None),
-        gap=Gap(0.03, 0.01, 0.009, Estimate(0.95, (0.9, 1.0))), next_experiment=None, reason="",
-    )  # fmt: skip
-    (tmp_path / "diagnosis").mkdir()
-    answer.write(tmp_path / "diagnosis" / "diagnosis.json")
-    story_page.write_story(tmp_path, {"reference": "recorded"}, WITHHELD)
-    page = (tmp_path / story_page.STORY_FILE).read_text()
-    assert told in page and ('<td class="number">0.5</td>' in page) == (effect == "asymmetry")
-
-
-def test_the_page_tells_success_that_fell_and_came_back(tmp_path: Path) -> None:
-    rates = {"before": (0.95, 0.2, 0.15), "after": (0.9, 0.95, 0.93)}
-    evaluations = {
-        place: {
-            "episodes": 200,
-            "policies": {
-                name: {
-                    "episodes": 200,
-                    "success_strict": {"mean": three[number]},
-                    "time_to_insert_s": {"median": 9.0},
-                }
-                for name, three in rates.items()
-            },
-        }
-        for number, place in enumerate(retraining.PLANTS)
-    }
-    for name in ("diagnosis", "repair"):
-        (tmp_path / name).mkdir()
-    (tmp_path / "repair" / retraining.COMPARISON_FILE).write_text(
-        json.dumps(retraining.compare_policies(evaluations))
-    )
-    answer = Answer(
-        verdict="none",
-        selected=(),
-        ranking=(),
-        where=Where({}, (), None),
-        gap=Gap(0.01, 0.01, 0.01, None),
-        next_experiment=None,
-    )
-    answer.write(tmp_path / "diagnosis/diagnosis.json")
-    story_page.write_story(tmp_path, {}, WITHHELD)
-    assert (
-        "found nothing; the machine has asymmetry on q3 and q4"
-        in (tmp_path / story_page.STORY_FILE).read_text()
-    )

@@ -1,4 +1,4 @@
-"""Stories: modes that run one after another, each in a process and a run folder of its own."""
+"""Stages of a story: modes that run one after another, each in a process and a run folder of its own."""
 
 from __future__ import annotations
 
@@ -8,14 +8,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import yaml
 
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
-from brokk_rl.report import Cell, Report
 from brokk_rl.session import RESOLVED, Session, read_record, write_text
 from brokk_rl.spec import spec
 
@@ -39,7 +37,6 @@ class StoryStage:
         links: Links made before it, both ends below the run folder: path and target.
         needs: A file below the run folder without whose content the story ends before this stage;
             `null`: nothing.
-        resumes: Whether an interrupted one goes on with `resume=`; otherwise it begins anew.
     """
 
     title: str
@@ -47,33 +44,16 @@ class StoryStage:
     takes: tuple[str, ...]
     links: dict[str, str]
     needs: str | None
-    resumes: bool
 
 
-def check_story(
-    session: Session, stages: Mapping[str, StoryStage], resume: str | None, groups: Sequence[str]
-) -> None:
-    """Refuse a story that cannot be run.
-
-    Args:
-        session: Of the story.
-        stages: The story, in order.
-        resume: Run folder of an interrupted story, the same as that of the session.
-        groups: Groups that stages can take.
-
-    Raises:
-        ConfigError: a stage takes another group, or `resume` is another folder.
-    """
+def check_stages(stages: Mapping[str, StoryStage], groups: Sequence[str]) -> None:
+    """Refuse stages that take another group than the story has, one of `groups`."""
     for stage in stages.values():
         for name in stage.takes:
             if name not in (*groups, DEVICE):
                 raise ConfigError(
                     f"a stage takes '{name}', which the story does not have; {list_choices(name, (*groups, DEVICE))}"
                 )
-    if resume is not None and Path(resume).resolve() != session.folder.resolve():
-        raise ConfigError(
-            f"resume={resume}: a story goes on in its folder; add session.out={resume}"
-        )
 
 
 def write_groups(
@@ -99,14 +79,14 @@ def write_groups(
 
 
 def run_story(
-    session: Session, stages: Mapping[str, StoryStage], write_page: Callable[[], None]
+    session: Session, stages: Mapping[str, StoryStage], write_page: Callable[[], None] | None = None
 ) -> None:
     """Run the stages that are not finished.
 
     Args:
         session: Folder and device of the story.
         stages: The story, in order.
-        write_page: Is called after each stage.
+        write_page: Is called after each stage that was run.
 
     Raises:
         BrokkError: a stage failed; the story goes on from there with `resume=`.
@@ -123,8 +103,8 @@ def run_story(
             continue
         log.info("%d of %d, %s: %s", number, len(stages), name, stage.title)
         _play_stage(session, name, stage, folder)
-        write_page()
-    write_page()
+        if write_page is not None:
+            write_page()
 
 
 def _list_words(stage: StoryStage, folder: Path) -> list[str]:
@@ -160,10 +140,7 @@ def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) ->
     words += [f"session.device={session.device}"] if DEVICE in stage.takes else []
     words += [f"session.out={place}"]
     if place.exists():
-        if stage.resumes:
-            words += [f"resume={place}"]
-        else:
-            shutil.rmtree(place)  # an unfinished stage has no record
+        shutil.rmtree(place)  # an unfinished stage begins anew
     # The command sets this for Hydra; a stage that inherited it would print a traceback of user errors.
     env = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
     with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words], env=env) as process:
@@ -177,47 +154,6 @@ def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) ->
             f"the stage '{name}' failed, see above; what came before it is kept: go on with resume={session.out} "
             f"session.out={session.out}"
         )
-
-
-def add_stages(page: Report, folder: Path, titles: Mapping[str, str]) -> None:
-    """Add the stages of a story to its page: purpose, outcome, minutes and commands.
-
-    Args:
-        page: The page.
-        folder: Run folder of the story.
-        titles: Purpose of each stage, by name.
-    """
-    page.add_heading("Stages")
-    rows, whole_s = [], 0.0
-    for name, title in titles.items():
-        record = read_record(folder / name)
-        if record is None:
-            rows.append([name, title, None])
-            continue
-        seconds = measure_seconds(record)
-        whole_s += seconds or 0.0
-        rows.append(
-            [
-                name,
-                Cell(title, f"{record['outcome']}; {record['mode']}"),
-                None if seconds is None else f"{seconds / 60:.1f}",
-            ]
-        )
-    rows.append(["", "all", f"{whole_s / 60:.1f}"])
-    page.add_table(["stage", "purpose", "minutes"], rows)
-    with page.add_details("The commands"):
-        records = (read_record(folder / name) for name in titles)
-        page.add_code(
-            "\n\n".join(f"brokk {' '.join(record['command'][1:])}" for record in records if record)
-        )
-
-
-def measure_seconds(record: Mapping[str, Any]) -> float | None:
-    """Return the duration of a stage by its `session.json`; `None` where it has not ended."""
-    if not record.get("ended"):
-        return None
-    begun, ended = (datetime.fromisoformat(record[key]) for key in ("started", "ended"))
-    return (ended - begun).total_seconds()
 
 
 def _has_content(path: Path) -> bool:
