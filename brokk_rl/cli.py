@@ -33,6 +33,7 @@ from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.explain import compose_choices, explain, explain_missing_value, read_mode_name
 from brokk_rl.mode_help import describe_mode
 from brokk_rl.session import read_earlier_job, remove_empty_folders
+from brokk_rl.sim import probe
 from brokk_rl.sweep import SweepFolder, name_job
 from brokk_rl.task_choice import choose_task
 
@@ -77,6 +78,7 @@ def main() -> int:
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     # Pictures are written to files. A notebook hands down a backend that may not be installed here.
     os.environ["MPLBACKEND"] = "agg"
+    probe.keep_renderer_for_drawing()
     # A run that a scheduler stops ends like one that is stopped by hand.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:

@@ -252,11 +252,9 @@ def check_rendering() -> Iterator[DoctorFinding]:
     if name:
         yield DoctorFinding("ok", f"MuJoCo draws with MUJOCO_GL={name}")
     else:
-        asked = os.environ.get("MUJOCO_GL")
-        tried = f"MUJOCO_GL={asked}" if asked else f"any of {', '.join(probe.RENDERERS)}"
         yield DoctorFinding(
             "warn",
-            f"MuJoCo cannot draw with {tried}: no videos",
+            f"MuJoCo cannot draw with any of {', '.join(probe.RENDERERS)}: no videos",
             "install libegl1 and libgl1, or libosmesa6",
         )
 

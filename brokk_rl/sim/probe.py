@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -9,8 +10,22 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+log = logging.getLogger(__name__)
+
 RENDERERS = ("egl", "osmesa", "glfw")
 """Values of MUJOCO_GL, in the order in which they are worth trying without a screen."""
+ASKED = "BROKK_MUJOCO_GL"
+"""Variable that keeps the MUJOCO_GL of the shell for the processes that draw."""
+
+
+def keep_renderer_for_drawing() -> None:
+    """Take MUJOCO_GL from this process and keep its value for the processes that draw.
+
+    MuJoCo loads the library at import and fails where it is missing or unknown, though only
+    processes of their own draw here.
+    """
+    if name := os.environ.pop("MUJOCO_GL", None):
+        os.environ[ASKED] = name
 
 
 def get_warp_version() -> str:
@@ -48,12 +63,14 @@ def capture_graph() -> str:
 def find_renderer() -> str | None:
     """Return the first value of MUJOCO_GL that can draw a picture here, `None` when there is none.
 
+    A value that the shell asked for is tried first.
+
     MuJoCo settles on one library at import and a broken driver may end the process, so each try has
     a process of its own.
     """
-    chosen = os.environ.get("MUJOCO_GL")
+    chosen = os.environ.get(ASKED) or os.environ.get("MUJOCO_GL")
     program = "from brokk_rl.sim.probe import render_test_picture; render_test_picture()"
-    for name in (chosen,) if chosen else RENDERERS:
+    for name in dict.fromkeys((chosen, *RENDERERS) if chosen else RENDERERS):
         environment = os.environ | {
             "MUJOCO_GL": name,
             "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
@@ -70,6 +87,8 @@ def find_renderer() -> str | None:
         except subprocess.TimeoutExpired:
             continue
         if done.returncode == 0:
+            if chosen and name != chosen:
+                log.warning("MUJOCO_GL=%s cannot draw here; MuJoCo draws with %s", chosen, name)
             return name
     return None
 

@@ -1,5 +1,6 @@
 """A video must come out wherever the program runs."""
 
+import os
 import types
 
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 from brokk_rl.errors import StorageError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.sim import video
-from brokk_rl.sim.probe import find_renderer
+from brokk_rl.sim.probe import RENDERERS, find_renderer, keep_renderer_for_drawing
 from brokk_rl.sim.scene import make_nominal_scenes
 
 
@@ -42,6 +43,15 @@ def test_a_folder_that_cannot_be_written_is_a_storage_error(machine, motion, tmp
     monkeypatch.setattr(video, "find_renderer", lambda: None)
     with pytest.raises(StorageError, match="could not be written"):
         video.render_video(machine, motion, tmp_path / "missing" / "insertion.mp4")
+
+
+@pytest.mark.slow
+def test_an_unknown_gl_library_falls_back_to_one_that_draws(monkeypatch, caplog):
+    monkeypatch.setenv("MUJOCO_GL", "nonsense")
+    keep_renderer_for_drawing()
+    assert "MUJOCO_GL" not in os.environ
+    found = find_renderer()
+    assert found is None or (found in RENDERERS and "MUJOCO_GL=nonsense" in caplog.text)
 
 
 @pytest.mark.slow
