@@ -32,10 +32,10 @@ from brokk_rl.arguments import read_arguments
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.explain import compose_choices, explain, explain_missing_value, read_mode_name
 from brokk_rl.mode_help import describe_mode
-from brokk_rl.session import read_earlier_job, remove_empty_folders
+from brokk_rl.policy_choice import insert_policy, is_going_on, prepare_arguments
+from brokk_rl.session import read_earlier_job, remove_empty_folders, require_new_folder
 from brokk_rl.sim import probe
 from brokk_rl.sweep import SweepFolder, name_job
-from brokk_rl.task_choice import choose_task
 
 log = logging.getLogger(__name__)
 
@@ -83,7 +83,7 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _make_hydra_raise():
-            sys.argv[1:] = read_arguments(sys.argv[1:])
+            sys.argv[1:] = prepare_arguments(read_arguments(sys.argv[1:]))
             extensions.register_options(sys.argv[1:])
             if _is_mode_help(sys.argv[1:]):
                 sys.stdout.write(_describe_chosen_mode())
@@ -133,9 +133,9 @@ def run_job(cfg: DictConfig) -> float | None:
 def _run(cfg: DictConfig) -> float | None:
     """Instantiate the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
-    cfg = _upgrade(cfg)
+    cfg = insert_policy(_upgrade(cfg))
     check_values(cfg)
-    cfg = _drop_consumed_groups(choose_task(cfg))
+    cfg = _drop_consumed_groups(cfg)
     if "session" not in cfg:
         distributed.check_together(get_class(str(cfg._target_)), sweep)
         return instantiate(cfg, _convert_="all").run()
@@ -145,10 +145,13 @@ def _run(cfg: DictConfig) -> float | None:
         if before and before.get("outcome") == "finished":
             log.info("job %s is done already: %s", HydraConfig.get().job.num, folder)
             return before.get("objective")
+        resume = bool(before) or is_going_on(cfg, folder)
+        if not resume and distributed.read_rank().first:
+            require_new_folder(folder)
+        log.info("run folder: %s", folder)
         again = {"resume": str(folder)} if before and "resume" in cfg and cfg.resume is None else {}
         mode = instantiate(cfg, session={"out": str(folder)}, **again, _convert_="all")
         distributed.check_together(type(mode), sweep)
-        resume = bool(before or getattr(mode, "resume", None))
         with mode.session.start(resolved, _collect_facts(cfg, mode), resume) as record:
             objective = mode.run()
             record.fields["objective"] = (
@@ -203,7 +206,7 @@ def _drop_consumed_groups(cfg: DictConfig) -> DictConfig:
     simulates, which is chosen like any other.
     """
     taken = set()
-    for name in re.findall(r"\$\{(\w+)\}", OmegaConf.to_yaml(cfg)):
+    for name in re.findall(r"\$\{(\w+)[.}]", OmegaConf.to_yaml(cfg)):
         if name in cfg:
             taken.add(name)
     if not taken:

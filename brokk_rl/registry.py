@@ -90,6 +90,14 @@ def list_options() -> list[Option]:
     return [found[key] for key in sorted(found)]
 
 
+def list_targets() -> frozenset[str]:
+    """Return every class that the file of an option names."""
+    found: set[str] = set()
+    for option in list_options():
+        found.update(re.findall(r"_target_['\"]?:\s*['\"]?([\w.]+)", option.path.read_text()))
+    return frozenset(found)
+
+
 def resolve_package_path(name: str) -> Path:
     """Return the path of a file or folder: a path, or `package:path` in an installed package.
 

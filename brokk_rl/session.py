@@ -150,12 +150,9 @@ class Session:
         if not distributed.read_rank().first:
             yield SessionRecord(self.folder)
             return
-        before = read_record(self.folder) if self.folder.is_dir() else None
-        if before and not resume:
-            raise StorageError(
-                f"{self.folder} already holds a run ({before.get('mode', '?')}, {before.get('outcome', '?')}). "
-                "Give another folder with session.out=<folder>, or delete this one."
-            )
+        before = read_record(self.folder)
+        if not resume:
+            require_new_folder(self.folder)
         fields = {
             "schema": 1, "outcome": "running", "objective": None, "started": _format_now(), "ended": None,
             "command": ["brokk", *sys.argv[1:]], **facts,
@@ -226,6 +223,20 @@ def read_record(folder: Path) -> dict[str, Any] | None:
         return None
     except ValueError as error:
         raise StorageError(f"{folder / RECORD} is not readable as JSON: {error}") from error
+
+
+def require_new_folder(folder: Path) -> None:
+    """Refuse a folder that holds a run.
+
+    Raises:
+        StorageError: It does.
+    """
+    if before := read_record(folder):
+        mode, outcome = before.get("mode", "?"), before.get("outcome", "?")
+        raise StorageError(
+            f"{folder} already holds a run ({mode}, {outcome}). Give another folder with "
+            "session.out=<folder>, or delete this one."
+        )
 
 
 def read_earlier_job(folder: Path, resolved: str) -> dict[str, Any] | None:

@@ -319,7 +319,7 @@ def list_changes(result: WhyResult) -> list[tuple[str, str]]:
     if result.cause == "task":
         changes.append(
             ("Ask the policy for what it was trained for, or widen the ranges of the task (task.…) and train on:",
-             f"brokk mode=train start_from={policy}")
+             f"brokk mode=train policy={policy}")
         )  # fmt: skip
     if not result.has_effects:
         return changes
@@ -335,7 +335,7 @@ def list_changes(result: WhyResult) -> list[tuple[str, str]]:
     else:
         changes.append(
             ("Train on with the effects that were found, then run this command again with the new policy:",
-             f"brokk mode=train {machine} actuator={simulator} start_from={policy} 'effect=[library,{effects}]'")
+             f"brokk mode=train {machine} actuator={simulator} policy={policy} 'effect=[library,{effects}]'")
         )  # fmt: skip
     return changes
 

@@ -71,7 +71,7 @@ def _add_usage(page: Report, result: Mapping[str, Any], machine: Machine) -> Non
             f"{machine.name} is known by its joints only; with a model of its bodies (mjcf) policies can be trained through this:"
         )
     page.add_code(
-        f"brokk mode=train {use}\nbrokk mode=evaluate policy.folder=<run folder> {use}\nbrokk mode=bench {use}"
+        f"brokk mode=train {use}\nbrokk mode=evaluate policy=<run folder> {use}\nbrokk mode=bench {use}"
     )
 
 

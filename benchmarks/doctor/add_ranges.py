@@ -18,6 +18,7 @@ import torch
 
 from brokk_rl import extensions
 from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
+from brokk_rl.policy_choice import restore_task
 from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
 
@@ -30,11 +31,11 @@ def measure(folder: Path) -> dict[str, object]:
     contract, cpu = json.loads((folder / "policy.json").read_text()), torch.device("cpu")
     machine = extensions.load_option("machine", "brokk170")
     task = extensions.load_option("task", contract["task"]["name"])
-    policy = TrainedPolicy(folder=str(folder))
+    policy = TrainedPolicy(path=str(folder), task=None)
     follower = "person" if contract["task"]["behaviour"]["advice"] else "none"
     sim = replace(extensions.load_option("sim", "native"), num_worlds=NUM_ENVS, num_threads=2)
     config = ControlLoopConfig(
-        machine=machine, sim=sim, task=policy.choose_task(task, machine, ()), actuator=extensions.load_option("actuator", "mlp"),
+        machine=machine, sim=sim, task=restore_task(task, str(folder)), actuator=extensions.load_option("actuator", "mlp"),
         effects={"library": extensions.load_option("effect", "library")}, follower=extensions.load_option("follower", follower),
     )  # fmt: skip
     torch.manual_seed(0)

@@ -37,10 +37,11 @@ from hydra.utils import instantiate
 
 from brokk_rl.contracts.task import Policy
 from brokk_rl.modes.train import Train
+from brokk_rl.policy_folder import describe_policy, write_policy
 from brokk_rl.rl.evaluation import evaluate_policy
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
-from brokk_rl.rl.policy import ClassicalPolicy, NetworkPolicy, write_bundle
+from brokk_rl.rl.policy import ClassicalPolicy, NetworkPolicy
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.tracking import NoTracking
 
@@ -176,9 +177,15 @@ def train(spec: Train, folder: Path, options: argparse.Namespace) -> tuple[Any, 
         "set_up_s": round(ready_s - begun_s, 2),
         "device": torch.cuda.get_device_name() if device.type == "cuda" else "cpu",
     }
-    write_bundle(
-        folder, actor, spec.rl.describe_network(), loop.task, loop.description, spec.machine, facts
+    contract = describe_policy(
+        spec.rl.describe_network(),
+        loop.task.describe(),
+        loop.task.max_episode_steps * spec.machine.period_s,
+        loop.description,
+        spec.machine,
+        actuator=spec.actuator,
     )
+    write_policy(folder, contract | {"trained": facts}, actor.state_dict())
     for checkpoint in folder.glob("model_*.pt"):
         checkpoint.unlink()
     return actor, facts | {"curve": read_curve(folder / PROGRESS)}
@@ -190,7 +197,9 @@ def evaluate(spec: Train, actor: Any, options: argparse.Namespace) -> dict[str, 
     torch.manual_seed(seed)  # effects draw from it, too
     loop = build(spec, number, number, seed, options.folder)
     loop.capture()
-    policy: Policy = NetworkPolicy(actor, loop) if actor else ClassicalPolicy().build(loop, 0)
+    policy: Policy = (
+        NetworkPolicy(actor, loop) if actor else ClassicalPolicy(task=None).build(loop, 0)
+    )
     return evaluate_policy(loop, policy, loop.starts, seed, 1).summary
 
 

@@ -43,7 +43,7 @@ def main() -> None:
 def evaluate(folder: Path, mount: str, seed: int, episodes: int, processes: int) -> None:
     """Evaluate one mount from the starts of one seed."""
     options = [
-        "mode=evaluate", "follower=person", "policy.folder=tasks:policies/behind_a_person",
+        "mode=evaluate", "follower=person", "policy=tasks:policies/behind_a_person",
         "~rivals.classical", "evaluation.video=false", f"evaluation.seed={seed}",
         f"evaluation.episodes={episodes}", "session.device=cpu", f"session.out={folder}",
     ]  # fmt: skip

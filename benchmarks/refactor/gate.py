@@ -57,7 +57,7 @@ COMMANDS: dict[str, dict[str, str]] = {
     "evaluate_others": {
         "warp": f"mode=evaluate sim=warp {ON_CPU} evaluation.episodes=32",
         "person": f"mode=evaluate {NATIVE} follower=person evaluation.episodes=256"
-        " policy.folder=tasks:policies/behind_a_person",
+        " policy=tasks:policies/behind_a_person",
     },
     # the loop reads the shipped bundle and refuses one whose golden answers are not reproduced
     "golden": {

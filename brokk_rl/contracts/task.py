@@ -264,7 +264,7 @@ class Task(Protocol):
 
     A class attribute `behaviour` names the fields that a policy has learned with, such as
     `("memory", "noise.filter")`. Checkpoints and policies carry them, and a policy is evaluated and
-    exported with its own (`brokk_rl.task_description`). Without it only the task's name is known.
+    exported with its own (`brokk_rl.policy_folder`). Without it only the task's name is known.
     """
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:

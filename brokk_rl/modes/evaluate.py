@@ -3,40 +3,31 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.target import TargetSensorSpec
-from brokk_rl.contracts.task import Policy, Task
+from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.policy_folder import describe_task
 from brokk_rl.progress import ItemProgress
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
-from brokk_rl.rl.policy import ClassicalPolicy, ShippedPolicy, TrainedPolicy
+from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.events import Event
 from brokk_rl.sim.objects import list_objects
 from brokk_rl.sim.video import render_video
 from brokk_rl.spec import name_spec, spec
-from brokk_rl.task_description import describe_task
 
 log = logging.getLogger(__name__)
-
-
-class PolicySpec(Protocol):
-    """A spec in `conf/policy`: builds a policy."""
-
-    def build(self, loop: ControlLoop, seed: int) -> Policy:
-        """Return the policy for the control loop."""
-        ...
 
 
 @spec
@@ -56,8 +47,6 @@ class Evaluate:
         policy: The policy in question.
         rivals: Policies beside it, by name.
         evaluation: How to evaluate.
-        asked: Keys of the task that were given on the command line; a trained policy acts by its
-            own task, and what contradicts it is refused.
     """
 
     session: Session
@@ -72,7 +61,6 @@ class Evaluate:
     policy: PolicySpec
     rivals: dict[str, PolicySpec]
     evaluation: Evaluation
-    asked: tuple[str, ...]
 
     def check(self) -> None:
         if self.target is not None and not hasattr(self.target, "sense"):
@@ -94,7 +82,7 @@ class Evaluate:
             target=self.target,
         )
         policies = {name_spec(self.policy): self.policy} | self.rivals
-        results = evaluate_policies(config, self.evaluation, self.session, policies, self.asked)
+        results = evaluate_policies(config, self.evaluation, self.session, policies)
         return float(results["success_strict"]["mean"])
 
 
@@ -103,12 +91,11 @@ def evaluate_policies(
     evaluation: Evaluation,
     session: Session,
     policies: dict[str, PolicySpec],
-    asked: Collection[str] = (),
 ) -> dict[str, Any]:
     """Evaluate policies from the same starts with the same noise.
 
-    Each trained policy acts by its own task, under the conditions of `config.task`; the others
-    share the task of the first policy. Writes `evaluation.json` and `insertion.mp4`.
+    A policy that has a task of its own acts by it, the others by `config.task`. Writes
+    `evaluation.json` and `insertion.mp4`.
 
     Args:
         config: The control loop.
@@ -116,17 +103,12 @@ def evaluate_policies(
         session: Where to write, and on which device.
         policies: By name; the first is the one in question and stands at the top of
             `evaluation.json`.
-        asked: Keys of the configuration that the caller gave; see
-            `brokk_rl.task_description.apply_behaviour`.
 
     Returns:
         The content of `evaluation.json`.
-
-    Raises:
-        ConfigError: The caller asked for something that a policy does not have.
     """
     device = session.torch_device()
-    tasks = choose_tasks(config, policies, asked)
+    tasks = {name: getattr(one, "task", None) or config.task for name, one in policies.items()}
     descriptions = {name: describe_task(task) for name, task in tasks.items()}
     loops: dict[str, tuple[ControlLoop, dict[str, Any]]] = {}
     starts: Starts | None = None
@@ -177,28 +159,6 @@ def evaluate_policies(
         path = render_video(config.machine, shown, session.folder / "insertion.mp4", objects)
         log.info("video of one episode: %s", path)
     return results
-
-
-def choose_tasks(
-    config: ControlLoopConfig, policies: dict[str, PolicySpec], asked: Collection[str]
-) -> dict[str, Task]:
-    """Return the task of each policy: its own, or that of the first one.
-
-    The classical controller as a rival has the numbers that were composed: a trained policy may
-    rest on those of an earlier version, which are no honest opponent.
-    """
-    tasks: dict[str, Task] = {}
-    shared, composed = config.task, getattr(config.task, "classical", None)
-    for name, policy in policies.items():
-        if isinstance(policy, TrainedPolicy | ShippedPolicy):
-            tasks[name] = policy.choose_task(config.task, config.machine, asked)
-        elif isinstance(policy, ClassicalPolicy) and composed is not None:
-            opponent: Any = shared
-            tasks[name] = replace(opponent, classical=composed)
-        else:
-            tasks[name] = shared
-        shared = next(iter(tasks.values()))
-    return tasks
 
 
 def _print_table(table: dict[str, dict[str, Any]]) -> None:

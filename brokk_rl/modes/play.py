@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
@@ -16,17 +16,16 @@ from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import PolicySpec, choose_tasks
-from brokk_rl.play.checkpoint_watch import CheckpointWatch, find_newest, read_task
+from brokk_rl.play.checkpoint_watch import CheckpointWatch
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
+from brokk_rl.policy_folder import find_policy
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
-from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy
 from brokk_rl.session import Session
 from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec
-from brokk_rl.task_description import apply_behaviour
 
 log = logging.getLogger(__name__)
 
@@ -64,9 +63,7 @@ class Play:
         effect: Effects around the actuator model, by name.
         event: Changes of the simulated machine, by name.
         follower: Who stands between policy and machine.
-        policy: The policy, unless a checkpoint is given.
-        checkpoint: Run folder, or checkpoint, of a training; its newest checkpoint is followed.
-        asked: Keys of the task that were given on the command line.
+        policy: The policy; that of a running training is loaded anew with each checkpoint.
         play: Viewer, worlds and pace.
     """
 
@@ -78,8 +75,6 @@ class Play:
     event: dict[str, Event]
     follower: Follower
     policy: PolicySpec
-    checkpoint: str | None
-    asked: tuple[str, ...]
     play: PlaySettings
 
     def run(self) -> None:
@@ -136,15 +131,11 @@ class Play:
             events=self.event,
             follower=self.follower,
         )
-        if self.checkpoint is None:
-            task = choose_tasks(config, {POLICY: self.policy}, self.asked)[POLICY]
-        else:
-            path = find_newest(Path(self.checkpoint))
-            task = apply_behaviour(self.task, read_task(path), self.asked, f"the policy in {path}")
-        config = replace(config, task=task)
         pool = max(NUM_STARTS, settings.worlds)
         loop = config.build(device, settings.worlds, pool, session.stream("starts"))
-        watch = CheckpointWatch(Path(self.checkpoint), loop) if self.checkpoint else None
+        watch = None
+        if isinstance(self.policy, TrainedPolicy) and find_policy(self.policy.path).is_checkpoint:
+            watch = CheckpointWatch(self.policy.path, loop)
         found = _gather_policies(loop, self.policy, watch, settings.seed)
         played = PlaySession(loop, found.policies, settings.neutral)
         if watch is not None:
@@ -173,9 +164,9 @@ def _gather_policies(
         note = _describe(watch)
     else:
         policies = {POLICY: policy.build(loop, seed)}
-        note = f"policy={name_spec(policy)} {getattr(policy, 'folder', '')}".rstrip()
+        note = f"policy={name_spec(policy)} {getattr(policy, 'path', '')}".rstrip()
     if "classical_action" in loop.task.offers:
-        classical = ClassicalPolicy().build(loop, seed)
+        classical = ClassicalPolicy(task=None).build(loop, seed)
         if type(policies[POLICY]) is type(classical):
             return _Found({CLASSICAL: classical}, "the task's classical controller")
         policies[CLASSICAL] = classical

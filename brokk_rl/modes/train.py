@@ -1,43 +1,47 @@
-"""`brokk mode=train`: trains a policy, evaluates it beside its rivals and writes its bundle."""
+"""`brokk mode=train`: trains a policy, evaluates it beside its rivals and writes its folder."""
 
 from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-import yaml
 
 from brokk_rl import distributed
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
-from brokk_rl.errors import CheckpointError, SimulationError
+from brokk_rl.errors import SimulationError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
+from brokk_rl.modes.evaluate import evaluate_policies
+from brokk_rl.policy_folder import (
+    CONTRACT,
+    describe_policy,
+    describe_spec,
+    list_checkpoints,
+    read_contract,
+    write_policy,
+)
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves, find_passing
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.policy import (
     ClassicalPolicy,
+    PolicySpec,
     TrainedPolicy,
     UntrainedPolicy,
     load_initial_weights,
-    locate_bundle,
-    read_bundle,
-    write_bundle,
 )
-from brokk_rl.rl.runner import TrainingGroup, TrainingRunner, list_checkpoints
+from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.success_sweep import LEVELS
 from brokk_rl.rl.tracking import NoTracking, Tracker, Tracking
-from brokk_rl.session import RESOLVED, Session, read_record
+from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec
-from brokk_rl.task_description import apply_behaviour, read_description
 
 log = logging.getLogger(__name__)
 
@@ -54,6 +58,8 @@ TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 class Train:
     """Trains a policy for a task through an actuator model, then evaluates and exports it.
 
+    A training goes on from the newest checkpoint in its own folder, if there is one.
+
     Attributes:
         session: Folder, seed, device.
         machine: The machine.
@@ -66,10 +72,8 @@ class Train:
         rl: How to train.
         tracking: Where figures go beside the run folder.
         evaluation: How to evaluate at the end.
-        start_from: Policy (`policy.folder`) with whose network training begins; `null` for a fresh
-            one.
-        resume: Run folder, or checkpoint, from which to go on.
-        asked: Keys of the task that were given on the command line, or by an experiment.
+        policy: A checkpoint: training goes on from it. A folder: it begins with the network of that
+            policy. `null`: it begins with a fresh network.
     """
 
     session: Session
@@ -83,9 +87,7 @@ class Train:
     rl: TrainingConfig
     tracking: Tracking
     evaluation: Evaluation
-    start_from: str | None
-    resume: str | None
-    asked: tuple[str, ...]
+    policy: TrainedPolicy | None
 
     together: ClassVar[bool] = True
     """Several processes that `torchrun` starts train one policy."""
@@ -96,13 +98,12 @@ class Train:
         Returns:
             The strict success of the trained policy; `None` in all processes but the first.
         """
-        checkpoint = self._find_start()
         device = self.session.torch_device()
         self.session.seed_all()
         config = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
-            task=self._choose_task(),
+            task=self.task,
             actuator=self.actuator,
             effects=self.effect,
             events=self.event,
@@ -124,39 +125,77 @@ class Train:
             tracking.open(self.session.folder, self._describe_run())
         ) as tracker:
             logger = self._open_logger(loop, group, tracker)
-            with group, logger:
+            with self._explain_interruption(), group, logger:
                 runner = TrainingRunner(loop, self.rl, self.session.folder, device, logger, group)
-                if checkpoint:
-                    runner.load(str(checkpoint))
-                    log.info(
-                        "going on from %s: %d control steps, %.0f s",
-                        checkpoint,
-                        logger.env_steps,
-                        logger.seconds,
-                    )
-                elif self.start_from:
-                    load_initial_weights(runner.alg.actor, self.start_from, self.machine)
+                self._begin(runner, logger)
+                if group.rank.first:
+                    write_json(self.session.folder / CONTRACT, self._describe_policy(loop))
                 runner.run()
             if not group.rank.first:
                 return None
             _log_success(logger, group.rank.count * loop.num_envs * loop.task.max_episode_steps)
-            facts = {
-                "env_steps": logger.env_steps,
-                "seconds": logger.seconds,
-                "seed": self.session.seed,
-                "device": str(device),
-                "follower": read_follower(self.session.folder),
-            }
-            results = self._finish(config, runner, facts)
+            results = self._finish(config, runner, logger)
             files = [path for name in TRACKED for path in sorted(self.session.folder.glob(name))]
             tracker.report(flatten_figures(results["policies"], "evaluation"), files)
         log.info("run folder: %s", self.session.folder)
         return float(results["success_strict"]["mean"])
 
+    def _begin(self, runner: TrainingRunner, logger: TrainingLogger) -> None:
+        """Load the checkpoint from which training goes on, or the network with which it begins."""
+        checkpoint = self._find_checkpoint()
+        if checkpoint is not None:
+            runner.load(str(checkpoint))
+            log.info(
+                "going on from %s: %d control steps, %.0f s",
+                checkpoint,
+                logger.env_steps,
+                logger.seconds,
+            )
+            return
+        if distributed.read_rank().first:  # a run that was stopped before its first checkpoint
+            (self.session.folder / PROGRESS).unlink(missing_ok=True)
+        if (beginning := self._find_beginning()) is not None:
+            load_initial_weights(runner.alg.actor, beginning, self.machine)
+
+    def _find_beginning(self) -> str | None:
+        """Return the policy with whose network training begins; `None` for a fresh one."""
+        if self.policy is None:
+            return None
+        folder = self.session.folder
+        if Path(self.policy.path).resolve() != folder.resolve():
+            return self.policy.path
+        earlier = read_contract(folder, self.policy.path)  # it was stopped before a checkpoint
+        return earlier.get("trained", {}).get("began_with")
+
+    def _find_checkpoint(self) -> Path | None:
+        """Return the checkpoint to go on from: the one that was given, else the newest here."""
+        folder = self.session.folder
+        here = list_checkpoints(folder)
+        if self.policy is not None and self.policy.path.endswith(".pt"):
+            given = Path(self.policy.path)
+            if not here or given.resolve().parent == folder.resolve():
+                return given
+        return here[-1] if here else None
+
+    @contextlib.contextmanager
+    def _explain_interruption(self) -> Iterator[None]:
+        """Say after Ctrl-C which checkpoint remains, and the command that goes on."""
+        try:
+            yield
+        except KeyboardInterrupt:
+            folder = self.session.folder
+            found = list_checkpoints(folder)
+            log.warning(
+                "%s; go on with: brokk mode=train policy=%s session.out=%s",
+                f"{found[-1]} remains" if found else "no checkpoint was written yet",
+                folder,
+                folder,
+            )
+            raise
+
     def _describe_run(self) -> dict[str, Any]:
         """Return what a tracker shows of the run: its parts, commit and whole configuration."""
-        folder = self.session.folder
-        record, resolved = read_record(folder) or {}, folder / RESOLVED
+        record = read_record(self.session.folder) or {}
         return {
             "machine": self.machine.name,
             "task": name_spec(self.task),
@@ -169,22 +208,26 @@ class Train:
             "commit": record.get("commit") or "unknown",
             "choices": record.get("choices", {}),
             "fingerprint": self.machine.fingerprint(),
-            "config": yaml.safe_load(resolved.read_text()) if resolved.is_file() else {},
+            "config": describe_spec(self),
         }
 
-    def _choose_task(self) -> Task:
-        """Return the task, with the behaviour of the policy with which training begins.
-
-        Raises:
-            ConfigError: Something was asked for that the policy does not have.
-        """
-        if self.start_from is None:
-            return self.task
-        folder = locate_bundle(self.start_from)
-        own = read_description(folder, read_bundle(folder, self.machine)[0])
-        if own is None:
-            return self.task
-        return apply_behaviour(self.task, own, self.asked, f"start_from={self.start_from}")
+    def _describe_policy(self, loop: ControlLoop) -> dict[str, Any]:
+        """Return the contract of the policy that is trained; see `brokk_rl.policy_folder`."""
+        contract = describe_policy(
+            self.rl.describe_network(),
+            loop.task.describe() if "describe" in loop.task.offers else None,
+            loop.task.max_episode_steps * self.machine.period_s,
+            loop.description,
+            self.machine,
+            actuator=self.actuator,
+        )
+        contract["trained"] = {
+            "began_with": self._find_beginning(),
+            "seed": self.session.seed,
+            "device": str(loop.device),
+            "follower": describe_spec(self.follower),
+        }
+        return contract
 
     def _open_logger(
         self, loop: ControlLoop, group: TrainingGroup, tracker: Tracker
@@ -202,19 +245,18 @@ class Train:
         )
 
     def _finish(
-        self, config: ControlLoopConfig, runner: TrainingRunner, facts: dict[str, Any]
+        self, config: ControlLoopConfig, runner: TrainingRunner, logger: TrainingLogger
     ) -> dict[str, Any]:
-        """Write bundle and curves, evaluate, export; return the content of `evaluation.json`."""
+        """Write policy and curves, evaluate, export; return the content of `evaluation.json`."""
         folder, loop, actor = self.session.folder, runner.env, runner.alg.get_policy()
-        network = self.rl.describe_network()
-        contract = write_bundle(
-            folder, actor, network, loop.task, loop.description, self.machine, facts
-        )
+        contract = self._describe_policy(loop)
+        contract["trained"] |= {"env_steps": logger.env_steps, "seconds": logger.seconds}
+        write_policy(folder, contract, actor.state_dict())
         answers = runner.record_answers()
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
-        policies: dict[str, PolicySpec] = {"trained": TrainedPolicy(folder=str(folder))}
+        policies: dict[str, PolicySpec] = {"trained": TrainedPolicy(path=str(folder), task=None)}
         if "classical_action" in loop.task.offers:
-            policies["classical"] = ClassicalPolicy()
+            policies["classical"] = ClassicalPolicy(task=None)
         else:
             log.info(
                 "the task (%s) has no classical controller to compare with",
@@ -228,20 +270,6 @@ class Train:
         else:
             log.warning(NOT_DEPLOYABLE.format(task=type(self.task).__name__))
         return results
-
-    def _find_start(self) -> Path | None:
-        """Return the checkpoint to go on from.
-
-        A run that was stopped before its first checkpoint begins anew in its folder.
-        """
-        if self.resume is None:
-            return None
-        folder = self.session.folder
-        if Path(self.resume).resolve() == folder.resolve() and not list_checkpoints(folder):
-            if distributed.read_rank().first:
-                (folder / PROGRESS).unlink(missing_ok=True)
-            return None
-        return find_checkpoint(Path(self.resume), "resume")
 
 
 def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
@@ -314,29 +342,3 @@ def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:
         type(loop.world).__name__,
         "active" if loop.graph_active else "not used (they need sim=warp on a GPU)",
     )
-
-
-def read_follower(folder: Path) -> dict[str, Any] | None:
-    """Return the configured `follower` of the run in `folder`; `None` without a configuration."""
-    resolved = folder / RESOLVED
-    return yaml.safe_load(resolved.read_text()).get("follower") if resolved.exists() else None
-
-
-def find_checkpoint(path: Path, key: str) -> Path:
-    """Return `path` if it is a checkpoint, else the newest checkpoint of the run folder `path`.
-
-    Args:
-        path: A checkpoint or a run folder.
-        key: Key of the configuration that gave it, for the message.
-
-    Raises:
-        CheckpointError: There is none.
-    """
-    if path.suffix == ".pt":
-        return path
-    found = list_checkpoints(path) if path.is_dir() else []
-    if not found:
-        raise CheckpointError(
-            f"{key}={path}: there is no checkpoint (model_<iteration>.pt), nor a run folder with one"
-        )
-    return found[-1]

@@ -19,22 +19,17 @@ from rsl_rl.models import MLPModel
 from brokk_rl.contracts.task import TaskProcess
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
-from brokk_rl.rl.policy import GOLDEN, ONNX, TOLERANCE, PlainActor
-from brokk_rl.session import write_json
-from brokk_rl.task_description import CONTRACT
+from brokk_rl.policy_folder import ONNX, TOLERANCE, write_golden_answers
+from brokk_rl.rl.policy import PlainActor
 
 MAX_EDGE_SHARE = 0.005
 """Share of observations that may differ by more: at the edge of a mask or of the dead band the last
 bit of a float decides between two commands. Chosen by hand."""
 OPSET = 18
 """ONNX operator set; chosen by hand, onnxruntime on the machine reads it."""
-NUM_GOLDEN = 16
-"""Answers in `golden.json`: whoever runs the file elsewhere compares with them first."""
 NOT_DEPLOYABLE = (
     "the task ({task}) cannot be deployed, so there is no policy.onnx: it has no methods "
-    "`describe` "
-    "and `deployable` (brokk_rl.contracts.task); policy=trained can evaluate the "
+    "`describe` and `deployable` (brokk_rl.contracts.task); policy=trained can evaluate the "
     "policy of a run folder without them"
 )
 
@@ -54,7 +49,7 @@ def export_onnx(
         actor: The network.
         task: The policy's task, built on the CPU: constants of a GPU would travel with the file.
         machine: The machine.
-        contract: Contract that `write_bundle` returned.
+        contract: Contract that `write_policy` wrote.
         answers: Observation vectors, `(B, O)`, and the commands, `(B, J)`, that the network gave
             for them in the run that trained it (`ControlLoop.record_answers`).
 
@@ -85,31 +80,15 @@ def export_onnx(
         raise CheckpointError(_explain_difference(module, observations, expected, difference))
     part.replace(folder / ONNX)
     largest = float(difference[~off].max())
-    golden = np.flatnonzero(~off)[:: max(1, len(off) // NUM_GOLDEN)][:NUM_GOLDEN]
-    vectors = observations[golden].numpy()
-    recorded = {
-        "observation": vectors.astype(float).tolist(),
-        "command": expected[golden].astype(float).tolist(),
-    }
-    if contract["observation"]:
-        encoder = restore_encoder(machine, contract["observation"])
-        recorded["inputs"] = {
-            name: np.asarray(value, float).tolist()
-            for name, value in encoder.decode_inputs(vectors).items()
-        }
-        if isinstance(encoder, ObservationEncoder):
-            ranges = measure_ranges(encoder, observations.numpy(), machine.joint_names)
-            contract = contract | {
-                "training_observations": {"count": len(observations), "ranges": ranges}
-            }
-    write_json(folder / GOLDEN, recorded)
     parity = {
         "observations": len(off),
         "largest_difference": largest,
         "at_an_edge": int(off.sum()),
         "onnxruntime": onnxruntime.__version__,
     }
-    write_json(folder / CONTRACT, contract | {"parity": parity})
+    write_golden_answers(
+        folder, contract | {"parity": parity}, machine, observations.numpy(), expected, ~off
+    )
     return largest
 
 

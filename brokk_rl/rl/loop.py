@@ -31,13 +31,13 @@ from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, TracedWorld, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
+from brokk_rl.policy_folder import TaskDescription, describe_task
 from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
 from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.faults import FaultRecorder
 from brokk_rl.sim.objects import list_objects
-from brokk_rl.task_description import TaskDescription, describe_task
 
 Starts = dict[str, torch.Tensor]
 

@@ -22,12 +22,12 @@ from rsl_rl.runners import OnPolicyRunner
 
 from brokk_rl import distributed
 from brokk_rl.errors import CheckpointError, ConfigError, DistributedError, StorageError
+from brokk_rl.policy_folder import TaskDescription, find_policy, list_checkpoints, read_checkpoint
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.policy import TrainedPolicy, scale_output
+from brokk_rl.rl.policy import load_policy, scale_output
 from brokk_rl.rl.ppo import CappedGaussian, DevicePPO
 from brokk_rl.rl.settings import TrainingConfig
-from brokk_rl.task_description import TaskDescription
 
 log = logging.getLogger(__name__)
 
@@ -85,7 +85,7 @@ class TrainingRunner(OnPolicyRunner):
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
             if training.teacher:
-                self.alg.follow(TrainedPolicy(folder=training.teacher.folder).build(env, 0).actor)
+                self.alg.follow(load_policy(find_policy(training.teacher.folder), env).actor)
 
     def run(self, until: Callable[[], bool] = lambda: False) -> None:
         """Train until the budget is spent; save a checkpoint every `save_interval`.
@@ -233,7 +233,12 @@ class TrainingRunner(OnPolicyRunner):
         """
         content = read_checkpoint(Path(path), self.device)
         self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
-        self._check_task(content, path)
+        TaskDescription.from_json(content["task"], path).require_same(
+            self.env.description,
+            path,
+            "resume with the run's own resolved.yaml: brokk --config-dir <run> --config-name "
+            "resolved policy=<run> session.out=<run>",
+        )
         try:
             self.alg.load(content, None, strict=True)
             own = [content, *content.get("others", [])][self.group.rank.index :][:1]
@@ -251,26 +256,6 @@ class TrainingRunner(OnPolicyRunner):
                 "Resume with the run's own resolved.yaml."
             ) from error
         return {}
-
-    def _check_task(self, content: dict[str, Any], path: str) -> None:
-        """Refuse a checkpoint of a training for another task; the message names what differs."""
-        if "task" not in content:
-            log.warning("%s does not say which task it trains; assumed: the one given", path)
-            return
-        own, here = TaskDescription.from_json(content["task"], path), self.env.description
-        differences = own.compare(here)
-        if own.name != here.name:
-            differences = {"": (own.name, here.name)}
-        if differences:
-            values = []
-            for key, (there, given) in differences.items():
-                name = f"task.{key}" if key else "task"
-                values.append(f"{name} is {there} there, {given} here")
-            raise CheckpointError(
-                f"{path} belongs to a training for another task: {'; '.join(values)}. Resume with "
-                "the run's own resolved.yaml: brokk --config-dir <run> --config-name resolved "
-                "resume=<run> session.out=<run>"
-            )
 
 
 class TrainingGroup:
@@ -417,40 +402,6 @@ def allow_tensor_cores(allowed: bool) -> Iterator[None]:
         yield
     finally:
         torch.set_float32_matmul_precision(before)
-
-
-def list_checkpoints(folder: Path) -> list[Path]:
-    """Return the checkpoints of a run folder, oldest first."""
-    return sorted(folder.glob("model_*.pt"), key=lambda path: int(path.stem.removeprefix("model_")))
-
-
-def read_checkpoint(path: Path, device: torch.device | str) -> dict[str, Any]:
-    """Read a checkpoint without running code from it.
-
-    Raises:
-        CheckpointError: The file is missing or corrupt, or a weight is NaN.
-    """
-    try:
-        content = torch.load(path, weights_only=True, map_location=device)
-        states = [content["actor_state_dict"], content["critic_state_dict"]]
-    except FileNotFoundError as error:
-        raise CheckpointError(f"there is no checkpoint {path}") from error
-    except Exception as error:  # torch raises many kinds: pickle, zip, runtime, end of file
-        raise CheckpointError(
-            f"{path} is corrupt or not a checkpoint of ours ({type(error).__name__}); take an "
-            "older one"
-        ) from error
-    bad: list[str] = []
-    for state in states:
-        for name, value in state.items():
-            if not torch.isfinite(value).all():
-                bad.append(name)
-    if bad:
-        raise CheckpointError(
-            f"{path} holds NaN or infinite weights in {', '.join(bad[:3])}; take an older "
-            "checkpoint"
-        )
-    return content
 
 
 def get_random_state(device: torch.device | str) -> dict[str, torch.Tensor]:

@@ -13,13 +13,13 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.policy_folder import describe_task
 from brokk_rl.progress import track_items
 from brokk_rl.record import Recording
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from brokk_rl.task_description import describe_task
 
 Rows = list[np.ndarray]
 

@@ -19,8 +19,8 @@ import onnxruntime
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder, restore_encoder
+from brokk_rl.policy_folder import TaskDescription
 from brokk_rl.registry import resolve_package_path
-from brokk_rl.task_description import TaskDescription
 
 log = logging.getLogger(__name__)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import logging
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +17,15 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import PolicySpec, evaluate_policies
+from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.train import Train
+from brokk_rl.policy_folder import CONTRACT
 from brokk_rl.rl.loop import ControlLoopConfig
-from brokk_rl.rl.policy import TrainedPolicy
+from brokk_rl.rl.policy import PolicySpec, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.tracking import Tracking
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import name_spec, spec
-from brokk_rl.task_description import CONTRACT
 from diagnosis import retraining
 
 log = logging.getLogger(__name__)
@@ -92,7 +91,6 @@ class CloseGap:
     tracking: Tracking
     evaluation: Evaluation
     resume: str | None
-    asked: tuple[str, ...]
 
     def check(self) -> None:
         if not self.found:
@@ -122,7 +120,7 @@ class CloseGap:
         folder = self.session.folder
         policies: dict[str, PolicySpec] = {
             retraining.BEFORE: self.policy,
-            retraining.AFTER: TrainedPolicy(folder=str(self._retrained())),
+            retraining.AFTER: TrainedPolicy(path=str(self._retrained()), task=None),
             **self.panel,
         }
         plants = self._plants()
@@ -133,7 +131,7 @@ class CloseGap:
         found = retraining.compare_policies(evaluations) | {
             "plants": {name: _describe_plant(plant) for name, plant in plants.items()},
             "retraining": {
-                "began with": self.policy.folder if self.warm else "a fresh network",
+                "began with": self.policy.path if self.warm else "a fresh network",
                 "trained with": _describe_plant(self._training_plant()),
                 "control steps": trained["env_steps"],
                 "seconds": trained["seconds"],
@@ -146,16 +144,11 @@ class CloseGap:
         _show(found, folder)
         return float(found["achieved"]["mean"])
 
-    @cached_property
-    def _own_task(self) -> Task:
-        """Task of the policy as it was, in which it is retrained too."""
-        return self.policy.choose_task(self.task, self.machine, self.asked)
-
     def _plants(self) -> dict[str, ControlLoopConfig]:
         known = ControlLoopConfig(
             machine=self.machine,
             sim=self.sim,
-            task=self._own_task,
+            task=self.task,
             actuator=self.actuator,
             effects=self.effect,
             follower=self.follower,
@@ -183,8 +176,7 @@ class CloseGap:
         Train(
             session=replace(self.session, out=str(place)), machine=self.machine, sim=self.sim, task=plant.task,
             actuator=plant.actuator, effect=plant.effects, event={}, follower=self.follower, rl=self.rl, tracking=self.tracking,
-            evaluation=self.evaluation, start_from=self.policy.folder if self.warm else None,
-            resume=str(place) if self.resume else None, asked=(),
+            evaluation=self.evaluation, policy=self.policy if self.warm else None,
         ).run()  # fmt: skip
         return place
 
@@ -198,7 +190,7 @@ class CloseGap:
         place.mkdir(exist_ok=True)
         log.info("on the %s", retraining.PLANT_NAMES[name])
         return evaluate_policies(
-            plant, self.evaluation, replace(self.session, out=str(place)), policies, self.asked
+            plant, self.evaluation, replace(self.session, out=str(place)), policies
         )
 
 

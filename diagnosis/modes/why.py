@@ -68,7 +68,7 @@ class Why:
     machine: Machine
     evaluation: Evaluation
     log: str | tuple[str, ...]
-    policy: dict[str, str]
+    policy_path: str
     simulator: str
     own: Actuator
     sent: bool
@@ -114,14 +114,14 @@ class Why:
 
     @property
     def _request(self) -> WhyRequest:
-        return WhyRequest(self.policy["folder"], self.simulator, self._is_own)
+        return WhyRequest(self.policy_path, self.simulator, self._is_own)
 
     def _build_own(self) -> Actuator:
         return replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def _try_inputs(self) -> None:
         """Refuse logs, a policy or a simulator that no stage could use, before the first one."""
-        load_policy(self.policy["folder"], self.machine)
+        load_policy(self.policy_path, self.machine)
         if self._is_own:
             self._build_own().build(self.machine, 1, torch.device("cpu"))
         record.read_recordings(self.log, self.machine)
@@ -160,7 +160,7 @@ class Why:
     def _examine(self) -> StoryStage:
         command = [
             "mode=doctor_policy", f"doctor.log={_quote(self.log)}",
-            f"doctor.policy={self.policy['folder']}", *self._choose_simulator(),
+            f"policy={self.policy_path}", *self._choose_simulator(),
             f"doctor.sent={str(self.sent).lower()}",
         ]  # fmt: skip
         if self.target_in_base_m is not None:
@@ -180,7 +180,7 @@ class Why:
 
         A foreign ONNX file has no task to succeed in: no stage measures it.
         """
-        if self.policy["folder"].endswith(ONNX_SUFFIX):
+        if self.policy_path.endswith(ONNX_SUFFIX):
             return {}
         stages = {BEFORE: self._evaluate("As trained", "[library]")}
         for name, node in effects.items() if len(effects) > 1 else ():
@@ -196,7 +196,7 @@ class Why:
 
     def _evaluate(self, title: str, effects: str) -> StoryStage:
         command = [
-            "mode=evaluate", f"policy.folder={self.policy['folder']}", *self._choose_simulator(),
+            "mode=evaluate", f"policy={self.policy_path}", *self._choose_simulator(),
             f"effect={effects}", "~policy@rivals.classical", "+rivals={}",
         ]  # fmt: skip
         return _make_stage(title, command, ("machine", "evaluation", "device"))

@@ -129,7 +129,7 @@ class BoreholeInsertion:
         "scaling",
         "classical",
     )
-    """Fields that a policy has learned with; see `brokk_rl.task_description`."""
+    """Fields that a policy has learned with; see `brokk_rl.policy_folder`."""
 
     def check(self) -> None:
         require_number("task.episode_s", self.episode_s, above=0)

@@ -194,7 +194,7 @@ class TermTask:
     termination: dict[str, Termination | None]
 
     behaviour: ClassVar[tuple[str, ...]] = ("observation", "action")
-    """Fields that a policy has learned with; see `brokk_rl.task_description`."""
+    """Fields that a policy has learned with; see `brokk_rl.policy_folder`."""
 
     def check(self) -> None:
         require_number("task.episode_s", self.episode_s, above=self.success.after_s)

@@ -56,7 +56,10 @@ BAD = {
     ("sim=native", "sim.num_worlds=0"): "sim: expected num_worlds",
     ("mode=evaluate", "evaluation.episodes=-5"): "evaluation.episodes",
     ("mode=evaluate", "task.episode_s=-5"): "task.episode_s",
-    ("mode=evaluate", "policy.folder=nowhere"): "nowhere holds no policy (policy.json is missing)",
+    (
+        "mode=evaluate",
+        "policy=./nowhere",
+    ): "policy=./nowhere: expected a run folder, a policy folder or a checkpoint",
     ("mode=bench", "rl.num_starts=0"): "rl.num_starts",
     ("session.device=gpu",): "session.device: expected auto, cpu, cuda or cuda:<index>",
     ("session.seed=-1",): "session.seed",

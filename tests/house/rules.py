@@ -24,7 +24,7 @@ FLOORS = (
     ("diagnosis.api", 5),
     ("brokk_rl.extensions", 5),
     ("brokk_rl.sweep", 5),
-    ("brokk_rl.task_choice", 5),
+    ("brokk_rl.policy_choice", 5),
     ("conf", 5),
     *((f"{package}.modes", MODE) for package in ("brokk_rl", *ROOMS, *EXTENSIONS)),
     *((package, 3) for package in (*ROOMS, *EXTENSIONS)),
@@ -43,7 +43,7 @@ COMPOSERS = (
     "brokk_rl.explain",
     "brokk_rl.extensions",
     "brokk_rl.sweep",
-    "brokk_rl.task_choice",
+    "brokk_rl.policy_choice",
 )
 """Modules that compose the configuration or explain why it does not compose."""
 DOORS = {

@@ -20,7 +20,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 
 from brokk_rl import cli, registry
-from brokk_rl.task_description import describe_task
+from brokk_rl.policy_folder import describe_task
 from tasks.borehole_insertion import BoreholeInsertion
 
 SHORT = (
@@ -80,7 +80,7 @@ def describe_words(words: tuple[str, ...]) -> str:
 
     A training that begins with a policy keeps the task of that policy.
     """
-    if f"start_from={SHIPPED}" in words:
+    if f"policy={SHIPPED}" in words:
         folder = Path(cli.__file__).parents[1] / SHIPPED.replace(":", "/")
         return str(read(folder / "policy.json")["task"]["fingerprint"])
     with hydra.initialize_config_module("conf", version_base="1.3"):
@@ -109,7 +109,7 @@ def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
     made = read(tmp_path / "run" / "policy.json")
     assert made["task"]["fingerprint"] == describe_words(words)
 
-    command("mode=evaluate", "policy.folder=run", *shared, *SHORT, *single, "session.out=seen")
+    command("mode=evaluate", "policy=./run", *shared, *SHORT, *single, "session.out=seen")
     found = read(tmp_path / "seen" / "evaluation.json")
     assert found["task"] == made["task"]
     if shared:  # on the same plant the figures are those of the training
@@ -118,7 +118,7 @@ def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
             == read(tmp_path / "run" / "evaluation.json")["policies"]["trained"]
         )
 
-    command("mode=export", "checkpoint=run", "session.out=export")
+    command("mode=export", "policy=./run", "session.out=export")
     exported = read(tmp_path / "export" / "policy.json")
     assert exported["task"] == made["task"] and exported["parity"]["largest_difference"] < 1e-3
     golden = read(tmp_path / "run" / "golden.json")
@@ -133,7 +133,7 @@ def test_training_that_begins_with_a_policy_keeps_the_task_of_that_policy(
 ) -> None:
     """The shipped policy corrects the classical controller of its time, not the one of today."""
     monkeypatch.chdir(tmp_path)
-    begin = [*TRAINED, *SHORT, "actuator=lag", f"start_from={SHIPPED}"]
+    begin = [*TRAINED, *SHORT, "actuator=lag", f"policy={SHIPPED}"]
     monkeypatch.setattr("sys.argv", ["brokk", *begin, "session.out=run"])
     assert cli.main() == 0
     shipped = Path(cli.__file__).parents[1] / SHIPPED.replace(":", "/")
@@ -145,4 +145,4 @@ def test_training_that_begins_with_a_policy_keeps_the_task_of_that_policy(
     monkeypatch.setattr("sys.argv", ["brokk", *begin, "task.memory=5", "session.out=other"])
     assert cli.main() == 2
     message = capsys.readouterr().err
-    assert "start_from" in message and "task.memory=5 was asked for, the policy has 13" in message
+    assert "task.memory=5 was asked for, the policy has 13" in message

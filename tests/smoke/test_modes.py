@@ -119,7 +119,7 @@ def test_the_resolved_config_runs_again_to_the_same_result(run: Path) -> None:
 def test_a_resumed_command_ends_where_an_uninterrupted_one_does(run: Path) -> None:
     arguments = ("mode=train", "session.out=parts", *SMALL, *FEW)
     command(run.parent, *arguments, "rl.budget.max_env_steps=768")
-    command(run.parent, *arguments, "resume=parts")
+    command(run.parent, *arguments, "policy=parts")
     parts = run.parent / "parts"
     weights = [
         torch.load(folder / "model_3.pt", weights_only=True)["actor_state_dict"]
@@ -136,7 +136,7 @@ def test_evaluating_the_policy_again_gives_the_same_figures(run: Path) -> None:
     command(
         run.parent,
         "mode=evaluate",
-        f"policy.folder={run}",
+        f"policy={run}",
         "session.out=evaluation",
         "actuator=lag",
         "session.device=cpu",
@@ -164,7 +164,7 @@ def test_a_policy_alone_can_be_evaluated_on_any_task(run: Path) -> None:
 
 
 def test_exporting_a_checkpoint_makes_the_same_policy(run: Path) -> None:
-    command(run.parent, "mode=export", f"checkpoint={run}", "session.out=export")
+    command(run.parent, "mode=export", f"policy={run}", "session.out=export")
     made = run.parent / "export"
     assert {path.name for path in made.iterdir()} == {
         "golden.json", "policy.json", "policy.onnx", "policy.safetensors", "resolved.yaml", "session.json",
@@ -223,7 +223,7 @@ def test_a_policy_of_another_task_is_refused_by_message(
     done = brokk(
         "mode=evaluate",
         "task=goal_pose",
-        f"policy.folder={run}",
+        f"policy={run}",
         "actuator=lag",
         "session.out=wrong",
         "session.device=cpu",

@@ -90,7 +90,7 @@ def test_two_processes_that_were_stopped_go_on_exactly(run: Path) -> None:
     arguments = ("mode=train", "session.out=parts", *SMALL)
     assert together(run.parent, *arguments, "rl.budget.max_env_steps=2304").returncode == 0
     assert (
-        together(run.parent, *arguments, "rl.budget.max_env_steps=3072", "resume=parts").returncode
+        together(run.parent, *arguments, "rl.budget.max_env_steps=3072", "policy=parts").returncode
         == 0
     )
     whole, parts = (

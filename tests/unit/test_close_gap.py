@@ -16,7 +16,8 @@ from training import CPU, plant, small, train
 
 from brokk_rl.errors import CheckpointError
 from brokk_rl.machine import Machine
-from brokk_rl.rl.policy import load_initial_weights, make_actor, write_bundle
+from brokk_rl.policy_folder import describe_policy, write_policy
+from brokk_rl.rl.policy import load_initial_weights, make_actor
 from diagnosis import retraining
 
 EPISODES = 200
@@ -129,25 +130,19 @@ def test_training_that_begins_with_a_policy_has_its_network_and_its_own_explorat
         spread(old).fill_(-3.0)  # as one that has settled
     env = runner.env
     network = training.describe_network()
-    write_bundle(tmp_path / "old", old, network, env.task, env.description, machine, {})
-    config = training.runner_config()
+    contract = describe_policy(network, None, 20.0, env.description, machine)
+    write_policy(tmp_path / "old", contract, old.state_dict())
     loop = plant(machine).build(CPU, 16, 64, 0)
-    actor = make_actor(
-        config["actor"], config["obs_groups"], loop.get_observations(), loop.num_actions
-    )
+    actor = make_actor(network, loop.get_observations(), loop.num_actions)
     load_initial_weights(actor, str(tmp_path / "old"), machine)
     groups = loop.get_observations()
     np.testing.assert_array_equal(actor(groups).detach(), old(groups).detach())
     shipped = option("rl", "ppo").runner["actor"]["distribution_cfg"]["init_std"]
     torch.testing.assert_close(spread(actor).exp(), torch.full((5,), shipped))
 
-    other = make_actor(
-        config["actor"] | {"hidden_dims": [8]},
-        config["obs_groups"],
-        loop.get_observations(),
-        loop.num_actions,
-    )
-    with pytest.raises(CheckpointError, match="start_from"):
+    network["actor"]["hidden_dims"] = [8]
+    other = make_actor(network, loop.get_observations(), loop.num_actions)
+    with pytest.raises(CheckpointError, match="policy="):
         load_initial_weights(other, str(tmp_path / "old"), machine)
 
 

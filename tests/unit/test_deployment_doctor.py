@@ -288,7 +288,7 @@ def test_the_doctor_from_the_command(
         "mode=doctor_policy",
         "~actuator",
         "doctor.log=log.parquet",
-        f"doctor.policy={folder}",
+        f"policy={folder}",
         "session.out=out",
     )
     told = json.loads(Path("out/doctor.json").read_text())

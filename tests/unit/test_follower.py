@@ -20,11 +20,10 @@ from brokk_rl.checks import check_follower
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
-from brokk_rl.modes.train import read_follower
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
-from brokk_rl.session import RESOLVED, Session
+from brokk_rl.session import Session
 
 CPU = torch.device("cpu")
 NEUTRAL: dict[str, Any] = {
@@ -418,7 +417,10 @@ def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_p
         session.folder.mkdir()
         torch.manual_seed(len(name))
         results = evaluate_policies(
-            plant, how, session, {"first": ClassicalPolicy(), "second": ClassicalPolicy()}
+            plant,
+            how,
+            session,
+            {"first": ClassicalPolicy(task=None), "second": ClassicalPolicy(task=None)},
         )
         assert (
             results["policies"]["first"] == results["policies"]["second"]
@@ -427,14 +429,3 @@ def test_every_policy_is_evaluated_with_the_same_persons(machine: Machine, tmp_p
     assert (tmp_path / "one" / "evaluation.json").read_text() == (
         tmp_path / "other" / "evaluation.json"
     ).read_text()
-
-
-def test_a_policy_says_behind_whom_it_was_trained(tmp_path: Path) -> None:
-    assert read_follower(tmp_path) is None
-    (tmp_path / RESOLVED).write_text(
-        "follower:\n  _target_: actuators.person.HumanFollower\n  delay_s: [0.2, 0.4]\n"
-    )
-    assert read_follower(tmp_path) == {
-        "_target_": "actuators.person.HumanFollower",
-        "delay_s": [0.2, 0.4],
-    }

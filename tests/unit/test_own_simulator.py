@@ -278,7 +278,7 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
         machine=make_machine("hinge"),
         evaluation=api._load_option("evaluation", "default"),
         log="log.parquet",
-        policy={"folder": "policy"},
+        policy_path="policy",
         simulator=name,
         own=api._load_option("actuator", "own"),
         sent=True,

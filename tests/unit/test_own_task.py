@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import json
-import logging
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 import training as runs
@@ -21,21 +20,21 @@ from conftest import Done
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import choose_tasks, evaluate_policies
+from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.export import Export
+from brokk_rl.policy_choice import prepare_arguments, restore_task
+from brokk_rl.policy_folder import (
+    TaskDescription,
+    describe_policy,
+    describe_task,
+    find_policy,
+    read_checkpoint,
+    write_policy,
+)
 from brokk_rl.rl.export import export_onnx
-from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy, read_bundle, write_bundle
-from brokk_rl.rl.runner import read_checkpoint
+from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session
-from brokk_rl.spec import restore_spec
-from brokk_rl.task_description import (
-    TaskDescription,
-    apply_behaviour,
-    describe_task,
-    read_description,
-    restore_task,
-)
 from deploy.policy.bundle import PolicyBundle
 
 CPU = torch.device("cpu")
@@ -61,52 +60,31 @@ def newest(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     runner, book = runs.make(machine, folder, training, loop)
     with book:
         runner.run()
-    network = training.describe_network()
-    actor = runner.alg.get_policy()
-    contract = write_bundle(folder, actor, network, loop.task, loop.description, machine, {})
-    export_onnx(folder, actor, loop.task, machine, contract, runner.record_answers())  # type: ignore[arg-type]
+    actor, process = runner.alg.get_policy(), loop.task
+    contract = describe_policy(
+        training.describe_network(),
+        process.describe(),  # type: ignore[attr-defined]
+        process.max_episode_steps * machine.period_s,
+        loop.description,
+        machine,
+        actuator=option("actuator", "lag"),
+    )
+    write_policy(folder, contract, actor.state_dict())
+    export_onnx(folder, actor, process, machine, contract, runner.record_answers())  # type: ignore[arg-type]
     return folder
 
 
-@pytest.fixture
-def old(tmp_path: Path) -> Path:
-    """The policy that ships, as files of version 1 were: nothing says what its task is."""
-    for path in SHIPPED.iterdir():
-        shutil.copy(path, tmp_path / path.name)
-    contract = json.loads((tmp_path / "policy.json").read_text())
-    for key in ("task", "history", "stop", "units", "limits", "kinematics"):
-        contract.pop(key)
-    (tmp_path / "policy.json").write_text(json.dumps(contract | {"schema": 1}))
-    model = onnx.load(tmp_path / "policy.onnx")
-    kept = {one.key: one.value for one in model.metadata_props if one.key != "brokk.task"}
-    onnx.helper.set_model_props(model, kept)
-    onnx.save(model, tmp_path / "policy.onnx")
-    from safetensors.torch import load_file, save_file
-
-    weights = load_file(tmp_path / "policy.safetensors")
-    save_file(weights, tmp_path / "policy.safetensors")
-    return tmp_path
+def test_a_policy_restores_the_behaviour_and_leaves_the_conditions(newest: Path) -> None:
+    found = restore_task(insertion(episode_s=40.0), str(newest))
+    assert found == insertion(episode_s=40.0, memory=1)
+    with pytest.raises(CheckpointError, match="expected a policy of task=goal_pose"):
+        restore_task(option("task", "goal_pose"), str(newest))
 
 
-def test_a_description_restores_the_behaviour_and_leaves_the_conditions() -> None:
-    trained = direct(insertion(memory=1, depth_m=0.1, episode_s=7.0))
-    text = json.dumps(describe_task(trained).to_json())
-    own = TaskDescription.from_json(json.loads(text), "a file")
-    found = restore_task(insertion(episode_s=40.0), own)
-    assert (found.memory, found.depth_m, found.action.kind) == (1, 0.1, "direct")
-    assert found.episode_s == 40.0 and found.switch == trained.switch
-    assert describe_task(found) == describe_task(trained)
-    assert found == replace(trained, episode_s=40.0)
-
-
-def test_advice_is_restored_from_and_to_null(machine: Machine) -> None:
-    folder = SHIPPED.with_name("behind_a_person")
-    own = read_description(folder, json.loads((folder / "policy.json").read_text()))
-    assert own is not None
-    advised = restore_task(insertion(), own)
+def test_advice_is_restored(machine: Machine) -> None:
+    advised = restore_task(insertion(), str(SHIPPED.with_name("behind_a_person")))
     assert advised.advice.delay_s == (0.2, 0.4) and advised.classical.straight is False
     assert advised.build(machine, 1, CPU).control.encoder.size == 198
-    assert restore_task(advised, describe_task(insertion())) == insertion()
 
 
 def test_each_field_of_the_behaviour_counts() -> None:
@@ -130,22 +108,6 @@ def test_each_field_of_the_behaviour_counts() -> None:
     assert describe_task(conditions) == own
 
 
-def test_what_was_asked_for_and_contradicts_is_refused_by_name() -> None:
-    own = describe_task(direct(insertion(memory=1)))
-    task = insertion()
-    with pytest.raises(
-        ConfigError, match=r"task\.memory=13 was asked for, the policy has 1\."
-    ) as e:
-        apply_behaviour(task, own, ["task.memory", "task.episode_s"], "the policy")
-    assert "action" not in str(e.value)
-    with pytest.raises(ConfigError, match=r"action\.kind=residual was asked for, .* has direct"):
-        apply_behaviour(task, own, ["task.action"], "the policy")
-    found = apply_behaviour(task, own, ["task", "task.episode_s", "task.actionable"], "the policy")
-    assert describe_task(found) == own
-    with pytest.raises(ConfigError, match="for task=borehole_insertion, but task=goal_pose was as"):
-        apply_behaviour(option("task", "goal_pose"), own, ["task"], "the policy")
-
-
 def test_a_changed_or_foreign_description_is_refused() -> None:
     data = describe_task(insertion()).to_json()
     data["behaviour"]["memory"] = 1
@@ -153,22 +115,6 @@ def test_a_changed_or_foreign_description_is_refused() -> None:
         TaskDescription.from_json(data, "policy.json")
     with pytest.raises(CheckpointError, match="incomplete"):
         TaskDescription.from_json({"name": "x"}, "policy.json")
-    own = describe_task(insertion())
-    own.behaviour["wings"] = 2
-    with pytest.raises(CheckpointError, match="differ in wings"):
-        restore_task(insertion(), own)
-    own = describe_task(insertion())
-    own.behaviour["switch"] = {"rule": "planar", "reach_m": [1.7, 2.4]}
-    with pytest.raises(CheckpointError, match="height_m"):
-        restore_task(insertion(), own)
-
-
-def test_values_of_a_file_become_specs_by_annotation_and_never_by_target() -> None:
-    task = insertion()
-    values = {"rule": "text", "reach_m": [1.0, 2.0], "height_m": 0.3}
-    assert restore_spec(type(task.switch), values).reach_m == (1.0, 2.0)
-    with pytest.raises(ConfigError, match="_target_"):
-        restore_spec(type(task.switch), values | {"_target_": "os.system"})
 
 
 def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
@@ -177,20 +123,20 @@ def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
     """The figures of a policy do not depend on the words of the caller, nor on its neighbours."""
     how = Evaluation(episodes=8, seed=3, num_recorded=1, video=False)
     session = Session(out=str(tmp_path), seed=0, device="cpu")
-    mine, shipped = TrainedPolicy(folder=str(newest)), TrainedPolicy(folder=str(SHIPPED))
     short = 4.0
+    default = insertion(episode_s=short)
+    mine = TrainedPolicy(path=str(newest), task=replace(default, memory=1))
+    shipped = TrainedPolicy(path=str(SHIPPED), task=restore_task(default, str(SHIPPED)))
     by_default = evaluate_policies(
-        runs.plant(machine, insertion(episode_s=short)),
+        runs.plant(machine, default),
         how,
         session,
-        {"newest": mine, "shipped": shipped, "classical": ClassicalPolicy()},
+        {"newest": mine, "shipped": shipped, "classical": ClassicalPolicy(task=mine.task)},
     )
     alone = evaluate_policies(
         runs.plant(machine, insertion(episode_s=short, memory=1)), how, session, {"newest": mine}
     )
-    other = evaluate_policies(
-        runs.plant(machine, insertion(episode_s=short)), how, session, {"shipped": shipped}
-    )
+    other = evaluate_policies(runs.plant(machine, default), how, session, {"shipped": shipped})
     assert by_default["policies"]["newest"] == alone["policies"]["newest"]
     assert by_default["policies"]["shipped"] == other["policies"]["shipped"]
     assert by_default["task"]["behaviour"]["memory"] == 1
@@ -201,7 +147,7 @@ def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
 def test_a_control_loop_of_another_task_is_refused(newest: Path, machine: Machine) -> None:
     loop = runs.plant(machine, insertion()).build(CPU, 2, 8, 0)
     with pytest.raises(CheckpointError, match=r"task\.memory is 1 there, 13 here"):
-        TrainedPolicy(folder=str(newest)).build(loop, 0)
+        TrainedPolicy(path=str(newest), task=None).build(loop, 0)
 
 
 def test_a_checkpoint_is_exported_by_what_it_says(
@@ -209,29 +155,25 @@ def test_a_checkpoint_is_exported_by_what_it_says(
 ) -> None:
     """Its file answers as the training run recorded; another network or task is noticed."""
     session = Session(out=str(tmp_path), seed=0, device="cpu")
-    export = Export(
-        session=session, machine=machine, task=insertion(), checkpoint=str(newest), asked=()
-    )
+    policy = TrainedPolicy(path=str(newest), task=None)
+    export = Export(session=session, machine=machine, task=insertion(memory=1), policy=policy)
     export.run()
     made = json.loads((tmp_path / "policy.json").read_text())
     assert made["task"]["behaviour"]["memory"] == 1 and made["parity"]["observations"] == 16
+    assert made["plant"] == json.loads((newest / "policy.json").read_text())["plant"]
     golden = [json.loads((folder / "golden.json").read_text()) for folder in (tmp_path, newest)]
     assert golden[0] == golden[1]
-    with pytest.raises(ConfigError, match=r"task\.memory=13 was asked for, the policy has 1"):
-        replace(export, asked=("task.memory",)).run()
+    with pytest.raises(CheckpointError, match=r"task\.memory is 1 there, 13 here"):
+        replace(export, task=insertion()).run()
 
     content = read_checkpoint(newest / "model_2.pt", CPU)
     content["answers"] = (content["answers"][0], content["answers"][1] + 0.01)
     torch.save(content, tmp_path / "model_2.pt")
+    other = replace(policy, path=str(tmp_path / "model_2.pt"))
     with pytest.raises(
         CheckpointError, match=r"differs from the answers .* not the one of the run"
     ):
-        replace(export, checkpoint=str(tmp_path / "model_2.pt")).run()
-    for key in ("task", "network", "answers"):
-        content.pop(key)
-    torch.save(content, tmp_path / "model_2.pt")
-    with pytest.raises(CheckpointError, match="do not describe themselves"):
-        replace(export, checkpoint=str(tmp_path / "model_2.pt")).run()
+        replace(export, policy=other).run()
 
 
 def test_recorded_answers_are_those_of_the_network_in_the_loop(machine: Machine) -> None:
@@ -267,71 +209,10 @@ def test_weights_of_another_policy_are_noticed(
         shutil.copy(SHIPPED / name, tmp_path / name)
     shutil.copy(newest / "policy.safetensors", tmp_path / "policy.safetensors")
     with pytest.raises(CheckpointError, match=r"policy\.safetensors and policy\.json are of diff"):
-        read_bundle(tmp_path, machine)
+        find_policy(str(tmp_path)).read()
     shutil.copy(newest / "policy.onnx", tmp_path / "policy.onnx")
     with pytest.raises(CheckpointError, match=r"policy\.json and policy\.onnx do not belong"):
         PolicyBundle(str(tmp_path), machine)
-
-
-def test_an_old_policy_is_read_with_what_is_assumed(
-    old: Path, machine: Machine, caplog: pytest.LogCaptureFixture
-) -> None:
-    policy = TrainedPolicy(folder=str(old))
-    assert policy.choose_task(insertion(), machine, ["task.memory"]) == insertion()
-    own = TrainedPolicy(folder=str(SHIPPED)).choose_task(insertion(), machine, ())
-    with caplog.at_level(logging.WARNING):
-        policy.build(runs.plant(machine, own).build(CPU, 2, 8, 0), 0)
-        PolicyBundle(str(old), machine)
-    assert "does not say which task" in caplog.text and "task.memory=13" in caplog.text
-    assert (
-        "its golden answers agree" in caplog.text and "policy.onnx holds all of it" in caplog.text
-    )
-
-
-def test_the_classical_rival_shares_the_task_but_has_the_numbers_composed_here(
-    machine: Machine,
-) -> None:
-    task = insertion()
-    task = replace(task, classical=replace(task.classical, gain_1_s=0.7))
-    config = runs.plant(machine, task)
-    policies: Any = {"trained": TrainedPolicy(folder=str(SHIPPED)), "classical": ClassicalPolicy()}
-    found: Any = choose_tasks(config, policies, ())
-    assert found["classical"].classical.gain_1_s == 0.7
-    assert found["trained"].classical.gain_1_s == 1.5  # of the policy that ships
-    own = replace(found["trained"], classical=task.classical)
-    assert describe_task(found["classical"]) == describe_task(own)
-
-
-@pytest.mark.parametrize("change", [lambda task: replace(task, memory=1), direct])
-def test_an_old_policy_whose_answers_differ_in_the_task_at_hand_is_refused(
-    change: Callable[[Any], Any], old: Path, machine: Machine
-) -> None:
-    loop = runs.plant(machine, change(insertion())).build(CPU, 2, 8, 0)
-    with pytest.raises(CheckpointError, match=r"its answers differ from golden\.json by up to"):
-        TrainedPolicy(folder=str(old)).build(loop, 0)
-
-
-def test_an_old_policy_without_answers_cannot_be_known(old: Path, machine: Machine) -> None:
-    (old / "golden.json").unlink()
-    loop = runs.plant(machine, insertion()).build(CPU, 2, 8, 0)
-    with pytest.raises(CheckpointError, match=r"there is no golden\.json to find it out"):
-        TrainedPolicy(folder=str(old)).build(loop, 0)
-
-
-def test_an_old_run_folder_knows_its_task_by_its_configuration(old: Path, machine: Machine) -> None:
-    source = Path(__file__).parents[2] / "conf" / "task" / "borehole_insertion.yaml"
-    task = yaml.safe_load(source.read_text())
-    task.pop("defaults")
-    task |= {"memory": 1, "noise": {"_target_": "tasks.noise.ObservationNoise", "filter": "none"}}
-    task["switch"]["_target_"] = "tasks.control.PhaseSwitch"  # as earlier versions had it
-    resolved = {"_target_": "brokk_rl.modes.train.Train", "task": task}
-    (old / "resolved.yaml").write_text(yaml.safe_dump(resolved))
-    found = TrainedPolicy(folder=str(old)).choose_task(insertion(), machine, [])
-    assert found.memory == 1 and found.noise.filter == "none" and found.noise.u_scale == 0.1
-    assert replace(found, memory=13, noise=insertion().noise) == insertion()
-    resolved["_target_"] = "brokk_rl.modes.evaluate.Evaluate"  # an evaluation trained nothing
-    (old / "resolved.yaml").write_text(yaml.safe_dump(resolved))
-    assert TrainedPolicy(folder=str(old)).choose_task(insertion(), machine, []) == insertion()
 
 
 def test_a_pitch_is_given_exactly_where_the_policy_asks_for_one(machine: Machine) -> None:
@@ -380,12 +261,85 @@ def test_the_command_finds_the_task_of_its_policy(
 ) -> None:
     """A follower is of the plant: what it brings to the task is no request."""
     words = ("task.episode_s=1.0", "task.memory=1", "follower=person")
-    done = brokk(*EVALUATE, *FEW, f"policy.folder={newest}", *words)
+    done = brokk(*EVALUATE, *FEW, f"policy={newest}", *words)
     assert done.code == 0, done.err
     found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
     assert found["task"]["behaviour"]["advice"] is None and found["follower"] == "person"
-    resolved = yaml.safe_load((tmp_path / "run" / "resolved.yaml").read_text())
-    assert resolved["asked"] == ["task.episode_s", "task.memory"]
+
+
+@pytest.fixture
+def foreign(newest: Path, tmp_path: Path) -> Path:
+    """The policy as one of a machine whose file nobody has any more."""
+    folder = tmp_path / "policies" / "foreign"
+    shutil.copytree(newest, folder)
+    contract = json.loads((folder / "policy.json").read_text())
+    contract["plant"]["machine"] |= {"name": "foreign", "title": "of somebody else"}
+    contract["fingerprint"] = option("machine", "brokk170").fingerprint()
+    machine = replace(option("machine", "brokk170"), name="foreign")
+    contract |= {"machine": "foreign", "fingerprint": machine.fingerprint()}
+    (folder / "policy.json").write_text(json.dumps(contract))
+    return folder
+
+
+def test_a_policy_brings_its_machine_and_the_actuator_of_its_training(
+    foreign: Path, brokk: Callable[..., Done], tmp_path: Path
+) -> None:
+    few = [word for word in FEW if not word.startswith("actuator")]
+    done = brokk(*EVALUATE, *few, "task.episode_s=1.0", f"policy={foreign}")
+    assert done.code == 0, done.err
+    record = json.loads((tmp_path / "run" / "session.json").read_text())
+    assert record["machine"] == "foreign"
+    found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert found["actuator"] == "firstorderlag" or found["actuator"] == "lag"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("policy=policies/foreign", "machine=brokk170"), ("=foreign, but machine=brokk170", "name differ")),
+        (("policy=runs/none",), ("policy=runs/none: expected a run folder", "no such path")),
+        (("policy=trainned",), ("there is no policy=trainned", "did you mean 'trained'")),
+        (("policy.folder=runs/x",), ("'policy.folder' is now 'policy'", "policy=runs/x")),
+        (("mode=export", "checkpoint=runs/x"), ("brokk mode=export policy=runs/x",)),
+        (("mode=train", "start_from=a/b", "session.out=c"), ("brokk mode=train session.out=c policy=a/b",)),
+        (("mode=train", "resume=a/b"), ("brokk mode=train policy=a/b session.out=a/b",)),
+        (("mode=train", "policy=classical"), ("training begins with a network",)),
+        (("mode=train", "policy=policies/foreign", "session.out=policies"), ("policies already holds a run",)),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_before_torch(
+    words: tuple[str, ...],
+    told: tuple[str, ...],
+    foreign: Path,
+    brokk: Callable[..., Done],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (foreign.parent / "session.json").write_text('{"mode": "train"}')
+    before = sorted(tmp_path.rglob("*"))
+    monkeypatch.delitem(sys.modules, "brokk_rl.modes.train", raising=False)
+    monkeypatch.delitem(sys.modules, "brokk_rl.modes.evaluate", raising=False)
+    mode = () if words[0].startswith("mode=") else ("mode=evaluate",)
+    done = brokk(*mode, *words)
+    assert done.code == 2, done.err
+    for text in told:
+        assert text in done.err
+    assert not {"brokk_rl.modes.train", "brokk_rl.modes.evaluate"} & set(sys.modules)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_training_that_goes_on_takes_up_the_words_of_its_run(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    run.mkdir()
+    kept = ["mode=train", "rl.num_envs=8", "effect=[]", "session.out=elsewhere"]
+    (run / "session.json").write_text(json.dumps({"overrides": kept}))
+    (run / "model_1.pt").touch()
+    ours = [f"policy={run}", f"session.out={run}", "rl.num_envs=16"]
+    assert prepare_arguments(ours)[3:] == ["mode=train", "effect=[]"]
+    begun = [f"policy={run}", "session.out=new"]
+    assert prepare_arguments(begun) == begun, "it begins with the network, by words of its own"
+    exact = [f"policy={run}/model_1.pt", "session.out=new"]
+    assert prepare_arguments(exact)[2:] == kept[:3]
 
 
 def test_answers_hold_many_phases(newest: Path) -> None:

@@ -12,9 +12,8 @@ import pytest
 import torch
 from composed import option
 
-from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
-from brokk_rl.play.checkpoint_watch import find_newest
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
 from brokk_rl.play.settings import PlaySettings
@@ -41,7 +40,7 @@ def made() -> Callable[..., PlaySession]:
     def make(neutral: bool = True) -> PlaySession:
         torch.manual_seed(0)
         loop = config.build(torch.device("cpu"), NUM, 16, seed=0)
-        return PlaySession(loop, {"classical": ClassicalPolicy().build(loop, 0)}, neutral)
+        return PlaySession(loop, {"classical": ClassicalPolicy(task=None).build(loop, 0)}, neutral)
 
     return make
 
@@ -250,16 +249,6 @@ def test_a_gamepad_moves_the_levers(tmp_path: Path) -> None:
     pad.close()
     with pytest.raises(ConfigError, match=r"play.gamepad=.*gone: No such file.*ls /dev/input"):
         Gamepad(tmp_path / "gone", "play.gamepad")
-
-
-def test_a_run_without_checkpoints_is_explained(tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="there is no such run folder"):
-        find_newest(tmp_path / "gone")
-    with pytest.raises(CheckpointError, match=r"rl\.save_interval"):
-        find_newest(tmp_path)
-    for number in (9, 10):
-        (tmp_path / f"model_{number}.pt").touch()
-    assert find_newest(tmp_path).name == "model_10.pt"
 
 
 @pytest.mark.parametrize(

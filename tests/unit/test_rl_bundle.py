@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,16 +20,10 @@ from safetensors.torch import load_file, save_file
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import ObservationEncoder
+from brokk_rl.policy_folder import TOLERANCE, describe_policy, find_policy, write_policy
 from brokk_rl.rl import export
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.policy import (
-    NetworkPolicy,
-    TrainedPolicy,
-    locate_bundle,
-    make_actor,
-    read_bundle,
-    write_bundle,
-)
+from brokk_rl.rl.policy import NetworkPolicy, TrainedPolicy, load_policy, make_actor
 
 CPU = torch.device("cpu")
 TRAINING = runs.small(max_seconds=1.0)
@@ -59,22 +55,16 @@ def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundl
         task, noise=replace(task.noise, **SILENT), action=replace(task.action, kind=kind)
     )
     loop = runs.plant(machine, task).build(CPU, 16, 64, 3)
-    config = TRAINING.runner_config()
-    actor = make_actor(
-        config["actor"], config["obs_groups"], loop.get_observations(), loop.num_actions
-    )
+    network = TRAINING.describe_network()
+    actor = make_actor(network, loop.get_observations(), loop.num_actions)
     with torch.no_grad():
         for parameter in actor.mlp.parameters():
             parameter.copy_(torch.randn_like(parameter) * 0.1)
-    contract = write_bundle(
-        folder,
-        actor,
-        TRAINING.describe_network(),
-        loop.task,
-        loop.description,
-        machine,
-        {"env_steps": 0},
+    time_s = loop.task.max_episode_steps * machine.period_s
+    contract = describe_policy(
+        network, loop.task.describe(), time_s, loop.description, machine, actuator=None
     )
+    write_policy(folder, contract, actor.state_dict())
     seen = []
     for _ in range(25):
         seen.append(loop.record_answers(actor, 16))
@@ -125,7 +115,7 @@ def test_the_contract_says_all_that_the_machine_needs(bundle: Bundle, machine: M
     parity = contract["parity"]
     assert (
         parity["observations"] == 400
-        and parity["largest_difference"] < export.TOLERANCE
+        and parity["largest_difference"] < TOLERANCE
         and parity["at_an_edge"] <= 2
     )
 
@@ -189,67 +179,86 @@ def test_on_the_machine_it_commands_what_it_did_in_the_simulator(
 
 def test_a_trained_policy_is_read_back_as_it_was_written(bundle: Bundle) -> None:
     groups = dict(bundle.loop.get_observations().items())
-    again = TrainedPolicy(folder=str(bundle.folder)).build(bundle.loop, 0)
+    again = TrainedPolicy(path=str(bundle.folder), task=None).build(bundle.loop, 0)
     with torch.no_grad():
         assert torch.equal(again.act(groups), NetworkPolicy(bundle.actor, bundle.loop).act(groups))
 
 
-def test_an_empty_folder_holds_no_policy(tmp_path: Path, machine: Machine) -> None:
+def test_an_empty_folder_holds_no_policy(tmp_path: Path) -> None:
     with pytest.raises(CheckpointError, match=r"holds no policy \(policy\.json is missing\)"):
-        read_bundle(tmp_path, machine)
+        find_policy(str(tmp_path))
 
 
-@pytest.mark.parametrize("file", ["policy.safetensors", "policy.json"])
-@pytest.mark.parametrize(
-    "content", [b"", b"{", b"\x10\x00\x00\x00\x00\x00\x00\x00nonsense in here"]
-)
-def test_a_corrupt_file_is_named_with_the_way_out(
-    file: str, content: bytes, copied: Path, machine: Machine
-) -> None:
-    (copied / file).write_bytes(content)
-    with pytest.raises(CheckpointError, match=r"is corrupt: .*mode=export"):
-        read_bundle(copied, machine)
+def corrupt(path: Path, content: bytes) -> None:
+    path.write_bytes(content)
 
 
-def test_truncated_and_missing_weights_are_corrupt(copied: Path, machine: Machine) -> None:
-    path = copied / "policy.safetensors"
+def cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(CheckpointError, match="is corrupt"):
-        read_bundle(copied, machine)
-    path.unlink()
-    with pytest.raises(CheckpointError, match="is corrupt"):
-        read_bundle(copied, machine)
 
 
-def test_weights_that_are_no_numbers_are_refused_by_name(copied: Path, machine: Machine) -> None:
-    weights = load_file(copied / "policy.safetensors")
+def spoil(path: Path) -> None:
+    weights = load_file(path)
     weights["mlp.0.weight"][0, 0] = torch.nan
-    save_file(weights, copied / "policy.safetensors")
-    with pytest.raises(CheckpointError, match=r"NaN or infinite weights in mlp\.0\.weight"):
-        read_bundle(copied, machine)
+    save_file(weights, path)
 
 
-def test_a_policy_of_another_machine_names_what_differs(copied: Path, machine: Machine) -> None:
-    slower = replace(machine, period_s=0.1)
+@pytest.mark.parametrize(
+    ("file", "damage", "told"),
+    [
+        ("policy.safetensors", lambda path: corrupt(path, b""), r"is corrupt: .*mode=export"),
+        ("policy.safetensors", lambda path: corrupt(path, b"{"), r"is corrupt: .*mode=export"),
+        ("policy.safetensors", cut_off, r"is corrupt: .*mode=export"),
+        ("policy.safetensors", spoil, r"NaN or infinite weights in mlp\.0\.weight"),
+        ("policy.json", lambda path: corrupt(path, b"{"), r"is corrupt: .*mode=export"),
+        ("policy.safetensors", Path.unlink, r"is corrupt: No such file"),
+    ],
+)
+def test_a_damaged_file_is_named_with_the_way_out(
+    file: str, damage: Callable[[Path], None], told: str, copied: Path
+) -> None:
+    damage(copied / file)
+    with pytest.raises(CheckpointError, match=told):
+        find_policy(str(copied)).read()
+
+
+def test_a_policy_of_another_machine_names_what_differs(copied: Path, bundle: Bundle) -> None:
+    contract = json.loads((copied / "policy.json").read_text())
+    contract["fingerprint"]["control"] = "0"
+    (copied / "policy.json").write_text(json.dumps(contract))
     with pytest.raises(CheckpointError, match="another machine: control differ"):
-        read_bundle(copied, slower)
+        load_policy(find_policy(str(copied)), bundle.loop)
+
+
+def test_the_plant_of_a_stranger_names_no_class_but_those_of_options(copied: Path) -> None:
+    contract = json.loads((copied / "policy.json").read_text())
+    contract["plant"]["machine"]["joints"][0]["_target_"] = "os.system"
+    (copied / "policy.json").write_text(json.dumps(contract))
+    assert "_target_" not in find_policy(str(copied)).list_plant()["machine"]["joints"][0]
+    contract["plant"]["machine"]["_target_"] = "os.system"
+    (copied / "policy.json").write_text(json.dumps(contract))
+    with pytest.raises(CheckpointError, match=r"machine os\.system, which no installed option has"):
+        find_policy(str(copied)).list_plant()
+
+
+def test_the_newest_of_weights_and_checkpoints_is_the_policy(copied: Path) -> None:
+    assert find_policy(str(copied)).file.name == "policy.safetensors"
+    (copied / "model_3.pt").touch()
+    os.utime(copied / "policy.safetensors", (0, 0))
+    assert find_policy(str(copied)).file.name == "model_3.pt"
 
 
 def test_a_policy_of_another_task_is_refused(copied: Path, machine: Machine) -> None:
     loop = runs.plant(machine, option("task", "goal_pose")).build(CPU, 2, 4, 0)
     with pytest.raises(CheckpointError, match=r"trained for task=borehole_insertion, not for task"):
-        TrainedPolicy(folder=str(copied)).build(loop, 0)
+        TrainedPolicy(path=str(copied), task=None).build(loop, 0)
 
 
 def test_an_observation_group_that_the_task_does_not_give_is_refused(bundle: Bundle) -> None:
-    config = TRAINING.runner_config()
+    network = TRAINING.describe_network()
+    network["obs_groups"] = {"actor": ["policy", "camera"]}
     with pytest.raises(ConfigError, match="gives no group camera"):
-        make_actor(
-            config["actor"],
-            {"actor": ["policy", "camera"]},
-            bundle.loop.get_observations(),
-            bundle.loop.num_actions,
-        )
+        make_actor(network, bundle.loop.get_observations(), bundle.loop.num_actions)
 
 
 def test_a_file_that_says_something_else_is_not_left_behind(
@@ -281,7 +290,6 @@ def test_a_policy_that_ships_is_named_by_package_and_path(
     (package / "__init__.py").touch()
     copied.rename(package / "mine")
     monkeypatch.syspath_prepend(package.parent)
-    assert (locate_bundle("shipping:mine") / "policy.json").exists()
-    assert locate_bundle("runs/mine") == Path("runs/mine")
+    assert find_policy("shipping:mine").file == package / "mine" / "policy.safetensors"
     with pytest.raises(CheckpointError, match="no package 'missing'"):
-        locate_bundle("missing:mine")
+        find_policy("missing:mine")

@@ -150,11 +150,11 @@ def results(loop: ControlLoop, policy: Any, seed: int = 7) -> dict[str, Any]:
 
 def test_evaluating_a_policy_twice_gives_the_same_figures(machine: Machine) -> None:
     loop = make(machine, 32, episode_s=6.0)
-    first = results(loop, ClassicalPolicy())
+    first = results(loop, ClassicalPolicy(task=None))
     torch.rand(100)
-    assert results(loop, ClassicalPolicy()) == first and first["episodes"] == 32
+    assert results(loop, ClassicalPolicy(task=None)) == first and first["episodes"] == 32
     assert sum(first["terminations"].values()) == 32, "every episode ends in one way"
-    assert results(make(machine, 32, episode_s=6.0), ClassicalPolicy()) == first, (
+    assert results(make(machine, 32, episode_s=6.0), ClassicalPolicy(task=None)) == first, (
         "also in another loop"
     )
 
@@ -204,7 +204,7 @@ def test_recorded_episodes_begin_at_their_start_and_hold_no_sample_of_the_next(
 ) -> None:
     loop = make(machine, 4, episode_s=0.5)
     starts = {name: value[:4] for name, value in loop.starts.items()}
-    found = evaluate_policy(loop, ClassicalPolicy().build(loop, 0), starts, 7, 2)
+    found = evaluate_policy(loop, ClassicalPolicy(task=None).build(loop, 0), starts, 7, 2)
     episodes = found.episodes
     assert len(episodes) == 2
     for row, episode in enumerate(episodes):
@@ -332,7 +332,7 @@ def test_a_policy_goes_where_a_sensor_sees_the_hole_and_rests_where_it_sees_none
     task = replace(option("task", "borehole_insertion"), episode_s=60.0)
     torch.manual_seed(0)
     loop = replace(runs.plant(machine, task), target=spec).build(CPU, 2, 2, 5)
-    policy, groups = ClassicalPolicy().build(loop, 0), loop.get_observations()
+    policy, groups = ClassicalPolicy(task=None).build(loop, 0), loop.get_observations()
     begun = loop.history.q[:, -1].clone()
     for _ in range(150):
         groups, *_ = loop.step(policy.act(dict(groups.items())))  # type: ignore[arg-type]

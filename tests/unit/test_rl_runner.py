@@ -14,8 +14,7 @@ import training as runs
 
 from brokk_rl.errors import CheckpointError, ConfigError, SimulationError, StorageError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.train import find_checkpoint
-from brokk_rl.rl.runner import list_checkpoints, read_checkpoint
+from brokk_rl.policy_folder import find_checkpoint, list_checkpoints, read_checkpoint
 from brokk_rl.rl.settings import TrainingBudget
 
 ITERATION = 16 * runs.STEPS
@@ -80,7 +79,7 @@ def test_checkpoints_are_sorted_by_iteration_not_by_name(tmp_path: Path) -> None
         "model_20.pt",
         "model_100.pt",
     ]
-    assert find_checkpoint(tmp_path, "resume").name == "model_100.pt"
+    assert find_checkpoint(str(tmp_path)).name == "model_100.pt"
 
 
 @pytest.mark.parametrize(
@@ -221,11 +220,11 @@ def test_a_refused_checkpoint_leaves_the_progress_alone(checkpoint: Path, machin
 
 
 def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path, machine: Machine) -> None:
-    for path in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(CheckpointError, match="there is no checkpoint"):
-            find_checkpoint(path, "resume")
-    with pytest.raises(CheckpointError, match="there is no checkpoint"):
-        read_checkpoint(find_checkpoint(tmp_path / "model_3.pt", "resume"), "cpu")
+    with pytest.raises(CheckpointError, match="holds no policy"):
+        find_checkpoint(str(tmp_path))
+    for name in ("nowhere", "model_3.pt"):
+        with pytest.raises(CheckpointError, match="there is no such path"):
+            find_checkpoint(str(tmp_path / name))
 
 
 def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.export import Export
 from brokk_rl.modes.train import Train
-from brokk_rl.rl.policy import ClassicalPolicy
+from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.session import Session
 from brokk_rl.sim.scene import make_nominal_scenes
@@ -140,14 +140,7 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
     }
     evaluation = replace(option("evaluation", "default"), episodes=4, num_recorded=1, video=False)
     train = Train(
-        **parts,
-        effect={},
-        event={},
-        tracking=NoTracking(),
-        evaluation=evaluation,
-        start_from=None,
-        resume=None,
-        asked=(),
+        **parts, effect={}, event={}, tracking=NoTracking(), evaluation=evaluation, policy=None
     )
     with caplog.at_level(logging.INFO):
         assert train.run() is not None
@@ -164,12 +157,11 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
             session=parts["session"],
             machine=machine,
             task=HoldStill(),
-            checkpoint=str(tmp_path),
-            asked=(),
+            policy=TrainedPolicy(path=str(tmp_path), task=None),
         ).run()
 
 
 def test_the_classical_policy_of_a_task_without_one_is_refused(machine: Machine) -> None:
     loop = runs.plant(machine, HoldStill()).build(CPU, 4, 8, 0)
     with pytest.raises(ConfigError, match=r"HoldStillProcess. has no classical controller"):
-        ClassicalPolicy().build(loop, 0)
+        ClassicalPolicy(task=None).build(loop, 0)

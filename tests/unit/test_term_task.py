@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 import training as runs
+from hydra.utils import instantiate
 from kinematic import KinematicWorld
 
 from brokk_rl.checks import check_task
@@ -21,11 +22,11 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.observation import ObservationEncoder, PartsEncoder, restore_encoder
+from brokk_rl.policy_folder import apply_behaviour, describe_spec, describe_task
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
-from brokk_rl.task_description import describe_task, restore_task
 from deploy.policy.bundle import PolicyBundle
 from tasks.reward import RewardTerm
 from tasks.term_task import (
@@ -227,7 +228,8 @@ def test_its_description_gives_the_same_terms_back() -> None:
         observation={"error": term("tasks.observations:commands")},
         action=JointAction(scale=1.0, mask=False),
     )
-    assert restore_task(other, describe_task(task)) == task
+    node = apply_behaviour(describe_spec(other), describe_task(task).behaviour)
+    assert instantiate(node, _convert_="all") == task
 
 
 def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(
@@ -249,7 +251,7 @@ def test_a_task_without_a_classical_controller_is_evaluated_without_that_rival(
 
     session = Session(out=str(tmp_path), seed=0, device="cpu")
     how = Evaluation(episodes=4, seed=3, num_recorded=1, video=False)
-    policies: Any = {"resting": Resting(), "classical": ClassicalPolicy()}
+    policies: Any = {"resting": Resting(), "classical": ClassicalPolicy(task=None)}
     found = evaluate_policies(runs.plant(machine, make()), how, session, policies)
     assert list(found["policies"]) == list(found["tasks"]) == ["resting"]
     assert found["terminations"] == {"fault": 0, "time_limit": 4}

@@ -85,7 +85,7 @@ def test_a_cost_that_was_not_measured_is_said(tmp_path: Path) -> None:
 
 def test_next_steps_are_commands_with_their_paths(tmp_path: Path) -> None:
     ((_, command),) = list_changes(make_result(tmp_path, 0.5))
-    assert "start_from=runs/policy" in command
+    assert "policy=runs/policy" in command
     assert f"@{tmp_path}/diagnosis/effects.yaml" in command
     own = replace(make_result(tmp_path, 0.5), request=WhyRequest("p", "my.xml", True))
     ((_, command),) = list_changes(own)
@@ -106,7 +106,7 @@ def test_a_diagnosis_without_an_answer_asks_for_recordings(tmp_path: Path) -> No
     ("changed", "expected"),
     [
         (["log=nowhere/*.parquet"], "no recording matches nowhere"),
-        (["policy.folder=nowhere"], "nowhere/policy.json is missing"),
+        (["policy=nowhere/x"], "nowhere/x: expected a run folder"),
         (["simulator=mlpp"], "did you mean 'mlp'?"),
         (["simulator=nowhere.xml"], "there is no such file"),
         (["simulator=nowhere:step"], "simulator=nowhere:step"),
@@ -116,7 +116,7 @@ def test_inputs_are_refused_before_the_first_stage(
     brokk: Callable[..., Any], changed: list[str], expected: str
 ) -> None:
     command = {
-        "log": "log=nowhere/*.parquet", "policy.folder": "policy.folder=tasks:policies/borehole_insertion"
+        "log": "log=nowhere/*.parquet", "policy": "policy=tasks:policies/borehole_insertion"
     }  # fmt: skip
     command |= {word.partition("=")[0]: word for word in changed}
     done = brokk("mode=why", *command.values(), "session.out=out")

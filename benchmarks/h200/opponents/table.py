@@ -23,6 +23,7 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.contracts.task import Policy
+from brokk_rl.policy_choice import restore_task
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.statistics import compute_wilson_interval
@@ -102,12 +103,15 @@ class PlantCases:
         }
         self._config = ControlLoopConfig(**parts, effects=instantiate(cfg.effect, _convert_="all"))
         task: Any = self._config.task
-        trained = TrainedPolicy(folder="tasks:policies/borehole_insertion")
+        trained = TrainedPolicy(path="tasks:policies/borehole_insertion", task=None)
         numbers = dataclasses.replace(task.classical, **before)
         self._cases: dict[str, Any] = {
-            "trained": (trained, trained.choose_task(task, self._config.machine, ())),
-            "classical": (ClassicalPolicy(), task),
-            "classical before": (ClassicalPolicy(), dataclasses.replace(task, classical=numbers)),
+            "trained": (trained, restore_task(task, trained.path)),
+            "classical": (ClassicalPolicy(task=None), task),
+            "classical before": (
+                ClassicalPolicy(task=None),
+                dataclasses.replace(task, classical=numbers),
+            ),
             "mpc": (instantiate(cfg.policy, _convert_="all"), task),
         }
         self.results: dict[str, Any] = {}

@@ -22,6 +22,7 @@ from hydra.utils import instantiate
 from matplotlib.figure import Figure
 
 from brokk_rl.kinematics import Kinematics
+from brokk_rl.policy_choice import restore_task
 from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
 from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
@@ -83,11 +84,11 @@ def read_scale(words: list[str]) -> float:
 def draw_trajectories(words: list[str], bundle: Path, picture: Path) -> None:
     """Draw paths of the chisel's tip from above and from the side, and one episode's commands."""
     spec = compose([*words, *CPU])
-    trained = TrainedPolicy(folder=str(bundle))
+    trained = TrainedPolicy(path=str(bundle), task=None)
     config = ControlLoopConfig(
         machine=spec.machine,
         sim=spec.sim,
-        task=trained.choose_task(spec.task, spec.machine, ()),
+        task=restore_task(spec.task, trained.path),
         actuator=spec.actuator,
         effects=spec.effect,
         follower=spec.follower,

@@ -53,7 +53,7 @@ def main(folder: Path, counts: list[int]) -> None:
                 "fault_rate": loop.statistics()["fault_rate"],
             }
             if num == 1024:
-                trained = TrainedPolicy(folder="tasks:policies/borehole_insertion")
+                trained = TrainedPolicy(path="tasks:policies/borehole_insertion", task=None)
                 for name, policy in (
                     ("trained", trained),
                     ("classical", instantiate(cfg["rivals"]["classical"])),
