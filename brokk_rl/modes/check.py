@@ -1,29 +1,35 @@
 """`brokk mode=check`: checks a machine with its task and actuator; makes one of a URDF or MJCF."""
 
+from __future__ import annotations
+
 import dataclasses
 import logging
 import re
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import torch
 import yaml
-from matplotlib.figure import Figure
-from rich.console import Console
 
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.contracts.task import Task
-from brokk_rl.errors import BrokkError
+from brokk_rl.contracts.world import Simulator
+from brokk_rl.errors import BrokkError, ConfigError, StorageError
+from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import compute_tool_kinematics
-from brokk_rl.machine import Machine
+from brokk_rl.machine import Dimension, Machine
 from brokk_rl.plot import BLUE, GREY, ORANGE, make_figure, remove_frame
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json, write_text
-from brokk_rl.sim.check_subject import CheckSubject
-from brokk_rl.sim.machine_check import MachineCheck, check_machine
-from brokk_rl.sim.model_import import import_model
-from brokk_rl.spec import name_spec, spec
+from brokk_rl.spec import Count, name_spec, spec
+
+if TYPE_CHECKING:
+    import torch
+    from matplotlib.figure import Figure
+
+    from brokk_rl.contracts.actuator import ActuatorModel
 
 log = logging.getLogger(__name__)
 
@@ -32,14 +38,122 @@ CLASSES = {
     frozenset({"axis", "origin_m", "mass_kg", "com_m", "yield_force", "stiffness"}): "Body",
 }
 """Class of a table of a machine's file by its keys; the others are the machine and its joints."""
+JOINT_COLUMNS = {
+    "lower": "lower",
+    "upper": "upper",
+    "max_speed": "max speed",
+    "travel_s": "travel, s",
+    "largest_weight": "weight",
+    "yield_force": "yield force",
+}
+"""Figures of a joint in the printed table."""
+
+
+@spec
+class CheckSubject:
+    """Subject and size of a check.
+
+    Attributes:
+        model: URDF or MJCF of a new machine; `None` checks `machine=…`.
+        name: Name of the new machine; `None`: that of its file.
+        chain: Last joint or link of the arm in it, its first and last link, or all its joints; `None`
+            for the longest chain.
+        tip: Site or link of the tool point; `None`: a frame named so, else the far end.
+        gripper: Whether the first joint of the gripper is the last one of the machine.
+        drive: What moves the joints; `auto` reads it off the model.
+        command: Quantity that commands set; `auto`: that of the model's actuators.
+        packages: Folders in which meshes of `package://…` are searched first.
+        num_poses: Random poses from which the reach is read.
+        num_starts: Starts of the task that are drawn, and worlds that are simulated.
+    """
+
+    model: str | None
+    name: str | None
+    chain: str | tuple[str, ...] | None
+    tip: str | None
+    gripper: bool
+    drive: Literal["auto", "electric", "hydraulic"]
+    command: Literal["auto", "valve", "velocity", "position", "torque"]
+    packages: tuple[str, ...]
+    num_poses: Count
+    num_starts: Count
+
+    def check(self) -> None:
+        if self.model is not None and not Path(self.model).is_file():
+            raise ConfigError(f"model: there is no file {self.model} (seen from {Path.cwd()})")
+        if self.name is not None and not re.fullmatch(r"\w+", self.name):
+            raise ConfigError(
+                f"name: expected letters, digits and _, got '{self.name}'; it names files and recordings"
+            )
+
+    @property
+    def chain_names(self) -> tuple[str, ...]:
+        """Names of `chain`; none for the longest."""
+        if isinstance(self.chain, str):
+            return (self.chain,)
+        return self.chain or ()
+
+
+@dataclass
+class MachineCheck:
+    """Result of a check.
+
+    Attributes:
+        problems: Conditions under which the machine cannot be simulated or trained.
+        unfit: What the task or the actuator has against this machine.
+        missing: Numbers and parts that the file lacks, guesses or does not know well.
+        joints: Limits, speed and weight of each joint by name.
+        reach: Extent of the tool point over random poses, m; empty where it is not known.
+        contact: Links that may touch something; empty where there is no model.
+        starts: Shares of starts of the task that can be done.
+        tips_m: Tool points of the random poses, `(P, 3)`; `None` where they are not known.
+        targets_m: Targets that can be reached, `(M, 3)`; `None` without.
+    """
+
+    problems: list[str] = field(default_factory=list)
+    unfit: list[str] = field(default_factory=list)
+    missing: list[str] = field(default_factory=list)
+    joints: dict[str, dict[str, float | None]] = field(default_factory=dict)
+    reach: dict[str, float] = field(default_factory=dict)
+    contact: list[str] = field(default_factory=list)
+    starts: dict[str, float] = field(default_factory=dict)
+    tips_m: np.ndarray | None = None
+    targets_m: np.ndarray | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain JSON data, without the points."""
+        return {key: value for key, value in asdict(self).items() if not key.endswith("_m")}
+
+    def summarise(self) -> str:
+        """Return the verdict in a sentence."""
+        if self.problems:
+            return f"It cannot be simulated or trained; problems: {len(self.problems)}."
+        if self.unfit:
+            return "It can be simulated, but not trained with this task and actuator."
+        return f"It can be simulated and trained. Missing, guessed or mended: {len(self.missing)}."
+
+    def list_remarks(self) -> list[tuple[str, str]]:
+        """Return all findings, each with its kind."""
+        kinds = {"problem": self.problems, "not fitting": self.unfit, "remark": self.missing}
+        return [(kind, text) for kind, texts in kinds.items() for text in texts]
 
 
 @spec
 class Check:
-    """Check a machine with a task and an actuator; make a machine of a URDF or MJCF."""
+    """Check a machine with a task and an actuator; make a machine of a URDF or MJCF.
+
+    Attributes:
+        session: Folder, seed, device.
+        machine: The machine, where no model is given.
+        sim: Physics of the trial.
+        task: Its starts are drawn; a new machine is checked without one.
+        actuator: How commands become motion.
+        subject: What to check.
+    """
 
     session: Session
     machine: Machine
+    sim: Simulator
     task: Task
     actuator: Actuator
     subject: CheckSubject
@@ -51,156 +165,287 @@ class Check:
             ConfigError: The model has no serial chain of hinges and slides.
             StorageError: A file could not be written.
         """
-        machine, remarks = self._choose_machine()
+        folder = self.session.folder
+        is_new = self.subject.model is not None
+        machine, remarks = self._import_model() if is_new else (self.machine, [])
         found = check_machine(machine, self.subject.num_poses, self.session.generator("check"))
         found.missing += remarks
-        starts, targets_m = self._draw_starts(machine, found)
-        self._try_actuator(machine, found)
-        folder = self.session.folder
+        drawn = None if is_new else self._draw_starts(machine, found)
+        if machine.has_bodies and not found.problems:
+            self._try_simulation(machine, found, drawn)
         facts = {
             "schema": 1,
             "machine": machine.name,
-            "task": name_spec(self.task),
+            "task": None if is_new else name_spec(self.task),
             "actuator": name_spec(self.actuator),
-            "starts": starts,
             **found.to_json(),
         }
         write_json(folder / "check.json", facts)
-        picture = _draw_workspace(machine, found, targets_m)
+        picture = _draw_workspace(machine, found)
         if picture:
             picture.savefig(folder / "workspace.png", dpi=130)
-        self._write_report(machine, found, starts, folder)
-        _show(machine, found, starts)
+        _write_report(machine, found, facts, folder)
+        _show(machine, found)
+        if is_new:
+            file = folder / f"{machine.name}.yaml"
+            log.info("machine: %s, beside its MJCF; meshes in a folder of their own", file)
+            print_text(f"next, with a task: brokk mode=check machine=@{file} task=… actuator=lag")
         log.info("report: %s", folder / "check.html")
 
-    def _choose_machine(self) -> tuple[Machine, list[str]]:
-        """Return the machine to check and remarks about it; writes the files of a new one."""
-        if self.subject.model is None:
-            return self.machine, []
-        path = Path(self.subject.model)
-        name = self.subject.name or re.sub(r"\W+", "_", path.stem)
-        imported = import_model(path, name)
+    def _import_model(self) -> tuple[Machine, list[str]]:
+        """Return the machine of the model and remarks about it; writes its files."""
+        from brokk_rl.sim.arm_model import ModelChoices
+        from brokk_rl.sim.model_import import import_model
+
+        subject = self.subject
+        path = Path(subject.model or "")
+        name = subject.name or re.sub(r"\W+", "_", path.stem)
+        choices = ModelChoices(
+            chain=subject.chain_names,
+            tip=subject.tip,
+            gripper=subject.gripper,
+            drive=subject.drive,
+            command=subject.command,
+            packages=subject.packages,
+        )
+        imported = import_model(path, name, choices)
         folder = self.session.folder
+        _write_meshes(folder, imported.meshes)
         write_text(folder / f"{name}.xml", imported.mjcf)
         values = yaml.safe_dump(
             _add_targets(imported.values), sort_keys=False, width=160, default_flow_style=None
         )
         write_text(folder / f"{name}.yaml", f"# {name}, made of {path.name}.\n{values}")
-        log.info(
-            "machine: %s beside its MJCF; machine=@%s",
-            folder / f"{name}.yaml",
-            folder / f"{name}.yaml",
-        )
         mjcf = str((folder / f"{name}.xml").resolve())
         return dataclasses.replace(imported.build(), mjcf=mjcf), imported.remarks
 
-    def _draw_starts(
-        self, machine: Machine, found: MachineCheck
-    ) -> tuple[dict[str, float], np.ndarray | None]:
-        """Return the shares of starts that can be done, and targets of such, `(N, 3)` or `None`."""
-        seed, count = self.session.stream("check"), self.subject.num_starts
+    def _draw_starts(self, machine: Machine, found: MachineCheck) -> dict[str, torch.Tensor] | None:
+        """Return starts of the task, `None` where it has none for this machine."""
+        import torch
+
         if not machine.has_bodies:
-            return {}, None
-        shares: dict[str, float] = {}
+            return None
+        seed, count = self.session.stream("check"), self.subject.num_starts
         try:
             process = self.task.build(machine, 1, torch.device("cpu"))
             if "count_starts" in process.offers:
-                shares = process.count_starts(count, seed)
+                found.starts = process.count_starts(count, seed)
             drawn = process.starts(count, seed)
         except BrokkError as error:
-            found.problems.append(str(error))
-            return shares, None
-        target_m = drawn.get("target_m")
-        return shares, None if target_m is None else target_m.numpy()
+            found.unfit.append(str(error))
+            return None
+        if "target_m" in drawn:
+            found.targets_m = drawn["target_m"].numpy()
+        return drawn
 
-    def _try_actuator(self, machine: Machine, found: MachineCheck) -> None:
+    def _try_simulation(
+        self, machine: Machine, found: MachineCheck, drawn: dict[str, torch.Tensor] | None
+    ) -> None:
+        """Simulate a second of full commands from drawn starts, and say which joint diverges."""
+        import torch
+
+        from brokk_rl.rl.speed_commands import accept_speeds
+        from brokk_rl.sim.machine_trial import try_machine
+
+        num, cpu = self.subject.num_starts, torch.device("cpu")
+        actuator: ActuatorModel | None = None
         try:
-            self.actuator.build(machine, 1, torch.device("cpu"))
+            with torch.random.fork_rng([]):
+                torch.manual_seed(self.session.stream("check"))
+                actuator = accept_speeds(self.actuator.build(machine, num, cpu), machine, num, cpu)
+        except BrokkError as error:
+            found.unfit.append(str(error))
+        try:
+            if fault := try_machine(machine, self.sim, actuator, num, drawn):
+                found.problems.append(fault)
         except BrokkError as error:
             found.problems.append(str(error))
 
-    def _write_report(
-        self, machine: Machine, found: MachineCheck, starts: dict[str, float], folder: Path
-    ) -> None:
-        tone = "bad" if found.problems else "good"
-        page = Report(f"Check of {machine.name}", _summarise(found), tone)
+
+def _write_meshes(folder: Path, meshes: dict[str, bytes]) -> None:
+    try:
+        for file, data in meshes.items():
+            (folder / file).parent.mkdir(exist_ok=True)
+            (folder / file).write_bytes(data)
+    except OSError as error:
+        raise StorageError(f"the meshes could not be written to {folder}: {error}") from error
+
+
+def check_machine(machine: Machine, num_poses: int, generator: np.random.Generator) -> MachineCheck:
+    """Check a machine on `num_poses` random poses within its joint limits."""
+    found = MachineCheck()
+    q = generator.uniform(machine.lower, machine.upper, (num_poses, machine.num_joints))
+    load = None
+    if machine.has_bodies:
+        found.tips_m = compute_tool_kinematics(machine, q).tip_in_base_m
+        distance_m, height_m = np.hypot(*found.tips_m[:, :2].T), found.tips_m[:, 2]
+        found.reach = {
+            "furthest_m": float(distance_m.max()),
+            "nearest_m": float(distance_m.min()),
+            "highest_m": float(height_m.max()),
+            "lowest_m": float(height_m.min()),
+            "share_above_ground": float((height_m > 0.0).mean()),
+        }
+        load = np.abs(Gravity(machine).load(q)).max(0)
+    _check_joints(machine, load, found)
+    _check_model(machine, found)
+    _list_missing(machine, found)
+    return found
+
+
+def _check_joints(machine: Machine, load: np.ndarray | None, found: MachineCheck) -> None:
+    """Fill in the joints, and name those whose limits, speed or force cannot be right."""
+    for j, joint in enumerate(machine.joints):
+        travel, speed = joint.upper.value - joint.lower.value, joint.max_speed.value
+        yield_force = joint.body.yield_force.value if joint.body else None
+        found.joints[joint.name] = {
+            "lower": joint.lower.value,
+            "upper": joint.upper.value,
+            "home": joint.home,
+            "max_speed": speed,
+            "travel_s": travel / speed if speed > 0 else None,
+            "largest_weight": None if load is None else float(load[j]),
+            "yield_force": yield_force,
+        }
+        if travel <= 0:
+            found.problems.append(f"{joint.name}: upper must be above lower")
+        if speed <= 0:
+            found.problems.append(f"{joint.name}: max_speed must be above 0, got {speed:g}")
+        if load is not None and yield_force is not None and yield_force < load[j]:
+            found.missing.append(
+                f"{joint.name}: yield_force {yield_force:g} is less than the weight it carries in its "
+                f"worst pose, {load[j]:.3g}; the drive counts it beyond the weight, so this is allowed"
+            )
+
+
+def _check_model(machine: Machine, found: MachineCheck) -> None:
+    """Compile the MJCF with the machine's numbers, and list the links that touch."""
+    from brokk_rl.sim.model import compile_model, list_touching
+
+    if not machine.has_bodies or machine.mjcf is None:
+        found.missing.append(
+            "without joints[].body, tool_m and mjcf it can be recorded and identified, not simulated"
+        )
+        return
+    try:
+        model = compile_model(machine, machine.period_s / 10.0)
+    except (BrokkError, ValueError) as error:
+        found.problems.append(str(error))
+        return
+    found.contact = [model.body(body).name for body in list_touching(model)]
+    if not found.contact:
+        found.missing.append(
+            "no link can touch anything: contact forces stay 0; give the tool's geoms contype and a <touch> sensor"
+        )
+
+
+def _list_missing(machine: Machine, found: MachineCheck) -> None:
+    """Name the numbers of low confidence, and the parts that only some modes need."""
+    guessed = []
+    for joint in machine.joints:
+        numbers = {"lower": joint.lower, "upper": joint.upper, "max_speed": joint.max_speed}
+        if body := joint.body:
+            numbers |= {
+                "mass_kg": body.mass_kg,
+                "yield_force": body.yield_force,
+                "stiffness": body.stiffness,
+            }
+            numbers |= {f"origin_m.{axis}": body.origin_m[i] for i, axis in enumerate("xyz")}
+        guessed += [f"{joint.name}.{name}" for name, one in numbers.items() if _is_guessed(one)]
+    for axis, one in zip("xyz", machine.tool_m or (), strict=False):
+        if _is_guessed(one):
+            guessed.append(f"tool_m.{axis}")
+    if guessed:
+        found.missing.append(
+            f"{len(guessed)} numbers of low confidence, to measure or to randomise widely: {', '.join(guessed)}"
+        )
+    if not machine.levers and machine.joints[0].command == "valve":
+        found.missing.append(
+            "levers: guidance of a person (mode=deploy) needs the lever of each joint"
+        )
+
+
+def _is_guessed(dimension: Dimension) -> bool:
+    return dimension.confidence == "low"
+
+
+def _write_report(
+    machine: Machine, found: MachineCheck, facts: dict[str, Any], folder: Path
+) -> None:
+    tone = "bad" if found.problems or found.unfit else "good"
+    page = Report(f"Check of {machine.name}", found.summarise(), tone)
+    page.add_facts(
+        {"machine": machine.title, "task": facts["task"] or "none", "actuator": facts["actuator"]}
+    )
+    headings = {
+        "Problems": found.problems,
+        "Not fitting": found.unfit,
+        "Missing, guessed or mended": found.missing,
+    }
+    for heading, texts in headings.items():
+        if texts:
+            page.add_heading(heading)
+            page.add_list(texts)
+    if found.tips_m is not None:
+        page.add_heading("Reach")
+        page.add_picture(
+            folder / "workspace.png", f"Tool points of {len(found.tips_m)} random poses"
+        )
         page.add_facts(
             {
-                "machine": machine.title,
-                "task": name_spec(self.task),
-                "actuator": name_spec(self.actuator),
+                key.replace("_m", ", m").replace("_", " "): f"{value:.2f}"
+                for key, value in found.reach.items()
             }
         )
-        if found.problems:
-            page.add_heading("Problems")
-            page.add_list(found.problems)
-        if found.missing:
-            page.add_heading("Missing or guessed")
-            page.add_list(found.missing)
-        if found.tips_m is not None:
-            page.add_heading("Reach")
-            page.add_picture(
-                folder / "workspace.png", f"Tool points of {len(found.tips_m)} random poses"
-            )
-            page.add_facts(
-                {
-                    key.replace("_m", ", m").replace("_", " "): f"{value:.2f}"
-                    for key, value in found.reach.items()
-                }
-            )
-        if starts:
-            page.add_heading("Starts of the task")
-            page.add_facts(
-                {f"{key}, of candidates": f"{share:.1%}" for key, share in starts.items()}
-            )
-        page.add_heading("Joints")
-        columns = list(next(iter(found.joints.values())))
-        rows = [[name, *figures.values()] for name, figures in found.joints.items()]
-        page.add_table(
-            ["joint", *(column.replace("_s", ", s").replace("_", " ") for column in columns)],
-            rows,
-            "rad, rad/s, Nm; of a sliding joint m, m/s, N. The yield force counts beyond the weight.",
-            digits=5,
+    if found.starts:
+        page.add_heading("Starts of the task")
+        page.add_facts(
+            {f"{key}, of candidates": f"{share:.1%}" for key, share in found.starts.items()}
         )
-        page.add_heading("Contact")
-        page.add_text(
-            f"These links may touch the block, and a touch sensor feels them: {', '.join(found.contact)}."
-            if found.contact
-            else "No link touches anything."
-        )
-        page.write(folder / "check.html")
+    page.add_heading("Joints")
+    columns = list(next(iter(found.joints.values())))
+    rows = [[name, *figures.values()] for name, figures in found.joints.items()]
+    page.add_table(
+        ["joint", *(column.replace("_s", ", s").replace("_", " ") for column in columns)],
+        rows,
+        "rad, rad/s, Nm; of a sliding joint m, m/s, N. The yield force counts beyond the weight.",
+        digits=5,
+    )
+    page.add_heading("Contact")
+    page.add_text(
+        f"These links may touch the block, and a touch sensor feels them: {', '.join(found.contact)}."
+        if found.contact
+        else "No link touches anything."
+    )
+    page.write(folder / "check.html")
 
 
-def _summarise(found: MachineCheck) -> str:
-    if found.problems:
-        return f"It cannot be trained with this task and actuator; problems: {len(found.problems)}."
-    return f"It can be simulated and trained. Missing or guessed: {len(found.missing)}."
-
-
-def _show(machine: Machine, found: MachineCheck, starts: dict[str, float]) -> None:
-    """Print the result."""
-    console = Console(highlight=False)
-    reach = found.reach
-    lines = [f"{machine.name}: {_summarise(found)}"]
-    if reach:
-        lines.append(
-            f"  reach {reach['nearest_m']:.2f} to {reach['furthest_m']:.2f} m, "
+def _show(machine: Machine, found: MachineCheck) -> None:
+    """Print the verdict, the joints, and every remark."""
+    cells = []
+    for name, figures in found.joints.items():
+        cells.append([name, *(_format_figure(figures[key]) for key in JOINT_COLUMNS)])
+    print_text(f"{machine.name}: {found.summarise()}")
+    print_table(["joint", *JOINT_COLUMNS.values()], cells)
+    print_text("rad, rad/s, Nm; of a slide m, m/s, N")
+    if reach := found.reach:
+        print_text(
+            f"reach {reach['nearest_m']:.2f} to {reach['furthest_m']:.2f} m, "
             f"height {reach['lowest_m']:.2f} to {reach['highest_m']:.2f} m"
         )
-    if starts:
-        lines.append(
-            "  starts: " + ", ".join(f"{name} {share:.1%}" for name, share in starts.items())
-        )
-    lines.append(f"  touches: {', '.join(found.contact) or 'nothing'}")
-    lines += [f"  problem: {text}" for text in found.problems]
-    lines += [f"  remark: {text}" for text in found.missing]
-    for line in lines:
-        console.print(line, soft_wrap=True, markup=False)
+    print_text(f"touches: {', '.join(found.contact) or 'nothing'}")
+    if found.starts:
+        shares = [f"{name} {share:.1%}" for name, share in found.starts.items()]
+        print_text(f"starts of the task: {', '.join(shares)}")
+    if remarks := found.list_remarks():
+        print_table([], remarks)
 
 
-def _draw_workspace(
-    machine: Machine, found: MachineCheck, targets_m: np.ndarray | None
-) -> Figure | None:
+def _format_figure(value: float | None) -> str | None:
+    return None if value is None else f"{round(value, 9):.4g}"
+
+
+def _draw_workspace(machine: Machine, found: MachineCheck) -> Figure | None:
     """Draw tool points, targets and the arm at home from the side and from above."""
     if found.tips_m is None:
         return None
@@ -224,9 +469,9 @@ def _draw_workspace(
             label="tool point",
             rasterized=True,
         )
-        if targets_m is not None:
+        if found.targets_m is not None:
             axis.plot(
-                *project(targets_m),
+                *project(found.targets_m),
                 ".",
                 color=ORANGE,
                 markersize=4,

@@ -22,9 +22,45 @@ DAMPING_RATIO = 0.7
 """Of the servo against the inertia seen at the joint at home; a heavier pose is damped less."""
 
 
-MAX_SPEED = 20.0
-"""Joint speed (rad/s or m/s) beyond which a world counts as diverged; forty times what such a
-machine can do."""
+MAX_SPEED, SPEED_MARGIN = 20.0, 4.0
+"""Joint speed (rad/s or m/s) beyond which a world counts as diverged: forty times what `brokk170`
+can do, and a multiple of what a faster machine can."""
+FASTEST_MODE = 0.7
+"""Largest change of phase of the drives' fastest mode in a substep, rad, that a new machine gets: the
+integrator becomes unstable at 2, and `brokk170` reaches 0.9 in its worst pose."""
+
+
+def compute_inertia(model: mujoco.MjModel, q: np.ndarray) -> np.ndarray:
+    """Return the mass matrix of an arm at `q`, `(J, J)`, kg m² or kg."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = q
+    mujoco.mj_forward(model, data)
+    full = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, full)
+    return full
+
+
+def find_fastest_mode(
+    model: mujoco.MjModel, stiffness: np.ndarray, poses: np.ndarray
+) -> tuple[float, int]:
+    """Return the fastest mode of an arm on its drives, rad/s, and the joint that moves most in it.
+
+    Coupled joints swing faster than each alone: what counts is the largest eigenvalue of M⁻¹ K.
+
+    Args:
+        model: Model of the arm alone.
+        stiffness: Of each drive, `(J,)`, Nm/rad or N/m.
+        poses: Poses to look at, `(P, J)`.
+    """
+    fastest, joint = 0.0, 0
+    for q in poses:
+        # symmetric: K^½ M⁻¹ K^½
+        root = np.sqrt(stiffness)
+        inverse = np.linalg.inv(compute_inertia(model, q))
+        values, vectors = np.linalg.eigh(root[:, None] * inverse * root)
+        if values[-1] > fastest:
+            fastest, joint = float(values[-1]), int(np.abs(vectors[:, -1]).argmax())
+    return float(np.sqrt(fastest)), joint
 
 
 def add_drive(spec: mujoco.MjSpec, machine: Machine, inertia: np.ndarray) -> None:
@@ -74,6 +110,7 @@ class DriveReferences:
 
         self.reference = torch.zeros(num_worlds, machine.num_joints, dtype=dtype, device=device)
         self._rate = 1.0 / machine.period_s
+        self._max_speed = max(MAX_SPEED, SPEED_MARGIN * float(machine.max_speed.max()))
         self._lead = constant(damping / stiffness)
         self._leash = constant(
             np.array([body.yield_force.value for body in machine.bodies]) / stiffness
@@ -122,7 +159,7 @@ class DriveReferences:
         The references count because the cut-off at the yield force turns NaN into a force that
         looks sound.
         """
-        return (self.reference.mul(0.0).add_(qvel).abs_().amax(1) <= MAX_SPEED).logical_not_()
+        return (self.reference.mul(0.0).add_(qvel).abs_().amax(1) <= self._max_speed).logical_not_()
 
     def reset(self, mask: torch.Tensor, q: torch.Tensor) -> None:
         """Put the references of the worlds of `mask`, `(N,)` bool, to `q`, `(N, J)`."""

@@ -15,7 +15,7 @@ import numpy as np
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import find_packages, resolve_package_path
-from brokk_rl.sim.drive import add_drive
+from brokk_rl.sim.drive import add_drive, compute_inertia
 from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.scene import add_block, add_objects
 
@@ -48,7 +48,7 @@ def compile_model(
         _remove_visuals(spec)
     model = spec.compile()
     _check_touch(model, machine)
-    add_drive(spec, machine, _compute_joint_inertia(model, machine))
+    add_drive(spec, machine, compute_inertia(model, machine.home).diagonal())
     return spec.compile()
 
 
@@ -86,6 +86,17 @@ def mask_contact_sensors(model: mujoco.MjModel) -> np.ndarray:
     return chosen
 
 
+def list_touching(model: mujoco.MjModel) -> list[int]:
+    """Return the bodies that move and may touch something."""
+    can_touch = (model.geom_contype | model.geom_conaffinity) != 0
+    moving = {
+        int(body)
+        for body in model.geom_bodyid[can_touch]
+        if model.body_dofnum[model.body_weldid[body]]
+    }
+    return sorted(moving)
+
+
 def _read_mjcf(machine: Machine) -> mujoco.MjSpec:
     path = find_mjcf(machine)
     try:  # included rather than attached, so that names stay as the MJCF gives them
@@ -121,13 +132,7 @@ def _check_touch(model: mujoco.MjModel, machine: Machine) -> None:
     """Raise a `ConfigError` where a link can touch something and no touch sensor would feel it."""
     is_touch = model.sensor_type == mujoco.mjtSensor.mjSENS_TOUCH
     felt = {int(model.site_bodyid[site]) for site in model.sensor_objid[is_touch]}
-    can_touch = (model.geom_contype | model.geom_conaffinity) != 0
-    moving = {
-        int(body)
-        for body in model.geom_bodyid[can_touch]
-        if model.body_dofnum[model.body_weldid[body]]
-    }
-    if missing := sorted(moving - felt):
+    if missing := [body for body in list_touching(model) if body not in felt]:
         raise ConfigError(
             f"machine {machine.name}: geoms of {', '.join(model.body(i).name for i in missing)} can touch "
             "the block, but no touch sensor feels it; add a site around them and a <touch> sensor to "
@@ -221,13 +226,6 @@ def _remove_visuals(spec: mujoco.MjSpec) -> None:
         spec.delete(geom)
     for thing in [*spec.cameras, *spec.lights]:
         spec.delete(thing)
-
-
-def _compute_joint_inertia(model: mujoco.MjModel, machine: Machine) -> np.ndarray:
-    """Return the diagonal of the mass matrix at home, `(J,)`."""
-    data = mujoco.MjData(model)
-    data.qpos[:] = machine.home
-    mujoco.mj_forward(model, data)
-    full = np.zeros((model.nv, model.nv))
-    mujoco.mj_fullM(model, data, full)
-    return np.diag(full).copy()
+    used = {geom.meshname for geom in spec.geoms}
+    for mesh in [one for one in spec.meshes if one.name not in used]:
+        spec.delete(mesh)

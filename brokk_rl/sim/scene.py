@@ -79,6 +79,14 @@ def make_nominal_scenes(num_worlds: int, device: torch.device | str = "cpu") -> 
     return torch.tensor(scene, device=device).repeat(num_worlds, 1)
 
 
+def make_empty_scenes(num_worlds: int, device: torch.device | str = "cpu") -> torch.Tensor:
+    """Return scenes without anything to touch, `(N, S)`: block and ground are far away and below."""
+    scene = make_nominal_scenes(num_worlds, device)
+    scene[:, COLUMNS.index("hole_x_m")] = 2.0 * FAR_M
+    scene[:, COLUMNS.index("rim_z_m")] = -2.0 * FAR_M
+    return scene
+
+
 def build_collision_geoms(scale: float, radius_m: float) -> BlockGeoms:
     """Return the colliding boxes of a block; sizes and positions are affine in both arguments."""
     length, width, middle = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale, -HEIGHT_M / 2

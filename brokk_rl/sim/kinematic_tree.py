@@ -1,0 +1,387 @@
+"""Choice of one arm in a model: a chain of hinges and slides among legs, fingers, loops and objects."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import mujoco
+
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.sim.model_source import KINDS, ModelSource
+
+GRIPPER = re.compile("grip|finger|jaw|claw|knuckle|thumb|pincer", re.IGNORECASE)
+"""Names of joints and links of grippers."""
+LOCK = 1e5
+"""Damping beyond which a joint without limits is a lock, as bases in scenes have it (1e11), Nm s/rad."""
+_TIES = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+CLOSES_LOOP = "closes a loop"
+
+
+@dataclass
+class ArmChain:
+    """The joints of an arm.
+
+    Attributes:
+        joints: From the base to the tool.
+        root: Body at its foot.
+        gripper: Joints of its gripper that are not part of the chain.
+        left_out: Other joints of the robot.
+    """
+
+    joints: list[int]
+    root: int
+    gripper: list[int] = field(default_factory=list)
+    left_out: list[int] = field(default_factory=list)
+
+
+class KinematicTree:
+    """Joints of a model that a drive can move, and their order.
+
+    Args:
+        source: The model.
+
+    Attributes:
+        loops: Sentences about loops that `<equality>` closes.
+        has_cylinders: Whether a slide closes a loop, as hydraulic cylinders do.
+    """
+
+    def __init__(self, source: ModelSource) -> None:
+        self._source, self.model = source, source.model
+        self.loops: list[str] = []
+        self.has_cylinders = False
+        self._passive: dict[int, str] = {}
+        for joint in range(self.model.njnt):
+            leader = source.followers.get(self.model.joint(joint).name)
+            if leader is not None:
+                self._passive[joint] = f"follows {leader}, so it is no joint of its own"
+            elif int(self.model.jnt_type[joint]) not in KINDS:
+                self._passive[joint] = "is neither a hinge nor a slide"
+            elif self._is_locked(joint):
+                self._passive[joint] = "cannot move: it has no limits and a damping like a lock"
+        self._cut_loops()
+
+    def choose(self, chain: Sequence[str], tip: str | None, with_gripper: bool) -> ArmChain:
+        """Return the arm: the one that is named, else the longest chain.
+
+        Args:
+            chain: Last joint or link, first and last link, or all joints; empty for the longest.
+            tip: Site or link of the tool point, which the chain must move.
+            with_gripper: Whether the first joint of the gripper is the last of the chain.
+
+        Raises:
+            ConfigError: There is no chain, several are alike, or a name is unknown.
+        """
+        gripper: list[int] = []
+        if chain:
+            joints = self._choose_named(chain)
+        else:
+            joints, gripper = self._find_longest()
+            beyond = self.list_above(self.find_frame(tip)[1]) if tip else []
+            if tip and not set(beyond) <= {*joints, *gripper}:
+                joints, gripper = beyond, []
+        if with_gripper and gripper:
+            joints = [*joints, gripper[0]]
+            gripper = gripper[1:]
+        used = {*joints, *gripper}
+        roots = self.model.body_rootid[self.model.jnt_bodyid]
+        root = int(roots[joints[0]])
+        others = [one for one in self._driven if one not in used and roots[one] == root]
+        return ArmChain(joints, root, gripper, others)
+
+    def name(self, joint: int) -> str:
+        """Return the name of a joint; one without is called by its body."""
+        found = self.model.joint(joint).name
+        return found or f"joint of {self.model.body(int(self.model.jnt_bodyid[joint])).name}"
+
+    def list_names(self, joints: Sequence[int]) -> str:
+        """Return the names of joints with commas between."""
+        return ", ".join(self.name(joint) for joint in joints)
+
+    def list_above(self, body: int, driven: bool = True) -> list[int]:
+        """Return the joints that move a body, from the base on."""
+        found: list[int] = []
+        while body:
+            first = int(self.model.body_jntadr[body])
+            own = range(first, first + int(self.model.body_jntnum[body]))
+            found = [joint for joint in own if not driven or joint not in self._passive] + found
+            body = int(self.model.body_parentid[body])
+        return found
+
+    def find_frame(self, name: str) -> tuple[str, int]:
+        """Return `site` or `body` and the body of a frame.
+
+        Raises:
+            ConfigError: There is none of this name.
+        """
+        for site in range(self.model.nsite):
+            if self.model.site(site).name == name:
+                return "site", int(self.model.site_bodyid[site])
+        for body in range(1, self.model.nbody):
+            if self.model.body(body).name == name:
+                return "body", body
+        names = [self.model.site(i).name for i in range(self.model.nsite)]
+        names += [self.model.body(i).name for i in range(1, self.model.nbody)]
+        raise ConfigError(
+            f"subject.tip={name}: {self._source.path.name} has no such site or link; {list_choices(name, names)}"
+        )
+
+    def describe_held(self, chain: ArmChain) -> list[str]:
+        """Return sentences about all joints that the machine does not have."""
+        said = list(self.loops)
+        inside = self.list_above(int(self.model.jnt_bodyid[chain.joints[-1]]), driven=False)
+        reasons: dict[str, list[int]] = {}
+        for joint, why in self._passive.items():
+            same_robot = int(self.model.body_rootid[self.model.jnt_bodyid[joint]]) == chain.root
+            if same_robot and why != CLOSES_LOOP and not self._is_free(joint):
+                reasons.setdefault(why, []).append(joint)
+        for why, joints in reasons.items():
+            said.append(f"{self.list_names(joints)} {why}; held where drawn.")
+        if chain.gripper:
+            said.append(
+                f"The gripper ({self.list_names(chain.gripper)}) is held where it is drawn; subject.gripper=true makes "
+                "its first joint the last of the machine."
+            )
+        if chain.left_out:
+            said.append(
+                f"{self.list_names(chain.left_out)} are not part of the chain and are held where they are drawn; "
+                "subject.chain=<joint or link> chooses another."
+            )
+        if any(self._is_free(joint) for joint in inside):
+            said.append(
+                f"The base ({self.model.body(chain.root).name}) floats in the model; here it stands still."
+            )
+        return said
+
+    @cached_property
+    def _driven(self) -> list[int]:
+        return [joint for joint in range(self.model.njnt) if joint not in self._passive]
+
+    @cached_property
+    def _children(self) -> dict[int, list[int]]:
+        """Driven joints behind each; -1 is the base."""
+        children: dict[int, list[int]] = {-1: []} | {joint: [] for joint in self._driven}
+        for joint in self._driven:
+            above = self.list_above(int(self.model.jnt_bodyid[joint]))
+            place = above.index(joint)
+            children[above[place - 1] if place else -1].append(joint)
+        return children
+
+    def _count_depth(self, joint: int) -> int:
+        """Return the number of joints of the longest chain that begins with a joint."""
+        return 1 + max((self._count_depth(child) for child in self._children[joint]), default=0)
+
+    def _list_behind(self, joint: int) -> list[int]:
+        found = [joint]
+        for child in self._children[joint]:
+            found += self._list_behind(child)
+        return found
+
+    def _is_free(self, joint: int) -> bool:
+        return int(self.model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_FREE
+
+    def _is_locked(self, joint: int) -> bool:
+        damping = self.model.dof_damping[self.model.jnt_dofadr[joint]]
+        return bool(damping > LOCK and not self.model.jnt_limited[joint])
+
+    def _cut_loops(self) -> None:
+        """Take the passive side of each loop that `<equality>` closes out of the tree."""
+        model = self.model
+        for number in range(model.neq):
+            if int(model.eq_type[number]) not in _TIES:
+                continue
+            ends = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
+            if model.eq_objtype[number] == mujoco.mjtObj.mjOBJ_SITE:
+                ends = [int(model.site_bodyid[end]) for end in ends]
+            paths = [self.list_above(end) for end in ends]
+            if not all(paths):  # a mocap body or the world
+                continue
+            sides = [[joint for joint in paths[i] if joint not in paths[1 - i]] for i in range(2)]
+            ranked = sorted(range(2), key=lambda i: self._rank_side(ends[i], sides[i]))
+            passive, kept = sides[ranked[0]], sides[ranked[1]]
+            if not passive or not kept:
+                continue
+            self.has_cylinders |= any(self._is_slide(joint) for joint in passive)
+            names = self.list_names(passive)
+            for joint in passive:
+                self._passive[joint] = CLOSES_LOOP
+            self.loops.append(
+                f"<equality> closes a loop of {names} with {self.list_names(kept)}; {names} are left out, and "
+                f"{self.name(kept[-1])} is driven directly."
+            )
+
+    def _rank_side(self, end: int, side: list[int]) -> tuple[bool, bool, float]:
+        """Return how much a side of a loop is the arm: joints go on behind it, no slide, mass."""
+        model = self.model
+        goes_on = any(
+            body > end and end in self._list_parents(body) and model.body_jntnum[body]
+            for body in range(model.nbody)
+        )
+        has_slide = any(self._is_slide(joint) for joint in side)
+        return goes_on, not has_slide, float(model.body_subtreemass[end])
+
+    def _list_parents(self, body: int) -> list[int]:
+        found = []
+        while body:
+            body = int(self.model.body_parentid[body])
+            found.append(body)
+        return found
+
+    def _is_slide(self, joint: int) -> bool:
+        return int(self.model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
+
+    def _find_longest(self) -> tuple[list[int], list[int]]:
+        """Return the joints of the longest chain, and those of the gripper at its end."""
+        chain: list[int] = []
+        children = self._choose_tree()
+        while children:
+            ranked = sorted(children, key=self._count_depth, reverse=True)
+            if self._is_gripper(chain, ranked):
+                behind = [joint for child in ranked for joint in self._list_behind(child)]
+                return chain, behind
+            chain.append(self._choose_branch(chain, ranked))
+            children = self._children[chain[-1]]
+        return chain, []
+
+    def _choose_tree(self) -> list[int]:
+        """Return the first joints of the robot with the longest chain.
+
+        Raises:
+            ConfigError: Nothing moves, or several robots are alike.
+        """
+        trees: dict[int, list[int]] = {}
+        for joint in self._children[-1]:
+            root = int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
+            trees.setdefault(root, []).append(joint)
+        if not trees:
+            raise self._refuse(
+                "it has no joint that moves"
+                + self._describe_passive()
+                + "; a fragment that a scene "
+                "includes has none either: give the scene"
+            )
+        depth = {
+            root: max(self._count_depth(joint) for joint in joints)
+            for root, joints in trees.items()
+        }
+        fixed = [root for root in trees if not self._is_floating(root)]
+        candidates = fixed if fixed and max(depth[root] for root in fixed) > 1 else list(trees)
+        most = max(depth[root] for root in candidates)
+        alike = [root for root in candidates if depth[root] == most]
+        if len(alike) > 1 and most > 1:
+            alike = [root for root in alike if self._has_drive(trees[root])] or alike
+        if len(alike) > 1 and most > 1:
+            names = ", ".join(self.model.body(root).name for root in alike)
+            ends = [self._name_end(max(trees[root], key=self._count_depth)) for root in alike]
+            raise self._refuse(
+                f"{len(alike)} robots ({names}) have {most} joints each; name the last joint of one: "
+                f"subject.chain={' or subject.chain='.join(ends)}"
+            )
+        return trees[alike[0]]
+
+    def _describe_passive(self) -> str:
+        said = [f"{self.name(joint)} {why}" for joint, why in self._passive.items()]
+        return f" ({'; '.join(said)})" if said else ""
+
+    def _is_floating(self, root: int) -> bool:
+        joints = self.model.body_jntnum[root]
+        return bool(joints) and self._is_free(int(self.model.body_jntadr[root]))
+
+    def _is_gripper(self, chain: list[int], ranked: list[int]) -> bool:
+        """Return whether the branches behind a chain are fingers: named so, or short and alike."""
+        if not chain:
+            return False
+        body = self.model.body(int(self.model.jnt_bodyid[ranked[0]])).name
+        depths = [self._count_depth(joint) for joint in ranked]
+        is_short = depths[0] < max(len(chain), 2)
+        if GRIPPER.search(f"{self.name(ranked[0])} {body}") and is_short:
+            return len(chain) > 1 or len(ranked) > 1
+        return len(ranked) > 1 and depths[0] == depths[1] and is_short
+
+    def _choose_branch(self, chain: list[int], ranked: list[int]) -> int:
+        """Return the joint with which the chain goes on.
+
+        Raises:
+            ConfigError: Several branches are alike: legs, fingers or two arms.
+        """
+        depths = [self._count_depth(joint) for joint in ranked]
+        alike = [
+            joint
+            for joint, depth in zip(ranked, depths, strict=True)
+            if depth >= depths[0] - 1 and (depth > 1 or depths[0] == 1)
+        ]
+        if len(alike) > 1 and depths[0] > 1:
+            alike = [joint for joint in alike if self._has_drive([joint])] or alike
+        if len(alike) == 1:
+            return alike[0]
+        base = int(self.model.body_parentid[self.model.jnt_bodyid[alike[0]]])
+        where = self.model.body(base).name
+        ends = [self._name_end(joint) for joint in alike]
+        if depths[0] == 1 and not chain:
+            raise self._refuse(
+                f"{len(alike)} single joints hang on '{where}' side by side ({', '.join(ends)}), such as wheels; "
+                "expected a chain of joints, an arm. Name one: subject.chain=" + ends[0]
+            )
+        kind = "two arms or legs" if len(alike) == 2 else "legs or fingers"
+        raise self._refuse(
+            f"{len(alike)} chains of {depths[0]} joints leave '{where}' ({', '.join(ends)}): {kind}. A machine is one "
+            f"arm on a base that stands still, so a robot that walks cannot be trained here (mjlab and Isaac Lab "
+            f"can). One of them as an arm: subject.chain={ends[0]}"
+        )
+
+    def _has_drive(self, joints: list[int]) -> bool:
+        """Return whether an actuator moves a joint of these or behind them."""
+        model = self.model
+        moved = set()
+        for actuator in range(model.nu):
+            if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
+                moved.add(int(model.actuator_trnid[actuator, 0]))
+        return any(behind in moved for joint in joints for behind in self._list_behind(joint))
+
+    def _name_end(self, joint: int) -> str:
+        """Return the name of the last joint of the longest chain behind one."""
+        while self._children[joint]:
+            joint = max(self._children[joint], key=self._count_depth)
+        return self.name(joint)
+
+    def _choose_named(self, names: Sequence[str]) -> list[int]:
+        """Return the joints of a chain that is named by its end, its ends, or its joints."""
+        model = self.model
+        by_name = {self.name(joint): joint for joint in range(model.njnt)}
+        found: list[tuple[int | None, int]] = []
+        for name in names:
+            if name in by_name:
+                joint = by_name[name]
+                if joint in self._passive:
+                    raise self._refuse(f"subject.chain: {name} {self._passive[joint]}")
+                found.append((joint, int(model.jnt_bodyid[joint])))
+                continue
+            bodies = [i for i in range(1, model.nbody) if model.body(i).name == name]
+            if not bodies:
+                listed = [*by_name, *(model.body(i).name for i in range(1, model.nbody))]
+                raise self._refuse(
+                    f"subject.chain: there is no joint or link '{name}'; {list_choices(name, listed)}"
+                )
+            found.append((None, bodies[0]))
+        joint, end = found[-1]
+        path = self.list_above(end)
+        if joint is not None:
+            path = path[: path.index(joint) + 1]
+        chosen = [one for one, _ in found]
+        if len(found) > 1 and None not in chosen:
+            if beside := [self.name(one) for one in chosen if one is not None and one not in path]:
+                raise self._refuse(
+                    f"subject.chain: {', '.join(beside)} do not lie on the way to {names[-1]}"
+                )
+            return [one for one in path if one in chosen]
+        if len(found) > 1:
+            before = self.list_above(found[0][1])
+            path = [one for one in path if one not in before]
+        if not path:
+            raise self._refuse(f"subject.chain={','.join(names)}: no joint moves it")
+        return path
+
+    def _refuse(self, text: str) -> ConfigError:
+        return ConfigError(f"subject.model={self._source.path}: {text}")
