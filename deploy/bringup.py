@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.bus.description import GATEWAY, REMOTE, BusDescription
 from deploy.recorder.capture import MCAP, CaptureConfig
 from deploy.recorder.capture_reader import read_capture
@@ -163,18 +163,11 @@ class BringupChecklist(BusAndPolicySettings):
         rate: Smallest part of a message's nominal rate.
     """
 
-    listen_s: float
-    patience_s: float
-    shadow_s: float
-    quiet: float
-    rate: float
-
-    def check(self) -> None:
-        for name in ("listen_s", "patience_s", "shadow_s", "quiet", "rate"):
-            if getattr(self, name) <= 0:
-                raise ConfigError(
-                    f"bringup.{name}: expected more than 0, got {getattr(self, name)}"
-                )
+    listen_s: Positive
+    patience_s: Positive
+    shadow_s: Positive
+    quiet: Positive
+    rate: Positive
 
     def run(
         self,

@@ -10,12 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Lever, Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 AXES = (("left", "theta"), ("left", "psi"), ("right", "theta"), ("right", "psi"))
 """Order of the four axes everywhere in `deploy`."""
@@ -54,14 +56,8 @@ class LeverGuidance:
     """
 
     levers: tuple[Lever, ...] | None
-    dead_zone: float
-    max_rate_rad_s: float
-
-    def check(self) -> None:
-        if not 0 <= self.dead_zone < 1 or self.max_rate_rad_s <= 0:
-            raise ConfigError(
-                "guidance: expected dead_zone in [0, 1) and max_rate_rad_s of more than 0"
-            )
+    dead_zone: Annotated[float, Interval(ge=0, lt=1)]
+    max_rate_rad_s: Positive
 
 
 def find_full_angles_rad(levers: Sequence[Lever]) -> np.ndarray:

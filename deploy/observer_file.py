@@ -10,16 +10,17 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
+from annotated_types import Ge, Interval
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, read_recordings
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.guard.limits import GuardLimits, ObserverLimits
 from deploy.guard.observer import Observer
 from deploy.guard.valve_model import SCHEMA, describe_sources, load_observer_file
@@ -116,19 +117,10 @@ class ThresholdSettings:
         margin: Slack over the largest difference in the recordings.
     """
 
-    window_s: float
-    share: float
-    least_slack_s: float
-    margin: float
-
-    def check(self) -> None:
-        if min(self.window_s, self.least_slack_s) <= 0 or not 0 < self.share < 1:
-            raise ConfigError(
-                "observe.thresholds: expected window_s and least_slack_s of more than 0 and share in (0, 1), "
-                f"got {self.window_s}, {self.least_slack_s} and {self.share}"
-            )
-        if not self.margin >= 1:
-            raise ConfigError(f"observe.thresholds.margin: expected 1 or more, got {self.margin}")
+    window_s: Positive
+    share: Annotated[float, Interval(gt=0, lt=1)]
+    least_slack_s: Positive
+    margin: Annotated[float, Ge(1)]
 
 
 @spec

@@ -25,7 +25,7 @@ from brokk_rl.contracts.actuator import Actuator, Excitation
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, make_motion
-from brokk_rl.spec import name_spec, spec
+from brokk_rl.spec import Count, Positive, name_spec, spec
 from diagnosis import effect_library
 from diagnosis.case import estimate_running_s
 from diagnosis.effect_library import EffectSimulator, EffectType
@@ -125,16 +125,9 @@ class TellableEffects:
     prices: Penalties
     error: ExpectedError
     excitations: dict[str, Excitation]
-    num_windows: int
-    num_compared: int
-    compared_s: float
-
-    def check(self) -> None:
-        if self.num_windows < 1 or self.num_compared < 1 or self.compared_s <= 0:
-            raise ConfigError(
-                "preview: expected num_windows and num_compared of 1 or more and compared_s above 0, got "
-                f"{self.num_windows}, {self.num_compared} and {self.compared_s}"
-            )
+    num_windows: Count
+    num_compared: Count
+    compared_s: Positive
 
     def assess(
         self,

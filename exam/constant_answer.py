@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Share, spec
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Verdict, Where
 
 
@@ -20,11 +19,7 @@ class ConstantAnswer:
     """
 
     effect: str | None
-    probability: float
-
-    def check(self) -> None:
-        if not 0 <= self.probability <= 1:
-            raise ConfigError(f"candidate.probability: expected 0 to 1, got {self.probability}")
+    probability: Share
 
     def answer(self, case: Path, out: Path, machine: Machine) -> None:
         """Write it."""

@@ -8,14 +8,15 @@ places coarsely, far ones finely, so that a hole is as many pixels wide everywhe
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.contracts.vision import Ellipse
-from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.calibrate.disparity_error import correct_depth
 from perception.stereo import PicturePart, Stereo
 
@@ -41,15 +42,8 @@ class FaceDepth:
     """
 
     stereo: Stereo
-    radius_px: float
-    extent: float
-
-    def check(self) -> None:
-        if self.radius_px <= 0 or self.extent < 1:
-            raise ConfigError(
-                "perception.faces: expected radius_px above 0 and extent of 1 or more, got "
-                f"{self.radius_px} and {self.extent}"
-            )
+    radius_px: Positive
+    extent: Annotated[float, Ge(1)]
 
     def build(self, frame: Frame, on_block: np.ndarray) -> FaceMatcher | None:
         """Return the matcher of a frame; `None` where its depth is fine enough, or has no pair.

@@ -7,14 +7,14 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import cv2
 import numpy as np
 
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
-from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 from perception import rectification, search
 from perception.contracts import (
     EllipseDetectorSpec,
@@ -151,24 +151,15 @@ class StagedPerception:
     proposer: HoleProposerSpec | None
     regions_first: bool
     pose: PoseEstimatorSpec
-    radius_m: float
-    size_slack: float
+    radius_m: Positive
+    size_slack: NonNegative
     comfortable_px: float
     smallest_block: float
     block_probability: float
-    roi: str
+    roi: Literal["mask", "box"]
     apart: float
     faces: FaceDepth | None
     rectification: RectificationCheck | None
-
-    def check(self) -> None:
-        if self.roi not in ("mask", "box"):
-            raise ConfigError(f"perception.roi: expected mask or box, got '{self.roi}'")
-        if self.radius_m <= 0 or self.size_slack < 0:
-            raise ConfigError(
-                "perception: expected radius_m > 0 and size_slack >= 0, got "
-                f"{self.radius_m} and {self.size_slack}"
-            )
 
     def build(self) -> StagedFinder:
         """Return a finder."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose
-from brokk_rl.errors import ConfigError, StorageError
+from brokk_rl.errors import StorageError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 # Colours in OpenCV's order, blue first.
 BLOCK = (255, 180, 60)
@@ -35,16 +37,9 @@ class OverlayDrawing:
         num_sigma: Size of the drawn uncertainty of a centre, in standard deviations.
     """
 
-    width_px: int
-    axis_m: float
+    width_px: Annotated[int, Ge(64)]
+    axis_m: Positive
     num_sigma: float
-
-    def check(self) -> None:
-        if self.width_px < 64 or self.axis_m <= 0:
-            raise ConfigError(
-                "overlay: expected width_px >= 64 and axis_m > 0, got "
-                f"{self.width_px} and {self.axis_m}"
-            )
 
     def write(self, path: Path, frame: Frame, detections: FrameDetections) -> None:
         """Write the picture in one step; see `perception.contracts.Overlay`."""

@@ -14,9 +14,8 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from brokk_rl.contracts.vision import Rejection
-from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 
 # All numbers below were chosen by hand.
 REASON = "vertical disparity of the pair, px"
@@ -76,15 +75,8 @@ class RectificationCheck:
         num_sigma: Standard deviations by which it must exceed the limit.
     """
 
-    limit_px: float
-    num_sigma: float
-
-    def check(self) -> None:
-        if self.limit_px <= 0 or self.num_sigma < 0:
-            raise ConfigError(
-                "perception.rectification: expected limit_px above 0 and num_sigma of 0 or more, "
-                f"got {self.limit_px} and {self.num_sigma}"
-            )
+    limit_px: Positive
+    num_sigma: NonNegative
 
     def find_fault(self, frame: Frame) -> Rejection | None:
         """Return why the pair of a frame is refused; `None` if it is not, or nothing can be seen."""

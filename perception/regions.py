@@ -11,14 +11,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.contracts.vision import Ellipse, Masks
-from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.pose import plane, rim
 from perception.pose.plane_conic import convert_to_gray
 from perception.segment.depth_plane import scale_noise
@@ -71,21 +72,14 @@ class FaceRegions:
         void: Least part of the inside without depth or behind the face, less that of the ring.
     """
 
-    radius_m: float
-    radius_px: float
+    radius_m: Positive
+    radius_px: Annotated[float, Ge(4)]
     noise_per_m: float
     border: float
     weak_border: float
     darker: float
     hole_mask: float
     void: float
-
-    def check(self) -> None:
-        if self.radius_m <= 0 or self.radius_px < 4:
-            raise ConfigError(
-                "perception.proposer: expected radius_m > 0 and radius_px >= 4, got "
-                f"{self.radius_m} and {self.radius_px}"
-            )
 
     def build(self) -> FaceRegionProposer:
         """Return a proposer."""

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 
 _SMOOTH_PX = 0.8
 """Blur of both pictures before refinement: noise would bias the gradient. Chosen by hand."""
@@ -67,9 +67,9 @@ class Stereo:
         farthest_m: Largest depth.
     """
 
-    shrink: int
-    nearest_m: float
-    window_px: int
+    shrink: Count
+    nearest_m: Positive
+    window_px: Count
     smoothness: float
     uniqueness: int
     consistency_px: int
@@ -77,26 +77,17 @@ class Stereo:
     speckle_range_px: int
     refinements: int
     least_gain: float
-    refinement_px: int
+    refinement_px: Count
     farthest_m: float
 
     def check(self) -> None:
-        if not 0 < self.nearest_m < self.farthest_m:
+        if self.nearest_m >= self.farthest_m:
             raise ConfigError(
-                "stereo: expected 0 < nearest_m < farthest_m, got "
-                f"{self.nearest_m} and {self.farthest_m}"
+                f"nearest_m: expected less than farthest_m={self.farthest_m}, got {self.nearest_m}"
             )
-        if self.shrink < 1:
-            raise ConfigError(f"stereo.shrink: expected 1 or more, got {self.shrink}")
-        if (
-            min(self.window_px, self.refinement_px) < 1
-            or self.window_px % 2 == 0
-            or self.refinement_px % 2 == 0
-        ):
-            raise ConfigError(
-                "stereo: windows are odd and positive, got "
-                f"{self.window_px} and {self.refinement_px}"
-            )
+        for name in ("window_px", "refinement_px"):
+            if getattr(self, name) % 2 == 0:
+                raise ConfigError(f"{name}: expected an odd number, got {getattr(self, name)}")
 
     def depth_m(
         self, left: np.ndarray, right: np.ndarray, focal_px: float, baseline_m: float

@@ -13,16 +13,17 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.contracts.target import MotionPlan, TargetReading
 from brokk_rl.contracts.vision import BoreholeFinder, FinderSpec, HolePose, TrackedHole, TrackerSpec
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception.calibrate import transforms
 from perception.mount.mounts import CameraMount, CameraMountSpec
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
@@ -59,23 +60,12 @@ class PerceivedTarget:
     mount: CameraMountSpec
     next_view: ExpectedCovariance
     arm: ArmShape
-    rate_hz: float
-    delay_s: float
-    window_px: tuple[int, int]
-    hint_m: float
-    steady_rad_s: float
-    num_processes: int
-
-    def check(self) -> None:
-        if self.rate_hz <= 0 or min(self.delay_s, self.hint_m) < 0 or self.steady_rad_s <= 0:
-            raise ConfigError(
-                "target: expected rate_hz and steady_rad_s above 0, delay_s and hint_m of 0 or more"
-            )
-        if min(self.window_px) < 64 or self.num_processes < 1:
-            raise ConfigError(
-                "target: expected window_px of 64 or more and num_processes of 1 or more, got "
-                f"{self.window_px} and {self.num_processes}"
-            )
+    rate_hz: Positive
+    delay_s: NonNegative
+    window_px: tuple[Annotated[int, Ge(64)], Annotated[int, Ge(64)]]
+    hint_m: NonNegative
+    steady_rad_s: Positive
+    num_processes: Count
 
     def sense(self, machine: Machine, num_envs: int, seed: int) -> PerceivedTargets:
         """Return the cameras of `num_envs` environments."""

@@ -9,7 +9,7 @@ import numpy as np
 from brokk_rl.contracts.vision import FrameDetections, HolePose
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 
 
 @spec
@@ -26,17 +26,12 @@ class TruthPerception:
 
     center_in_base_m: tuple[float, float, float]
     axis_in_base: tuple[float, float, float]
-    radius_m: float
-    std_m: float
+    radius_m: Positive
+    std_m: NonNegative
 
     def check(self) -> None:
         if abs(float(np.linalg.norm(self.axis_in_base)) - 1.0) > 1e-6:
-            raise ConfigError(f"perception.axis_in_base: {self.axis_in_base} is not a unit vector")
-        if self.radius_m <= 0 or self.std_m < 0:
-            raise ConfigError(
-                "perception: expected radius_m > 0 and std_m >= 0, got "
-                f"{self.radius_m} and {self.std_m}"
-            )
+            raise ConfigError(f"axis_in_base: {self.axis_in_base} is not a unit vector")
 
     def build(self) -> TruthFinder:
         """Return a finder that always finds this borehole."""

@@ -8,7 +8,7 @@ from actuators.excite.poses import draw_start_poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine, mask_exclusive_joints
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, Share, spec
 
 
 @spec
@@ -32,28 +32,26 @@ class Levels:
 
     share: float
     pose_s: float
-    turn_s: float
+    turn_s: Positive
     exclusive_share: float
-    shortest_s: float
+    shortest_s: Positive
     longest_s: float
-    zero_share: float
-    small_share: float
+    zero_share: Share
+    small_share: Share
     small_level: float
     stop_margin: float
 
     def check(self) -> None:
-        if not 0 < self.shortest_s <= self.longest_s:
+        if self.shortest_s > self.longest_s:
             raise ConfigError(
-                f"excitation: expected 0 < shortest_s <= longest_s, got {self.shortest_s} and {self.longest_s}"
+                f"longest_s: expected shortest_s={self.shortest_s} or more, got {self.longest_s}"
             )
-        if not 0 <= self.zero_share + self.small_share <= 1:
+        if self.zero_share + self.small_share > 1:
             raise ConfigError(
-                f"excitation: zero_share + small_share must lie in [0, 1], got {self.zero_share + self.small_share}"
+                f"zero_share: expected 1 or less with small_share, got {self.zero_share + self.small_share}"
             )
-        if not 0 < self.turn_s <= self.pose_s:
-            raise ConfigError(
-                f"excitation: expected 0 < turn_s <= pose_s, got {self.turn_s} and {self.pose_s}"
-            )
+        if self.turn_s > self.pose_s:
+            raise ConfigError(f"pose_s: expected turn_s={self.turn_s} or more, got {self.pose_s}")
 
     def weight(self, before: float) -> float:
         """Return `share`."""

@@ -2,15 +2,17 @@
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import count
+from typing import Annotated
 
 import numpy as np
+from annotated_types import MinLen
 from numpy.typing import ArrayLike
 
 from actuators.excite.poses import draw_start_poses
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 
 class Motif:
@@ -109,16 +111,10 @@ class Ramps(Motif):
     """
 
     share: float
-    slopes_per_s: tuple[float, ...]
+    slopes_per_s: Annotated[tuple[Positive, ...], MinLen(1)]
     highest: float
     reach: float
     stop_margin: float
-
-    def check(self) -> None:
-        if not self.slopes_per_s or min(self.slopes_per_s) <= 0:
-            raise ConfigError(
-                f"excitation: slopes_per_s: expected one or more above 0, got {list(self.slopes_per_s)}"
-            )
 
     def programs(
         self, machine: Machine, generator: np.random.Generator

@@ -14,9 +14,10 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
+from annotated_types import Interval
 
 from actuators.excite.schedule import Approach, ExcitationPlan
 from brokk_rl.commands import SpeedProgram, find_rest, read_targets
@@ -25,7 +26,7 @@ from brokk_rl.errors import ConfigError, LinkError
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 
 @spec
@@ -39,18 +40,8 @@ class CommandGuards:
             a machine whose geometry is known.
     """
 
-    max_command: float
-    max_tool_speed_m_s: float | None
-
-    def check(self) -> None:
-        if not 0 < self.max_command <= 1:
-            raise ConfigError(
-                f"collect.guards.max_command: expected (0, 1], got {self.max_command}"
-            )
-        if self.max_tool_speed_m_s is not None and self.max_tool_speed_m_s <= 0:
-            raise ConfigError(
-                f"collect.guards.max_tool_speed_m_s: expected more than 0 or null, got {self.max_tool_speed_m_s}"
-            )
+    max_command: Annotated[float, Interval(gt=0, le=1)]
+    max_tool_speed_m_s: Positive | None
 
 
 class ToolSpeed:

@@ -8,7 +8,7 @@ import numpy as np
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, spec
 
 
 @spec
@@ -19,11 +19,7 @@ class Repeat:
         times: How many repeats.
     """
 
-    times: int
-
-    def check(self) -> None:
-        if self.times < 1:
-            raise ConfigError(f"excitation: times: expected 1 or more, got {self.times}")
+    times: Count
 
     def weight(self, before: float) -> float:
         """Return as much as all before it have, for each repeat.

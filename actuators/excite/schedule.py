@@ -2,13 +2,15 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Interval
 
 from brokk_rl.contracts.actuator import Excitation, Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 NUM_TRIES = 6
 """How often the length of the programs is fitted to the room that the ways between them leave; the
@@ -30,22 +32,16 @@ class Approach:
         patience: An approach is given up after this many times its nominal duration.
     """
 
-    level: float
-    smallest: float
-    settle_s: float
-    tolerance: float
+    level: Annotated[float, Interval(gt=0, le=1)]
+    smallest: Positive
+    settle_s: Positive
+    tolerance: Positive
     rest_s: float
-    patience: float
+    patience: Annotated[float, Ge(1)]
 
     def check(self) -> None:
-        if not 0 < self.smallest <= self.level <= 1:
-            raise ConfigError(
-                f"collect.approach: expected 0 < smallest <= level <= 1, got {self.smallest} and {self.level}"
-            )
-        if self.tolerance <= 0 or self.settle_s <= 0 or self.patience < 1:
-            raise ConfigError(
-                "collect.approach: expected tolerance and settle_s above 0, patience of 1 or more"
-            )
+        if self.smallest > self.level:
+            raise ConfigError(f"smallest: expected level={self.level} or less, got {self.smallest}")
 
     def duration_s(self, machine: Machine, start: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Return the nominal time from `start` to `target`, each `(…, J)`, with the rest."""

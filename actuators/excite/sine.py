@@ -1,13 +1,15 @@
 """The paper's excitation: one joint at a time, sines of random frequency and amplitude."""
 
 from collections.abc import Sequence
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Interval
 
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 
 @spec
@@ -25,20 +27,20 @@ class Sine:
     """
 
     share: float
-    lowest_hz: float
+    lowest_hz: Positive
     highest_hz: float
-    smallest: float
-    largest: float
+    smallest: Positive
+    largest: Annotated[float, Interval(gt=0, le=1)]
     stop_margin: float
 
     def check(self) -> None:
-        if not 0 < self.lowest_hz <= self.highest_hz:
+        if self.lowest_hz > self.highest_hz:
             raise ConfigError(
-                f"excitation: expected 0 < lowest_hz <= highest_hz, got {self.lowest_hz} and {self.highest_hz}"
+                f"highest_hz: expected lowest_hz={self.lowest_hz} or more, got {self.highest_hz}"
             )
-        if not 0 < self.smallest <= self.largest <= 1:
+        if self.smallest > self.largest:
             raise ConfigError(
-                f"excitation: expected 0 < smallest <= largest <= 1, got {self.smallest} and {self.largest}"
+                f"smallest: expected largest={self.largest} or less, got {self.smallest}"
             )
 
     def weight(self, before: float) -> float:

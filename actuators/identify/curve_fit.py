@@ -20,7 +20,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
 from brokk_rl.record import Recording
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 
 # Chosen by hand; not searched.
 NUM_DRAWS = 200
@@ -72,18 +72,14 @@ class ValveCurveFit:
     """
 
     knots: tuple[float, ...]
-    longest_lag_s: float
-    sweeps: int
-    iterations: int
+    longest_lag_s: Positive
+    sweeps: Count
+    iterations: Count
 
     def check(self) -> None:
         if self.knots[0] != 0.0 or self.knots[-1] != 1.0 or (np.diff(self.knots) <= 0).any():
             raise ConfigError(
-                f"curve_fit.knots: expected strokes that rise from 0 to 1, got {list(self.knots)}"
-            )
-        if self.longest_lag_s <= 0 or min(self.sweeps, self.iterations) < 1:
-            raise ConfigError(
-                "curve_fit: longest_lag_s must be above 0, sweeps and iterations 1 or more"
+                f"knots: expected strokes that rise from 0 to 1, got {list(self.knots)}"
             )
 
     def fit_curves(

@@ -23,7 +23,7 @@ from brokk_rl.errors import ConfigError, StorageError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json, write_text
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 EDGE_S = 0.3
 """Time at either end of a recording that is left out: filters begin and end there."""
@@ -47,16 +47,16 @@ class ForceFit:
     name: str
     actuator: ForceDrive
     motion_hz: float
-    force_hz: float
+    force_hz: Positive
     terms: tuple[str, ...]
 
     def check(self) -> None:
         for term in self.terms:
             if term not in TERMS:
-                raise ConfigError(f"fit.terms: '{term}' is no term; {list_choices(term, TERMS)}")
-        if not 0.0 < self.force_hz <= self.motion_hz:
+                raise ConfigError(f"terms: '{term}' is no term; {list_choices(term, TERMS)}")
+        if self.force_hz > self.motion_hz:
             raise ConfigError(
-                f"fit: expected 0 < force_hz <= motion_hz, got {self.force_hz} and {self.motion_hz}"
+                f"force_hz: expected motion_hz={self.motion_hz} or less, got {self.force_hz}"
             )
 
     def fit(

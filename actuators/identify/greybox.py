@@ -31,7 +31,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json, write_text
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -176,41 +176,30 @@ class GreyBoxFit:
     actuator: Actuator
     free: dict[str, tuple[float, float]]
     coupled: bool
-    horizon_s: float
-    windows: int
-    validation_windows: int
-    candidates: int
-    starts: int
-    iterations: int
-    tolerance: float
-    robust: float
+    horizon_s: Positive
+    windows: Count
+    validation_windows: Count
+    candidates: Count
+    starts: Count
+    iterations: Count
+    tolerance: Positive
+    robust: Positive
 
     def check(self) -> None:
         if not self.free:
-            raise ConfigError("fit.free: expected at least one number to fit")
+            raise ConfigError("free: expected at least one number to fit")
         for name, (low, high) in self.free.items():
             if not low < high:
                 raise ConfigError(
-                    f"fit.free.{name}: expected [low, high] with low < high, got [{low}, {high}]"
+                    f"free.{name}: expected [low, high] with low < high, got [{low}, {high}]"
                 )
-        if (
-            min(
-                self.windows, self.validation_windows, self.candidates, self.starts, self.iterations
-            )
-            < 1
-        ):
-            raise ConfigError(
-                "fit: windows, validation_windows, candidates, starts and iterations must be 1 or more"
-            )
         if self.starts > self.candidates + 1:
             raise ConfigError(
-                f"fit.starts: {self.starts} of {self.candidates} candidates; raise fit.candidates"
+                f"starts: {self.starts} of {self.candidates} candidates; raise candidates"
             )
-        if min(self.horizon_s, self.tolerance, self.robust) <= 0:
-            raise ConfigError("fit: horizon_s, tolerance and robust must be above 0")
         if getattr(self.actuator, "spread", None):
             raise ConfigError(
-                "fit.actuator.spread: expected {}; a number that is drawn anew at each reset cannot be fitted"
+                "actuator.spread: expected {}; a number that is drawn anew at each reset cannot be fitted"
             )
 
     def fit(

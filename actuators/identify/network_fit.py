@@ -29,7 +29,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
 from brokk_rl.rl.execution import capture_graph
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Share, spec
 
 
 class FreeRunOptimizer:
@@ -193,30 +193,28 @@ class NetworkFit:
     name: str
     network: Literal["mlp", "coupled"]
     loss: Literal["rollout", "one_step"]
-    width: int
+    width: Count
     quiet: float | None
     one_step_updates: int
-    one_step_batch: int
+    one_step_batch: Count
     horizons_s: tuple[float, ...]
     updates: int
-    batch: int
+    batch: Count
     learning_rate: float
-    still_share: float
-    busy_share: float
+    still_share: Share
+    busy_share: Share
     average: float
-    validate_every: int
+    validate_every: Count
     validation_s: float
-    patience: int
+    patience: Count
     save_every_s: float
 
     def check(self) -> None:
         if self.loss == "rollout" and not self.horizons_s:
-            raise ConfigError("fit.horizons_s: loss=rollout needs at least one horizon")
-        if min(self.width, self.batch, self.one_step_batch, self.validate_every, self.patience) < 1:
-            raise ConfigError("fit: width, batches, validate_every and patience must be 1 or more")
-        if min(self.still_share, self.busy_share) < 0 or self.still_share + self.busy_share >= 1:
+            raise ConfigError("horizons_s: loss=rollout needs at least one horizon")
+        if self.still_share + self.busy_share >= 1:
             raise ConfigError(
-                "fit: still_share and busy_share must leave room for times at which a joint is commanded"
+                "still_share: expected room beside busy_share for times at which a joint is commanded"
             )
 
     def fit(

@@ -5,8 +5,12 @@ Nothing here needs torch, so that the command refuses bad values before it is lo
 
 from __future__ import annotations
 
+from typing import Annotated
+
+from annotated_types import Ge
+
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 
 
 @spec
@@ -28,21 +32,11 @@ class Identification:
 
     recordings: str | tuple[str, ...]
     test: str | tuple[str, ...] | None
-    folds: int | None
-    hold_out: int
-    stride_s: float
-    threads: int
+    folds: Annotated[int, Ge(2)] | None
+    hold_out: Annotated[int, Ge(3)]
+    stride_s: Positive
+    threads: Count
 
     def check(self) -> None:
-        if self.hold_out < 3:
-            raise ConfigError(f"identify.hold_out: expected 3 or more, got {self.hold_out}")
-        if self.threads < 1:
-            raise ConfigError(f"identify.threads: expected 1 or more, got {self.threads}")
-        if self.stride_s <= 0:
-            raise ConfigError(f"identify.stride_s: expected more than 0, got {self.stride_s}")
-        if self.folds is not None and self.folds < 2:
-            raise ConfigError(
-                f"identify.folds: expected 2 or more, or null for one split, got {self.folds}"
-            )
         if self.folds is not None and self.test is not None:
-            raise ConfigError("identify: folds and test are two ways of judging; give one of them")
+            raise ConfigError("folds: folds and test are two ways of judging; give one of them")

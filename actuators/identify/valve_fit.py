@@ -17,13 +17,13 @@ from scipy.optimize import least_squares
 
 from actuators.identify.speed_data import PLAYS, SpeedData
 from actuators.models.valve import ValveActuator
-from brokk_rl.errors import ConfigError, StorageError
+from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
 from brokk_rl.session import write_text
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -47,13 +47,9 @@ class ValveFit:
 
     name: str
     actuator: ValveActuator
-    longest_lag_s: float
-    sweeps: int
-    iterations: int
-
-    def check(self) -> None:
-        if self.longest_lag_s <= 0 or min(self.sweeps, self.iterations) < 1:
-            raise ConfigError("fit: longest_lag_s must be above 0, sweeps and iterations 1 or more")
+    longest_lag_s: Positive
+    sweeps: Count
+    iterations: Count
 
     def fit(
         self,

@@ -38,10 +38,11 @@ contact force does not tilt the machine (the actuator does not know it).
 from __future__ import annotations
 
 import math
-from typing import Literal, get_type_hints
+from typing import Annotated, Literal, get_type_hints
 
 import numpy as np
 import torch
+from annotated_types import Ge, Interval
 
 from actuators.models.parameters import (
     PerJoint,
@@ -55,7 +56,7 @@ from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 LAMINAR = 1e-4
 """Drop, of relief pressure, below which an orifice is laminar: it gives the flow a finite slope."""
@@ -140,35 +141,15 @@ class HydraulicCircuit:
     breakaway: PerJoint
     stribeck_speed: PerJoint
     viscous: PerJoint
-    margin: float
-    standby: float
-    pump_s: float
-    line: float
-    power: float
-    bypass_stroke: float
-    outrigger_nm_rad: float
-    substep_s: float
+    margin: Positive
+    standby: Positive
+    pump_s: Positive
+    line: Positive
+    power: Positive
+    bypass_stroke: Positive
+    outrigger_nm_rad: Annotated[float, Ge(0)]
+    substep_s: Annotated[float, Interval(gt=0, le=0.005)]
     spread: dict[str, float]
-
-    def check(self) -> None:
-        if self.compensation not in ("pre", "post", "none"):
-            raise ConfigError(
-                f"actuator.compensation: expected pre, post or none, got '{self.compensation}'"
-            )
-        if not 0 < self.substep_s <= 0.005:
-            raise ConfigError(
-                "actuator.substep_s: expected (0, 0.005] s, where the circuit is accurate, got "
-                f"{self.substep_s}"
-            )
-        for name in ("margin", "standby", "pump_s", "line", "power", "bypass_stroke"):
-            if not getattr(self, name) > 0:
-                raise ConfigError(
-                    f"actuator.{name}: expected more than 0, got {getattr(self, name)}"
-                )
-        if not self.outrigger_nm_rad >= 0:
-            raise ConfigError(
-                f"actuator.outrigger_nm_rad: expected 0 (rigid) or more, got {self.outrigger_nm_rad}"
-            )
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> CircuitModel:
         """Return a model for `num_envs` environments on `device`.

@@ -22,10 +22,11 @@ pushing, and the simulator's drive yields.
 """
 
 import math
-from typing import get_type_hints
+from typing import Annotated, get_type_hints
 
 import numpy as np
 import torch
+from annotated_types import Interval
 
 from actuators.models.parameters import (
     PerJoint,
@@ -38,7 +39,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 
 @spec
@@ -102,19 +103,11 @@ class Hydraulic:
     oil_start_c: float
     oil_ambient_c: float
     oil_rise_c: float
-    oil_time_s: float
+    oil_time_s: Positive
     oil_reference_c: float
     thermal_gain: float
-    substep_s: float
+    substep_s: Annotated[float, Interval(gt=0, le=0.01)]
     spread: dict[str, float]
-
-    def check(self) -> None:
-        if not 0 < self.substep_s <= 0.01:
-            raise ConfigError(
-                f"actuator.substep_s: expected (0, 0.01] s, where the plant is stable, got {self.substep_s}"
-            )
-        if self.oil_time_s <= 0:
-            raise ConfigError(f"actuator.oil_time_s: expected more than 0, got {self.oil_time_s}")
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> "HydraulicModel":
         """Return a model for `num_envs` environments on `device`.

@@ -7,11 +7,11 @@ import numpy as np
 import torch
 
 from actuators.models import checkpoint
-from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
+from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, spec
 
 
 @spec
@@ -131,11 +131,7 @@ class ArxFit:
     """
 
     name: str
-    ridge: float
-
-    def check(self) -> None:
-        if self.ridge < 0:
-            raise ConfigError(f"ridge: expected 0 or more, got {self.ridge}")
+    ridge: NonNegative
 
     def fit(
         self,

@@ -29,7 +29,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import RATE_TOLERANCE
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -53,23 +53,19 @@ class Collection:
         guards: Bounds that no program can exceed.
     """
 
-    num_runs: int
+    num_runs: Count
     run_minutes: float
-    file_minutes: float
-    flush_s: float
+    file_minutes: Positive
+    flush_s: Positive
     only_plan: bool
     approach: Approach
     guards: CommandGuards
 
     def check(self) -> None:
-        if self.num_runs < 1:
-            raise ConfigError(f"collect.num_runs: expected 1 or more, got {self.num_runs}")
-        if not 0 < self.file_minutes <= self.run_minutes:
+        if self.file_minutes > self.run_minutes:
             raise ConfigError(
-                f"collect: expected 0 < file_minutes <= run_minutes, got {self.file_minutes} and {self.run_minutes}"
+                f"file_minutes: expected run_minutes={self.run_minutes} or less, got {self.file_minutes}"
             )
-        if self.flush_s <= 0:
-            raise ConfigError(f"collect.flush_s: expected more than 0, got {self.flush_s}")
 
 
 @spec

@@ -24,7 +24,7 @@ from actuators.recordings.inspection import (
 from actuators.recordings.preview import EffectPreview, PreviewResult
 from brokk_rl import record
 from brokk_rl.commands import view_recordings
-from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure
 from brokk_rl.progress import track_items
@@ -32,7 +32,7 @@ from brokk_rl.record import Breach, Recording
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.simulator import WarpSimulator
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, spec
 
 log = logging.getLogger(__name__)
 
@@ -50,11 +50,7 @@ class InspectionRequest:
     """
 
     recordings: str | tuple[str, ...] | None
-    pictures: int
-
-    def check(self) -> None:
-        if self.pictures < 0:
-            raise ConfigError(f"inspect.pictures: expected 0 or more, got {self.pictures}")
+    pictures: Index
 
 
 @dataclass(frozen=True)

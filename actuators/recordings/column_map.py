@@ -47,7 +47,7 @@ from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -216,19 +216,15 @@ class ColumnMap:
     time: Column | AlignedTime | dict[str, Column | AlignedTime]
     joints: dict[str, JointColumns]
     optional: dict[str, Column]
-    overrun: float
-    longest_gap_s: float
-    shortest_s: float
+    overrun: NonNegative
+    longest_gap_s: Positive
+    shortest_s: NonNegative
     damaged: Damaged = "refuse"  # maps from before this field have none
 
     def check(self) -> None:
         if self.delimiter == self.decimal:
             raise ConfigError(
                 f"column map: '{self.decimal}' cannot be both delimiter and decimal sign"
-            )
-        if self.overrun < 0 or self.longest_gap_s <= 0 or self.shortest_s < 0:
-            raise ConfigError(
-                "column map: expected overrun >= 0, longest_gap_s > 0 and shortest_s >= 0"
             )
         for time in self.time.values() if isinstance(self.time, dict) else (self.time,):
             if time.scale <= 0:

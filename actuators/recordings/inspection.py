@@ -5,14 +5,15 @@ Axes: `T` time, `J` joints. Recordings may be broken: missing values are NaN and
 
 import warnings
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording, find_stretches
-from brokk_rl.spec import spec
+from brokk_rl.spec import Share, spec
 
 Kind = Literal["no motion", "no command", "frozen", "repeated rows", "beyond limit", "exclusive"]
 KINDS: dict[Kind, str] = {
@@ -53,23 +54,21 @@ class InspectionThresholds:
         at_limit: A joint so close to its limit, as a part of its travel, may stand at its stop.
     """
 
-    commanded: float
-    driving: float
+    commanded: Share
+    driving: Share
     still: float
     settle_s: float
     unanswered_s: float
     drift: float
-    equal_rows: int
+    equal_rows: Annotated[int, Ge(2)]
     steps: float
     at_limit: float
 
     def check(self) -> None:
-        if not 0 <= self.commanded <= self.driving <= 1:
+        if self.commanded > self.driving:
             raise ConfigError(
-                f"thresholds: expected 0 <= commanded <= driving <= 1, got {self.commanded} and {self.driving}"
+                f"commanded: expected driving={self.driving} or less, got {self.commanded}"
             )
-        if self.equal_rows < 2:
-            raise ConfigError(f"thresholds.equal_rows: expected 2 or more, got {self.equal_rows}")
 
 
 @dataclass(frozen=True)

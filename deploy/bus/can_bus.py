@@ -16,8 +16,8 @@ from typing import ClassVar, Literal, Self
 import can
 from can.io.blf import BLFParseError, BLFReader
 
-from brokk_rl.errors import ConfigError, LinkError
-from brokk_rl.spec import spec
+from brokk_rl.errors import LinkError
+from brokk_rl.spec import Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -170,13 +170,9 @@ class BusReplay:
     """
 
     path: str
-    speed: float
+    speed: Positive
 
     interface: ClassVar[str] = "replay"
-
-    def check(self) -> None:
-        if self.speed <= 0:
-            raise ConfigError(f"bus.speed: expected more than 0, got {self.speed}")
 
     @property
     def channel(self) -> str:

@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
+
+from annotated_types import Ge, Interval
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, NonNegative, Positive, spec
 
 Numbers = tuple[float, ...]
 ROUNDING = 1e-6
@@ -52,33 +55,21 @@ class EnvelopeLimits:
         face_speed_m_s: Largest speed of the tip there.
     """
 
-    margin_m: float
-    release_m: float
-    speed_margin: float
-    coast_s: float
-    reaction_s: float
+    margin_m: Positive
+    release_m: Positive
+    speed_margin: Annotated[float, Ge(1)]
+    coast_s: Positive
+    reaction_s: Positive
     ground_m: float | None
     stay_out: dict[str, StayOutBox]
     face_normal: tuple[float, float, float]
-    face_near_m: float
-    face_radius_m: float
-    face_speed_m_s: float
+    face_near_m: Positive
+    face_radius_m: Positive
+    face_speed_m_s: Positive
 
     def check(self) -> None:
-        names = ("margin_m", "release_m", "coast_s", "reaction_s", "face_near_m", "face_radius_m")
-        for name in (*names, "face_speed_m_s"):
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(
-                    f"guard.envelope.{name}: expected more than 0, got {getattr(self, name)}"
-                )
-        if self.speed_margin < 1:
-            raise ConfigError(
-                f"guard.envelope.speed_margin: expected 1 or more, got {self.speed_margin}"
-            )
         if abs(math.hypot(*self.face_normal) - 1.0) > ROUNDING:
-            raise ConfigError(
-                f"guard.envelope.face_normal: expected a unit vector, got {self.face_normal}"
-            )
+            raise ConfigError(f"face_normal: expected a unit vector, got {self.face_normal}")
 
 
 @spec
@@ -91,13 +82,7 @@ class ObserverLimits:
     """
 
     path: str
-    false_alarms: float
-
-    def check(self) -> None:
-        if not 0 < self.false_alarms < 1:
-            raise ConfigError(
-                f"guard.observer.false_alarms: expected a chance in (0, 1), got {self.false_alarms}"
-            )
+    false_alarms: Annotated[float, Interval(gt=0, lt=1)]
 
 
 @spec
@@ -133,59 +118,26 @@ class GuardLimits:
             there is none either, and where commands are sent that is an error.
     """
 
-    max_command: float
-    max_rate_1_s: float
-    max_reversals_1_s: int
-    overrun: float
-    neutral: float
-    stop_margin: float
-    joints_s: float
-    levers_s: float
-    status_s: float
-    request_s: float
-    ignored_s: float
-    controls_s: float
-    round_trip_s: float
-    gap_s: float
-    jump_margin: float
-    jump_slack: float
-    range_slack: float
-    num_jumps: int
+    max_command: Annotated[float, Interval(gt=0, le=1)]
+    max_rate_1_s: Positive
+    max_reversals_1_s: Count
+    overrun: NonNegative
+    neutral: Annotated[float, Interval(gt=0, lt=1)]
+    stop_margin: NonNegative
+    joints_s: Positive
+    levers_s: Positive
+    status_s: Positive
+    request_s: Positive
+    ignored_s: Positive
+    controls_s: Positive
+    round_trip_s: Positive
+    gap_s: Positive
+    jump_margin: Annotated[float, Ge(1)]
+    jump_slack: Positive
+    range_slack: Positive
+    num_jumps: Count
     envelope: EnvelopeLimits | None
     observer: ObserverLimits | None
-
-    def check(self) -> None:
-        if not 0 < self.max_command <= 1:
-            raise ConfigError(f"guard.max_command: expected (0, 1], got {self.max_command}")
-        # Zero and infinity would switch a check off, which nobody may do by a number.
-        positive = (
-            "max_rate_1_s",
-            "joints_s",
-            "levers_s",
-            "status_s",
-            "request_s",
-            "ignored_s",
-            "controls_s",
-            "round_trip_s",
-            "gap_s",
-            "jump_slack",
-            "range_slack",
-        )
-        for name in positive:
-            if not 0 < getattr(self, name) < math.inf:
-                raise ConfigError(f"guard.{name}: expected more than 0, got {getattr(self, name)}")
-        if (
-            self.overrun < 0
-            or self.stop_margin < 0
-            or not 0 < self.neutral < 1
-            or self.jump_margin < 1
-            or self.num_jumps < 1
-            or self.max_reversals_1_s < 1
-        ):
-            raise ConfigError(
-                "guard: expected overrun and stop_margin of 0 or more, neutral in (0, 1), "
-                "jump_margin, num_jumps and max_reversals_1_s of 1 or more"
-            )
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ import time
 
 from rich.console import Console
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.page.protocol import FeedSpec
 from deploy.page.server import serve_page
 from deploy.page.settings import PageSettings
@@ -29,11 +28,7 @@ class PageMode:
     feed: FeedSpec
     page: PageSettings
     video: VideoSettings | None
-    seconds: float | None
-
-    def check(self) -> None:
-        if self.seconds is not None and self.seconds <= 0:
-            raise ConfigError(f"seconds: expected more than 0, or null, got {self.seconds}")
+    seconds: Positive | None
 
     def run(self) -> None:
         """Serve until the time is over or a person stops it; leave the link in `page.url`.

@@ -10,14 +10,15 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge, Interval
 
-from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 from deploy.guidance import AXES, LeverPositions
 from deploy.page.protocol import (
     BoreholeChoice,
@@ -81,23 +82,12 @@ class DemoMachine:
         rate_hz: Of the camera.
     """
 
-    lag_s: float
-    amplitude: float
+    lag_s: NonNegative
+    amplitude: Annotated[float, Interval(gt=0, le=1)]
     frames: bool
-    width_px: int
-    height_px: int
-    rate_hz: float
-
-    def check(self) -> None:
-        if (
-            self.lag_s < 0
-            or not 0 < self.amplitude <= 1
-            or self.rate_hz <= 0
-            or min(self.width_px, self.height_px) < 16
-        ):
-            raise ConfigError(
-                "feed: expected lag_s of 0 or more, amplitude in (0, 1], rate_hz of more than 0, 16 px or more"
-            )
+    width_px: Annotated[int, Ge(16)]
+    height_px: Annotated[int, Ge(16)]
+    rate_hz: Positive
 
     def build(self, machine: Machine) -> DemoFeed:
         """Return it at work."""

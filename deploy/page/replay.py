@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
+from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.guard.drift_watch import Misfit
 from deploy.guard.guard import GuardState, GuardTrip
 from deploy.guidance import AXES, convert_to_positions, find_full_angles_rad
@@ -72,16 +72,11 @@ class CaptureReplay:
     """
 
     capture: str
-    bus_s: float
-    advice_s: float
-    borehole_s: float
-    delay_s: float
-    camera_s: float
-
-    def check(self) -> None:
-        ages_s = (self.bus_s, self.advice_s, self.borehole_s, self.camera_s)
-        if min(*ages_s, self.delay_s) <= 0:
-            raise ConfigError("feed: expected ages and delay of more than 0")
+    bus_s: Positive
+    advice_s: Positive
+    borehole_s: Positive
+    delay_s: Positive
+    camera_s: Positive
 
     def build(self, machine: Machine) -> ReplayFeed:
         """Return the feed, at the beginning of the recording and playing.

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
+
+from annotated_types import Interval
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 from deploy.guidance import AXES
 from deploy.page.scene import describe_geometry
 
@@ -44,33 +46,24 @@ class PageSettings:
     """
 
     host: str
-    port: int
+    port: Annotated[int, Interval(ge=0, le=LAST_PORT)]
     names: tuple[str, ...]
     token: str | None
     language: Literal["auto", "en", "de"]
-    rate_hz: float
-    frames_hz: float
-    picture_px: int
-    jpeg_quality: int
-    points: int
-    tolerance: float
+    rate_hz: Positive
+    frames_hz: Positive
+    picture_px: Annotated[int, Interval(ge=LEAST_PX, le=MOST_PX)]
+    jpeg_quality: Annotated[int, Interval(ge=1, le=100)]
+    points: Count
+    tolerance: Positive
     borehole_radius_m: float
-    stale_s: float
-    clients: int
+    stale_s: Positive
+    clients: Count
 
     def check(self) -> None:
-        if not 0 <= self.port <= LAST_PORT:
-            raise ConfigError(f"page.port: expected 0 to {LAST_PORT}, got {self.port}")
         if self.token is not None and len(self.token) < LEAST_TOKEN:
             raise ConfigError(
-                f"page.token: expected at least {LEAST_TOKEN} characters, or null for a new one each time"
-            )
-        smallest = min(self.rate_hz, self.frames_hz, self.stale_s, self.tolerance)
-        if smallest <= 0 or min(self.points, self.clients) < 1:
-            raise ConfigError("page: rates, stale_s, tolerance, points and clients are more than 0")
-        if not 1 <= self.jpeg_quality <= 100 or not LEAST_PX <= self.picture_px <= MOST_PX:
-            raise ConfigError(
-                f"page: expected jpeg_quality in 1 … 100 and picture_px in {LEAST_PX} … {MOST_PX}"
+                f"token: expected at least {LEAST_TOKEN} characters, or null for a new one each time"
             )
 
     def describe_setup(self, machine: Machine) -> dict[str, Any]:

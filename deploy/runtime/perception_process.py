@@ -12,9 +12,10 @@ import math
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.contracts.vision import (
     AimedSource,
@@ -26,9 +27,9 @@ from brokk_rl.contracts.vision import (
     TrackedHole,
     TrackerSpec,
 )
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 from deploy.picture import shrink_picture
 from deploy.runtime.bus_process import TEXT
 from deploy.runtime.process import Stop
@@ -62,18 +63,10 @@ class CameraConfig:
     source: FrameSourceSpec
     finder: FinderSpec | None
     tracker: TrackerSpec
-    rate_hz: float
-    num_px: int
-    stale_s: float
-    record_hz: float
-
-    def check(self) -> None:
-        is_positive = min(self.rate_hz, self.stale_s) > 0 and self.record_hz >= 0
-        if not is_positive or self.num_px < SMALLEST_PICTURE_PX:
-            raise ConfigError(
-                "camera: expected rate_hz and stale_s above 0, record_hz of 0 or more, "
-                f"num_px of {SMALLEST_PICTURE_PX} or more"
-            )
+    rate_hz: Positive
+    num_px: Annotated[int, Ge(SMALLEST_PICTURE_PX)]
+    stale_s: Positive
+    record_hz: NonNegative
 
 
 def run(stop: Stop, camera: CameraConfig, memory: LoopMemory) -> None:

@@ -18,7 +18,7 @@ from typing import Any, Protocol
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.guidance import find_full_angles_rad
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
@@ -67,7 +67,7 @@ class DeploymentLoop(BusAndPolicySettings):
     commands: bool
     armed: bool
     record: bool
-    seconds: float | None
+    seconds: Positive | None
     show: bool
     page: PageSettings | None
     camera: CameraConfig | None
@@ -76,10 +76,8 @@ class DeploymentLoop(BusAndPolicySettings):
     def check(self) -> None:
         if self.armed and not self.commands:
             raise ConfigError(
-                "deploy.armed: nothing is ever sent in this mode; deploy=auto sends the policy's commands"
+                "armed: nothing is ever sent in this mode; deploy=auto sends the policy's commands"
             )
-        if self.seconds is not None and self.seconds <= 0:
-            raise ConfigError(f"deploy.seconds: expected more than 0, or null, got {self.seconds}")
         if self.video is not None and self.page is None:
             raise ConfigError("video: there is no page to show it; choose page=… as well")
         if isinstance(self.target, DetectedTarget) and (

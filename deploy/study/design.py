@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Interval
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -68,7 +69,7 @@ class Design:
         alpha: Level of the tests.
     """
 
-    num_participants: int
+    num_participants: Annotated[int, Ge(2)]
     order: Literal["counterbalanced", "fixed"]
     holes: dict[str, Hole]
     starts: dict[str, tuple[float, ...]]
@@ -77,21 +78,13 @@ class Design:
     limit_s: float
     success: Success
     primary: str
-    alpha: float
+    alpha: Annotated[float, Interval(gt=0, lt=1)]
 
     def check(self) -> None:
-        if self.num_participants < 2:
-            raise ConfigError(
-                f"study.design.num_participants: expected 2 or more, got {self.num_participants}"
-            )
         if len(self.holes) != len(self.starts) or len(self.holes) < 2:
             raise ConfigError(
-                "study.design: expected as many starts as holes, 2 or more, "
+                "starts: expected as many starts as holes, 2 or more, "
                 f"got {len(self.holes)} holes and {len(self.starts)} starts"
-            )
-        if not 0 < self.alpha < 1:
-            raise ConfigError(
-                f"study.design.alpha: expected a level between 0 and 1, got {self.alpha}"
             )
 
     def check_machine(self, machine: Machine) -> None:

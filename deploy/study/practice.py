@@ -14,7 +14,7 @@ import numpy as np
 from scipy import optimize
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from brokk_rl.statistics import compute_wilson_interval
 from deploy.study import permutation_tests
 
@@ -38,19 +38,13 @@ class Practice:
         chance_sd: From trial to trial.
     """
 
-    base_s: float
+    base_s: Positive
     skill_sd: float
     hole_sd: float
     learning: float
     learning_sd: float
     guidance_sd: float
-    chance_sd: float
-
-    def check(self) -> None:
-        if self.base_s <= 0 or self.chance_sd <= 0:
-            raise ConfigError(
-                f"study.practice: expected base_s and chance_sd above 0, got {self.base_s} and {self.chance_sd}"
-            )
+    chance_sd: Positive
 
     def draw(
         self,

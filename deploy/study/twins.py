@@ -17,13 +17,12 @@ import numpy as np
 
 from brokk_rl.contracts.link import Connection
 from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
-from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.progress import track_items
 from brokk_rl.record import Recording
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, spec
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
 from deploy.guard.guard import GuardDecision, GuardState, GuardTrip
@@ -65,11 +64,7 @@ class Twins:
     guidance: LeverGuidance
     policy: str
     settle_s: float
-    num_processes: int
-
-    def check(self) -> None:
-        if self.num_processes < 0:
-            raise ConfigError(f"ground.num_processes: expected 0 or more, got {self.num_processes}")
+    num_processes: Index
 
     def run(
         self, machine: Machine, session: Session, trials: TrialBatch, operators: OperatorModel

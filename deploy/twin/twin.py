@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import logging
 import time
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import numpy as np
+from annotated_types import Interval
 
 from brokk_rl.contracts.link import Connection, Link
-from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
 from brokk_rl.signals import Command
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from deploy.bus.c_header import generate_c_header
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import GATEWAY, STAMP, BusDescription
@@ -76,18 +77,10 @@ class Twin:
     dbc: str
     remote: bool
     deadman: bool
-    again_s: float | None
-    fault_port: int | None
+    again_s: Positive | None
+    fault_port: Annotated[int, Interval(ge=1, le=65535)] | None
     seconds: float | None
     realtime: bool
-
-    def check(self) -> None:
-        if self.fault_port is not None and not 0 < self.fault_port < 65536:
-            raise ConfigError(
-                f"twin.fault_port: expected 1 to 65535, or null, got {self.fault_port}"
-            )
-        if self.again_s is not None and self.again_s <= 0:
-            raise ConfigError(f"twin.again_s: expected more than 0, or null, got {self.again_s}")
 
     def run(self, stop: Stop, machine: Machine, plant: Connection, session: Session) -> None:
         """Run until told to stop, or the time is over.

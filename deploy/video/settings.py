@@ -7,7 +7,7 @@ from importlib.util import find_spec
 from typing import Protocol
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, spec
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.video.sources import LoopPictures, OpenedDevice, TestPattern, VideoSource
 
@@ -96,17 +96,16 @@ class VideoSettings:
 
     cameras: dict[str, VideoCamera]
     host: str
-    min_bitrate: int
+    min_bitrate: Count
     max_bitrate: int
-    viewers: int
+    viewers: Count
 
     def check(self) -> None:
-        if not self.cameras or self.viewers < 1:
-            raise ConfigError("video: expected a camera and a viewer at least")
-        if not 0 < self.min_bitrate <= self.max_bitrate:
+        if not self.cameras:
+            raise ConfigError("cameras: expected one or more")
+        if self.min_bitrate > self.max_bitrate:
             raise ConfigError(
-                "video: expected 0 < min_bitrate <= max_bitrate, "
-                f"got {self.min_bitrate} and {self.max_bitrate}"
+                f"min_bitrate: expected max_bitrate={self.max_bitrate} or less, got {self.min_bitrate}"
             )
 
     def require_packages(self) -> None:

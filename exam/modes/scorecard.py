@@ -15,7 +15,7 @@ from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.record import Recording
 from brokk_rl.report import Cell
 from brokk_rl.session import Session, write_json
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from diagnosis.answer import ANSWER_FILE
 from exam import scorecard
 from exam.real_cases import DIAGNOSIS_FOLDER, CaseRun, RealCase, RefusalError
@@ -42,11 +42,7 @@ class ScorecardSettings:
     """
 
     data: str
-    limit_s: float
-
-    def check(self) -> None:
-        if self.limit_s <= 0:
-            raise ConfigError(f"scorecard.limit_s: expected more than 0, got {self.limit_s:g}")
+    limit_s: Positive
 
 
 @spec

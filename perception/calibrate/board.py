@@ -5,17 +5,18 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.contracts.vision import FrameSourceSpec
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Positive, spec
 from perception.calibrate import arm, clock_offset, evaluation, transforms, verdict
 from perception.calibrate.disparity_error import (
     BoardDisparity,
@@ -185,34 +186,18 @@ class BoardCalibration:
     source: FrameSourceSpec
     board: Charuco | TagGrid
     joints: str
-    corner_px: float
-    max_error_px: float
-    joint_std_rad: float
-    zero_std_rad: float
-    wobble_m: float
-    wobble_rad: float
-    clock_s: float
+    corner_px: Positive
+    max_error_px: Positive
+    joint_std_rad: Positive
+    zero_std_rad: NonNegative
+    wobble_m: Positive
+    wobble_rad: Positive
+    clock_s: NonNegative
     least_correlation: float
     least_turn_rad: float
-    max_poses: int
-    work_m: float
+    max_poses: Annotated[int, Ge(10)]
+    work_m: Positive
     temperature_c: float | None
-
-    def check(self) -> None:
-        positive = (
-            self.corner_px,
-            self.max_error_px,
-            self.joint_std_rad,
-            self.wobble_m,
-            self.wobble_rad,
-            self.work_m,
-        )
-        if min(positive) <= 0 or min(self.zero_std_rad, self.clock_s) < 0 or self.max_poses < 10:
-            raise ConfigError(
-                "calibration: expected corner_px, max_error_px, joint_std_rad, wobble_m, "
-                "wobble_rad and work_m above 0, zero_std_rad and clock_s of 0 or more, max_poses "
-                "of 10 or more"
-            )
 
     def calibrate(self, machine: Machine) -> dict[str, Any]:
         """Return the content of `calibration.yaml`.

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
 import yaml
+from annotated_types import Ge
 from scipy.stats import chi2
 
 from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.calibrate import arm, transforms, verdict
 from perception.calibrate.extrinsics import PoseResidual, build_calibration
 from perception.calibrate.hand_eye import STUDENT_T_FREEDOM
@@ -228,23 +229,13 @@ class TouchCalibration:
 
     source: FrameSourceSpec
     points: str
-    tip_std_m: float
-    click_px: float
-    noise_per_m: float
-    window_px: int
-    least_width_m: float
-    work_m: float
+    tip_std_m: Positive
+    click_px: Positive
+    noise_per_m: Positive
+    window_px: Annotated[int, Ge(2)]
+    least_width_m: Positive
+    work_m: Positive
     temperature_c: float | None
-
-    def check(self) -> None:
-        smallest = min(
-            self.tip_std_m, self.click_px, self.noise_per_m, self.least_width_m, self.work_m
-        )
-        if smallest <= 0 or self.window_px < 2:
-            raise ConfigError(
-                "calibration: expected tip_std_m, click_px, noise_per_m, least_width_m and work_m "
-                "above 0, window_px of 2 or more"
-            )
 
     def calibrate(self, machine: Machine) -> dict[str, Any]:
         """Return the content of `calibration.yaml`.

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Ge, Interval
 
 from brokk_rl.contracts.vision import Ellipse
-from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.contracts import SizePrior
 from perception.ellipse import conic
 from perception.ellipse import edges as ellipse_edges
@@ -61,13 +62,13 @@ class ContourArcs:
             is limited then.
     """
 
-    sigma_px: float
+    sigma_px: Positive
     arc_tolerance_px: float
     corner_rad: float
-    arc_points: int
+    arc_points: Annotated[int, Ge(6)]
     reach_px: float
     angle_rad: float
-    coverage: float
+    coverage: Annotated[float, Interval(gt=0, le=1)]
     gap: float
     rms_px: float
     rms_relative: float
@@ -82,15 +83,6 @@ class ContourArcs:
     prior_slack: float
     smallest_px: float
     prior_flattest: float
-
-    def check(self) -> None:
-        if self.sigma_px <= 0:
-            raise ConfigError(f"perception.ellipse: expected sigma_px > 0, got {self.sigma_px}")
-        if not 0 < self.coverage <= 1 or self.arc_points < 6:
-            raise ConfigError(
-                "perception.ellipse: expected 0 < coverage <= 1 and arc_points >= 6, got "
-                f"{self.coverage} and {self.arc_points}"
-            )
 
     def build(self) -> ArcDetector:
         """Return a detector."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import cv2
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, spec
 from perception.ellipse.detector import ArcDetector, ContourArcs
 
 
@@ -26,17 +29,9 @@ class EdgeDrawing:
     """
 
     arcs: ContourArcs
-    gradient: int
-    anchor: int
-    sigma_px: float
-
-    def check(self) -> None:
-        if self.sigma_px < 1.0 or min(self.gradient, self.anchor) < 0:
-            raise ConfigError(
-                "perception/ellipse=edge_drawing: expected sigma_px of 1 or more, gradient and anchor of "
-                "0 or more, got "
-                f"{self.sigma_px}, {self.gradient} and {self.anchor}"
-            )
+    gradient: Index
+    anchor: Index
+    sigma_px: Annotated[float, Ge(1)]
 
     def build(self) -> ArcDetector:
         """Return a detector.

@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Annotated, Any, Protocol
 
 import cv2
 import numpy as np
 import yaml
+from annotated_types import Ge
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.pose.plane_conic import convert_to_gray, linearize
 
 MIN_CORNERS = 4
@@ -167,22 +168,18 @@ class Charuco:
     """
 
     dictionary: str
-    columns: int
-    rows: int
+    columns: Annotated[int, Ge(2)]
+    rows: Annotated[int, Ge(2)]
     square_m: float
-    marker_m: float
-    min_corners: int
+    marker_m: Positive
+    min_corners: Annotated[int, Ge(MIN_CORNERS)]
     max_error_px: float
 
     def check(self) -> None:
-        _check_board(self.dictionary, self.min_corners)
-        if min(self.columns, self.rows) < 2:
+        _check_dictionary(self.dictionary)
+        if self.marker_m >= self.square_m:
             raise ConfigError(
-                f"board: expected 2 or more columns and rows, got {self.columns} and {self.rows}"
-            )
-        if not 0 < self.marker_m < self.square_m:
-            raise ConfigError(
-                f"board: expected 0 < marker_m < square_m, got {self.marker_m} and {self.square_m}"
+                f"marker_m: expected less than square_m={self.square_m}, got {self.marker_m}"
             )
 
     def build(self) -> BoardTracker:
@@ -214,11 +211,11 @@ class TagGrid:
     rows: int
     marker_m: float
     gap_m: float
-    min_corners: int
+    min_corners: Annotated[int, Ge(MIN_CORNERS)]
     max_error_px: float
 
     def check(self) -> None:
-        _check_board(self.dictionary, self.min_corners)
+        _check_dictionary(self.dictionary)
 
     def build(self) -> BoardTracker:
         """Return a tracker."""
@@ -265,16 +262,10 @@ class GivenPoses:
         return GivenPoseTracker(poses)
 
 
-def _check_board(dictionary: str, min_corners: int) -> None:
+def _check_dictionary(dictionary: str) -> None:
     if not dictionary.startswith("DICT_") or not hasattr(cv2.aruco, dictionary):
         known = sorted(name for name in dir(cv2.aruco) if name.startswith("DICT_"))
-        raise ConfigError(
-            f"board.dictionary: OpenCV has no '{dictionary}'; choices: {', '.join(known)}"
-        )
-    if min_corners < MIN_CORNERS:
-        raise ConfigError(
-            f"board.min_corners: a pose needs {MIN_CORNERS} corners or more, got {min_corners}"
-        )
+        raise ConfigError(f"dictionary: OpenCV has no '{dictionary}'; choices: {', '.join(known)}")
 
 
 def _is_pose(pose: np.ndarray) -> bool:

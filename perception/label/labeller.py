@@ -19,7 +19,7 @@ from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, Positive, spec
 from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.label.camera_pose import CameraPose, CameraTracker, CameraTrackerSpec
@@ -93,23 +93,17 @@ class BlockLabelling:
     source: FrameSourceSpec
     camera: CameraTrackerSpec
     placing: str
-    noise_per_m: float
-    num_sigma: float
-    num_refined: int
-    reach_px: float
-    max_outline_px: float
+    noise_per_m: Positive
+    num_sigma: Positive
+    num_refined: Index
+    reach_px: Positive
+    max_outline_px: Positive
     min_depth_share: float
 
     def check(self) -> None:
-        smallest = min(self.noise_per_m, self.num_sigma, self.reach_px, self.max_outline_px)
-        if smallest <= 0 or self.num_refined < 0:
-            raise ConfigError(
-                "label: expected noise_per_m, num_sigma, reach_px and max_outline_px above 0, "
-                "num_refined of 0 or more"
-            )
         if self.max_outline_px >= self.reach_px / 2:
             raise ConfigError(
-                f"label.max_outline_px: the outline is compared with copies up to reach_px="
+                f"max_outline_px: the outline is compared with copies up to reach_px="
                 f"{self.reach_px:g} px away; expected less than half of that, got "
                 f"{self.max_outline_px:g}"
             )

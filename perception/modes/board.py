@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 from matplotlib.figure import Figure
 
 from brokk_rl.errors import ConfigError, StorageError
@@ -33,12 +35,9 @@ class PrintBoard:
 
     session: Session
     board: Charuco
-    margin_m: float
+    margin_m: Annotated[float, Ge(0.02)]
 
     def check(self) -> None:
-        # The ruler and its text stand in the lower margin.
-        if self.margin_m < 0.02:
-            raise ConfigError(f"margin_m: expected 0.02 or more, got {self.margin_m}")
         if self.board.columns * self.board.square_m < RULER_M:
             raise ConfigError(
                 f"board: expected {RULER_M} m across or more, for the ruler; got "

@@ -33,7 +33,7 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, spec
 from perception.contracts import Overlay, RejectionExplainer, WholePictureFinder
 
 log = logging.getLogger(__name__)
@@ -52,14 +52,8 @@ class PerceiveOptions:
 
     input: str | None
     until: Literal["holes", "ellipses"]
-    frames: int | None
+    frames: Count | None
     pictures: bool
-
-    def check(self) -> None:
-        if self.frames is not None and self.frames < 1:
-            raise ConfigError(
-                f"perceive.frames: expected 1 or more, or null for all, got {self.frames}"
-            )
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, spec
 from perception import dataset
 from perception.sources import validation
 from perception.sources.folder import CameraModel, read_camera
@@ -33,14 +33,8 @@ class RecordCamera:
     session: Session
     capture: StereoVideo | ExportedPictures
     lens: str
-    every: int
-    count: int | None
-
-    def check(self) -> None:
-        if self.every < 1 or (self.count is not None and self.count < 1):
-            raise ConfigError(
-                f"record_camera: expected every and count of 1 or more, got {self.every} and {self.count}"
-            )
+    every: Count
+    count: Count | None
 
     def run(self) -> None:
         """Write `frames/<number>.*` and `frames/camera.yaml`.

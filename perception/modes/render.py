@@ -8,7 +8,7 @@ from pathlib import Path
 from brokk_rl.errors import ConfigError
 from brokk_rl.progress import track_items
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Index, spec
 from perception.render.frame_renderer import FrameRenderer
 
 log = logging.getLogger(__name__)
@@ -25,15 +25,8 @@ class Rendering:
         first: Number of the first one, so that several processes can share the work.
     """
 
-    count: int
-    first: int
-
-    def check(self) -> None:
-        if self.count < 1 or self.first < 0:
-            raise ConfigError(
-                "render: expected count of 1 or more and first of 0 or more, got "
-                f"{self.count} and {self.first}"
-            )
+    count: Count
+    first: Index
 
 
 @spec

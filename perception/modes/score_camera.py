@@ -11,10 +11,11 @@ import logging
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
+from annotated_types import MinLen
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -57,12 +58,8 @@ class ScoreOptions:
 
     truth: str
     kind: Literal["real", "rendered"]
-    name: str
+    name: Annotated[str, MinLen(1)]
     table: str | None
-
-    def check(self) -> None:
-        if not self.name:
-            raise ConfigError("score.name: expected a name such as zed2i_quarry_may")
 
 
 @spec

@@ -18,7 +18,7 @@ import numpy as np
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_link_pose, rotate_about_axis
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception.render.stereo_camera import build_camera_pose
 
 BASE = "base"
@@ -36,14 +36,10 @@ class MountError:
         view_rad: Turn likewise.
     """
 
-    shared_m: float
-    shared_rad: float
-    view_m: float
-    view_rad: float
-
-    def check(self) -> None:
-        if min(self.shared_m, self.shared_rad, self.view_m, self.view_rad) < 0:
-            raise ConfigError("mount.error: expected numbers of 0 or more")
+    shared_m: NonNegative
+    shared_rad: NonNegative
+    view_m: NonNegative
+    view_rad: NonNegative
 
     @property
     def covariance(self) -> np.ndarray:
@@ -126,19 +122,17 @@ class MountAxis:
     lower: float
     upper: float
     start: float
-    max_speed: float
-    num_views: int
+    max_speed: Positive
+    num_views: Count
 
     def check(self) -> None:
         if abs(float(np.linalg.norm(self.axis)) - 1.0) > 1e-6:
-            raise ConfigError(f"mount.axes: {self.axis} is not a unit vector")
+            raise ConfigError(f"axis: {self.axis} is not a unit vector")
         if not self.lower <= self.start <= self.upper or self.lower == self.upper:
             raise ConfigError(
-                "mount.axes: expected lower <= start <= upper and lower below upper, got "
+                "start: expected lower <= start <= upper and lower below upper, got "
                 f"{self.lower}, {self.start} and {self.upper}"
             )
-        if self.max_speed <= 0 or self.num_views < 1:
-            raise ConfigError("mount.axes: expected max_speed above 0 and num_views of 1 or more")
 
     def step(self, position: np.ndarray) -> np.ndarray:
         """Return the motion of the axis at positions, `(…,)`, as `(…, 4, 4)`."""
@@ -173,12 +167,8 @@ class AxesMount:
     position_m: tuple[float, float, float]
     yaw_rad: float
     pitch_rad: float
-    settle_s: float
+    settle_s: NonNegative
     error: MountError
-
-    def check(self) -> None:
-        if self.settle_s < 0:
-            raise ConfigError(f"mount.settle_s: expected 0 or more, got {self.settle_s}")
 
     def build(self, machine: Machine) -> AxesMountModel:
         """Return the mount on a machine."""
@@ -255,12 +245,12 @@ class PlacesMount:
     """
 
     places: dict[str, CameraPlace]
-    move_s: float
+    move_s: NonNegative
     error: MountError
 
     def check(self) -> None:
-        if not self.places or self.move_s < 0:
-            raise ConfigError("mount: expected one place or more, and move_s of 0 or more")
+        if not self.places:
+            raise ConfigError("places: expected one place or more")
 
     def build(self, machine: Machine) -> PlacesMountModel:
         """Return the mount."""

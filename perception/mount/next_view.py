@@ -11,13 +11,15 @@ Axes: `V` views, `T` times of the plan, `J` joints.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.contracts.vision import CameraView, TrackedHole
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.mount.mounts import CameraMount
 from perception.mount.occlusion import ArmShape, compute_visible_share, sample_circle
 from perception.render.stereo_camera import StereoRig
@@ -95,11 +97,11 @@ class ExpectedCovariance:
             leave its view.
     """
 
-    horizon_s: float
-    num_times: int
-    rate_hz: float
-    disparity_px: float
-    center_px: float
+    horizon_s: Positive
+    num_times: Annotated[int, Ge(2)]
+    rate_hz: Positive
+    disparity_px: Positive
+    center_px: Positive
     visible: tuple[float, float]
     tilt_rad: float
     margin: float
@@ -107,14 +109,8 @@ class ExpectedCovariance:
     improvement: float
 
     def check(self) -> None:
-        if min(self.horizon_s, self.rate_hz, self.disparity_px, self.center_px) <= 0:
-            raise ConfigError(
-                "next_view: expected horizon_s, rate_hz, disparity_px and center_px above 0"
-            )
-        if self.num_times < 2 or not 0 <= self.visible[0] < self.visible[1] <= 1:
-            raise ConfigError(
-                "next_view: expected num_times of 2 or more and 0 <= visible[0] < visible[1] <= 1"
-            )
+        if not 0 <= self.visible[0] < self.visible[1] <= 1:
+            raise ConfigError(f"visible: expected 0 <= lowest < highest <= 1, got {self.visible}")
 
     def build(
         self, machine: Machine, mount: CameraMount, rig: StereoRig, arm: ArmShape

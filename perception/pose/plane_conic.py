@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Annotated
 
 import cv2
 import numpy as np
+from annotated_types import Interval
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, Rejection
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.contracts import PoseEstimator, PoseEstimatorSpec
 from perception.ellipse import conic
 from perception.pose import alignment, appearance, broken_rim, plane, rim
@@ -108,8 +110,8 @@ class PlaneConic:
         blind: Part of the face around a hole with known depth below which `without_depth` serves.
     """
 
-    radius_m: float
-    radius_tolerance: float
+    radius_m: Positive
+    radius_tolerance: Annotated[float, Interval(gt=0, lt=1)]
     axis_ratio: float
     coverage: float
     broken: float
@@ -131,15 +133,9 @@ class PlaneConic:
     blind: float
 
     def check(self) -> None:
-        if not 0 < self.radius_tolerance < 1 or self.radius_m <= 0:
-            raise ConfigError(
-                "perception.pose: expected radius_m > 0 and 0 < radius_tolerance < 1, got "
-                f"{self.radius_m} and {self.radius_tolerance}"
-            )
         if not self.rings or list(self.rings) != sorted(self.rings) or self.rings[0] <= self.inner:
             raise ConfigError(
-                f"perception.pose.rings: expected increasing limits above inner={self.inner}, got "
-                f"{list(self.rings)}"
+                f"rings: expected increasing limits above inner={self.inner}, got {list(self.rings)}"
             )
 
     def build(self) -> PlaneConicEstimator:

@@ -15,7 +15,7 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import Session, write_text
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.calibrate.arm import compute_link_poses
 from perception.label.camera_pose import Charuco
 from perception.render.block_sampler import build_frame
@@ -71,9 +71,9 @@ class BoardOnArm:
     ahead_m: float
     middle: tuple[float, ...]
     spread: tuple[float, ...]
-    move_s: float
-    rest_s: float
-    rate_hz: float
+    move_s: Positive
+    rest_s: Positive
+    rate_hz: Positive
     clock_s: float
     zero_std_rad: float
     sensor_std_rad: float
@@ -81,11 +81,9 @@ class BoardOnArm:
     def check(self) -> None:
         if not len(self.middle) == len(self.spread) == self.machine.num_joints:
             raise ConfigError(
-                f"scene: expected middle and spread of {self.machine.num_joints} joints, got "
+                f"middle: expected it and spread of {self.machine.num_joints} joints, got "
                 f"{len(self.middle)} and {len(self.spread)}"
             )
-        if min(self.move_s, self.rest_s, self.rate_hz) <= 0:
-            raise ConfigError("scene: expected move_s, rest_s and rate_hz above 0")
 
     def open(self, rig: StereoRig, session: Session) -> BoardScenes:
         """Return the scenes.

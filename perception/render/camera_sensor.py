@@ -9,15 +9,15 @@ steps spread the noise over neighbours, so that it no longer averages out as tha
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import cv2
 import numpy as np
+from annotated_types import Interval
 
-from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegativeRange, Ordered, PositiveRange, spec
 
-Range = tuple[float, float]
+Percent = Annotated[int, Interval(ge=1, le=100)]
 
 _SHARPENING_PX = 1.0
 """Standard deviation of the unsharp mask, as in common image processors; chosen by hand."""
@@ -211,47 +211,26 @@ class MosaicSensor:
         seed: `null`: another pair for each frame. A number draws one pair for all of them.
     """
 
-    full_well_e: Range
-    read_noise_e: Range
+    full_well_e: PositiveRange
+    read_noise_e: NonNegativeRange
     photo_response: float
-    bits: int
-    red_gain: Range
-    blue_gain: Range
-    exposure: Range
+    bits: Annotated[int, Interval(ge=6, le=16)]
+    red_gain: PositiveRange
+    blue_gain: PositiveRange
+    exposure: PositiveRange
     gain_std: float
     color_std: float
-    focus_px: Range
-    motion_px: Range
-    gamma: Range
-    sharpening: Range
-    jpeg_quality: tuple[int, int]
+    focus_px: NonNegativeRange
+    motion_px: NonNegativeRange
+    gamma: PositiveRange
+    sharpening: NonNegativeRange
+    jpeg_quality: Annotated[tuple[Percent, Percent], Ordered()]
     seed: int | None
 
     @property
     def usual_gamma(self) -> float:
         """Exponent of the tone curve that a user of the pictures expects."""
         return (self.gamma[0] + self.gamma[1]) / 2
-
-    def check(self) -> None:
-        for name in ("full_well_e", "gamma", "red_gain", "blue_gain", "exposure"):
-            low, high = getattr(self, name)
-            if not 0 < low <= high:
-                raise ConfigError(
-                    f"rig.sensor.{name}: expected 0 < lowest <= highest, got {low} and {high}"
-                )
-        if not 1 <= self.jpeg_quality[0] <= self.jpeg_quality[1] <= 100:
-            raise ConfigError(
-                f"rig.sensor.jpeg_quality: expected 1 <= lowest <= highest <= 100, got "
-                f"{self.jpeg_quality}"
-            )
-        if not 6 <= self.bits <= 16:
-            raise ConfigError(f"rig.sensor.bits: expected 6 to 16, got {self.bits}")
-        for name in ("read_noise_e", "focus_px", "motion_px", "sharpening"):
-            low, high = getattr(self, name)
-            if not 0 <= low <= high:
-                raise ConfigError(
-                    f"rig.sensor.{name}: expected 0 <= lowest <= highest, got {low} and {high}"
-                )
 
     def draw_pair(self, generator: np.random.Generator) -> tuple[MosaicCamera, MosaicCamera]:
         """Return the left and the right camera for one frame.

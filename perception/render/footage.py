@@ -11,11 +11,11 @@ import yaml
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session, write_text
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegative, Range, spec
 from perception.label.camera_pose import Charuco
 from perception.render.drilled_block import DrilledBlock
 from perception.render.printed_board import PrintedPlate, build_plate
-from perception.render.scene_ranges import Range, SceneRanges, draw_uniform, view_from
+from perception.render.scene_ranges import SceneRanges, draw_uniform, view_from
 from perception.render.scene_sampler import compose_scene, compute_hidden_share
 from perception.render.scene_sequence import StagedScene, build_pose
 from perception.render.stereo_camera import StereoRig
@@ -48,21 +48,19 @@ class Footage:
     name: str
     kind: SceneRanges
     board: Charuco
-    margin_m: float
-    gap_m: float
+    margin_m: NonNegative
+    gap_m: NonNegative
     distance_m: Range
     obliquity_rad: Range
-    roll_rad: float
-    click_px: float
+    roll_rad: NonNegative
+    click_px: NonNegative
 
     def check(self) -> None:
         if self.kind.block.present < 1.0 or self.kind.block.holes[0] < 1:
             raise ConfigError(
-                "scene=footage: expected a block with a hole (kind.block.present=1, holes of 1 or "
+                "kind: expected a block with a hole (kind.block.present=1, holes of 1 or "
                 f"more), got {self.kind.block.present} and {self.kind.block.holes}"
             )
-        if min(self.margin_m, self.gap_m, self.roll_rad, self.click_px) < 0:
-            raise ConfigError("scene: expected margin_m, gap_m, roll_rad and click_px of 0 or more")
 
     def open(self, rig: StereoRig, session: Session) -> FootageScenes:
         """Return the scenes.

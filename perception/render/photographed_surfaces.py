@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import PositiveRange, Share, spec
 from perception.render.materials import Photograph, read_photograph
-from perception.render.scene_ranges import Range, Scene, draw_log_uniform
+from perception.render.scene_ranges import Scene, draw_log_uniform
 
 ENDINGS = (".png", ".jpg", ".jpeg")
 
@@ -29,21 +29,15 @@ class PhotographedSurfaces:
     """
 
     folder: str | None
-    share: float
-    block_share: float
-    size_m: Range
+    share: Share
+    block_share: Share
+    size_m: PositiveRange
 
     def check(self) -> None:
-        shares = (self.share, self.block_share)
-        if not 0 <= min(shares) <= max(shares) <= 1 or not 0 < self.size_m[0] <= self.size_m[1]:
-            raise ConfigError(
-                "studio.surfaces: expected shares from 0 to 1 and 0 < lowest <= highest size_m, "
-                f"got {shares} and {self.size_m}"
-            )
         if self.folder is not None and not _list_photographs(self.folder):
             raise ConfigError(
-                f"studio.surfaces.folder={self.folder}: expected a folder with photographs "
-                f"({', '.join(ENDINGS)}), found none"
+                f"folder: expected a folder with photographs ({', '.join(ENDINGS)}), found none in "
+                f"{self.folder}"
             )
 
     def paint(self, scene: Scene, generator: np.random.Generator) -> Scene:

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from annotated_types import Interval
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, Ordered, PositiveRange, Range, spec
 from perception.render.camera_sensor import CameraExposure
 from perception.render.drilled_block import DrilledBlock
 from perception.render.ray_tracer import Light
 from perception.render.solids import Solid, SolidPose
 
-Range = tuple[float, float]
-Count = tuple[int, int]
+Transmission = Annotated[float, Interval(gt=0, le=1)]
+CountRange = Annotated[tuple[Index, Index], Ordered()]
+"""Fewest and most."""
 
 
 @spec
@@ -75,8 +77,8 @@ class BlockRanges:
     thickness_m: Range
     brightness: Range
     grain: Range
-    holes: Count
-    side_holes: Count
+    holes: CountRange
+    side_holes: CountRange
     radius_m: Range
     depth_m: Range
     fill_brightness: Range
@@ -84,27 +86,27 @@ class BlockRanges:
     lamp_probability: float
     bar_probability: float
     edge_m: Range
-    chips: Count
+    chips: CountRange
     chip_m: Range
-    dents: Count
+    dents: CountRange
     dent_m: Range
-    decoys: Count
+    decoys: CountRange
     decoy_radius_m: Range
     decoy_brightness: Range
-    stains: Count
+    stains: CountRange
     stain_brightness: Range
-    cracks: Count
+    cracks: CountRange
 
     def check(self) -> None:
         need = 2 * (max(self.radius_m[1], self.decoy_radius_m[1]) + self.edge_m[0])
         if need > min(self.width_m[0], self.length_m[0]):
             raise ConfigError(
-                f"scene.block: a face of {self.width_m[0]} m has no room for a hole that needs "
+                f"width_m: a face of {self.width_m[0]} m has no room for a hole that needs "
                 f"{need:g} m"
             )
         if self.depth_m[1] >= self.thickness_m[0]:
             raise ConfigError(
-                f"scene.block: holes of {self.depth_m[1]} m go through a block of "
+                f"depth_m: holes of {self.depth_m[1]} m go through a block of "
                 f"{self.thickness_m[0]} m"
             )
 
@@ -123,15 +125,14 @@ class SurroundingsRanges:
 
     arm: float
     hidden: Range
-    clutter: Count
+    clutter: CountRange
     backdrop_m: Range
     ground_brightness: Range
 
     def check(self) -> None:
         if self.hidden[1] > 0 and self.arm < 1 and self.hidden[0] > 0:
             raise ConfigError(
-                f"scene.around: hidden {self.hidden} needs an arm in every picture (arm: 1.0), got "
-                f"{self.arm}"
+                f"hidden: {self.hidden} needs an arm in every picture (arm: 1.0), got {self.arm}"
             )
 
 
@@ -162,26 +163,17 @@ class LightRanges:
     ambient: Range
     elevation_rad: Range
     bounces: bool
-    shadows: Count
-    level: Range
+    shadows: CountRange
+    level: PositiveRange
     exposure: Range
-    transmission: Range
+    transmission: Annotated[tuple[Transmission, Transmission], Ordered()]
     patchiness: Range
     airlight: Range
     blur_px: Range
-    full_well_e: Range
+    full_well_e: PositiveRange
     read_noise_e: Range
-    gamma: Range
+    gamma: PositiveRange
     vignetting: Range
-
-    def check(self) -> None:
-        if not 0 < self.transmission[0] <= self.transmission[1] <= 1:
-            raise ConfigError(
-                "scene.light.transmission: expected values above 0 and up to 1, got "
-                f"{self.transmission}"
-            )
-        if min(self.level[0], self.full_well_e[0], self.gamma[0]) <= 0:
-            raise ConfigError("scene.light: expected level, full_well_e and gamma above 0")
 
 
 @dataclass(frozen=True)
@@ -252,12 +244,6 @@ class SceneRanges:
     around: SurroundingsRanges
     light: LightRanges
 
-    def check(self) -> None:
-        for part in (self.sight, self.block, self.around, self.light):
-            for field, value in vars(part).items():
-                if isinstance(value, tuple) and value[0] > value[1]:
-                    raise ConfigError(f"scene: {field} {value} ends before it begins")
-
 
 def draw_uniform(value: Range, generator: np.random.Generator) -> float:
     """Draw evenly from a range."""
@@ -269,6 +255,6 @@ def draw_log_uniform(value: Range, generator: np.random.Generator) -> float:
     return math.exp(generator.uniform(math.log(value[0]), math.log(value[1])))
 
 
-def draw_integer(value: Count, generator: np.random.Generator) -> int:
+def draw_integer(value: CountRange, generator: np.random.Generator) -> int:
     """Draw a whole number, both ends included."""
     return int(generator.integers(value[0], value[1] + 1))

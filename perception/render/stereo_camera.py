@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from annotated_types import Ge
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.render.camera_sensor import LinearSensor, MosaicSensor
 from perception.render.ray_tracer import Pinhole
 
@@ -96,23 +97,15 @@ class StereoRig:
         sensor: Makes the pictures of both cameras from light.
     """
 
-    width: int
-    height: int
-    focal_px: float
-    baseline_m: float
+    width: Annotated[int, Ge(16)]
+    height: Annotated[int, Ge(16)]
+    focal_px: Positive
+    baseline_m: Positive
     position_in_base_m: tuple[float, float, float]
     yaw_rad: float
     pitch_rad: float
     error: PairMisalignment
     sensor: LinearSensor | MosaicSensor
-
-    def check(self) -> None:
-        if min(self.width, self.height) < 16 or self.focal_px <= 0 or self.baseline_m <= 0:
-            raise ConfigError(
-                "rig: expected width and height of 16 or more, focal_px and baseline_m above 0, got "
-                f"{self.width} x {self.height}, "
-                f"{self.focal_px}, {self.baseline_m}"
-            )
 
     @property
     def left(self) -> Pinhole:

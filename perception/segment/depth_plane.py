@@ -16,7 +16,7 @@ import numpy as np
 from brokk_rl.contracts.vision import Masks
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 from perception.pose.plane import DEGENERATE
 
 ONE, X, Y, XX, XY, YY = (0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)
@@ -111,36 +111,28 @@ class DepthPlane:
         seed: Of the trials; the same frame always gives the same mask.
     """
 
-    width_px: int
+    width_px: Count
     min_known: float
-    noise_per_m: float
-    num_sigma: float
-    num_trials: int
-    num_samples: int
-    num_planes: int
-    neighbourhood: float
+    noise_per_m: Positive
+    num_sigma: Positive
+    num_trials: Count
+    num_samples: Count
+    num_planes: Count
+    neighbourhood: Positive
     min_area: float
-    min_extent_m: float
+    min_extent_m: Positive
     max_extent_m: float
     max_tilt_rad: float
     min_front: float
-    edge_px: int
-    edge_contrast: float
+    edge_px: Count
+    edge_contrast: Positive
     seed: int
 
     def check(self) -> None:
-        counts = (self.width_px, self.num_trials, self.num_samples, self.num_planes, self.edge_px)
-        if (
-            min(counts) < 1
-            or min(self.noise_per_m, self.num_sigma, self.neighbourhood, self.edge_contrast) <= 0
-        ):
+        if self.min_extent_m >= self.max_extent_m:
             raise ConfigError(
-                "perception/segmenter=depth_plane: sizes, counts and noise must be above 0"
-            )
-        if not 0 < self.min_extent_m < self.max_extent_m:
-            raise ConfigError(
-                "segmenter: expected 0 < min_extent_m < max_extent_m, got "
-                f"{self.min_extent_m} and {self.max_extent_m}"
+                f"min_extent_m: expected less than max_extent_m={self.max_extent_m}, got "
+                f"{self.min_extent_m}"
             )
 
     def build(self) -> PlaneSegmenter:

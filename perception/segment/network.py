@@ -15,10 +15,10 @@ import cv2
 import numpy as np
 
 from brokk_rl.contracts.vision import Masks
-from brokk_rl.errors import CheckpointError, ConfigError
+from brokk_rl.errors import CheckpointError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, NonNegative, spec
 from perception.segment.window import Window, bound_block, center_window, cover_picture, tile_halves
 
 SHIPPED = Path(__file__).parents[1] / "weights"
@@ -56,14 +56,9 @@ class Onnx:
     """
 
     weights: str
-    margin: float | None
+    margin: NonNegative | None
     gate: str | None
-    threads: int
-
-    def check(self) -> None:
-        _check_margin(self.margin)
-        if self.threads < 1:
-            raise ConfigError(f"segmenter.threads: expected 1 or more, got {self.threads}")
+    threads: Count
 
     def build(self) -> NetworkSegmenter:
         """Return the segmenter.
@@ -124,11 +119,8 @@ class Unet:
     """
 
     weights: str
-    margin: float | None
+    margin: NonNegative | None
     device: str
-
-    def check(self) -> None:
-        _check_margin(self.margin)
 
     def build(self) -> NetworkSegmenter:
         """Return the segmenter.
@@ -278,10 +270,3 @@ def check_size(path: Path, header: dict) -> tuple[int, int]:
         )
     width, height = header["size_px"]
     return int(width), int(height)
-
-
-def _check_margin(margin: float | None) -> None:
-    if margin is not None and margin < 0:
-        raise ConfigError(
-            f"segmenter.margin: expected 0 or more, or null for one look, got {margin}"
-        )

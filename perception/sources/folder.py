@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 import yaml
 
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, Share, spec
 from perception import dataset
 from perception.calibrate.disparity_error import correct_depth
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
@@ -39,18 +39,11 @@ class FrameFolder:
     """
 
     folder: str
-    rate_hz: float
-    least_known: float
+    rate_hz: Positive
+    least_known: Share
     needs: Literal["depth", "camera", "nothing"]
     base_from_camera: CameraPlacement
     stereo: Stereo
-
-    def check(self) -> None:
-        if self.rate_hz <= 0 or not 0 <= self.least_known <= 1:
-            raise ConfigError(
-                "source: expected rate_hz above 0 and least_known from 0 to 1, got "
-                f"{self.rate_hz} and {self.least_known}"
-            )
 
     def build(self) -> FolderSource:
         """Return the source, not yet opened."""

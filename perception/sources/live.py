@@ -8,9 +8,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, Share, spec
 from perception.calibrate.disparity_error import correct_depth
 from perception.calibrate.extrinsics import CameraExtrinsics
 from perception.sources import validation
@@ -70,16 +70,9 @@ class Freshness:
         least_known: Least part of the picture with known depth.
     """
 
-    timeout_s: float
-    max_age_s: float
-    least_known: float
-
-    def check(self) -> None:
-        if min(self.timeout_s, self.max_age_s) <= 0 or not 0 <= self.least_known <= 1:
-            raise ConfigError(
-                "source.fresh: expected timeout_s and max_age_s above 0, least_known from 0 to 1, got "
-                f"{self.timeout_s}, {self.max_age_s} and {self.least_known}"
-            )
+    timeout_s: Positive
+    max_age_s: Positive
+    least_known: Share
 
 
 class LiveSource:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.contracts.vision import CameraView, TrackedHole
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.mount.approach import plan_approach_motion
 from perception.mount.mounts import CameraMountSpec
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
@@ -37,11 +37,7 @@ class MovingCamera:
     next_view: ExpectedCovariance
     arm: ArmShape
     machine: Machine
-    hint_m: float
-
-    def check(self) -> None:
-        if self.hint_m <= 0:
-            raise ConfigError(f"source.hint_m: expected more than 0, got {self.hint_m}")
+    hint_m: Positive
 
     def build(self) -> MovingSource:
         """Return the source, not yet opened."""

@@ -11,8 +11,8 @@ from typing import Literal
 import cv2
 import numpy as np
 
-from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.spec import spec
+from brokk_rl.errors import FrameError
+from brokk_rl.spec import Positive, spec
 from perception.sources import validation
 from perception.sources.folder import read_picture
 
@@ -119,11 +119,7 @@ class ExportedPictures:
     color: str
     right: str | None
     depth: str | None
-    depth_unit_m: float
-
-    def check(self) -> None:
-        if self.depth_unit_m <= 0:
-            raise ConfigError(f"capture.depth_unit_m: expected above 0, got {self.depth_unit_m}")
+    depth_unit_m: Positive
 
     def read(self) -> Iterator[RawFrame]:
         """Yield frames in the order of their numbers.

@@ -11,7 +11,7 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 from perception.render.block_sampler import build_frame, draw_block_materials
 from perception.render.drilled_block import FRONT, DrilledBlock, DrilledHole
 from perception.render.frame_renderer import FrameRenderer, RenderedFrame
@@ -55,26 +55,17 @@ class SimulatedCamera:
     surroundings: SceneRanges
     stereo: Stereo
     task_scene: tuple[float, float, float, float, float, float]
-    block_m: tuple[float, float, float]
-    hole_depth_m: float
-    arm_m: tuple[float, float]
-    num_frames: int
-    rate_hz: float
+    block_m: tuple[Positive, Positive, Positive]
+    hole_depth_m: Positive
+    arm_m: tuple[Positive, Positive]
+    num_frames: Count
+    rate_hz: Positive
     seed: int
 
     def check(self) -> None:
-        if (
-            min(self.block_m) <= 0
-            or min(self.arm_m) <= 0
-            or self.rate_hz <= 0
-            or self.num_frames < 1
-        ):
+        if self.hole_depth_m >= self.block_m[2]:
             raise ConfigError(
-                "source: expected block_m, arm_m and rate_hz above 0 and num_frames of 1 or more"
-            )
-        if not 0 < self.hole_depth_m < self.block_m[2]:
-            raise ConfigError(
-                f"source: a hole of {self.hole_depth_m} m does not fit into a block "
+                f"hole_depth_m: a hole of {self.hole_depth_m} m does not fit into a block "
                 f"{self.block_m[2]} m high"
             )
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import importlib
 import time
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Interval
 
 from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
 from perception.sources import validation
 from perception.sources.live import Freshness, LensCalibration, LiveSource, RawCapture
@@ -43,8 +44,8 @@ class Zed:
     rate_hz: int
     depth_mode: Literal["NEURAL_PLUS", "NEURAL", "NEURAL_LIGHT", "ULTRA", "QUALITY", "PERFORMANCE"]
     sensing: Literal["standard", "fill"]
-    confidence: int
-    nearest_m: float
+    confidence: Annotated[int, Interval(ge=1, le=100)]
+    nearest_m: Positive
     farthest_m: float
     base_from_camera: CameraPlacement
     fresh: Freshness
@@ -52,16 +53,12 @@ class Zed:
     def check(self) -> None:
         if self.sensing == "fill":
             raise ConfigError(
-                "source.sensing=fill: it invents depth where nothing was seen, also across boreholes; "
-                "use standard"
+                "sensing: 'fill' invents depth where nothing was seen, also across boreholes; use standard"
             )
-        if not 0 < self.nearest_m < self.farthest_m:
+        if self.nearest_m >= self.farthest_m:
             raise ConfigError(
-                "source: expected 0 < nearest_m < farthest_m, got "
-                f"{self.nearest_m} and {self.farthest_m}"
+                f"nearest_m: expected less than farthest_m={self.farthest_m}, got {self.nearest_m}"
             )
-        if not 1 <= self.confidence <= 100:
-            raise ConfigError(f"source.confidence: expected 1 to 100, got {self.confidence}")
 
     def build(self) -> LiveSource:
         """Return the source, not yet opened."""

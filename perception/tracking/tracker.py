@@ -10,7 +10,7 @@ import numpy as np
 
 from brokk_rl.contracts.vision import HolePose, TrackedHole
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, NonNegative, Positive, spec
 
 SMALLEST_VARIANCE_M2 = 1e-8
 """Variance below which a detection counts no more, (0.1 mm)²: no camera measures better."""
@@ -34,23 +34,17 @@ class VarianceFusion:
             the base may have moved against the hole; it grows with the square root of the time.
     """
 
-    near_m: float
-    memory: int
-    confirm: int
-    stale_s: float
+    near_m: Positive
+    memory: Count
+    confirm: Count
+    stale_s: Positive
     forget_s: float
-    drift_m_sqrt_s: float
+    drift_m_sqrt_s: NonNegative
 
     def check(self) -> None:
-        if not 0 < self.stale_s <= self.forget_s or min(self.memory, self.confirm) < 1:
+        if self.stale_s > self.forget_s:
             raise ConfigError(
-                "tracker: expected 0 < stale_s <= forget_s, memory and confirm of 1 or more, got "
-                f"{self.stale_s}, {self.forget_s}, {self.memory} and {self.confirm}"
-            )
-        if self.near_m <= 0 or self.drift_m_sqrt_s < 0:
-            raise ConfigError(
-                "tracker: expected near_m above 0 and drift_m_sqrt_s of 0 or more, got "
-                f"{self.near_m} and {self.drift_m_sqrt_s}"
+                f"stale_s: expected forget_s={self.forget_s} or less, got {self.stale_s}"
             )
 
     def build(self) -> FusionTracker:

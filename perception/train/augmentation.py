@@ -17,8 +17,7 @@ from typing import Protocol
 import torch
 from torch.nn import functional
 
-from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import NonNegativeRange, Share, spec
 
 LUMINANCE_STEPS = (
     (16, 11, 10, 16, 24, 40, 51, 61), (12, 12, 14, 19, 26, 58, 60, 55), (14, 13, 16, 24, 40, 57, 69, 56),
@@ -110,12 +109,9 @@ class Exposure:
         tint: Largest relative difference of a colour's gain.
     """
 
-    probability: float
-    gain: Range
+    probability: Share
+    gain: NonNegativeRange
     tint: float
-
-    def check(self) -> None:
-        _check_ranges(self, gain=self.gain)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures with another exposure."""
@@ -138,11 +134,8 @@ class Contrast:
         gain: Range of the factor.
     """
 
-    probability: float
-    gain: Range
-
-    def check(self) -> None:
-        _check_ranges(self, gain=self.gain)
+    probability: Share
+    gain: NonNegativeRange
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures with another contrast."""
@@ -159,11 +152,8 @@ class Gamma:
         exponent: Range of the exponent.
     """
 
-    probability: float
-    exponent: Range
-
-    def check(self) -> None:
-        _check_ranges(self, exponent=self.exponent)
+    probability: Share
+    exponent: NonNegativeRange
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures with another tone curve."""
@@ -181,13 +171,10 @@ class Shadow:
         softness: Range of the edge's width, as a part of the picture's.
     """
 
-    probability: float
+    probability: Share
     depth: Range
-    width: Range
-    softness: Range
-
-    def check(self) -> None:
-        _check_ranges(self, width=self.width, softness=self.softness)
+    width: NonNegativeRange
+    softness: NonNegativeRange
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures with a shadow across them."""
@@ -217,13 +204,10 @@ class Haze:
         unevenness: Largest change of the transmission across the picture.
     """
 
-    probability: float
-    transmission: Range
-    brightness: Range
+    probability: Share
+    transmission: NonNegativeRange
+    brightness: NonNegativeRange
     unevenness: float
-
-    def check(self) -> None:
-        _check_ranges(self, transmission=self.transmission, brightness=self.brightness)
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures through dust."""
@@ -251,11 +235,8 @@ class Blur:
         sigma_px: Range of the standard deviation, px of the network's picture.
     """
 
-    probability: float
-    sigma_px: Range
-
-    def check(self) -> None:
-        _check_ranges(self, sigma_px=self.sigma_px)
+    probability: Share
+    sigma_px: NonNegativeRange
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures out of focus."""
@@ -274,11 +255,8 @@ class MotionBlur:
         length_px: Range of the way, px of the network's picture.
     """
 
-    probability: float
-    length_px: Range
-
-    def check(self) -> None:
-        _check_ranges(self, length_px=self.length_px)
+    probability: Share
+    length_px: NonNegativeRange
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures smeared along a line, centred on where they were."""
@@ -306,13 +284,10 @@ class PictureNoise:
         grain_px: Range of the grain's size.
     """
 
-    probability: float
+    probability: Share
     constant: Range
     photon: Range
-    grain_px: Range
-
-    def check(self) -> None:
-        _check_ranges(self, grain_px=self.grain_px)
+    grain_px: NonNegativeRange
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures with noise."""
@@ -340,11 +315,8 @@ class Jpeg:
         quality: Range of JPEG's quality, 1 to 100.
     """
 
-    probability: float
-    quality: Range
-
-    def check(self) -> None:
-        _check_ranges(self, quality=self.quality)
+    probability: Share
+    quality: NonNegativeRange
 
     def changed(self, pictures: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
         """Return the pictures as a JPEG file gives them back."""
@@ -376,17 +348,3 @@ def _filter_pictures(pictures: torch.Tensor, kernels: torch.Tensor) -> torch.Ten
     ]
     each = kernels.repeat_interleave(pictures.shape[1], 0)
     return functional.conv2d(wide, each, groups=len(each))[0].unflatten(0, pictures.shape[:2])
-
-
-def _check_ranges(step: Augmentation, **ranges: Range) -> None:
-    """Raise a `ConfigError` for a probability outside [0, 1] or a range empty or below 0."""
-    if not 0.0 <= step.probability <= 1.0:
-        raise ConfigError(
-            f"{type(step).__name__}.probability: expected 0 to 1, got {step.probability}"
-        )
-    for name, (low, high) in ranges.items():
-        if not 0.0 <= low <= high:
-            raise ConfigError(
-                f"{type(step).__name__}.{name}: expected 0 <= lowest <= highest, got "
-                f"[{low}, {high}]"
-            )

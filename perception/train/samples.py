@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from torch.nn import functional
 
-from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.errors import FrameError
 from brokk_rl.progress import track_items
-from brokk_rl.spec import spec
+from brokk_rl.spec import PositiveRange, spec
 from perception import dataset
 from perception.segment.network import SMALLEST_PIECE, THRESHOLD
 from perception.segment.window import Window, bound_block, center_window, cover_picture
@@ -58,16 +58,10 @@ class Crop:
         mirror: How often left and right are swapped.
     """
 
-    width: tuple[float, float]
+    width: PositiveRange
     shift: float
     roll_rad: float
     mirror: float
-
-    def check(self) -> None:
-        if not 0 < self.width[0] <= self.width[1]:
-            raise ConfigError(
-                f"training.crop.width: expected 0 < lowest <= highest, got {list(self.width)}"
-            )
 
     def windows(
         self, seen: torch.Tensor, shape: tuple[int, int], generator: torch.Generator

@@ -7,13 +7,14 @@ import io
 import logging
 import math
 import time
-from typing import Any
+from typing import Annotated, Any
 
 import torch
+from annotated_types import Ge
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.session import Session
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Positive, spec
 from perception.segment.network import LEAST_BLOCK, THRESHOLD, find_weights
 from perception.segment.unet import UNet, compute_loss, read_checkpoint
 from perception.train import evaluation, export
@@ -66,40 +67,30 @@ class SegmenterTraining:
     frames: str | tuple[str, ...]
     negatives: str | tuple[str, ...] | None
     validation: str | tuple[str, ...] | None
-    hold_out: int
-    size_px: tuple[int, int]
+    hold_out: Annotated[int, Ge(2)]
+    size_px: tuple[Count, Count]
     widths: tuple[int, ...]
     start: str | None
-    updates: int
-    max_seconds: float | None
-    batch: int
-    rate: float
+    updates: Count
+    max_seconds: Positive | None
+    batch: Count
+    rate: Positive
     decay: float
-    average: float
+    average: Positive
     bfloat16: bool
     closer: float
     margin: float
-    validate_every: int
+    validate_every: Count
     crop: Crop
     augment: dict[str, Augmentation]
 
     def check(self) -> None:
         multiple = 2 ** (len(self.widths) - 1)
-        if any(side % multiple for side in self.size_px) or min(self.size_px, default=0) <= 0:
+        if any(side % multiple for side in self.size_px):
             raise ConfigError(
-                f"training.size_px: {len(self.widths)} widths halve it {len(self.widths) - 1} times, so expected multiples of "
+                f"size_px: {len(self.widths)} widths halve it {len(self.widths) - 1} times, so expected multiples of "
                 f"{multiple}, got {list(self.size_px)}"
             )
-        if min(self.updates, self.batch, self.validate_every) < 1 or self.hold_out < 2:
-            raise ConfigError(
-                "training: expected updates, batch, validate_every of 1 or more, hold_out of 2 or "
-                "more"
-            )
-        if (
-            min(self.average, self.rate, math.inf if self.max_seconds is None else self.max_seconds)
-            <= 0
-        ):
-            raise ConfigError("training: expected average, rate and max_seconds above 0")
 
     def fit(self, session: Session, resume: bool) -> dict[str, Any]:
         """Train; write network (safetensors, ONNX), curve and samples (PNG) into the session's folder.

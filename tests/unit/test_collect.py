@@ -166,7 +166,7 @@ def test_actuator_and_effects_are_chosen_as_everywhere(
             ("excitation=holds", "run_minutes"),
         ),
         (("excitation=[repeat]",), ("nothing before it",)),
-        (("collect.guards.max_command=2",), ("collect.guards.max_command", "(0, 1]")),
+        (("collect.guards.max_command=2",), ("collect.guards.max_command", "above 0 up to 1")),
         (("collect.flush_s=0",), ("collect.flush_s",)),
         (("actuator.gian=2",), ("'actuator' has no 'gian'",)),
     ],

@@ -594,7 +594,7 @@ def test_truth_and_masks_come_back_as_they_were_written(rig: StereoRig, tmp_path
 @pytest.mark.parametrize(
     ("part", "change", "told"),
     [
-        ("sight", {"distance_m": (3.0, 2.0)}, "ends before it begins"),
+        ("sight", {"distance_m": (3.0, 2.0)}, "distance_m: expected .lowest, highest."),
         ("block", {"width_m": (0.1, 1.0)}, "no room"),
         ("block", {"depth_m": (0.2, 0.9)}, "go through"),
         ("light", {"transmission": (0.0, 1.0)}, "transmission"),
