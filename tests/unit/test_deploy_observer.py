@@ -391,13 +391,13 @@ def test_a_file_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
     [{"window_s": 0.0}, {"least_slack_s": 0.0}, {"share": 0.0}, {"share": 1.0}, {"margin": 0.9}],
 )
 def test_thresholds_that_make_no_sense_are_refused(change: dict[str, float]) -> None:
-    with pytest.raises(ConfigError, match=r"observe\.thresholds"):
+    with pytest.raises(ConfigError, match="|".join(change)):
         replace(SETTINGS, **change)
 
 
 @pytest.mark.parametrize("chance", [0.0, 1.0])
 def test_a_rate_of_false_alarms_that_makes_no_sense_is_refused(chance: float) -> None:
-    with pytest.raises(ConfigError, match=r"guard\.observer"):
+    with pytest.raises(ConfigError, match="false_alarms"):
         replace(LIMITS, false_alarms=chance)
 
 

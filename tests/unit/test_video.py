@@ -69,7 +69,7 @@ def test_a_picture_without_a_code_is_not_read() -> None:
 
 def test_settings_that_make_no_sense_are_refused() -> None:
     video = option("video", "pattern")
-    with pytest.raises(ConfigError, match="a camera"):
+    with pytest.raises(ConfigError, match="cameras: expected one or more"):
         replace(video, cameras={})
     with pytest.raises(ConfigError, match="min_bitrate"):
         replace(video, min_bitrate=5_000_000)
