@@ -260,9 +260,9 @@ def test_a_model_that_stands_still_is_no_good_news(
 
 def test_what_makes_no_sense_is_refused_by_name(brokk: Callable[..., Any]) -> None:
     for override, message in (
-        ("identify.folds=1", "identify.folds: expected a whole number of 2 or more"),
-        ("identify.hold_out=2", "identify.hold_out: expected a whole number of 3 or more"),
-        ("identify.stride_s=0", "identify.stride_s: expected a finite number above 0"),
+        ("identify.folds=1", "folds: expected a whole number of 2 or more"),
+        ("identify.hold_out=2", "hold_out: expected a whole number of 3 or more"),
+        ("identify.stride_s=0", "stride_s: expected a finite number above 0"),
         ("~fit@baselines.arx", "baselines: arx must be among them"),
     ):
         done = brokk("mode=identify", "identify.recordings=none/*", override)
