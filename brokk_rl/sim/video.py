@@ -11,6 +11,7 @@ import math
 import os
 import pickle
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -26,6 +27,7 @@ import torch
 from brokk_rl.errors import StorageError
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
+from brokk_rl.progress import ItemProgress
 from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.posed_scene import SHOWN_GROUPS, PosedScene
 from brokk_rl.sim.probe import find_renderer
@@ -44,6 +46,8 @@ NUM_STILLS = 3
 """Pictures of a video. Chosen by hand; not searched."""
 RENDER_TIMEOUT_S = 600
 """Bound on the rendering process; 200 frames take about 40 s on a CPU."""
+DRAWN = "one picture is drawn"
+"""Line by which the rendering process counts its pictures."""
 FONT_SIZE = 18
 """Size of the text, px. Chosen by hand; not searched."""
 MARK_RADIUS_M, MARK_RGBA = 0.06, (0.1, 0.75, 0.35, 0.8)
@@ -178,33 +182,53 @@ def _render_in_subprocess(job: RenderJob) -> bool:
         "PYTHONPATH": os.pathsep.join(part for part in sys.path if part),
     }
     program = "import sys; from brokk_rl.sim.video import render_job; render_job(sys.argv[1])"
-    try:
-        done = subprocess.run(
+    told = []
+    with (
+        ItemProgress("drawing a video", len(_choose_steps(len(job.q)))) as progress,
+        subprocess.Popen(
             [sys.executable, "-c", program, str(file)],
             env=environment,
             cwd=file.parent,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
             text=True,
-            timeout=RENDER_TIMEOUT_S,
-        )
-    except subprocess.TimeoutExpired:
-        log.warning(
-            "MuJoCo's renderer took more than %d s, so the video is a drawing", RENDER_TIMEOUT_S
-        )
-        return False
-    if done.returncode:
+        ) as process,
+    ):
+        assert process.stdout is not None
+        for line in process.stdout:
+            if line.strip() == DRAWN:
+                progress.advance()
+            else:
+                told.append(line)
+    if process.returncode:
+        reason = "it took too long" if process.returncode == -signal.SIGALRM else "".join(told)
         log.warning(
             "MuJoCo's renderer failed with MUJOCO_GL=%s, so the video is a drawing: %s",
             library,
-            done.stderr.strip()[-500:],
+            reason.strip()[-500:],
         )
-    return done.returncode == 0
+    return process.returncode == 0
 
 
 def render_job(file: str) -> None:
     """Render the `RenderJob` that `render_video` has left in `file`; runs in its own process."""
+    signal.alarm(RENDER_TIMEOUT_S)
     job: RenderJob = pickle.loads(Path(file).read_bytes())
-    write_video(job.path, draw_rendered(job), len(job.q), job.machine.period_s)
+    draw = draw_rendered(job)
+
+    def draw_and_tell(steps: Iterable[int]) -> Iterator[np.ndarray]:
+        for picture in draw(steps):
+            yield picture
+            sys.stdout.write(f"{DRAWN}\n")
+            sys.stdout.flush()
+
+    write_video(job.path, draw_and_tell, len(job.q), job.machine.period_s)
+
+
+def _choose_steps(num_steps: int) -> list[int]:
+    """Return the steps that a video shows: every one, or `MAX_FRAMES` of a longer episode."""
+    stride = max(1, math.ceil(num_steps / MAX_FRAMES))
+    return sorted({*range(0, num_steps, stride), num_steps - 1})
 
 
 def write_video(path: Path, draw: DrawFrames, num_steps: int, period_s: float) -> None:
@@ -220,7 +244,7 @@ def write_video(path: Path, draw: DrawFrames, num_steps: int, period_s: float) -
     import imageio_ffmpeg
 
     stride = max(1, math.ceil(num_steps / MAX_FRAMES))
-    steps = sorted({*range(0, num_steps, stride), num_steps - 1})
+    steps = _choose_steps(num_steps)
     # stills at equal distances from the first frame to the last
     stills = {round(i * (len(steps) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
     rate_hz = 1.0 / (period_s * stride)
