@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import copy
+import dataclasses
 import logging
 import math
 import os
-import re
 import shutil
 import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -21,16 +20,15 @@ from typing import Any
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 from rich.logging import RichHandler
 
 import brokk_rl
-from brokk_rl import distributed, extensions, gpu_pool, registry
+from brokk_rl import distributed, extensions, gpu_pool
 from brokk_rl.arguments import read_arguments
 from brokk_rl.errors import BrokkError, ConfigError
-from brokk_rl.explain import compose_choices, explain, explain_missing_value, read_mode_name
+from brokk_rl.explain import compose_choices, explain, read_mode_name
 from brokk_rl.mode_help import describe_mode
 from brokk_rl.policy_choice import insert_policy, is_going_on, prepare_arguments
 from brokk_rl.session import read_earlier_job, remove_empty_folders, require_new_folder
@@ -38,14 +36,6 @@ from brokk_rl.sim import probe
 from brokk_rl.sweep import SweepFolder, name_job
 
 log = logging.getLogger(__name__)
-
-
-CHECKED_FIRST = (
-    "session machine sim task rl evaluation tracking excitation collect identify play bench subject "
-    "diagnosis compare convert log inspect observe perceive render label twin study"
-)
-"""Nodes whose specs are checked before the mode is imported, and torch with it: their modules do
-without."""
 
 
 class FailedJob(BaseException):
@@ -131,33 +121,24 @@ def run_job(cfg: DictConfig) -> float | None:
 
 
 def _run(cfg: DictConfig) -> float | None:
-    """Instantiate the mode and run it, within its session where it has one."""
+    """Build the mode and run it, within its session where it has one."""
+    from brokk_rl.build import build_mode
+
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
-    cfg = insert_policy(_upgrade(cfg))
-    check_values(cfg)
-    cfg = _drop_consumed_groups(cfg)
-    if "session" not in cfg:
-        distributed.check_together(get_class(str(cfg._target_)), sweep)
-        return instantiate(cfg, _convert_="all").run()
-    folder, resolved = choose_run_folder(cfg), _format_resolved(cfg)
-    try:
-        before = read_earlier_job(folder, resolved) if sweep else None
-        if before and before.get("outcome") == "finished":
-            log.info("job %s is done already: %s", HydraConfig.get().job.num, folder)
-            return before.get("objective")
-        resume = bool(before) or is_going_on(cfg, folder)
-        if not resume and distributed.read_rank().first:
-            require_new_folder(folder)
-        log.info("run folder: %s", folder)
-        again = {"resume": str(folder)} if before and "resume" in cfg and cfg.resume is None else {}
-        mode = instantiate(cfg, session={"out": str(folder)}, **again, _convert_="all")
+    cfg = insert_policy(cfg)
+    values, shared = extensions.read_values(cfg)
+    if "session" not in values:
+        mode = build_mode(values, shared)
         distributed.check_together(type(mode), sweep)
-        with mode.session.start(resolved, _collect_facts(cfg, mode), resume) as record:
-            objective = mode.run()
-            record.fields["objective"] = (
-                objective if objective is not None and math.isfinite(objective) else None
-            )
-            return objective
+        return mode.run()
+    folder = choose_run_folder(values)
+    goes_on = is_going_on(cfg, folder)
+    try:
+        if not (sweep or goes_on) and distributed.read_rank().first:
+            require_new_folder(folder)
+        mode = build_mode(values | {"session": values["session"] | {"out": str(folder)}}, shared)
+        distributed.check_together(type(mode), sweep)
+        return _run_in_session(mode, values, sweep, goes_on)
     except Exception:
         if sweep:
             # Hydra made these folders, in several levels where an override holds a path. A folder
@@ -166,21 +147,24 @@ def _run(cfg: DictConfig) -> float | None:
         raise
 
 
-def check_values(cfg: DictConfig) -> None:
-    """Build the specs that need no torch, so that their bad values are refused within a second.
-
-    Raises:
-        ConfigError: A value is bad, or one that must be given is not.
-    """
-    if missing := OmegaConf.missing_keys(cfg) - {"session.out"}:
-        raise ConfigError(explain_missing_value(min(missing)))
-    cfg = copy.deepcopy(cfg)  # a node that takes in another one resolves that one in its place
-    for name in CHECKED_FIRST.split():
-        node = OmegaConf.select(cfg, name, throw_on_missing=False)
-        if not isinstance(node, DictConfig):
-            continue
-        given = {"out": "."} if name == "session" else {}  # the command chooses the folder itself
-        instantiate(node, **given, _convert_="all")
+def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: bool) -> float | None:
+    """Run a mode in its run folder; a finished job of a sweep is not run again."""
+    folder, resolved = mode.session.folder, _format_resolved(mode, values)
+    before = read_earlier_job(folder, resolved) if sweep else None
+    if before and before.get("outcome") == "finished":
+        log.info("job %s is done already: %s", HydraConfig.get().job.num, folder)
+        return before.get("objective")
+    if before and getattr(mode, "resume", "") is None:
+        mode = dataclasses.replace(mode, resume=str(folder))
+    resume = bool(before) or goes_on
+    log.info("run folder: %s", folder)
+    facts = _collect_facts(read_mode_name(values), mode)
+    with mode.session.start(resolved, facts, resume) as record:
+        objective = mode.run()
+        record.fields["objective"] = (
+            objective if objective is not None and math.isfinite(objective) else None
+        )
+        return objective
 
 
 def _is_first_process() -> bool:
@@ -191,33 +175,7 @@ def _is_first_process() -> bool:
         return True
 
 
-def _upgrade(cfg: DictConfig) -> DictConfig:
-    """Return the configuration in current terms, as `resolved.yaml` of an older run needs it."""
-    text = registry.rename_targets(OmegaConf.to_yaml(cfg))
-    content: Any = OmegaConf.to_container(OmegaConf.create(text))
-    registry.upgrade_fields(content)
-    return cfg if content == OmegaConf.to_container(cfg) else DictConfig(content)
-
-
-def _drop_consumed_groups(cfg: DictConfig) -> DictConfig:
-    """Return the configuration without groups that only another node uses (`actuator: ${actuator}`).
-
-    An option can thus bring groups of its own: `link=simulated` brings the actuator that it
-    simulates, which is chosen like any other.
-    """
-    taken = set()
-    for name in re.findall(r"\$\{(\w+)[.}]", OmegaConf.to_yaml(cfg)):
-        if name in cfg:
-            taken.add(name)
-    if not taken:
-        return cfg
-    taken -= set(getattr(get_class(str(cfg._target_)), "__dataclass_fields__", ()))
-    whole = OmegaConf.to_container(cfg, resolve=True)
-    assert isinstance(whole, dict)
-    return OmegaConf.create({key: value for key, value in whole.items() if key not in taken})
-
-
-def _collect_facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
+def _collect_facts(name: str, mode: Any) -> dict[str, Any]:
     """Return the fields of `session.json` about mode, options, overrides and machine."""
     settings = HydraConfig.get()
     made = OmegaConf.to_container(settings.runtime.choices)
@@ -232,13 +190,13 @@ def _collect_facts(cfg: DictConfig, mode: Any) -> dict[str, Any]:
         key, _, value = override.partition("=")
         if value.startswith("["):  # Hydra does not record options that were chosen as a list.
             chosen.setdefault(key, value)
-    facts: dict[str, Any] = {"mode": read_mode_name(cfg), "choices": chosen, "overrides": overrides}
+    facts: dict[str, Any] = {"mode": name, "choices": chosen, "overrides": overrides}
     if machine := getattr(mode, "machine", None):
         facts |= {"machine": machine.name, "fingerprint": machine.fingerprint()}
     return facts
 
 
-def choose_run_folder(cfg: DictConfig) -> Path:
+def choose_run_folder(values: Mapping[str, Any]) -> Path:
     """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`."""
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
@@ -246,13 +204,13 @@ def choose_run_folder(cfg: DictConfig) -> Path:
         return Path(settings.sweep.dir) / name_job(
             int(settings.job.num), list(settings.overrides.task), list(fixed)
         )
-    out = OmegaConf.select(cfg, "session.out", default=None)
-    if out:
+    out = values["session"]["out"]
+    if out and out != "???":
         return Path(out)
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
     name = Path(name).stem if name else None  # An option may be a file: experiment=@<path>.
     stem = "_".join(
-        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", read_mode_name(cfg), name))
+        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", read_mode_name(values), name))
     )
     return Path("runs") / stem
 
@@ -295,14 +253,16 @@ def _describe_chosen_mode() -> str:
     )
 
 
-def _format_resolved(cfg: DictConfig) -> str:
+def _format_resolved(mode: Any, values: dict[str, Any]) -> str:
     """Return the text of `resolved.yaml`, which runs again in a new folder."""
-    values = OmegaConf.create(OmegaConf.to_container(cfg, resolve=True))
-    values.session.out = "???"
-    settings = {"defaults": [{"hydra": "brokk"}, "_self_"]}
+    content: dict[str, Any] = {"defaults": [{"hydra": "brokk"}, "_self_"], "run": values["run"]}
+    for field in dataclasses.fields(mode):
+        if field.name in values:
+            content[field.name] = values[field.name]
+    content["session"] = values["session"] | {"out": "???"}
     return (
         "# Runs again: brokk --config-dir <this folder> --config-name resolved\n"
-        + OmegaConf.to_yaml(OmegaConf.merge(settings, values))
+        + OmegaConf.to_yaml(OmegaConf.create(content))
     )
 
 

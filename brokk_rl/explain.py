@@ -6,21 +6,14 @@ import contextlib
 import errno
 import re
 import sys
-import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import hydra
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import (
-    ConfigCompositionException,
-    HydraException,
-    InstantiationException,
-    MissingConfigException,
-)
-from hydra.utils import get_class
+from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     InterpolationResolutionError,
@@ -45,7 +38,7 @@ def explain(error: BaseException) -> str | None:
     if any(type(e).__name__ == "OutOfMemoryError" for e in chain):
         return f"the memory of the GPU is full: use fewer environments, or session.device=cpu ({error})"
     if ours:
-        return f"{ours}{_locate_node(error)}"
+        return str(ours)
     if missing:
         return explain_missing_value(str(missing.full_key or missing))
     lacking = next((e for e in chain if isinstance(e, ModuleNotFoundError) and e.name), None)
@@ -53,8 +46,6 @@ def explain(error: BaseException) -> str | None:
         return text
     if isinstance(error, MissingConfigException):
         return _explain_missing_option(error)
-    if isinstance(error, InstantiationException):
-        return _explain_bad_node(error, chain[-1])
     if isinstance(error, ConfigCompositionException):
         return _explain_bad_override(error)
     if isinstance(error, InterpolationResolutionError):
@@ -142,71 +133,6 @@ def _explain_interpolation(error: InterpolationResolutionError) -> str:
     return f"{key}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
 
 
-def _explain_bad_node(error: InstantiationException, cause: BaseException) -> str | None:
-    """Explain a node that cannot be built: an unknown or missing field, an import that fails.
-
-    An import that fails in this package is a defect and gives `None`.
-    """
-    if located := re.search(r"locating target '([\w.]+)'", str(error)):
-        return _explain_import(located[1], cause, _locate_node(error))
-    called = re.search(r"call to target '([\w.]+)'", str(error))
-    if called and isinstance(error.__cause__, TypeError):
-        known = list(getattr(get_class(called[1]), "__dataclass_fields__", ()))
-        name = called[1].rpartition(".")[2]
-        text = str(error.__cause__)
-        if unknown := re.search(r"unexpected keyword argument '(\w+)'", text):
-            place = re.search(r"full_key: (\S+)", str(error))
-            key = f"{place[1]}.{unknown[1]}" if place else unknown[1]
-            if renamed := registry.find_renamed_field(key):
-                return f"{name} has no field '{unknown[1]}': '{renamed[0]}' is now '{renamed[1]}'"
-            choices = list_choices(unknown[1], known)
-            return f"{name} has no field '{unknown[1]}'; {choices}{_locate_node(error)}"
-        if lacking := re.search(r"missing \d+ required keyword-only arguments?: (.+)", text):
-            return f"{name} lacks {lacking[1]}{_locate_node(error)}"
-    return str(error)
-
-
-def _explain_import(target: str, cause: BaseException, node: str) -> str | None:
-    """Explain a class that cannot be imported: file, line and error of the module that fails."""
-    module, _, name = target.rpartition(".")
-    place = _find_line(cause)
-    if place is None:
-        if isinstance(cause, ModuleNotFoundError) and "is not a package" not in str(cause):
-            return (
-                f"{target}: there is no module '{cause.name}' (seen from {Path.cwd()}); install its "
-                f"package, or add its folder to PYTHONPATH{node}"
-            )
-        return f"{target}: the module '{module}' has no '{name}'{node}"
-    file, line = place
-    if Path(file).is_relative_to(Path(__file__).parents[1]) and "site-packages" not in file:
-        return None
-    return (
-        f"{target} cannot be imported: {file}, line {line}: {type(cause).__name__}: {cause}{node}"
-    )
-
-
-def _find_line(error: BaseException) -> tuple[str, int] | None:
-    """Return file and line that raised an error, `None` where only the import itself did."""
-    if isinstance(error, SyntaxError) and error.filename:
-        return error.filename, error.lineno or 1
-    found = None
-    for frame in traceback.extract_tb(error.__traceback__):
-        importing = Path(frame.filename).parts
-        if not frame.filename.startswith("<") and not {"hydra", "importlib"} & set(importing):
-            found = frame.filename, frame.lineno or 1
-    return found
-
-
-def _locate_node(error: BaseException) -> str:
-    """Return the end of a message: the place in the configuration that could not be built."""
-    found = (
-        re.search(r"full_key: (\S+)", str(error))
-        if isinstance(error, InstantiationException)
-        else None
-    )
-    return f" (in '{found[1]}': change {found[1]}.<field>=… or its file)" if found else ""
-
-
 def _explain_bad_override(error: ConfigCompositionException) -> str:
     """Explain an override of a key that the configuration does not have."""
     text = str(error)
@@ -225,8 +151,6 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
         return text
     where, key = found[1], found[2].split("@")[0]
     source = f"{where} changes" if where and where != "config" else "you gave"
-    if renamed := registry.find_renamed_field(key):
-        return f"{source} '{key}', but '{renamed[0]}' is now '{renamed[1]}'"
     # The mode itself may not compose; the message is then shorter.
     with contextlib.suppress(Exception):
         cfg = compose_choices()
@@ -246,7 +170,7 @@ def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
         parent, _, leaf = parent.rpartition(".")
     names = []
     if isinstance(node, DictConfig):
-        names = [str(k) for k in node if str(k) not in ("hydra", "_target_")]
+        names = [str(k) for k in node if str(k) not in ("hydra", "run", "_target_")]
     if keys:
         return f"'{parent or mode}' has no '{leaf}'; {_suggest(keys, value)}"
     for option in registry.list_options():
@@ -306,6 +230,6 @@ def compose_choices() -> DictConfig:
             return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
 
 
-def read_mode_name(cfg: DictConfig) -> str:
+def read_mode_name(cfg: Mapping[Any, Any]) -> str:
     """Return the mode that a composed configuration runs."""
-    return str(cfg._target_).split(".")[-2]
+    return str(cfg["run"]).split(".")[-2]

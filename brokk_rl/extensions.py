@@ -17,12 +17,13 @@ from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
 from hydra.core.plugins import Plugins
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from brokk_rl import registry
+from brokk_rl.build import build_mode, build_node
 from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.explain import explain_missing_value
 
 GROUP = re.compile(r"\+{0,2}(?P<group>[\w/]+)(?:@[\w.:]*)?=(?P<value>.*)", re.DOTALL)
 """An override of a config group: group, package, value."""
@@ -84,7 +85,41 @@ def load_option(group: str, name: str, **fields: object) -> Any:
     changes = [f"subject.{field}={value}" for field, value in fields.items()]
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject='{name}'", *changes])
-    return instantiate(cfg.subject, _convert_="all")
+    return build_node(OmegaConf.to_container(cfg.subject, resolve=True), group)
+
+
+def load_mode(*words: str) -> Any:
+    """Return the mode of a command, for tests and programs: `load_mode("mode=evaluate", "sim=native")`.
+
+    Args:
+        words: Arguments of the command, `session.out=<folder>` among them.
+
+    Raises:
+        ConfigError: A value is refused, or one that must be given is not.
+    """
+    register_options(words)
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        return build_mode(*read_values(hydra.compose("config", overrides=list(words))))
+
+
+def read_values(cfg: DictConfig) -> tuple[dict[str, Any], set[str]]:
+    """Return the configuration as plain data, and the nodes that others take in.
+
+    An option can thus bring groups of its own: `link=simulated` holds `actuator: ${actuator}`, the
+    actuator that it simulates, which is chosen like any other.
+
+    Raises:
+        ConfigError: A value that must be given is not.
+    """
+    if missing := OmegaConf.missing_keys(cfg) - {"session.out"}:
+        raise ConfigError(explain_missing_value(min(missing)))
+    shared = set()
+    for _, value in registry.iterate_leaves(OmegaConf.to_container(cfg)):
+        for name in re.findall(r"\$\{(\w+)[.}]", str(value)):
+            if name in cfg:
+                shared.add(name)
+    values: Any = OmegaConf.to_container(cfg, resolve=True)
+    return values, shared
 
 
 def _offer_file(group: str, name: str, options: Sequence[registry.Option]) -> None:
@@ -106,7 +141,7 @@ def _read(
     """
     where = f"{group}=@{name}"
     try:
-        text = registry.rename_targets(Path(name).expanduser().read_text())
+        text = Path(name).expanduser().read_text()
         loaded = OmegaConf.create(text)
     except FileNotFoundError as error:
         raise ConfigError(f"{where}: there is no such file (seen from {Path.cwd()})") from error
@@ -122,7 +157,7 @@ def _read(
     node = OmegaConf.to_container(loaded, resolve=False) if isinstance(loaded, DictConfig) else None
     if not isinstance(node, dict) or not node:
         raise ConfigError(f"{where}: expected a mapping, as in a file of conf/{group}")
-    for place, value in _iterate_leaves(node):
+    for place, value in registry.iterate_leaves(node):
         _check_plain(where, place, value)
     beside = Path(name).expanduser().parent / str(node.get("mjcf"))
     if group == "machine" and beside.is_file():
@@ -135,13 +170,13 @@ def _read(
     ours = {
         str(target)
         for shipped, _ in _iterate_shipped(options)
-        for place, target in _iterate_leaves(shipped)
+        for place, target in registry.iterate_leaves(shipped)
         if place[-1] == "_target_"
     }
     package = _find_package(
         where, group, text, node, mine, {package for _, package in _iterate_shipped(options, group)}
     )
-    for place, target in _iterate_leaves(node):
+    for place, target in registry.iterate_leaves(node):
         if place[-1] == "_target_":
             # the option itself, or those of a file that holds several by name
             itself = package != EVERYWHERE and len(place) == (1 if "_target_" in node else 2)
@@ -202,17 +237,3 @@ def _iterate_shipped(
             text = option.path.read_text()
             stated = PACKAGE.search(text)
             yield yaml.safe_load(text) or {}, stated[1] if stated else None
-
-
-def _iterate_leaves(
-    node: Any, place: tuple[str, ...] = ()
-) -> Iterator[tuple[tuple[str, ...], Any]]:
-    """Yield each leaf with the keys that lead to it; items of a list have the keys of their list."""
-    if isinstance(node, dict) and node:
-        for key, value in node.items():
-            yield from _iterate_leaves(value, (*place, str(key)))
-    elif isinstance(node, list) and node:
-        for value in node:
-            yield from _iterate_leaves(value, place)
-    else:
-        yield place, node

@@ -33,7 +33,7 @@ def describe_mode(choices: Mapping[str, Any], node: Mapping[str, Any], width: in
         "",
         "Groups, as chosen, and their other options:",
     ]
-    taken, groups = {"_target_"}, {key: [choices[key]] for key in reversed(list(choices))}
+    taken, groups = {"run"}, {key: [choices[key]] for key in reversed(list(choices))}
     # Hydra records no options that were chosen as a list; each is an entry of the node.
     # A mode's own values have a class, and may bear the name of a group: `bench`.
     lists = {}
@@ -49,7 +49,7 @@ def describe_mode(choices: Mapping[str, Any], node: Mapping[str, Any], width: in
             lines += _format_entry(f"{key}={text}", ", ".join(others), width)
     own = {key: value for key, value in node.items() if key not in taken}
     lines += ["", "Values of the mode:"]
-    lines += _describe_values("", str(node["_target_"]), own, width)
+    lines += _describe_values("", str(node["run"]), own, width)
     lines += [
         "",
         f"Values of a group: brokk mode={name} --cfg job --package <group>",

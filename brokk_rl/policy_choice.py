@@ -21,10 +21,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import OverrideParseException
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
+from brokk_rl.build import RUN, build_node
 from brokk_rl.errors import CheckpointError, ConfigError, list_choices
 from brokk_rl.policy_folder import (
     CONTRACT,
@@ -95,7 +95,7 @@ def insert_policy(cfg: DictConfig) -> DictConfig:
     OmegaConf.set_readonly(cfg, False)
     OmegaConf.set_struct(cfg, False)
     target = OmegaConf.select(cfg, f"policy.{TARGET}", default=None)
-    if cfg.get(TARGET) == TRAIN:
+    if cfg.get(RUN) == TRAIN:
         target = _choose_beginning(cfg, target)
     given = _list_given(list(HydraConfig.get().overrides.task))
     if target == SHIPPED:
@@ -126,7 +126,7 @@ def restore_task(task: T, policy: str) -> T:
     if own is None or own.name != here.name:
         raise CheckpointError(f"{policy}: expected a policy of task={here.name}, got {own}")
     node = apply_behaviour(describe_spec(task), own.behaviour)
-    return instantiate(node, _convert_="all")
+    return build_node(node, "task")
 
 
 def apply_behaviour(node: Mapping[str, Any], behaviour: Mapping[str, Any]) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def _keep_targets(before: Any, after: Any) -> Any:
 
 def is_going_on(cfg: DictConfig, folder: Path) -> bool:
     """Return whether a command goes on with the run in `folder`."""
-    if cfg.get(TARGET) != TRAIN:
+    if cfg.get(RUN) != TRAIN:
         return cfg.get("resume") is not None
     path = OmegaConf.select(cfg, "policy.path", default=None)
     return path is not None and _find_run(path).resolve() == folder.resolve()
@@ -279,7 +279,7 @@ def _choose_beginning(cfg: DictConfig, target: str | None) -> str | None:
 
 def _take_over(cfg: DictConfig, given: set[str]) -> DictConfig:
     """Return the configuration with machine, option and behaviour of the first policy."""
-    stored = find_policy(str(cfg.policy.path), may_lack=cfg.get(TARGET) == TRAIN)
+    stored = find_policy(str(cfg.policy.path), may_lack=cfg.get(RUN) == TRAIN)
     own = stored.task
     if own is None:  # a checkpoint by itself: the mode compares when it reads it
         return cfg
@@ -319,7 +319,7 @@ def _insert_plant(cfg: DictConfig, stored: StoredPolicy, given: set[str]) -> lis
 
     Return what was brought: nothing where the machine is the same.
     """
-    here = instantiate(cfg.machine, _convert_="all")
+    here = build_node(OmegaConf.to_container(cfg.machine, resolve=True), "machine")
     name, theirs = stored.contract["machine"], stored.contract["fingerprint"]
     differing = [part for part, stamp in here.fingerprint().items() if theirs.get(part) != stamp]
     if not differing:

@@ -8,12 +8,10 @@ is therefore cheap, and a broken option can be listed too.
 from __future__ import annotations
 
 import ast
-import copy
 import inspect
-import json
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 from importlib import metadata, resources, util
 from pathlib import Path
 from typing import Any
@@ -47,7 +45,8 @@ class Option:
     def summary(self) -> str:
         """Return the first sentence of the file's comment, else the first line of its target."""
         text = self.path.read_text()
-        target = (yaml.safe_load(text) or {}).get("_target_")
+        content = yaml.safe_load(text) or {}
+        target = content.get("_target_") or content.get("run")
         comment = re.split(r"(?<=\.) ", _read_comment(text))[0]
         return comment or (_read_docstring(target).split("\n")[0] if target else "")
 
@@ -115,75 +114,16 @@ def resolve_package_path(name: str) -> Path:
         ) from error
 
 
-@lru_cache
-def load_renamed_targets() -> dict[str, str]:
-    """Return the current target of each target that an earlier version had."""
-    return json.loads((Path(__file__).parent / "renamed_targets.json").read_text())
-
-
-@lru_cache
-def load_renamed_fields() -> dict[str, str]:
-    """Return the current name of each field and group of fields that an earlier version had."""
-    return json.loads((Path(__file__).parent / "renamed_fields.json").read_text())
-
-
-def find_renamed_field(key: str) -> tuple[str, str] | None:
-    """Return the earlier and the current name of the longest renamed part at the head of `key`.
-
-    `None` where no part of `key` was renamed.
-    """
-    renamed = load_renamed_fields()
-    parts = key.split(".")
-    for count in range(len(parts), 0, -1):
-        head = ".".join(parts[:count])
-        if head in renamed:
-            return head, renamed[head]
-    return None
-
-
-def rename_targets(text: str) -> str:
-    """Return YAML text with current targets, so that files of earlier versions still load."""
-    renamed = load_renamed_targets()
-
-    def rename(found: re.Match[str]) -> str:
-        return found[1] + renamed.get(found[2], found[2])
-
-    return re.sub(r"(_target_['\"]?:\s*['\"]?)([\w.]+)", rename, text)
-
-
-def upgrade_fields(node: Any) -> None:
-    """Write fields of earlier versions as the current ones, so that their `resolved.yaml` still runs.
-
-    Changes the plain data `node` in place, at each `_target_` of `earlier_fields.json`: a field that
-    the earlier version did not have gets the value by which it acted, and a field that moved is put
-    to its new place. Where a true or false became a term, false switches the term off (`null`).
-    """
-    if isinstance(node, list):
+def iterate_leaves(node: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield each leaf with the keys that lead to it; items of a list have the keys of their list."""
+    if isinstance(node, dict) and node:
+        for key, value in node.items():
+            yield from iterate_leaves(value, (*place, str(key)))
+    elif isinstance(node, list) and node:
         for value in node:
-            upgrade_fields(value)
-    if not isinstance(node, dict):
-        return
-    for value in node.values():
-        upgrade_fields(value)
-    for change in _load_earlier_fields():
-        if node.get("_target_") not in change["targets"]:
-            continue
-        for name, value in change["added"].items():
-            node.setdefault(name, copy.deepcopy(value))
-        for name in change["moved"].keys() & node.keys():
-            *path, last = change["moved"][name].split(".")
-            place, value = node, node.pop(name)
-            for part in path:
-                place = place[part]
-            if not isinstance(value, bool):
-                place[last] = value
-            elif not value:
-                place[last] = None
-
-
-@lru_cache
-def _load_earlier_fields() -> list[dict[str, Any]]:
-    return json.loads((Path(__file__).parent / "earlier_fields.json").read_text())
+            yield from iterate_leaves(value, place)
+    else:
+        yield place, node
 
 
 def _find_folder(package: str, who: str) -> Path:

@@ -23,7 +23,7 @@ from actuators import open_loop
 from actuators.contracts import ActuatorFit
 from actuators.effects.composition import ActuatorWithEffects, MeasuredActuatorModel
 from actuators.open_loop import FreeRunWindows
-from brokk_rl import record, registry
+from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import BrokkError, RecordingError
 from brokk_rl.history import History
@@ -233,7 +233,7 @@ def read_effects(path: Path, machine: Machine) -> dict[str, Any]:
         RecordingError: it is missing, no YAML, or names something that is no effect.
     """
     try:
-        nodes = yaml.safe_load(registry.rename_targets(path.read_text())) or {}
+        nodes = yaml.safe_load(path.read_text()) or {}
         known = {kind.name: kind.target for kind in effect_library.load_effects(machine)}
         found = {}
         for name, node in nodes.items():

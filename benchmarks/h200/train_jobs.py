@@ -31,11 +31,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import hydra
 import torch
-from hydra.utils import instantiate
 
 from brokk_rl.contracts.task import Policy
+from brokk_rl.extensions import load_mode
 from brokk_rl.modes.train import Train
 from brokk_rl.policy_folder import describe_policy, write_policy
 from brokk_rl.rl.evaluation import evaluate_policy
@@ -136,9 +135,7 @@ def run_job(job: dict, words: list[str], options: argparse.Namespace) -> dict[st
 
 def compose(words: list[str]) -> Train:
     """Return the training that words of the command line ask for."""
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["mode=train", "session.out=unused", *words])
-    return instantiate(cfg, _convert_="all")
+    return load_mode("mode=train", "session.out=unused", *words)
 
 
 def train(spec: Train, folder: Path, options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:

@@ -7,10 +7,10 @@ import pytest
 from composed import every
 from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
+from brokk_rl.build import build_node
 
 OVERRIDES = ("experiment", "ablation", "preset", "search", "exam_protocol")
 PARTS = [
@@ -29,24 +29,25 @@ def composed(*overrides: str) -> DictConfig:
 def test_every_option_composes_and_is_what_its_spec_says(group: str, name: str) -> None:
     cfg = composed("~mode", "+machine=brokk170", f"+{group}@subject={name}").subject
     if "_target_" in cfg and not OmegaConf.missing_keys(cfg) - {"out"}:
-        instantiate(cfg, _convert_="all", **({"out": "somewhere"} if group == "session" else {}))
+        given = {"out": "somewhere"} if group == "session" else {}
+        build_node({**OmegaConf.to_container(cfg, resolve=True), **given}, group)
 
 
 @every("mode")
 def test_every_mode_composes(name: str) -> None:
     # `import` is a word of Python's and cannot name a module
     module = "import_logs" if name == "import" else name
-    assert f".modes.{module}." in composed(f"mode={name}")._target_
+    assert f".modes.{module}." in composed(f"mode={name}").run
 
 
 @every("experiment")
 def test_every_experiment_composes(name: str) -> None:
-    assert composed(f"experiment={name}")._target_
+    assert composed(f"experiment={name}").run
 
 
 @every("preset")
 def test_every_preset_composes(name: str) -> None:
-    assert composed(f"preset={name}")._target_
+    assert composed(f"preset={name}").run
 
 
 @every("exam_protocol")
@@ -74,4 +75,4 @@ def test_every_option_says_in_one_line_what_it_is(entry: registry.Option) -> Non
 
 
 def test_the_default_is_to_train() -> None:
-    assert composed()._target_ == "brokk_rl.modes.train.Train"
+    assert composed().run == "brokk_rl.modes.train.Train"

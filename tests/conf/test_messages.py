@@ -107,7 +107,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("-m", "mode=compare", "compare.runs=a,b"): ("compare.runs", "'a'"),
     # values
     ("mode=compare",): ("compare.runs=<value>",),
-    (*COMPARE, "session.seed=abc"): ("Session.seed", "expected a whole number", "'abc'"),
+    (*COMPARE, "session.seed=abc"): ("session.seed: expected a whole number", "'abc'"),
     (*COMPARE, "session.seed=-1"): ("session.seed", "0 or more"),
     (*COMPARE, "session.device=gpu"): ("session.device", "cpu", "'gpu'"),
     ("mode=board", "board.rows=0"): ("expected 2 or more columns and rows, got",),

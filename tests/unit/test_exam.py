@@ -14,12 +14,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from composed import option
-from hydra import compose, initialize_config_module
-from hydra.utils import instantiate
 from small_exam import SMALL
 
 from brokk_rl import record
 from brokk_rl.errors import RecordingError, StorageError
+from brokk_rl.extensions import load_mode
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from diagnosis.answer import ANSWER_FILE
@@ -220,18 +219,9 @@ def test_cases_of_an_exam_hang_on_the_salt_and_those_of_development_on_the_seed_
     tmp_path: Path,
 ) -> None:
     def drawn(seed: int, salt: str) -> str:
-        with initialize_config_module("conf", version_base="1.3"):
-            sealed = "true" if seed >= 1000 else "false"
-            cfg = compose(
-                "config",
-                [
-                    *SMALL,
-                    f"session.out={tmp_path}",
-                    f"session.seed={seed}",
-                    f"exam.sealed={sealed}",
-                ],
-            )
-        return repr(instantiate(cfg, _convert_="all").questions(salt))
+        given = (f"session.seed={seed}", f"exam.sealed={'true' if seed >= 1000 else 'false'}")
+        mode = load_mode(*SMALL, f"session.out={tmp_path}", *given)
+        return repr(mode.questions(salt))
 
     assert drawn(1000, "a") == drawn(1000, "a") != drawn(1000, "b")
     assert drawn(1, "a") == drawn(1, "b")

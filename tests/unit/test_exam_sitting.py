@@ -17,6 +17,7 @@ from composed import option
 from small_exam import SMALL
 
 from brokk_rl.errors import RecordingError
+from brokk_rl.extensions import load_mode
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from diagnosis.answer import Answer, Estimate, Gap, Where
@@ -105,9 +106,6 @@ def test_an_exam_of_arms_known_by_their_joints_asks_nothing_that_needs_masses(
 @pytest.fixture(scope="module")
 def slow_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An exam of one case: all joints at 0.6 of their speed, withheld recordings of 40 s."""
-    from hydra import compose, initialize_config_module
-    from hydra.utils import instantiate
-
     out = tmp_path_factory.mktemp("examined") / "exam"
     gain = (
         "{flow_gain: {_target_: exam.case_distribution.EffectDistribution, numbers: {gain: [1.0, 0.6]}, "
@@ -120,8 +118,7 @@ def slow_case(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "exam.reference.file_s=60", "exam.field.programs=[[levels]]", "exam.field.file_s=20", "exam.withheld.programs=[[levels]]",
         "exam.withheld.file_s=40", f"session.out={out}",
     ]  # fmt: skip
-    with initialize_config_module("conf", version_base="1.3"):
-        mode = instantiate(compose("config", words), _convert_="all")
+    mode = load_mode(*words)
     out.mkdir()
     mode.run()
     return out

@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import copy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from composed import option as load_option
-from hydra.utils import instantiate
 
 import brokk_rl
-import conf
 from brokk_rl import registry
 from brokk_rl.errors import ConfigError
 from brokk_rl.modes import doctor
 from brokk_rl.modes.doctor import Doctor, DoctorFinding, DoctorLimits
 from brokk_rl.registry import Option
-from tasks.termination import JointLimit
 
 
 def option(folder: Path, group: str, text: str) -> Option:
@@ -35,15 +29,6 @@ def test_an_option_without_a_comment_is_described_by_its_target(tmp_path: Path) 
     summary = "List the options of every config group, one line each."
     assert option(tmp_path, "mode", text).summary() == summary
     assert option(tmp_path, "mode", "# Another.\n" + text).summary() == "Another."
-
-
-def test_targets_of_earlier_versions_are_renamed_wherever_yaml_may_hold_them() -> None:
-    renamed = registry.load_renamed_targets()
-    assert renamed, "a file of an earlier version would not load"
-    old, new = next(iter(renamed.items()))
-    text = f"a: {{_target_: {old}, b: 1}}\n_target_: '{old}'\nnote: {old}\n"
-    expected = f"a: {{_target_: {new}, b: 1}}\n_target_: '{new}'\nnote: {old}\n"
-    assert registry.rename_targets(text) == expected
 
 
 def test_the_version_needs_no_configuration(brokk: Callable[..., Any]) -> None:
@@ -172,36 +157,6 @@ def test_the_doctor_runs_here(brokk: Callable[..., Any]) -> None:
         "extensions",
     ):
         assert topic in done.out
-
-
-def test_fields_of_earlier_versions_become_the_current_ones() -> None:
-    """A field that moved keeps its value; a new one gets the value by which that version acted."""
-    terms = load_option("task", "borehole_insertion").termination
-    for ends in (True, False):
-        old = {
-            "_target_": "tasks.borehole_insertion.BoreholeInsertion",
-            "limit_margin": 0.02,
-            "end_on_success": ends,
-        }
-        config: dict[str, Any] = {"jobs": [{"task": old}]}
-        registry.upgrade_fields(config)
-        found = instantiate(old["termination"], _convert_="all")
-        assert found == terms | {
-            "joint_limit": JointLimit(margin=0.02),
-            "success": terms["success"] if ends else None,
-        }
-        again = copy.deepcopy(config)
-        registry.upgrade_fields(again)
-        assert again == config and not {"limit_margin", "end_on_success"} & old.keys()
-
-
-def test_a_training_of_an_earlier_version_acts_as_it_did() -> None:
-    config = yaml.safe_load((Path(conf.__file__).parent / "rl/ppo.yaml").read_text())
-    for name in ("tf32", "symmetry", "fault_steps"):
-        del config[name]
-    registry.upgrade_fields(config)
-    found = instantiate(config, _convert_="all")
-    assert found == replace(load_option("rl", "ppo"), fault_steps=0)
 
 
 def test_an_option_that_does_not_exist_is_told_with_the_choices_in_a_program_too() -> None:

@@ -11,10 +11,7 @@ import json
 import sys
 from pathlib import Path
 
-import hydra
-from hydra.utils import instantiate
-
-from brokk_rl.extensions import register_options
+from brokk_rl.extensions import load_mode
 from brokk_rl.progress import ItemProgress
 from brokk_rl.session import write_json
 from exam import dataset
@@ -31,9 +28,7 @@ def main(opened: Path, num_cases: int, folder: Path, workers: int) -> None:
         f"exam.salt={published['salt']}",
         f"session.out={folder}",
     ]
-    register_options(overrides)
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        mode = instantiate(hydra.compose("config", overrides), _convert_="all")
+    mode = load_mode(*overrides)
     settings = mode.exam
     recorder = CaseRecorder(
         mode.machine,

@@ -19,17 +19,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
 import naming
 import numpy as np
 import yaml
 from case_data import read_changes
 from choose_rule import CLASSES, QUIET, THRESHOLDS, count_names
-from hydra.utils import instantiate
 from sit import RULES_FILE
 from sittings import SITTINGS, describe_command
 
-from brokk_rl.extensions import register_options
+from brokk_rl.extensions import load_mode
 from brokk_rl.session import write_json, write_text
 from diagnosis import effect_library, effects_file
 from diagnosis.answer import read_answer
@@ -196,9 +194,7 @@ def main(
             folders[title] = work / title.replace(" ", "_")
             write_named(answers, cases, rule, folders[title])
     overrides = ["mode=exam", *SITTINGS[sitting].options, f"session.out={work}"]
-    register_options(overrides)
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        mode = instantiate(hydra.compose("config", overrides), _convert_="all")
+    mode = load_mode(*overrides)
     settings = mode.exam
     known = json.loads((exam / "exam.json").read_text())["known"]
     machine = restrict_machine(mode.machine, known)

@@ -15,12 +15,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import torch
-from hydra.utils import instantiate
 from matplotlib.figure import Figure
 
+from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.policy_choice import restore_task
 from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
@@ -137,9 +136,7 @@ def draw_path(machine: Any, episode: RecordedEpisode, color: str, above: Any, si
 
 def compose(words: list[str]) -> Any:
     """Return the training that words of the command line ask for."""
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        cfg = hydra.compose("config", overrides=["mode=train", "session.out=unused", *words])
-    return instantiate(cfg, _convert_="all")
+    return load_mode("mode=train", "session.out=unused", *words)
 
 
 if __name__ == "__main__":

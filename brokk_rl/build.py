@@ -1,0 +1,189 @@
+"""Build the specs of a composed configuration: each node once, and what needs torch last.
+
+A composed configuration is plain data. A table with `_target_` becomes a spec of that class, from
+the inside out; the key `run` names the class of the mode, whose fields are the nodes.
+"""
+
+from __future__ import annotations
+
+import importlib
+import re
+import sys
+import traceback
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from importlib.abc import MetaPathFinder
+from pathlib import Path
+from typing import Any
+
+from brokk_rl import extras
+from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.spec import SpecError
+
+TARGET = "_target_"
+RUN = "run"
+"""Key of the class of the mode; no mode has such a field, since `run` is its method."""
+SLOW = "torch"
+"""Package whose import takes seconds."""
+
+
+def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
+    """Return the mode of a composed configuration.
+
+    Nodes whose classes do without torch are built first, so that their bad values are refused
+    before torch is loaded.
+
+    Args:
+        values: The configuration as plain data, with `run`.
+        shared: Nodes that others take in, whole or in part. They are built here only if the mode has such
+            a field.
+
+    Raises:
+        ConfigError: A class cannot be found, a key is unknown, or a value is refused.
+    """
+    nodes = {key: value for key, value in values.items() if key != RUN}
+    built, late, refusals = {}, list(shared), []
+    with _refuse_slow_import():
+        for key in nodes.keys() - shared:
+            try:
+                built[key] = build_node(nodes[key], key)
+            except _SlowImport:
+                late.append(key)
+            except ConfigError as error:
+                refusals.append(error)
+    if refusals:
+        raise ConfigError("\n".join(sorted(map(str, refusals)))) from refusals[0]
+    kind = load_class(values[RUN], "")
+    known = [field.name for field in fields(kind)]
+    for key in late:
+        if key in known or key not in shared:
+            built[key] = build_node(nodes[key], key)
+    for key in built:
+        if key not in known:
+            raise ConfigError(f"the mode has no '{key}'; {list_choices(key, known)}")
+    return _call(kind, {key: built[key] for key in nodes if key in built}, "")
+
+
+def build_node(node: Any, place: str = "") -> Any:
+    """Return plain data with a spec in the place of each table that has a `_target_`.
+
+    Args:
+        node: The data.
+        place: Its key in the configuration, for messages.
+
+    Raises:
+        ConfigError: A class cannot be found, or refuses its values.
+    """
+    if isinstance(node, list):
+        return [build_node(item, f"{place}[{index}]") for index, item in enumerate(node)]
+    if not isinstance(node, Mapping):
+        return node
+    values = {}
+    for key, value in node.items():
+        if key != TARGET:
+            values[key] = build_node(value, f"{place}.{key}" if place else str(key))
+    if TARGET not in node:
+        return values
+    return _call(load_class(node[TARGET], place), values, place)
+
+
+def load_class(target: object, place: str) -> Any:
+    """Return the class that a dotted name stands for.
+
+    Raises:
+        ConfigError: There is no such class, or its module cannot be imported. An error in a module
+            of this package is a defect and is raised as it is.
+    """
+    module, _, name = str(target).rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except Exception as error:
+        reason = _explain_import(module, name, error)
+        if reason is None:
+            raise
+        raise ConfigError(_complete("", f"{target}{reason}", place)) from error
+
+
+def _explain_import(module: str, name: str, error: Exception) -> str | None:
+    """Return why a class cannot be imported, `None` for a defect of this package."""
+    missing = str(getattr(error, "name", None))
+    if isinstance(error, ModuleNotFoundError):
+        text = extras.explain_missing_module(missing, f"{module}.{name}")
+        if text:
+            return f": {text}"
+    found = _find_line(error)
+    if found is None:
+        if isinstance(error, ModuleNotFoundError) and "is not a package" not in str(error):
+            return (
+                f": there is no module '{missing}' (seen from {Path.cwd()}); install its package, "
+                "or add its folder to PYTHONPATH"
+            )
+        return f": the module '{module}' has no '{name}'"
+    file, line = found
+    if Path(file).is_relative_to(Path(__file__).parents[1]) and "site-packages" not in file:
+        return None
+    return f" cannot be imported: {file}, line {line}: {type(error).__name__}: {error}"
+
+
+def _find_line(error: BaseException) -> tuple[str, int] | None:
+    """Return file and line that raised an error, `None` where only the import itself did."""
+    if isinstance(error, SyntaxError) and error.filename:
+        return error.filename, error.lineno or 1
+    found = None
+    for frame in traceback.extract_tb(error.__traceback__):
+        importing = frame.filename == __file__ or "importlib" in Path(frame.filename).parts
+        if not frame.filename.startswith("<") and not importing:
+            found = frame.filename, frame.lineno or 1
+    return found
+
+
+def _call(kind: Any, values: dict[str, Any], place: str) -> Any:
+    """Return the spec with these fields; an error names them as they are typed."""
+    try:
+        return kind(**values)
+    except SpecError as error:
+        lines = []
+        for key, text in error.problems:
+            lines.append(_complete(".".join(filter(None, (place, key))), text, place))
+        raise ConfigError("\n".join(lines)) from error
+    except ConfigError as error:
+        found = re.fullmatch(r"([\w.]+(?:\[\w+\])?): (.+)", str(error), re.DOTALL)
+        head, text = found.groups() if found else ("", str(error))
+        if place and re.split(r"[.\[]", head)[0] in [field.name for field in fields(kind)]:
+            head = f"{place}.{head}"
+        raise ConfigError(_complete(head, text, place)) from error
+
+
+def _complete(key: str, text: str, place: str) -> str:
+    """Return a message with the argument that changes the value of `key`, a field of `place`."""
+    message = f"{key}: {text}" if key else text
+    if not place:
+        return message
+    typed = key.partition("[")[0]
+    if typed == place or not typed.startswith(place):
+        return f"{message} (in '{place}': change {place}.<field>=… or its file)"
+    return f"{message} (change {typed}=… or its file)"
+
+
+class _SlowImport(BaseException):
+    """A module imports torch; no `Exception`, so that nothing takes it for a missing package."""
+
+
+class _SlowFinder(MetaPathFinder):
+    """Refuses the import of torch."""
+
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> None:
+        if fullname == SLOW:
+            raise _SlowImport
+
+
+@contextmanager
+def _refuse_slow_import() -> Iterator[None]:
+    """Make a module that imports torch raise `_SlowImport`; Python imports it anew later."""
+    finder = _SlowFinder()
+    sys.meta_path.insert(0, finder)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(finder)

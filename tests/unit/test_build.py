@@ -1,0 +1,95 @@
+"""Building: each node once, what needs torch last, and messages with the key as it is typed."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from brokk_rl import build, extensions
+from brokk_rl.build import build_node
+from brokk_rl.errors import ConfigError
+
+PARTS = """
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import Positive, spec
+
+@spec
+class Fast:
+    size_m: Positive
+    rate: float
+    def check(self) -> None:
+        if self.rate > self.size_m:
+            raise ConfigError(f"rate: expected up to {self.size_m}, got {self.rate}")
+"""
+FAST = {"_target_": "some_parts.Fast", "size_m": 2.0, "rate": 1.0}
+
+
+@pytest.fixture
+def parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with modules that can be imported."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "some_parts", raising=False)
+    (tmp_path / "some_parts.py").write_text(PARTS)
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("node", "message"),
+    [
+        (FAST | {"size_m": -1}, "a.b.size_m: expected a finite number above 0, got -1 (change a.b.size_m=…"),
+        (FAST | {"rate": 3.0}, "a.b.rate: expected up to 2.0, got 3.0 (change a.b.rate=…"),
+        (FAST | {"siez_m": 1}, "a.b: has no field 'siez_m'; did you mean 'size_m'?"),
+        ([FAST, FAST | {"rate": "x"}], "a.b[1].rate: expected a number, got 'x'"),
+        ({"_target_": "nowhere.at.All"}, "nowhere.at.All: there is no module 'nowhere'"),
+        ({"_target_": "some_parts.Fest"}, "the module 'some_parts' has no 'Fest' (in 'a.b': change a.b.<field>=…"),
+    ],
+)  # fmt: skip
+def test_a_refused_node_is_named_as_typed(node: Any, message: str, parts: Path) -> None:
+    with pytest.raises(ConfigError) as told:
+        build_node(node, "a.b")
+    assert message in str(told.value)
+
+
+def test_the_error_of_an_own_module_is_told_with_its_line(parts: Path) -> None:
+    (parts / "some_parts.py").write_text("import math\n\nmath.nothing\n")
+    with pytest.raises(ConfigError) as told:
+        build_node(FAST, "actuator")
+    assert "no attribute 'nothing'" in str(told.value)
+    assert f"{parts / 'some_parts.py'}, line 3" in str(told.value)
+
+
+def test_each_node_of_a_mode_is_built_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    built: list[str] = []
+    call = build._call
+    monkeypatch.setattr(build, "_call", lambda *given: built.append(given[2]) or call(*given))
+    extensions.load_mode("mode=train", "sim=native", "session.out=unused")
+    assert len(built) == len(set(built)) and {"task", "actuator", ""} <= set(built)
+    # a node that another one takes in is built there alone
+    built.clear()
+    extensions.load_mode("mode=collect", "link=simulated", "session.out=unused")
+    assert len(built) == len(set(built)) and "link.actuator" in built and "actuator" not in built
+
+
+def test_every_node_without_torch_is_built_before_torch_is_loaded() -> None:
+    program = """
+import sys
+from brokk_rl import build, extensions
+order = []
+call = build._call
+def record(kind, values, place):
+    order.append((place.split(".")[0], "torch" in sys.modules))
+    return call(kind, values, place)
+build._call = record
+extensions.load_mode("mode=train", "session.out=unused")
+late = {node for node, loaded in order if loaded}
+print(sorted({node for node, loaded in order} - late))
+assert not [node for node, loaded in order if not loaded and node in late]
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    for node in ("session", "machine", "sim", "task", "rl", "evaluation", "tracking"):
+        assert f"'{node}'" in done.stdout
