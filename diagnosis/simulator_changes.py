@@ -201,7 +201,7 @@ PRIOR = """    # {comment}
 
 
 def write_sysid_priors(changes: Sequence[Any], path: Path) -> None:
-    """Write `sysid_parameters.py` from changes of an MJCF file (`diagnosis.mjcf_changes.MjcfChange`).
+    """Write `sysid_parameters.py` from changes of an MJCF file (`diagnosis.mjcf.changes.MjcfChange`).
 
     Raises:
         StorageError: The file could not be written.

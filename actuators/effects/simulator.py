@@ -1,6 +1,6 @@
 """Effects on numbers inside of an MJCF file: friction, damping, armature, gain and limit of its drives.
 
-They exist around `actuators.models.own_simulator` only. The way back is a change of the file.
+They exist around `diagnosis.own_simulator` only. The way back is a change of the file.
 """
 
 from __future__ import annotations

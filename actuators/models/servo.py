@@ -38,7 +38,7 @@ NEAR_CRITICAL = 1e-4
 """Distance of the squared damping from 1 within which the loop counts as critically damped: there
 the two solutions agree to a ten-thousandth, and 0 / 0 is avoided."""
 FULL_TORQUE_TRAVEL = 0.05
-"""Error of position, over the travel, that `shortage` counts in; as in `brokk_rl.sim.mjcf_plant`."""
+"""Error of position, over the travel, that `shortage` counts in; as in `diagnosis.mjcf.plant`."""
 NO_LIMIT_RAD = 1e6
 """Pull without a limit; finite, so that no gradient is NaN."""
 SMALL_SHARE = 0.05

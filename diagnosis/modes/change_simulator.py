@@ -21,6 +21,7 @@ from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from diagnosis import answer, baseline, effect_library, simulator_changes
 from diagnosis.answer import Answer
+from diagnosis.own_simulator import OwnSimulator
 
 MJCF_FILE, SYSID_FILE = "changed.xml", "sysid_parameters.py"
 RANGES_FILE, TABLE_FILE = "randomisation.yaml", "randomisation.json"
@@ -57,11 +58,11 @@ class ChangeSimulator:
     session: Session
     machine: Machine
     simulator: str
-    own: Actuator
+    own: OwnSimulator
     changes: ChangeRequest
 
     def check(self) -> None:
-        replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        replace(self.own, source=self.simulator)
 
     def run(self) -> None:
         """Write the files.
@@ -79,7 +80,7 @@ class ChangeSimulator:
             raise ConfigError(
                 f"changes.diagnosis={self.changes.diagnosis}: its verdict is '{given.verdict}', so there is nothing to change"
             )
-        own: Any = replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        own = replace(self.own, source=self.simulator)
         kinds = effect_library.load_effects(self.machine, None, own)
         costs = {}
         if self.changes.why is not None:
@@ -91,7 +92,7 @@ class ChangeSimulator:
         write_json(folder / TABLE_FILE, [asdict(one) for one in ranges])
         told: dict[str, Any] = {"changes": [], "not_in_the_file": {}, "replay": {}}
         if own.path is not None:
-            told = self._change_file(own, given, recordings)
+            told = self._change_file(own, own.path, given, recordings)
         write_json(folder / CHANGES_FILE, told)
         _print(told, ranges, folder)
 
@@ -101,10 +102,10 @@ class ChangeSimulator:
         return record.read_recordings(self.changes.recordings, self.machine)
 
     def _change_file(
-        self, own: Any, given: Answer, recordings: Sequence[Recording]
+        self, own: OwnSimulator, path: Path, given: Answer, recordings: Sequence[Recording]
     ) -> dict[str, Any]:
         """Write the changed MJCF and the priors; return what was done."""
-        from diagnosis import mjcf_changes  # MuJoCo is not in every installation
+        from diagnosis.mjcf import changes as mjcf_changes  # MuJoCo is not in every installation
 
         folder = self.session.folder
         findings = []
@@ -124,7 +125,7 @@ class ChangeSimulator:
                     )
                 )
         changed = folder / MJCF_FILE
-        changes, left = mjcf_changes.write_changed_mjcf(own.path, self.machine, findings, changed)
+        changes, left = mjcf_changes.write_changed_mjcf(path, self.machine, findings, changed)
         simulator_changes.write_sysid_priors(changes, folder / SYSID_FILE)
         told: dict[str, Any] = {
             "changes": [asdict(one) for one in changes],

@@ -37,6 +37,7 @@ from diagnosis.baseline import Baseline
 from diagnosis.case import GapCase
 from diagnosis.detection import ProgressCallback
 from diagnosis.effect_library import EffectType
+from diagnosis.own_simulator import OwnSimulator
 from diagnosis.pipeline import DiagnosisPipeline
 from diagnosis.request import DiagnosisSubject
 
@@ -66,7 +67,7 @@ class Diagnose:
     fit: ActuatorFit
     actuator: Actuator | None
     simulator: str | None
-    own: Actuator
+    own: OwnSimulator
     curve_fit: ValveCurveFit
     thresholds: InspectionThresholds
     excitation: dict[str, Excitation]
@@ -79,14 +80,14 @@ class Diagnose:
             raise ConfigError(
                 f"give either actuator=… or simulator={self.simulator}: one is held against the recordings"
             )
-        replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        replace(self.own, source=self.simulator)
 
     @property
     def base(self) -> Actuator | None:
         """The simulator that is held against the field; `None` where there is a reference."""
         if self.simulator is None:
             return self.actuator
-        return replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+        return replace(self.own, source=self.simulator)
 
     def run(self) -> None:
         """Write `diagnosis.json`, `report.html`, `effects.yaml` and the arrays of the report.

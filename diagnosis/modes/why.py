@@ -18,7 +18,6 @@ import yaml
 from rich.console import Console
 
 from brokk_rl import record, registry
-from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.rl.settings import Evaluation
@@ -26,6 +25,7 @@ from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import report, why_answer, why_report
 from diagnosis.deployment.contract import load_policy
+from diagnosis.own_simulator import OwnSimulator
 from diagnosis.request import FITS
 from diagnosis.story import HANDED_ON_FOLDER, StoryStage, run_story, write_groups
 from diagnosis.why_answer import (
@@ -70,7 +70,7 @@ class Why:
     log: str | tuple[str, ...]
     policy_path: str
     simulator: str
-    own: Actuator
+    own: OwnSimulator
     sent: bool
     target_in_base_m: tuple[float, float, float] | None
     resume: str | None
@@ -116,8 +116,8 @@ class Why:
     def _request(self) -> WhyRequest:
         return WhyRequest(self.policy_path, self.simulator, self._is_own)
 
-    def _build_own(self) -> Actuator:
-        return replace(self.own, source=self.simulator)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    def _build_own(self) -> OwnSimulator:
+        return replace(self.own, source=self.simulator)
 
     def _try_inputs(self) -> None:
         """Refuse logs, a policy or a simulator that no stage could use, before the first one."""

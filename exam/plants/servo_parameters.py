@@ -137,7 +137,7 @@ def change_servos(
         ConfigError: a fault is unknown.
     """
     found = {name: value.copy() for name, value in numbers.items()}
-    # as `brokk_rl.sim.mjcf_plant` counts: an error of 5 % of the travel, and full speed
+    # as `diagnosis.mjcf.plant` counts: an error of 5 % of the travel, and full speed
     found["full_n_m"] = 0.05 * found["stiffness"] * (machine.upper - machine.lower)
     found["full_rad_s"] = machine.max_speed.copy()
     for name, size in faults.items():

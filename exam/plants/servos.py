@@ -18,8 +18,8 @@ from brokk_rl.commands import find_rest
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Dimension, Machine
 from brokk_rl.signals import Command, JointState
-from brokk_rl.sim.mjcf_plant import MjcfPlant
 from brokk_rl.spec import spec
+from diagnosis.mjcf.plant import MjcfPlant
 from exam.case_distribution import PlantRun
 from exam.plants import servo_parameters
 from exam.plants.electronics import CommandBus

@@ -49,7 +49,7 @@ COMPOSERS = (
 DOORS = {
     "hydra": COMPOSERS,
     "omegaconf": COMPOSERS,
-    "mujoco": ("brokk_rl.sim", "diagnosis.mjcf_changes"),
+    "mujoco": ("brokk_rl.sim", "diagnosis.mjcf"),
     "mujoco_warp": ("brokk_rl.sim",),
     "warp": ("brokk_rl.sim",),
     "rsl_rl": ("brokk_rl.rl",),

@@ -18,11 +18,11 @@ from arm import ARM, NOISE_RAD, make_machine, record_arm, rub
 from brokk_rl.errors import ConfigError
 from brokk_rl.record import write_recording
 from brokk_rl.session import Session
-from brokk_rl.sim.mjcf_plant import MjcfPlant
 from diagnosis import api, baseline, effect_library
 from diagnosis.answer import ANSWER_FILE, Answer, Ranked, Selected, Where
 from diagnosis.closure import Estimate
-from diagnosis.mjcf_changes import JointFinding, write_changed_mjcf
+from diagnosis.mjcf.changes import JointFinding, write_changed_mjcf
+from diagnosis.mjcf.plant import MjcfPlant
 from diagnosis.modes.change_simulator import ChangeRequest, ChangeSimulator
 from diagnosis.simulator_changes import write_sysid_priors
 

@@ -428,7 +428,7 @@ class FunctionPlant:
 
 @lru_cache(maxsize=8)
 def _load_file(path: Path, changed_ns: int, machine: Machine) -> Any:
-    from brokk_rl.sim.mjcf_plant import MjcfPlant  # MuJoCo is not in every installation
+    from diagnosis.mjcf.plant import MjcfPlant  # MuJoCo is not in every installation
 
     return MjcfPlant(path, machine)
 

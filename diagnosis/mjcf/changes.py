@@ -17,7 +17,7 @@ import numpy as np
 
 from brokk_rl.machine import Machine
 from brokk_rl.session import write_text
-from brokk_rl.sim.mjcf_plant import MjcfPlant, limit_force_range
+from diagnosis.mjcf.plant import MjcfPlant, limit_force_range
 
 
 @dataclass(frozen=True)
