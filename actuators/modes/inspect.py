@@ -31,7 +31,6 @@ from brokk_rl.progress import track_items
 from brokk_rl.record import Breach, Recording
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json
-from brokk_rl.sim.simulator import WarpSimulator
 from brokk_rl.spec import Index, spec
 
 log = logging.getLogger(__name__)
@@ -44,12 +43,12 @@ class InspectionRequest:
     """Recordings to inspect.
 
     Attributes:
-        recordings: Glob, or list of globs, of recordings; `None` inspects the machine instead.
+        recordings: Glob, or list of globs, of recordings.
         pictures: One picture a recording up to so many recordings, beyond that those with the most
             findings; an overview always.
     """
 
-    recordings: str | tuple[str, ...] | None
+    recordings: str | tuple[str, ...]
     pictures: Index
 
 
@@ -88,14 +87,10 @@ class InspectedFile:
 
 @spec
 class Inspect:
-    """Shows rates, gaps, ranges, noise, format breaches and findings of recordings.
-
-    Without recordings it shows what each simulator simulates of the machine.
-    """
+    """Shows rates, gaps, ranges, noise, format breaches and findings of recordings."""
 
     session: Session
     machine: Machine
-    sim: WarpSimulator
     inspect: InspectionRequest
     thresholds: InspectionThresholds
     preview: EffectPreview | None
@@ -103,15 +98,10 @@ class Inspect:
     def run(self) -> None:
         """Write `inspection.json`, `inspection.html` and pictures, and print the tables.
 
-        Without recordings `machine.json` is written instead.
-
         Raises:
             RecordingError: no recording matches; a broken one is no error here.
             StorageError: a file could not be written.
         """
-        if self.inspect.recordings is None:
-            self._inspect_machine()
-            return
         paths = record.find_files(self.inspect.recordings, "recording")
         inspected = [self._look(path) for path in track_items(paths, "inspecting")]
         folder = self.session.folder
@@ -149,13 +139,6 @@ class Inspect:
         if preview:
             preview_report.show_preview(preview, self.machine)
         log.info("report: %s", folder / "inspection.html")
-
-    def _inspect_machine(self) -> None:
-        from brokk_rl.sim import machine_table
-
-        found = machine_table.inspect_machine(self.machine, self.sim, self.session.torch_device())
-        write_json(self.session.folder / "machine.json", found)
-        machine_table.show_machine(found)
 
     def _look(self, path: Path) -> InspectedFile:
         recording, breaches = record.examine_recording(path, self.machine)

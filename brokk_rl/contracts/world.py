@@ -120,9 +120,9 @@ class TracedWorld(Protocol):
 class Simulator(Protocol):
     """A spec in `conf/sim`: builds a world.
 
-    `build` may take one more argument, `varied: tuple[Property, ...]`; it then returns a
-    `VariedWorld`, and events can be used with it. With an argument `objects` it builds objects
-    beside the block (`brokk_rl.sim.objects`).
+    `build` may take two more arguments. With `varied: tuple[Property, ...]` it returns a
+    `VariedWorld`, and events can be used with it. With `objects` it builds objects beside the block
+    (`brokk_rl.sim.objects`).
     """
 
     def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:

@@ -154,10 +154,10 @@ def evaluate_policies(
     if evaluation.video:
         recorded = evaluated[first].episodes
         shown = next((episode for episode in recorded if episode.success), recorded[0])
-        log.info("drawing a video of one episode")
         objects = list_objects(config.task, config.sim)
         path = render_video(config.machine, shown, session.folder / "insertion.mp4", objects)
-        log.info("video of one episode: %s", path)
+        if path:
+            log.info("video of one episode: %s", path)
     return results
 
 

@@ -145,8 +145,7 @@ def check_parity(
     if not result.is_alike:
         raise ConfigError(
             f"machine {machine.name}: sim=warp does not simulate it as MuJoCo C does: "
-            f"{result.describe()}; choose sim.fused=false or sim=native, and see what "
-            "brokk mode=inspect says of the machine"
+            f"{result.describe()}; choose sim.fused=false or sim=native"
         )
     return result
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING
 
-from brokk_rl.errors import ConfigError, DeviceError
+from brokk_rl.errors import DeviceError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Count, Index, Positive, spec
 
 if TYPE_CHECKING:
     import torch
@@ -33,16 +33,9 @@ class NativeSimulator:
         num_threads: Threads; 0 takes all cores.
     """
 
-    num_worlds: int
-    substeps: int
-    num_threads: int
-
-    def check(self) -> None:
-        if self.num_worlds < 1 or self.substeps < 1 or self.num_threads < 0:
-            raise ConfigError(
-                "sim: expected num_worlds and substeps of 1 or more and num_threads of 0 or more, "
-                f"got {self.num_worlds}, {self.substeps} and {self.num_threads}"
-            )
+    num_worlds: Count
+    substeps: Count
+    num_threads: Index
 
     def build(
         self,
@@ -52,29 +45,20 @@ class NativeSimulator:
         varied: tuple[Property, ...] = (),
         objects: tuple[SceneObject, ...] = (),
     ) -> NativeWorld:
-        """Return the worlds; `num_worlds` overrides the number in the config.
-
-        `varied` names properties of the machine that differ from world to world, `objects` what
-        stands beside the block.
+        """Return the worlds; see `brokk_rl.contracts.world.Simulator`.
 
         Raises:
             DeviceError: `device` is not the CPU.
         """
+        from brokk_rl.sim.native_world import NativeWorld
+
         if not _is_cpu(device):
             raise DeviceError(
                 f"sim=native runs on the CPU, but device '{device}' was asked for; "
                 "choose sim=warp, or the CPU"
             )
-        from brokk_rl.sim.native_world import NativeWorld
-
-        return NativeWorld(
-            machine,
-            _choose(num_worlds, self.num_worlds),
-            self.substeps,
-            self.num_threads,
-            varied,
-            objects,
-        )
+        num = self.num_worlds if num_worlds is None else num_worlds
+        return NativeWorld(machine, num, self.substeps, self.num_threads, varied, objects)
 
 
 @spec
@@ -99,32 +83,15 @@ class WarpSimulator:
             (`brokk_rl.sim.parity`); 0 for no comparison.
     """
 
-    num_worlds: int
-    substeps: int
-    num_contacts: int
-    num_constraints: int
-    iterations: int
-    linesearch_iterations: int
-    tolerance: float
+    num_worlds: Count
+    substeps: Count
+    num_contacts: Count
+    num_constraints: Count
+    iterations: Count
+    linesearch_iterations: Count
+    tolerance: Positive
     fused: bool
-    parity_worlds: int
-
-    def check(self) -> None:
-        counts = (
-            self.num_worlds,
-            self.substeps,
-            self.num_contacts,
-            self.num_constraints,
-            self.iterations,
-            self.linesearch_iterations,
-        )
-        if min(counts) < 1 or self.tolerance <= 0.0:
-            raise ConfigError(
-                "sim: expected counts of 1 or more and a positive tolerance, "
-                f"got {counts} and {self.tolerance}"
-            )
-        if self.parity_worlds < 0:
-            raise ConfigError(f"sim.parity_worlds: expected 0 or more, got {self.parity_worlds}")
+    parity_worlds: Index
 
     def build(
         self,
@@ -134,10 +101,7 @@ class WarpSimulator:
         varied: tuple[Property, ...] = (),
         objects: tuple[SceneObject, ...] = (),
     ) -> WarpWorld:
-        """Return the worlds; `num_worlds` overrides the number in the config.
-
-        `varied` names properties of the machine that differ from world to world, `objects` what
-        stands beside the block.
+        """Return the worlds; see `brokk_rl.contracts.world.Simulator`.
 
         On a CPU this is slow and meant for tests.
 
@@ -158,7 +122,7 @@ class WarpSimulator:
             device = torch.device("cuda", torch.cuda.current_device())
         if self.parity_worlds:
             _check_parity(self, machine, device, objects)
-        num = _choose(num_worlds, self.num_worlds)
+        num = self.num_worlds if num_worlds is None else num_worlds
         return self._make_world(machine, device, num, varied, objects)
 
     def _make_world(
@@ -166,8 +130,8 @@ class WarpSimulator:
         machine: Machine,
         device: torch.device,
         num_worlds: int,
-        varied: tuple[Property, ...] = (),
-        objects: tuple[SceneObject, ...] = (),
+        varied: tuple[Property, ...],
+        objects: tuple[SceneObject, ...],
     ) -> WarpWorld:
         from brokk_rl.sim.warp_world import WarpWorld
 
@@ -207,7 +171,7 @@ class AutoSimulator:
         varied: tuple[Property, ...] = (),
         objects: tuple[SceneObject, ...] = (),
     ) -> World:
-        """Return the worlds on `device`; `num_worlds` overrides the configured number."""
+        """Return the worlds on `device`; see `brokk_rl.contracts.world.Simulator`."""
         chosen = self.native if _is_cpu(device) else self.warp
         return chosen.build(machine, device, num_worlds, varied, objects)
 
@@ -222,14 +186,9 @@ def _check_parity(
     """Compare a simulator with MuJoCo C on a machine, once in a process."""
     from brokk_rl.sim.parity import check_parity
 
-    world = simulator._make_world(machine, device, simulator.parity_worlds, objects=objects)
+    world = simulator._make_world(machine, device, simulator.parity_worlds, (), objects)
     return check_parity(world, machine, simulator.substeps, objects)
 
 
 def _is_cpu(device: torch.device | str) -> bool:
     return str(device).partition(":")[0] == "cpu"
-
-
-def _choose(given: int | None, configured: int) -> int:
-    """Return the number of worlds that was given, else the configured one."""
-    return configured if given is None else given

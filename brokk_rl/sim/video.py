@@ -1,7 +1,6 @@
-"""Videos and stills of a recorded episode.
+"""Videos and stills of a recorded episode, drawn by MuJoCo in a process of its own.
 
-MuJoCo's renderer draws them where a GL library works. Elsewhere matplotlib draws a side and a top
-view.
+GL drivers can end a process, and MuJoCo chooses its GL library at import.
 """
 
 from __future__ import annotations
@@ -11,11 +10,10 @@ import math
 import os
 import pickle
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -31,7 +29,7 @@ from brokk_rl.progress import ItemProgress
 from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.posed_scene import SHOWN_GROUPS, PosedScene
 from brokk_rl.sim.probe import find_renderer
-from brokk_rl.sim.scene import FAR_M, HALF_LENGTH_M, HALF_WIDTH_M, HOLE_DEPTH_M
+from brokk_rl.sim.scene import FAR_M
 
 log = logging.getLogger(__name__)
 
@@ -44,10 +42,6 @@ CLOSE_WIDTH = 380
 """Width of the close-up at the right, pixels."""
 NUM_STILLS = 3
 """Pictures of a video. Chosen by hand; not searched."""
-RENDER_TIMEOUT_S = 600
-"""Bound on the rendering process; 200 frames take about 40 s on a CPU."""
-DRAWN = "one picture is drawn"
-"""Line by which the rendering process counts its pictures."""
 FONT_SIZE = 18
 """Size of the text, px. Chosen by hand; not searched."""
 MARK_RADIUS_M, MARK_RGBA = 0.06, (0.1, 0.75, 0.35, 0.8)
@@ -59,11 +53,6 @@ TOOL_VIEW = (1.2, 30.0, -30.0)
 before the tool does not hide it."""
 VIDEO_QUALITY = 7
 """Of ffmpeg's encoder as imageio_ffmpeg scales it, 0 to 10; its default is 5."""
-SCHEMATIC_DPI = 100
-"""Dots an inch. Chosen by hand; not searched."""
-
-DrawFrames = Callable[[Iterable[int]], Iterator[np.ndarray]]
-"""Yields one picture, `(height, width, 3)` uint8, for each of the given steps."""
 
 
 class SimulatedEpisode(Protocol):
@@ -120,6 +109,15 @@ class RenderJob:
     objects: tuple[SceneObject, ...] = ()
 
     @property
+    def stride(self) -> int:
+        """Steps from frame to frame."""
+        return max(1, math.ceil(len(self.q) / MAX_FRAMES))
+
+    def list_frames(self) -> list[int]:
+        """Return the steps that are drawn: the last one always."""
+        return sorted({*range(0, len(self.q), self.stride), len(self.q) - 1})
+
+    @property
     def has_block(self) -> bool:
         """True where the block is within the machine's reach; tasks without one put it far away."""
         return float(np.hypot(*self.scene[:2])) < FAR_M
@@ -132,18 +130,24 @@ class RenderJob:
 
 def render_video(
     machine: Machine, episode: SimulatedEpisode, path: Path, objects: tuple[SceneObject, ...] = ()
-) -> Path:
+) -> Path | None:
     """Write an mp4 to `path` and stills beside it.
 
-    `<stem>_0.png` shows the start, the last still the end. The renderer runs in a process of its
-    own: GL drivers can end the process, and MuJoCo chooses its GL library at import.
+    `<stem>_0.png` shows the start, the last still the end.
 
     Returns:
-        `path`.
+        `path`; `None` where no GL library can draw here.
 
     Raises:
         StorageError: The files cannot be written.
     """
+    library = find_renderer()
+    if library is None:
+        log.warning(
+            "no video: MuJoCo finds no GL library that can draw here; install libegl1 or libosmesa6, or set "
+            "MUJOCO_GL to egl, osmesa or glfw (see `brokk mode=doctor`)"
+        )
+        return None
     with tempfile.TemporaryDirectory() as folder:
         draft = Path(folder) / "video.mp4"
         job = RenderJob(
@@ -156,8 +160,8 @@ def render_video(
             path=draft,
             objects=objects,
         )
-        if not _render_in_subprocess(job):
-            write_video(draft, draw_schematic(job, SIZE), len(job.q), machine.period_s)
+        if not _run_renderer(job, library):
+            return None
         try:
             for file in sorted(draft.parent.glob("video*.[mp][pn]*")):
                 shutil.copyfile(file, path.with_name(file.name.replace("video", path.stem, 1)))
@@ -166,90 +170,51 @@ def render_video(
     return path
 
 
-def _render_in_subprocess(job: RenderJob) -> bool:
-    """Run MuJoCo's renderer in a separate process; return whether it drew everything."""
-    library = find_renderer()
-    if library is None:
-        log.warning(
-            "no GL library works here, so the video is a drawing; for rendered pictures install "
-            "libegl1 (see `brokk mode=doctor`)"
-        )
-        return False
-    file = job.path.with_suffix(".job")
+def _run_renderer(job: RenderJob, library: str) -> bool:
+    """Draw a job in a process of its own; return whether it drew everything."""
+    file, told = job.path.with_suffix(".job"), job.path.with_suffix(".log")
     file.write_bytes(pickle.dumps(job))
     environment = os.environ | {
         "MUJOCO_GL": library,
         "PYTHONPATH": os.pathsep.join(part for part in sys.path if part),
     }
     program = "import sys; from brokk_rl.sim.video import render_job; render_job(sys.argv[1])"
-    told = []
     with (
-        ItemProgress("drawing a video", len(_choose_steps(len(job.q)))) as progress,
+        told.open("w") as errors,
+        ItemProgress("drawing the video", len(job.list_frames())) as progress,
         subprocess.Popen(
             [sys.executable, "-c", program, str(file)],
             env=environment,
             cwd=file.parent,
             stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
+            stderr=errors,
             text=True,
         ) as process,
     ):
-        assert process.stdout is not None
-        for line in process.stdout:
-            if line.strip() == DRAWN:
-                progress.advance()
-            else:
-                told.append(line)
+        assert process.stdout is not None, "piped"
+        for _ in process.stdout:  # a line a frame
+            progress.advance()
     if process.returncode:
-        reason = "it took too long" if process.returncode == -signal.SIGALRM else "".join(told)
         log.warning(
-            "MuJoCo's renderer failed with MUJOCO_GL=%s, so the video is a drawing: %s",
+            "no video: MuJoCo's renderer failed with MUJOCO_GL=%s: %s",
             library,
-            reason.strip()[-500:],
+            told.read_text().strip()[-500:],
         )
     return process.returncode == 0
 
 
 def render_job(file: str) -> None:
-    """Render the `RenderJob` that `render_video` has left in `file`; runs in its own process."""
-    signal.alarm(RENDER_TIMEOUT_S)
-    job: RenderJob = pickle.loads(Path(file).read_bytes())
-    draw = draw_rendered(job)
-
-    def draw_and_tell(steps: Iterable[int]) -> Iterator[np.ndarray]:
-        for picture in draw(steps):
-            yield picture
-            sys.stdout.write(f"{DRAWN}\n")
-            sys.stdout.flush()
-
-    write_video(job.path, draw_and_tell, len(job.q), job.machine.period_s)
-
-
-def _choose_steps(num_steps: int) -> list[int]:
-    """Return the steps that a video shows: every one, or `MAX_FRAMES` of a longer episode."""
-    stride = max(1, math.ceil(num_steps / MAX_FRAMES))
-    return sorted({*range(0, num_steps, stride), num_steps - 1})
-
-
-def write_video(path: Path, draw: DrawFrames, num_steps: int, period_s: float) -> None:
-    """Write an mp4 and stills.
-
-    Args:
-        path: The mp4; stills lie beside it as `<stem>_<i>.png`.
-        draw: Draws the pictures.
-        num_steps: `T`.
-        period_s: Time from step to step.
-    """
+    """Draw the `RenderJob` that `render_video` has left in `file`; runs in its own process."""
     import imageio.v2 as imageio
     import imageio_ffmpeg
 
-    stride = max(1, math.ceil(num_steps / MAX_FRAMES))
-    steps = _choose_steps(num_steps)
+    job: RenderJob = pickle.loads(Path(file).read_bytes())
+    frames = job.list_frames()
     # stills at equal distances from the first frame to the last
-    stills = {round(i * (len(steps) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
-    rate_hz = 1.0 / (period_s * stride)
+    stills = {round(i * (len(frames) - 1) / (NUM_STILLS - 1)): i for i in range(NUM_STILLS)}
+    rate_hz = 1.0 / (job.machine.period_s * job.stride)
     writer = imageio_ffmpeg.write_frames(
-        str(path),
+        str(job.path),
         SIZE,
         fps=rate_hz,  # pyright: ignore[reportArgumentType]
         quality=VIDEO_QUALITY,
@@ -257,10 +222,13 @@ def write_video(path: Path, draw: DrawFrames, num_steps: int, period_s: float) -
     )
     writer.send(None)
     try:
-        for count, picture in enumerate(draw(steps)):
+        for count, picture in enumerate(draw_frames(job, frames)):
             writer.send(np.ascontiguousarray(picture))
             if count in stills:
-                imageio.imwrite(path.with_name(f"{path.stem}_{stills[count]}.png"), picture)
+                still = job.path.with_name(f"{job.path.stem}_{stills[count]}.png")
+                imageio.imwrite(still, picture)
+            sys.stdout.write("\n")
+            sys.stdout.flush()
     finally:
         writer.close()
 
@@ -343,35 +311,31 @@ class SceneRenderer:
         return renderer.render()
 
 
-def draw_rendered(job: RenderJob) -> DrawFrames:
-    """Return a function that renders steps: overview, close-up of target or tool, commands."""
+def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
+    """Yield a picture, `(height, width, 3)` uint8, a step: overview, close-up, commands."""
     from PIL import Image, ImageDraw, ImageFont
 
     lines, font, (width, height) = write_captions(job), ImageFont.load_default(FONT_SIZE), SIZE
     split = width - CLOSE_WIDTH
     outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
     fixed = None if job.mark_m is None else _look_at(job.mark_m, TARGET_VIEW)
-
-    def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
-        with SceneRenderer(job.machine, job.objects) as renderer:
-            for step in steps:
-                renderer.set_pose(job.q[step], job.scene)
-                close = "close" if job.has_block else fixed
-                if close is None:  # neither a block nor a target: the tool
-                    tool = compute_tool_kinematics(job.machine, job.q[step])
-                    close = _look_at(tool.tip_in_base_m, TOOL_VIEW)
-                views = (
-                    renderer.render("overview", split, height, job.mark_m),
-                    renderer.render(close, CLOSE_WIDTH, height, job.mark_m),
-                )
-                picture = Image.fromarray(np.concatenate(views, axis=1))
-                pen = ImageDraw.Draw(picture)
-                pen.rectangle((split - 1, 0, split + 1, height), fill="white")
-                pen.text((16, 12), lines[step], fill="white", font=font, **outline)
-                _draw_command_bars(pen, job.machine.joint_names, job.u[step], font, height)
-                yield np.asarray(picture)
-
-    return draw
+    with SceneRenderer(job.machine, job.objects) as renderer:
+        for step in steps:
+            renderer.set_pose(job.q[step], job.scene)
+            close = "close" if job.has_block else fixed
+            if close is None:  # neither a block nor a target: the tool
+                tool = compute_tool_kinematics(job.machine, job.q[step])
+                close = _look_at(tool.tip_in_base_m, TOOL_VIEW)
+            views = (
+                renderer.render("overview", split, height, job.mark_m),
+                renderer.render(close, CLOSE_WIDTH, height, job.mark_m),
+            )
+            picture = Image.fromarray(np.concatenate(views, axis=1))
+            pen = ImageDraw.Draw(picture)
+            pen.rectangle((split - 1, 0, split + 1, height), fill="white")
+            pen.text((16, 12), lines[step], fill="white", font=font, **outline)
+            _draw_command_bars(pen, job.machine.joint_names, job.u[step], font, height)
+            yield np.asarray(picture)
 
 
 def _look_at(point_m: np.ndarray, view: tuple[float, float, float]) -> mujoco.MjvCamera:
@@ -395,74 +359,3 @@ def _draw_command_bars(
         middle = left + 70.0
         ends = sorted((middle, middle + 70.0 * float(np.clip(value, -1.0, 1.0))))
         pen.rectangle((ends[0], y + 1, ends[1], y + 13), fill=(250, 170, 10))
-
-
-def draw_schematic(job: RenderJob, size: tuple[int, int]) -> DrawFrames:
-    """Return a function that draws steps with matplotlib, without a GL library.
-
-    Args:
-        job: The episode.
-        size: Width and height of a picture, pixels.
-    """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    pose = Kinematics(job.machine).pose(torch.as_tensor(job.q, dtype=torch.float32))
-    tip = pose.tip_in_base_m[:, None]
-    # points of the arm: foot, joints, tip
-    chain = torch.cat((torch.zeros_like(tip), pose.joints_in_base_m, tip), 1).numpy()
-    lines = write_captions(job)
-
-    def draw(steps: Iterable[int]) -> Iterator[np.ndarray]:
-        inches = (size[0] / SCHEMATIC_DPI, size[1] / SCHEMATIC_DPI)
-        figure = Figure(figsize=inches, dpi=SCHEMATIC_DPI, layout="constrained")
-        canvas = FigureCanvasAgg(figure)
-        side, top = figure.subplots(1, 2)
-        # (second coordinate shown, line of the arm, line of the chisel) of each view
-        views = [(up, *_draw_view(axes, job, up)) for axes, up in ((side, 2), (top, 1))]
-        title = figure.suptitle("", family="monospace", fontsize=10)
-        for step in steps:
-            for up, links, chisel in views:
-                links.set_data(chain[step, :-1, 0], chain[step, :-1, up])
-                chisel.set_data(chain[step, -2:, 0], chain[step, -2:, up])
-            title.set_text(lines[step])
-            canvas.draw()
-            yield np.asarray(canvas.buffer_rgba())[..., :3]
-
-    return draw
-
-
-def _draw_view(axes: Any, job: RenderJob, up: int) -> tuple[Any, Any]:
-    """Draw the block or the marked target, seen along y (`up` = 2) or from above (`up` = 1).
-
-    Returns:
-        The still empty lines of the arm and of the chisel.
-    """
-    x, y, rim_z, yaw, scale, radius = job.scene
-    if job.mark_m is not None:
-        axes.plot(job.mark_m[0], job.mark_m[up], "o", color=MARK_RGBA[:3], markersize=9)
-    length, width = HALF_LENGTH_M * scale, HALF_WIDTH_M * scale
-    if up == 2:
-        half = abs(length * np.cos(yaw)) + abs(width * np.sin(yaw))
-        xs = [-half, -radius, -radius, radius, radius, half, half, -half]
-        zs = [0.0, 0.0, -HOLE_DEPTH_M, -HOLE_DEPTH_M, 0.0, 0.0, -rim_z, -rim_z]
-        axes.fill(x + np.array(xs), rim_z + np.array(zs), color="0.75", zorder=0)
-        axes.axhline(0.0, color="0.4", linewidth=1)
-    else:
-        turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-        corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (length, width)
-        axes.fill(*(corners @ turn.T + (x, y)).T, color="0.75", zorder=0)
-        angles = np.linspace(0, 2 * np.pi, 60)
-        rim = (x + radius * np.cos(angles), y + radius * np.sin(angles))
-        axes.plot(*rim, color="0.2", linewidth=1)
-    axes.set(
-        xlim=(-1.0, 5.0),
-        ylim=(-0.8, 3.6) if up == 2 else (-2.6, 2.6),
-        xlabel="x / m",
-        ylabel="z / m" if up == 2 else "y / m",
-    )
-    axes.set_aspect("equal")
-    joints = {"markersize": 5, "markerfacecolor": "0.2", "markeredgecolor": "0.2"}
-    (links,) = axes.plot([], [], "-o", color="darkorange", linewidth=5, **joints)
-    (chisel,) = axes.plot([], [], color="0.15", linewidth=3)
-    return links, chisel

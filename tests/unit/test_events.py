@@ -15,7 +15,6 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim.events import Event, EventWorld, build_varied_world
 from brokk_rl.sim.model import compile_model
-from brokk_rl.sim.native_world import NativeWorld
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator
 
@@ -178,7 +177,7 @@ def test_a_restored_state_keeps_its_properties(machine: Machine) -> None:
 def test_what_cannot_be_varied_is_refused_by_name(machine: Machine) -> None:
     class Plain:
         def build(self, machine: Machine, device: Any, num_worlds: int | None = None) -> Any:
-            return NativeWorld(machine, 1, 5, 1)
+            return NATIVE.build(machine, "cpu", 1)
 
     with pytest.raises(ConfigError, match=r"event=mass: sim=.*cannot vary"):
         build_varied_world(Plain(), {"mass": event("mass")}, machine, CPU, 1)

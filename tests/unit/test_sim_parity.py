@@ -1,4 +1,4 @@
-"""Parts of an MJCF are refused by name, or simulated as MuJoCo C does."""
+"""A simulator that leaves out a part of an MJCF is seen by its motion, or refused by name."""
 
 import dataclasses
 
@@ -11,12 +11,12 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim import model_features
 from brokk_rl.sim.model import ASSETS, compile_model
-from brokk_rl.sim.model_features import list_left_out
-from brokk_rl.sim.native_world import NativeWorld
 from brokk_rl.sim.parity import POSITION_TOLERANCE, check_parity, measure_parity
+from brokk_rl.sim.simulator import NativeSimulator
 
 SUBSTEPS = 5
 NUM_WORLDS = 32
+NATIVE = NativeSimulator(num_worlds=NUM_WORLDS, substeps=SUBSTEPS, num_threads=0)
 JOINT, TOOL = '<joint name="q3"', '<geom name="chisel" class="chisel_contact"'
 OPTIONS = '<compiler angle="radian" autolimits="true"/>'
 
@@ -79,28 +79,12 @@ def make_warp(machine: Machine, is_fused: bool):
     return simulator.build(machine, "cpu", NUM_WORLDS)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("is_fused", [False, True], ids=["staged", "fused"])
-@pytest.mark.parametrize("name", CHANGES)
-def test_each_part_is_refused_by_name_or_simulated_as_mujoco_c_does(
-    machine, tmp_path, name, is_fused
-):
-    changed = change_mjcf(machine, tmp_path, CHANGES[name])
-    backend = "fused" if is_fused else "staged"
-    if list_left_out(compile_model(changed, 0.01), backend):
-        with pytest.raises(ConfigError, match="remove that from the MJCF"):
-            make_warp(changed, is_fused)
-        return
-    result = measure_parity(make_warp(changed, is_fused), changed, SUBSTEPS)
-    assert result.is_alike, result.describe()
-
-
 @pytest.mark.parametrize("name", [name for name in CHANGES if name != "no sensors"])
 def test_each_part_matters_so_that_leaving_it_out_would_be_seen(machine, tmp_path, name):
     """MuJoCo C with the part in place of the simulator, and without it as the reference."""
     changed = change_mjcf(machine, tmp_path, CHANGES[name])
     try:
-        world = NativeWorld(changed, NUM_WORLDS, SUBSTEPS, 0)
+        world = NATIVE.build(changed, "cpu")
     except ConfigError:
         return
     result = measure_parity(world, machine, SUBSTEPS)
@@ -120,7 +104,7 @@ class Spoiled:
     """A native world of which one thing is wrong."""
 
     def __init__(self, machine: Machine, fault: str) -> None:
-        self._world, self._fault = NativeWorld(machine, NUM_WORLDS, SUBSTEPS, 0), fault
+        self._world, self._fault = NATIVE.build(machine, "cpu"), fault
         self.num_worlds, self.device, self.faults = (
             NUM_WORLDS,
             torch.device("cpu"),
@@ -157,21 +141,6 @@ def test_one_that_is_right_is_not(machine):
     assert result.num_different == 0 and result.position_error.max() == 0.0
 
 
-def test_every_field_of_this_mujoco_is_in_a_list(machine):
-    assert model_features.list_unknown_fields(compile_model(machine, 0.01)) == []
-
-
-def test_a_field_that_no_list_knows_is_refused_by_name_where_it_is_used(
-    machine, tmp_path, monkeypatch
-):
-    kept = tuple(one for one in model_features.FEATURES if one.name != "adhesion")
-    monkeypatch.setattr(model_features, "FEATURES", kept)
-    model_features.check_simulated(compile_model(machine, 0.01), "brokk170", "fused")
-    changed = compile_model(change_mjcf(machine, tmp_path, CHANGES["adhesion"]), 0.01)
-    with pytest.raises(ConfigError, match=r"'geom_adhesion', which is new in MuJoCo .* sim=native"):
-        model_features.check_simulated(changed, "brokk170", "fused")
-
-
 def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
     def refuse(name: str) -> str:
         model = compile_model(change_mjcf(machine, tmp_path, CHANGES[name]), 0.01)
@@ -179,7 +148,6 @@ def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
             model_features.check_simulated(model, "brokk170", "fused")
         return str(refusal.value)
 
-    assert refuse("damping").endswith("choose sim=native or sim.fused=false")
     assert refuse("friction").endswith("choose sim=native")
     assert refuse("no actuation").endswith("from the MJCF")
 
@@ -197,4 +165,4 @@ def test_mujoco_c_itself_refuses_what_the_drive_cannot_do(machine, tmp_path):
     changed = change_mjcf(machine, tmp_path, CHANGES["no actuation"])
     assert compile_model(changed, 0.01).opt.disableflags & mujoco.mjtDisableBit.mjDSBL_ACTUATION
     with pytest.raises(ConfigError, match="actuation=disable"):
-        NativeWorld(changed, 1, SUBSTEPS, 1)
+        NATIVE.build(changed, "cpu", 1)

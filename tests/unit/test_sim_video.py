@@ -1,4 +1,4 @@
-"""A video must come out wherever the program runs."""
+"""A film of an episode, and what is said where none can be drawn."""
 
 import os
 import types
@@ -25,24 +25,16 @@ def motion(machine):
     )
 
 
-def test_without_a_gl_library_the_video_is_a_drawing(machine, motion, tmp_path, monkeypatch):
+def test_without_a_gl_library_there_is_no_video(machine, motion, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(video, "find_renderer", lambda: None)
-    path = video.render_video(machine, motion, tmp_path / "insertion.mp4")
-    assert path.stat().st_size > 1000
-    assert sorted(file.name for file in tmp_path.glob("*.png")) == [
-        f"insertion_{i}.png" for i in range(3)
-    ]
+    assert video.render_video(machine, motion, tmp_path / "film.mp4") is None
+    assert "libegl1" in caplog.text and list(tmp_path.iterdir()) == []
 
 
-def test_a_renderer_that_fails_still_leaves_a_drawing(machine, motion, tmp_path, monkeypatch):
+def test_a_renderer_that_fails_says_why(machine, motion, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(video, "find_renderer", lambda: "nonsense")
-    assert video.render_video(machine, motion, tmp_path / "insertion.mp4").stat().st_size > 1000
-
-
-def test_a_folder_that_cannot_be_written_is_a_storage_error(machine, motion, tmp_path, monkeypatch):
-    monkeypatch.setattr(video, "find_renderer", lambda: None)
-    with pytest.raises(StorageError, match="could not be written"):
-        video.render_video(machine, motion, tmp_path / "missing" / "insertion.mp4")
+    assert video.render_video(machine, motion, tmp_path / "film.mp4") is None
+    assert "MUJOCO_GL=nonsense" in caplog.text and "invalid value" in caplog.text
 
 
 @pytest.mark.slow
@@ -60,23 +52,17 @@ def test_a_gl_library_gives_pictures_of_the_machine(machine, motion, tmp_path):
 
     if find_renderer() is None:
         pytest.skip("no GL library works here")
-    video.render_video(machine, motion, tmp_path / "insertion.mp4")
-    picture = imageio.imread(tmp_path / "insertion_2.png").astype(int)
+    video.render_video(machine, motion, tmp_path / "film.mp4")
+    picture = imageio.imread(tmp_path / "film_2.png").astype(int)
     yellow = (picture[..., 0] > 180) & (picture[..., 2] < 60)
     assert picture.shape == (540, 1200, 3) and yellow.mean() > 0.01
+    with pytest.raises(StorageError, match="could not be written"):
+        video.render_video(machine, motion, tmp_path / "missing" / "film.mp4")
 
 
-def test_a_task_without_a_block_shows_its_target(machine, motion, tmp_path, monkeypatch):
-    """The drawing holds a green ball, and the caption the distance to it by hand."""
-    import imageio.v2 as imageio
-
-    monkeypatch.setattr(video, "find_renderer", lambda: None)
+def test_a_caption_tells_the_distance_to_a_target_without_a_block(machine, motion, tmp_path):
     motion.scene[0] = 50.0
     tip = compute_tool_kinematics(machine, motion.q[0]).tip_in_base_m
     motion.target_m = tip + np.array([0.3, 0.0, 0.4])
-    video.render_video(machine, motion, tmp_path / "reach.mp4")
-    picture = imageio.imread(tmp_path / "reach_0.png").astype(int)
-    green = (picture[..., 1] > 150) & (picture[..., 0] < 80) & (picture[..., 2] < 140)
-    assert green.sum() > 50
     job = video.RenderJob(machine=machine, path=tmp_path, **vars(motion))
     assert "50.0 cm to the target" in video.write_captions(job)[0]

@@ -133,23 +133,12 @@ def test_nan_and_a_full_buffer_are_faults_of_their_worlds_alone(machine, warp):
     assert world.faults.tolist() == [False, True, True]
 
 
-@pytest.mark.parametrize(
-    ("drawn", "instead", "named"),
-    [
-        ('<joint name="q3"', '<joint damping="5" name="q3"', "dampers in joints"),
-        ('<joint name="q3"', '<joint frictionloss="5" name="q3"', "friction in joints"),
-        (
-            'class="chisel_contact"><geom',
-            'class="chisel_contact"><geom condim="4"',
-            "condim above 3",
-        ),
-    ],
-)
-def test_what_the_launches_leave_out_is_refused_by_name(machine, tmp_path, drawn, instead, named):
+def test_what_the_launches_leave_out_is_refused_by_name(machine, tmp_path):
     text = (ASSETS / machine.mjcf).read_text()
+    drawn = '<joint name="q3"'
     assert drawn in text
-    (tmp_path / "other.xml").write_text(text.replace(drawn, instead))
-    with pytest.raises(ConfigError, match=named):
+    (tmp_path / "other.xml").write_text(text.replace(drawn, f'{drawn} frictionloss="5"'))
+    with pytest.raises(ConfigError, match="friction in joints"):
         FUSED.build(dataclasses.replace(machine, mjcf=str(tmp_path / "other.xml")), "cpu")
 
 
