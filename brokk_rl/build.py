@@ -42,27 +42,40 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     Raises:
         ConfigError: A class cannot be found, a key is unknown, or a value is refused.
     """
-    nodes = {key: value for key, value in values.items() if key != RUN}
+    built, late = build_quick_nodes(values, shared)
+    kind = load_class(values[RUN], "")
+    known = [field.name for field in fields(kind)]
+    for key in late:
+        if key in known or key not in shared:
+            built[key] = build_node(values[key], key)
+    for key in built:
+        if key not in known:
+            raise ConfigError(f"the mode has no '{key}'; {list_choices(key, known)}")
+    return _call(kind, {key: built[key] for key in values if key in built}, "")
+
+
+def build_quick_nodes(
+    values: Mapping[str, Any], shared: Collection[str] = ()
+) -> tuple[dict[str, Any], list[str]]:
+    """Return the nodes whose classes do without torch, and the keys of the others.
+
+    Raises:
+        ConfigError: Classes cannot be found or refuse their values; all of them are named.
+    """
     built, late, refusals = {}, list(shared), []
     with _refuse_slow_import():
-        for key in nodes.keys() - shared:
+        for key, value in values.items():
+            if key == RUN or key in shared:
+                continue
             try:
-                built[key] = build_node(nodes[key], key)
+                built[key] = build_node(value, key)
             except _SlowImport:
                 late.append(key)
             except ConfigError as error:
                 refusals.append(error)
     if refusals:
-        raise ConfigError("\n".join(sorted(map(str, refusals)))) from refusals[0]
-    kind = load_class(values[RUN], "")
-    known = [field.name for field in fields(kind)]
-    for key in late:
-        if key in known or key not in shared:
-            built[key] = build_node(nodes[key], key)
-    for key in built:
-        if key not in known:
-            raise ConfigError(f"the mode has no '{key}'; {list_choices(key, known)}")
-    return _call(kind, {key: built[key] for key in nodes if key in built}, "")
+        raise ConfigError("\n".join(map(str, refusals))) from refusals[0]
+    return built, late
 
 
 def build_node(node: Any, place: str = "") -> Any:

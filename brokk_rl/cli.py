@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import io
 import logging
-import math
 import os
+import re
 import shutil
 import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from datetime import datetime
-from pathlib import Path
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -28,12 +25,10 @@ import brokk_rl
 from brokk_rl import distributed, extensions, gpu_pool
 from brokk_rl.arguments import read_arguments
 from brokk_rl.errors import BrokkError, ConfigError
-from brokk_rl.explain import compose_choices, explain, read_mode_name
-from brokk_rl.mode_help import describe_mode
-from brokk_rl.policy_choice import insert_policy, is_going_on, prepare_arguments
-from brokk_rl.session import read_earlier_job, remove_empty_folders, require_new_folder
+from brokk_rl.explain import compose_choices, explain, list_sources
+from brokk_rl.help import add_comments, collect_comments, describe_command, describe_mode
 from brokk_rl.sim import probe
-from brokk_rl.sweep import SweepFolder, name_job
+from brokk_rl.sweep import SweepFolder
 
 log = logging.getLogger(__name__)
 
@@ -57,6 +52,10 @@ def main() -> int:
     if sys.platform == "win32":
         sys.stderr.write("error: brokk_rl needs Linux or macOS; on Windows install it in WSL 2\n")
         return 2
+    asks_help = {"--help", "-h"} & set(sys.argv[1:])
+    if not sys.argv[1:] or (asks_help and not any("mode=" in word for word in sys.argv[1:])):
+        sys.stdout.write(describe_command())
+        return 0
     trace = "1" in (os.environ.get("BROKK_TRACE"), os.environ.get("HYDRA_FULL_ERROR"))
     set_up_logging()
     # The launcher options keep the names that submitit gave them; Hydra warns of that three times.
@@ -73,13 +72,14 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with _make_hydra_raise():
-            sys.argv[1:] = prepare_arguments(read_arguments(sys.argv[1:]))
+            sys.argv[1:] = _prepare_policy(read_arguments(sys.argv[1:]))
             extensions.register_options(sys.argv[1:])
-            if _is_mode_help(sys.argv[1:]):
+            if {"--help", "-h"} & set(sys.argv[1:]):
                 sys.stdout.write(_describe_chosen_mode())
                 return 0
             command = hydra.main(version_base="1.3", config_path="pkg://conf", config_name="config")
-            command(run_job)()
+            with _add_comments() if "--cfg" in sys.argv[1:] else contextlib.nullcontext():
+                command(run_job)()
             sys.stdout.flush()
     except BrokenPipeError:
         # Python flushes stdout once more when it ends; that must not fail again.
@@ -107,7 +107,9 @@ def run_job(cfg: DictConfig) -> float | None:
     set_up_logging()  # A launcher may run the job in a process of its own.
     try:
         with gpu_pool.take_place():
-            return _run(cfg)
+            from brokk_rl.job import run
+
+            return run(cfg)
     except Exception as error:
         if HydraConfig.get().mode is not RunMode.MULTIRUN:
             raise FailedJob(error) from error
@@ -120,51 +122,13 @@ def run_job(cfg: DictConfig) -> float | None:
         raise BrokkError(message) from error
 
 
-def _run(cfg: DictConfig) -> float | None:
-    """Build the mode and run it, within its session where it has one."""
-    from brokk_rl.build import build_mode
+def _prepare_policy(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments with the policy that they name, if any, as an option of Hydra."""
+    if not any(re.match(r"policy|checkpoint|resume|start_from|doctor\.", one) for one in arguments):
+        return list(arguments)  # the readers of policies take a quarter of a second to import
+    from brokk_rl.policy_choice import prepare_arguments
 
-    sweep = HydraConfig.get().mode is RunMode.MULTIRUN
-    cfg = insert_policy(cfg)
-    values, shared = extensions.read_values(cfg)
-    if "session" not in values:
-        mode = build_mode(values, shared)
-        distributed.check_together(type(mode), sweep)
-        return mode.run()
-    folder = choose_run_folder(values)
-    goes_on = is_going_on(cfg, folder)
-    try:
-        if not (sweep or goes_on) and distributed.read_rank().first:
-            require_new_folder(folder)
-        mode = build_mode(values | {"session": values["session"] | {"out": str(folder)}}, shared)
-        distributed.check_together(type(mode), sweep)
-        return _run_in_session(mode, values, sweep, goes_on)
-    except Exception:
-        if sweep:
-            # Hydra made these folders, in several levels where an override holds a path. A folder
-            # into which a job has written stays.
-            remove_empty_folders([folder, *folder.parents])
-        raise
-
-
-def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: bool) -> float | None:
-    """Run a mode in its run folder; a finished job of a sweep is not run again."""
-    folder, resolved = mode.session.folder, _format_resolved(mode, values)
-    before = read_earlier_job(folder, resolved) if sweep else None
-    if before and before.get("outcome") == "finished":
-        log.info("job %s is done already: %s", HydraConfig.get().job.num, folder)
-        return before.get("objective")
-    if before and getattr(mode, "resume", "") is None:
-        mode = dataclasses.replace(mode, resume=str(folder))
-    resume = bool(before) or goes_on
-    log.info("run folder: %s", folder)
-    facts = _collect_facts(read_mode_name(values), mode)
-    with mode.session.start(resolved, facts, resume) as record:
-        objective = mode.run()
-        record.fields["objective"] = (
-            objective if objective is not None and math.isfinite(objective) else None
-        )
-        return objective
+    return prepare_arguments(arguments)
 
 
 def _is_first_process() -> bool:
@@ -173,46 +137,6 @@ def _is_first_process() -> bool:
         return distributed.read_rank().first
     except ConfigError:
         return True
-
-
-def _collect_facts(name: str, mode: Any) -> dict[str, Any]:
-    """Return the fields of `session.json` about mode, options, overrides and machine."""
-    settings = HydraConfig.get()
-    made = OmegaConf.to_container(settings.runtime.choices)
-    assert isinstance(made, dict)
-    chosen = {
-        str(key): value
-        for key, value in made.items()
-        if value and str(key).split("/")[0] != "hydra"
-    }
-    overrides = list(settings.overrides.task)
-    for override in overrides:
-        key, _, value = override.partition("=")
-        if value.startswith("["):  # Hydra does not record options that were chosen as a list.
-            chosen.setdefault(key, value)
-    facts: dict[str, Any] = {"mode": name, "choices": chosen, "overrides": overrides}
-    if machine := getattr(mode, "machine", None):
-        facts |= {"machine": machine.name, "fingerprint": machine.fingerprint()}
-    return facts
-
-
-def choose_run_folder(values: Mapping[str, Any]) -> Path:
-    """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`."""
-    settings = HydraConfig.get()
-    if settings.mode is RunMode.MULTIRUN:
-        fixed = settings.job.config.override_dirname.exclude_keys
-        return Path(settings.sweep.dir) / name_job(
-            int(settings.job.num), list(settings.overrides.task), list(fixed)
-        )
-    out = values["session"]["out"]
-    if out and out != "???":
-        return Path(out)
-    name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
-    name = Path(name).stem if name else None  # An option may be a file: experiment=@<path>.
-    stem = "_".join(
-        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", read_mode_name(values), name))
-    )
-    return Path("runs") / stem
 
 
 def set_up_logging() -> None:
@@ -234,12 +158,6 @@ def set_up_logging() -> None:
     logging.getLogger("matplotlib").setLevel(logging.WARNING)
 
 
-def _is_mode_help(arguments: Sequence[str]) -> bool:
-    """Return true where the help of one mode is asked for, not that of the command."""
-    asked = "--help" in arguments or "-h" in arguments
-    return asked and any(argument.startswith("mode=") for argument in arguments)
-
-
 def _describe_chosen_mode() -> str:
     """Return the help of the mode of the command line, with the options chosen there."""
     cfg = compose_choices()
@@ -249,21 +167,20 @@ def _describe_chosen_mode() -> str:
     return describe_mode(
         {str(key): value for key, value in choices.items()},
         {str(key): value for key, value in node.items()},
+        collect_comments(list_sources()),
         shutil.get_terminal_size().columns,
     )
 
 
-def _format_resolved(mode: Any, values: dict[str, Any]) -> str:
-    """Return the text of `resolved.yaml`, which runs again in a new folder."""
-    content: dict[str, Any] = {"defaults": [{"hydra": "brokk"}, "_self_"], "run": values["run"]}
-    for field in dataclasses.fields(mode):
-        if field.name in values:
-            content[field.name] = values[field.name]
-    content["session"] = values["session"] | {"out": "???"}
-    return (
-        "# Runs again: brokk --config-dir <this folder> --config-name resolved\n"
-        + OmegaConf.to_yaml(OmegaConf.create(content))
-    )
+@contextlib.contextmanager
+def _add_comments() -> Iterator[None]:
+    """Put comments into the configuration that Hydra prints in the block."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        yield
+    text = printed.getvalue()
+    if "--config-name" not in sys.argv and "-cn" not in sys.argv:
+        text = add_comments(text, collect_comments(list_sources()))
+    sys.stdout.write(text)
 
 
 @contextlib.contextmanager

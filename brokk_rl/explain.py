@@ -12,8 +12,10 @@ from typing import Any
 
 import hydra
 import yaml
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import ConfigCompositionException, HydraException, MissingConfigException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import (
     InterpolationResolutionError,
@@ -23,6 +25,9 @@ from omegaconf.errors import (
 
 from brokk_rl import extras, registry
 from brokk_rl.errors import BrokkError, list_choices
+
+MISSING_SKIPPED = RunMode.MULTIRUN
+"""Mode in which Hydra leaves out groups that must be given: the jobs of a sweep bring them."""
 
 
 def explain(error: BaseException) -> str | None:
@@ -207,27 +212,61 @@ def _find_keys(node: Any, name: str, above: str = "") -> list[str]:
 def compose_choices() -> DictConfig:
     """Compose the options that the command line chooses, without its values.
 
-    Of a sweep's options the first is taken. Options that do not compose are left out, up to the
-    mode: the message of an error then lists what the mode has by itself.
+    Options that do not compose are left out, up to the mode: the message of an error then lists
+    what the mode has by itself.
     """
+    chosen = list_chosen_options(sys.argv[1:])
+    modes = [line for line in chosen if line.startswith("mode=")]
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        try:
+            return _compose_without_missing(chosen)
+        except (HydraException, OmegaConfBaseException):
+            return _compose_without_missing(modes[-1:])
+
+
+def _compose_without_missing(chosen: list[str]) -> DictConfig:
+    """Compose options; a group that must be given and is not is left out."""
+    try:
+        return hydra.compose("config", overrides=chosen, return_hydra_config=True)
+    except ConfigCompositionException as error:
+        group = re.match(r"You must specify '([\w/@.]+)'", str(error))
+        if group is None:
+            raise
+        cfg = _compose_without_missing([*chosen, f"~{group[1]}"])
+        OmegaConf.set_readonly(cfg.hydra, False)
+        OmegaConf.set_struct(cfg.hydra, False)
+        cfg.hydra.runtime.choices[group[1]] = "???"
+        return cfg
+
+
+def list_sources() -> list[tuple[str, Path]]:
+    """Return package and file of each option that the command line chooses, as they are composed."""
+    files = {f"{option.group}/{option.name}": option.path for option in registry.list_options()}
+    found = []
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        chosen = list_chosen_options(sys.argv[1:])
+        for entry in loader.compute_defaults_list("config", chosen, MISSING_SKIPPED).defaults:
+            if path := files.get(str(entry.config_path)):
+                found.append((entry.package or "", path))
+    return found
+
+
+def list_chosen_options(arguments: Sequence[str]) -> list[str]:
+    """Return the arguments that choose options; of a sweep's options the first is taken."""
     groups = {option.group for option in registry.list_options()}
     chosen: list[str] = []
     for override in OverridesParser.create().parse_overrides(
-        [argument for argument in sys.argv[1:] if "=" in argument and argument[0] != "-"]
+        [argument for argument in arguments if "=" in argument and argument[0] != "-"]
     ):
         plain = override.is_sweep_override() or isinstance(override.value(), (str, list))
-        if override.key_or_group not in groups or not plain:
+        if override.key_or_group.split("@")[0] not in groups or not plain:
             continue
         line = str(override.input_line)
         if override.is_sweep_override():
             line = f"{line.partition('=')[0]}={next(iter(override.sweep_string_iterator()))}"
         chosen.append(line)
-    modes = [line for line in chosen if line.startswith("mode=")]
-    with hydra.initialize_config_module("conf", version_base="1.3"):
-        try:
-            return hydra.compose("config", overrides=chosen, return_hydra_config=True)
-        except (HydraException, OmegaConfBaseException):
-            return hydra.compose("config", overrides=modes[-1:], return_hydra_config=True)
+    return chosen
 
 
 def read_mode_name(cfg: Mapping[Any, Any]) -> str:

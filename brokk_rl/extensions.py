@@ -21,7 +21,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from brokk_rl import registry
-from brokk_rl.build import build_mode, build_node
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.explain import explain_missing_value
 
@@ -85,6 +84,8 @@ def load_option(group: str, name: str, **fields: object) -> Any:
     changes = [f"subject.{field}={value}" for field, value in fields.items()]
     with hydra.initialize_config_module("conf", version_base="1.3"):
         cfg = hydra.compose("config", overrides=["~mode", f"+{group}@subject='{name}'", *changes])
+    from brokk_rl.build import build_node  # the command composes without it
+
     return build_node(OmegaConf.to_container(cfg.subject, resolve=True), group)
 
 
@@ -97,6 +98,8 @@ def load_mode(*words: str) -> Any:
     Raises:
         ConfigError: A value is refused, or one that must be given is not.
     """
+    from brokk_rl.build import build_mode
+
     register_options(words)
     with hydra.initialize_config_module("conf", version_base="1.3"):
         return build_mode(*read_values(hydra.compose("config", overrides=list(words))))

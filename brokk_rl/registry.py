@@ -45,10 +45,11 @@ class Option:
     def summary(self) -> str:
         """Return the first sentence of the file's comment, else the first line of its target."""
         text = self.path.read_text()
+        if comment := _read_comment(text):
+            return re.split(r"(?<=\.) ", comment)[0]
         content = yaml.safe_load(text) or {}
         target = content.get("_target_") or content.get("run")
-        comment = re.split(r"(?<=\.) ", _read_comment(text))[0]
-        return comment or (_read_docstring(target).split("\n")[0] if target else "")
+        return _read_docstring(target).split("\n")[0] if target else ""
 
     def comment(self) -> str:
         """Return the whole comment at the top of the file, in one line."""
@@ -69,8 +70,8 @@ def find_packages() -> dict[str, Path]:
     return found
 
 
-def list_options() -> list[Option]:
-    """Return every option of every group, sorted by group and name.
+def list_options(only: str | None = None) -> list[Option]:
+    """Return every option of every group, or of one group, sorted by group and name.
 
     Raises:
         ConfigError: Two packages offer the same option.
@@ -86,7 +87,7 @@ def list_options() -> list[Option]:
                     f"{group}={name} is offered twice, by {other.package} ({other.path}) and by {package} ({path}): rename one"
                 )
             found[group, name] = Option(group, name, package, path)
-    return [found[key] for key in sorted(found)]
+    return [found[key] for key in sorted(found) if only in (None, key[0])]
 
 
 def list_targets() -> frozenset[str]:

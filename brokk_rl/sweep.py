@@ -12,7 +12,6 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, read_write
 
 from brokk_rl import gpu_pool
-from brokk_rl.session import list_missing_folders, remove_empty_folders
 
 LONGEST_NAME = 120
 """Characters of a job's folder name; file systems take 255 bytes, and paths are read by people."""
@@ -58,6 +57,8 @@ class SweepFolder(Callback):
             config.hydra.overrides.hydra.append(
                 f"hydra.job.config.override_dirname.exclude_keys={fixed}"
             )
+        from brokk_rl.session import list_missing_folders  # numpy comes with it
+
         type(self).new = tuple(list_missing_folders(Path(str(config.hydra.sweep.dir))))
         if str(config.hydra.launcher._target_).endswith(".LocalLauncher"):
             gpu_pool.offer_places()
@@ -65,6 +66,8 @@ class SweepFolder(Callback):
     @classmethod
     def drop_if_unused(cls) -> None:
         """Remove the folders of a sweep into which no job has written."""
+        from brokk_rl.session import remove_empty_folders
+
         if (
             cls.new
             and cls.new[0].is_dir()

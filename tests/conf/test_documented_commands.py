@@ -13,9 +13,11 @@ import hydra
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
+from omegaconf import OmegaConf
 from packages import forget_package, install_package
 
 from brokk_rl import cli, extensions, registry
+from brokk_rl.build import build_quick_nodes
 from brokk_rl.modes.new import NewPackage, PackageRequest
 
 ROOT = Path(__file__).parents[2]
@@ -154,7 +156,8 @@ def explain_fault(overrides: list[str], whole: bool) -> str | None:
     try:
         cfg = hydra.compose("config", overrides=overrides)
         if whole:
-            cli.check_values(cfg)
+            cfg = OmegaConf.merge(cfg, {"session": {"out": "folder"}}) if "session" in cfg else cfg
+            build_quick_nodes(*extensions.read_values(cfg))
     except Exception as error:
         return cli.explain(error) or repr(error)
     return None

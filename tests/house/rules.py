@@ -18,6 +18,7 @@ MODE = 4
 """Floor of the modes: `brokk_rl.modes` and `<room>.modes`."""
 FLOORS = (
     ("brokk_rl.cli", 5),
+    ("brokk_rl.job", 5),
     ("brokk_rl.arguments", 5),
     ("brokk_rl.explain", 5),
     ("brokk_rl.__main__", 5),
@@ -40,6 +41,7 @@ bedrock, and ground for the rest."""
 COMPOSERS = (
     "brokk_rl.arguments",
     "brokk_rl.cli",
+    "brokk_rl.job",
     "brokk_rl.explain",
     "brokk_rl.extensions",
     "brokk_rl.sweep",
