@@ -7,6 +7,7 @@ Trains sixteen worlds on a CPU and prints each file of the project with the func
 
 from __future__ import annotations
 
+import inspect
 import sys
 import tempfile
 from collections import Counter, defaultdict
@@ -45,8 +46,10 @@ class PathRecorder:
         if event not in ("call", "return") or not code.co_filename.startswith(f"{ROOT}/"):
             return
         file = code.co_filename.removeprefix(f"{ROOT}/")
-        if file.startswith((".venv", "benchmarks")) or code.co_name.startswith("<"):
-            return  # the bodies of modules and classes run at import
+        # the bodies of modules and classes run at import, comprehensions with their function
+        is_function = code.co_flags & inspect.CO_OPTIMIZED and not code.co_name.startswith("<")
+        if file.startswith((".venv", "benchmarks")) or not is_function:
+            return
         if event == "return":
             if file == "brokk_rl/rl/ppo.py" and code.co_name == "update":
                 raise FirstUpdate

@@ -13,11 +13,10 @@ from composed import option
 from kinematic import Kinematic
 
 from brokk_rl.machine import Machine
-from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.logger import NoTracking, TrainingLogger
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
-from brokk_rl.rl.tracking import NoTracking
 
 CPU = torch.device("cpu")
 STEPS = 4

@@ -22,9 +22,8 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "h200"))
 from train_jobs import build, compose  # pyright: ignore[reportMissingImports]
 
-from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.logger import NoTracking, TrainingLogger
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner, allow_tensor_cores
-from brokk_rl.rl.tracking import NoTracking
 
 VARIANTS = {
     "eager": (False, True, False),

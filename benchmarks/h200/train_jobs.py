@@ -38,11 +38,10 @@ from brokk_rl.extensions import load_mode
 from brokk_rl.modes.train import Train
 from brokk_rl.policy_folder import describe_policy, write_policy
 from brokk_rl.rl.evaluation import evaluate_policy
-from brokk_rl.rl.logger import PROGRESS, TrainingLogger
+from brokk_rl.rl.logger import PROGRESS, NoTracking, TrainingLogger
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, NetworkPolicy
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
-from brokk_rl.rl.tracking import NoTracking
 
 log = logging.getLogger("train_jobs")
 COLUMNS = {

@@ -1,9 +1,6 @@
 """Contracts of actuator models, excitations, effects and followers.
 
-`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
-extensions.
-Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
-a target.
+Axes: `N` environments, `J` joints, `H` samples of history (oldest first).
 """
 
 from __future__ import annotations

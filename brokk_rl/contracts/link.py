@@ -1,10 +1,4 @@
-"""The link to the machine's valves.
-
-`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
-extensions.
-Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
-a target.
-"""
+"""The link to the machine's valves."""
 
 from __future__ import annotations
 

@@ -1,10 +1,4 @@
-"""Simulated operators at the levers, and the ground of their trials.
-
-`brokk_rl.checks` holds a public checker for each contract, for our own entries and for those of
-extensions.
-Axes: `N` environments, `J` joints, `H` samples of history (oldest first), `K` numbers that describe
-a target.
-"""
+"""Simulated operators at the levers, and the ground of their trials."""
 
 from __future__ import annotations
 

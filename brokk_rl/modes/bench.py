@@ -20,12 +20,11 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.rl.benchmark_sizes import BenchmarkSizes
 from brokk_rl.rl.execution import capture_graph
-from brokk_rl.rl.logger import TrainingLogger
+from brokk_rl.rl.logger import NoTracking, TrainingLogger
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.rl.success_sweep import LEVELS, report_sweep, run_sweep, summarise
-from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.session import Session, read_versions, write_json
 from brokk_rl.spec import spec
 

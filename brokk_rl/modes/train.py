@@ -26,7 +26,15 @@ from brokk_rl.policy_folder import (
     write_policy,
 )
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
-from brokk_rl.rl.logger import PROGRESS, TrainingLogger, draw_curves, find_passing
+from brokk_rl.rl.logger import (
+    PROGRESS,
+    NoTracking,
+    Tracker,
+    Tracking,
+    TrainingLogger,
+    draw_curves,
+    find_passing,
+)
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.policy import (
     ClassicalPolicy,
@@ -38,7 +46,6 @@ from brokk_rl.rl.policy import (
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.rl.success_sweep import LEVELS
-from brokk_rl.rl.tracking import NoTracking, Tracker, Tracking
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec

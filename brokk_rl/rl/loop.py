@@ -32,7 +32,7 @@ from brokk_rl.contracts.world import Simulator, TracedWorld, World
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import TaskDescription, describe_task
-from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
+from brokk_rl.rl.execution import capture_graph, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
 from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
@@ -273,14 +273,14 @@ class ControlLoop(VecEnv):
             for name in ("_command", "_judge", "_perceive"):
                 compiled = torch.compile(getattr(self, name), fullgraph=True, dynamic=False)
                 setattr(self, name, compiled)
+        if not graphs and not fuse:
+            return
         with report_compile_errors():
             if graphs:
                 self._graph = capture_graph(self._advance, self.device)
-            elif fuse:
+            else:
                 with self._always_alike():
                     self._advance()
-            else:
-                return
         self.begin()
 
     def get_observations(self) -> TensorDict:
@@ -466,3 +466,22 @@ class ControlLoop(VecEnv):
     def _draw(self) -> Starts:
         rows = torch.randint(len(self.starts["q"]), (self.num_envs,), device=self.device)
         return {key: value[rows] for key, value in self.starts.items()}
+
+
+@contextlib.contextmanager
+def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
+    """Limit torch to one thread inside of this context; nothing changes where `device` is a GPU.
+
+    The tensors of a control step are too small to be shared by threads. Torch's other threads would
+    wait for the next tensor in a busy loop, on the cores on which the physics runs. On a computer
+    with other work, every step would then wait for the slowest thread.
+    """
+    before = torch.get_num_threads()
+    if torch.device(device).type != "cpu" or before == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -29,7 +29,8 @@ from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Normal
 
-from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
+from brokk_rl.rl.execution import capture_graph, report_compile_errors
+from brokk_rl.rl.loop import limit_to_one_thread
 from brokk_rl.rl.rollout import CapturedRollout, pad_columns, run_network
 
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5

@@ -81,7 +81,8 @@ class TrainingRunner(OnPolicyRunner):
             super().__init__(env, config, log_dir=None, device=str(device))
         log.debug(printed.getvalue())
         self.logger = logger
-        scale_output(self.alg.actor, training.output_gain)
+        if training.output_gain != 1.0:
+            scale_output(self.alg.actor, training.output_gain)
         if isinstance(self.alg, DevicePPO):
             self.alg.fuse = training.fuse
             if training.teacher:

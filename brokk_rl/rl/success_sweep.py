@@ -20,11 +20,10 @@ from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
 from brokk_rl.plot import BLUE, ORANGE, make_figure, remove_frame
 from brokk_rl.rl.benchmark_sizes import KEYS, SuccessSweep
-from brokk_rl.rl.logger import PROGRESS, WINDOW, TrainingLogger, find_passing
+from brokk_rl.rl.logger import PROGRESS, WINDOW, NoTracking, TrainingLogger, find_passing
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
-from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.session import Session, write_json
 
 log = logging.getLogger(__name__)

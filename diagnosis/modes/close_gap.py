@@ -20,10 +20,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.train import Train
 from brokk_rl.policy_folder import CONTRACT
+from brokk_rl.rl.logger import Tracking
 from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import PolicySpec, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
-from brokk_rl.rl.tracking import Tracking
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import name_spec, spec
 from diagnosis import retraining

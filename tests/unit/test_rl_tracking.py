@@ -14,7 +14,7 @@ from composed import option
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from brokk_rl.errors import ConfigError
-from brokk_rl.rl.tracking import NoTracking, TensorBoardTracking, WandbTracking, _find_sweep
+from brokk_rl.rl.logger import NoTracking, TensorBoardTracking, WandbTracking, _find_sweep
 
 
 def test_without_a_tracker_nothing_is_written(tmp_path: Path) -> None:

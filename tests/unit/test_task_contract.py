@@ -20,8 +20,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.export import Export
 from brokk_rl.modes.train import Train
+from brokk_rl.rl.logger import NoTracking
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
-from brokk_rl.rl.tracking import NoTracking
 from brokk_rl.session import Session
 from brokk_rl.sim.scene import make_nominal_scenes
 
