@@ -172,6 +172,25 @@ def compute_tool_kinematics(machine: Machine, q: np.ndarray) -> ToolKinematics:
     )
 
 
+def solve_joint_step(
+    tool: ToolKinematics, wanted: np.ndarray, scale: np.ndarray, damping: float
+) -> np.ndarray:
+    """Return the step of the joints, over `scale`, that moves the tool as wanted, `(…, J)`.
+
+    Damped least squares (Nakamura and Hanafusa 1986), repeated they are inverse kinematics.
+
+    Args:
+        tool: Present pose and derivatives.
+        wanted: Motion of the tip, m, then of the axis, `(…, 6)`.
+        scale: Unit of each joint's step, such as its top speed; 0 keeps a joint at rest, `(J,)`.
+        damping: Bounds the step where the arm is stretched, in the unit of `wanted`.
+    """
+    jacobian = np.concatenate((tool.jacobian, tool.turn), -2) * scale
+    across = np.swapaxes(jacobian, -1, -2)
+    square = across @ jacobian + damping**2 * np.eye(len(scale))
+    return np.linalg.solve(square, across @ wanted[..., None])[..., 0]
+
+
 def compute_link_pose(machine: Machine, q: np.ndarray, joint: str) -> np.ndarray:
     """Return the frame of the link behind a joint in the base frame, `(…, 4, 4)`.
 

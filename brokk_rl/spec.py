@@ -27,6 +27,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Strict,
+    TypeAdapter,
     ValidationError,
 )
 from pydantic import dataclasses as pydantic_dataclasses
@@ -130,6 +131,19 @@ def restore_spec(kind: type[T], values: Mapping[str, Any]) -> T:
         SpecError: A field is unknown, missing, or of another type.
     """
     return kind(**values)
+
+
+def require_value(key: str, hint: Any, value: Any) -> Any:
+    """Return a value as the annotation `hint` has it, as a field of a spec would.
+
+    Raises:
+        ConfigError: The value is refused; the message names `key`.
+    """
+    try:
+        return TypeAdapter(_constrain(hint)).validate_python(value)
+    except ValidationError:
+        problem = {"type": "value", "input": value}
+        raise ConfigError(f"{key}: {_describe_problem(problem, hint)}") from None
 
 
 def _check(self: Any) -> None:
@@ -333,7 +347,7 @@ def _describe_constrained(inner: Any, constraints: Sequence[Any]) -> str:
         if isinstance(constraint, Ordered):
             text = f"(lowest, highest), {text}"
         if isinstance(constraint, MinLen):
-            text = f"{text}, {constraint.min_length} or more"
+            text = f"{text}, at least {constraint.min_length} of them"
     if {"ge", "le"} <= bounds.keys():
         return f"{text} from {bounds['ge']:g} to {bounds['le']:g}"
     words = {"gt": "above {:g}", "ge": "of {:g} or more", "lt": "below {:g}", "le": "up to {:g}"}

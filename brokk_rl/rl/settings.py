@@ -6,33 +6,59 @@ This module needs no torch, so that a bad value is refused before torch is loade
 from __future__ import annotations
 
 import copy
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from brokk_rl.bounds import require_number, require_range
+from annotated_types import Gt, Interval, MinLen
+
 from brokk_rl.errors import ConfigError
-from brokk_rl.spec import spec
+from brokk_rl.spec import (
+    Count,
+    Index,
+    NonNegative,
+    NonNegativeRange,
+    Ordered,
+    Positive,
+    Range,
+    Share,
+    require_value,
+    spec,
+)
 
 SETTLED_PART = 0.9
 """Part of `desired_kl` that is gone at the end of the budget; chosen by hand, see
 `TrainingConfig.settling`."""
 CAPPED = "brokk_rl.rl.ppo:CappedGaussian"
 """The distribution whose cap `Exploration` moves."""
-RUNNER_BOUNDS: dict[str, dict[str, Any]] = {
-    "num_steps_per_env": {"least": 1, "whole": True},
-    "algorithm.num_learning_epochs": {"least": 1, "whole": True},
-    "algorithm.num_mini_batches": {"least": 1, "whole": True},
-    "algorithm.clip_param": {"above": 0},
-    "algorithm.gamma": {"above": 0, "most": 1},
-    "algorithm.lam": {"least": 0, "most": 1},
-    "algorithm.value_loss_coef": {"least": 0},
-    "algorithm.entropy_coef": {"least": 0},
-    "algorithm.learning_rate": {"above": 0},
-    "algorithm.max_grad_norm": {"above": 0},
-    "algorithm.desired_kl": {"above": 0},
-    "actor.distribution_cfg.init_std": {"above": 0},
+PositiveShare = Annotated[float, Gt(0), Interval(le=1)]
+Widths = Annotated[tuple[Count, ...], MinLen(1)]
+Activation = Literal[
+    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish",
+    "identity",
+]  # fmt: skip
+RUNNER_VALUES: dict[str, Any] = {
+    "num_steps_per_env": Count,
+    "algorithm.num_learning_epochs": Count,
+    "algorithm.num_mini_batches": Count,
+    "algorithm.clip_param": Positive,
+    "algorithm.gamma": PositiveShare,
+    "algorithm.lam": Share,
+    "algorithm.value_loss_coef": NonNegative,
+    "algorithm.entropy_coef": NonNegative,
+    "algorithm.learning_rate": Positive,
+    "algorithm.max_grad_norm": Positive,
+    "algorithm.desired_kl": Positive,
+    "algorithm.schedule": Literal["adaptive", "fixed"],
+    "algorithm.optimizer": Literal["adam", "adamw", "sgd", "rmsprop"],
+    "actor.hidden_dims": Widths,
+    "actor.activation": Activation,
+    "actor.distribution_cfg.init_std": Positive,
+    "actor.distribution_cfg.std_type": Literal["scalar", "log"],
+    "actor.distribution_cfg.std_range": NonNegativeRange,
+    "critic.hidden_dims": Widths,
+    "critic.activation": Activation,
 }
-"""Bounds of rsl-rl's numbers, which it does not check itself: outside of them it divides by zero,
-climbs instead of descends, or trains nothing."""
+"""Allowed values of rsl-rl's own configuration. It does not check numbers itself: outside of these
+it divides by zero, climbs instead of descends, or trains nothing; unknown words end it late."""
 
 REFUSED_CLASSES = {
     "RNNModel": "recurrent networks are neither exported nor deployed; task.memory gives a history",
@@ -41,6 +67,12 @@ REFUSED_CLASSES = {
     "StudentTeacher": "train with PPO",
 }
 """Classes of rsl-rl that would fail after the whole budget, and the reason or another way."""
+REFUSED_PARTS = {
+    "rnd_cfg": "random network distillation is not supported; more exploration comes from "
+    "rl.runner.actor.distribution_cfg.std_range",
+    "symmetry_cfg": "expected null; rl.symmetry=true learns from each step and its mirror image",
+}
+"""Parts of rsl-rl's algorithm that are not supported, and another way."""
 
 
 @spec
@@ -52,19 +84,15 @@ class TrainingBudget:
         max_seconds: Seconds of training, those before a resume included.
     """
 
-    max_env_steps: int | None
-    max_seconds: float | None
+    max_env_steps: Count | None
+    max_seconds: Positive | None
 
     def check(self) -> None:
         if self.max_env_steps is None and self.max_seconds is None:
             raise ConfigError(
-                "rl.budget: give max_env_steps, max_seconds or both; "
+                "max_env_steps: expected a bound here, in max_seconds or in both, got none; "
                 "training without an end is not possible"
             )
-        if self.max_env_steps is not None:
-            require_number("rl.budget.max_env_steps", self.max_env_steps, least=1)
-        if self.max_seconds is not None:
-            require_number("rl.budget.max_seconds", self.max_seconds, above=0)
 
     def share_spent(self, env_steps: int, seconds: float) -> float:
         """Return the spent share of the budget, 1 or more when all of it is spent."""
@@ -86,14 +114,8 @@ class Exploration:
         over: Shares of the budget between which it falls; in equal ratios.
     """
 
-    cap: tuple[float, float]
-    over: tuple[float, float]
-
-    def check(self) -> None:
-        for value in self.cap:
-            require_number("rl.exploration.cap", value, above=0)
-        require_range("rl.exploration.over", self.over, least=0)
-        require_number("rl.exploration.over", self.over[1], most=1)
+    cap: tuple[Positive, Positive]
+    over: Annotated[tuple[Share, Share], Ordered()]
 
     def cap_at(self, share_spent: float) -> float:
         """Return the cap when this share of the budget is spent."""
@@ -115,12 +137,8 @@ class Teacher:
     """
 
     folder: str
-    weight: float
-    until: float
-
-    def check(self) -> None:
-        require_number("rl.teacher.weight", self.weight, above=0)
-        require_number("rl.teacher.until", self.until, above=0, most=1)
+    weight: Positive
+    until: PositiveShare
 
     def weight_at(self, share_spent: float) -> float:
         """Return the weight when this share of the budget is spent."""
@@ -136,12 +154,8 @@ class NearStarts:
         height_m: Heights above the target, (lowest, highest).
     """
 
-    share: float
-    height_m: tuple[float, float]
-
-    def check(self) -> None:
-        require_number("rl.near_starts.share", self.share, above=0, most=1)
-        require_range("rl.near_starts.height_m", self.height_m)
+    share: PositiveShare
+    height_m: Range
 
 
 FAULT_STEPS = 100
@@ -187,19 +201,19 @@ class TrainingConfig:
             `num_steps_per_env`, …), handed on as it is.
     """
 
-    num_envs: int | None
-    num_starts: int
+    num_envs: Count | None
+    num_starts: Count
     budget: TrainingBudget
-    save_interval: int
-    keep_checkpoints: int
-    settling: float
-    output_gain: float
+    save_interval: Count
+    keep_checkpoints: Count
+    settling: Share
+    output_gain: Positive
     exploration: Exploration | None
     symmetry: bool
     teacher: Teacher | None
     near_starts: NearStarts | None
-    max_fault_rate: float
-    fault_steps: int | None
+    max_fault_rate: Share
+    fault_steps: Index | None
     fuse: bool
     tf32: bool
     random_episode_lengths: bool
@@ -212,53 +226,51 @@ class TrainingConfig:
         return self.fault_steps
 
     def check(self) -> None:
-        counts = ("num_starts", "save_interval", "keep_checkpoints")
-        for name in counts if self.num_envs is None else ("num_envs", *counts):
-            require_number(f"rl.{name}", getattr(self, name), least=1)
-        for name in ("settling", "max_fault_rate"):
-            require_number(f"rl.{name}", getattr(self, name), least=0, most=1)
-        if self.fault_steps is not None:
-            require_number("rl.fault_steps", self.fault_steps, least=0)
-        require_number("rl.output_gain", self.output_gain, above=0)
-        self._check_runner()
-        distribution = self.runner.get("actor", {}).get("distribution_cfg") or {}
-        if self.exploration and distribution.get("class_name") != CAPPED:
-            raise ConfigError(
-                f"rl.exploration: expected the distribution {CAPPED} "
-                "(rl.runner.actor.distribution_cfg.class_name), got "
-                f"{distribution.get('class_name')}"
-            )
-
-    def _check_runner(self) -> None:
-        """Refuse numbers that rsl-rl would take without a word, and parts of it that fail later."""
+        for path, allowed in RUNNER_VALUES.items():
+            *above, name = path.split(".")
+            holder = self._read_runner(".".join(above)) if above else self.runner
+            if holder and holder.get(name) is not None:  # rsl-rl has a default of its own
+                value = require_value(f"runner.{path}", allowed, holder[name])
+                if isinstance(value, int):  # 1e2 was given for a whole number
+                    holder[name] = value
         for name in ("algorithm", "actor", "critic"):
-            class_name = str(self.runner.get(name, {}).get("class_name", ""))
+            class_name = str(self._read_runner(f"{name}.class_name"))
             if reason := REFUSED_CLASSES.get(class_name.replace(":", ".").rpartition(".")[2]):
                 raise ConfigError(
-                    f"rl.runner.{name}.class_name: {class_name} of rsl-rl is not supported: {reason}"
+                    f"runner.{name}.class_name: {class_name} of rsl-rl is not supported: {reason}"
                 )
-        if self.runner.get("algorithm", {}).get("rnd_cfg") is not None:
+        for name, reason in REFUSED_PARTS.items():
+            if self._read_runner(f"algorithm.{name}") is not None:
+                raise ConfigError(f"runner.algorithm.{name}: {reason}")
+        if self.num_envs is not None:
+            self.check_batches(self.num_envs)
+        distribution = self._read_runner("actor.distribution_cfg.class_name")
+        if self.exploration and distribution != CAPPED:
             raise ConfigError(
-                "rl.runner.algorithm.rnd_cfg: random network distillation is not supported; "
-                "more exploration comes from rl.runner.actor.distribution_cfg.std_range"
+                f"exploration: expected the distribution {CAPPED} "
+                f"(rl.runner.actor.distribution_cfg.class_name), got {distribution}"
             )
-        if self.runner.get("algorithm", {}).get("symmetry_cfg") is not None:
+
+    def check_batches(self, num_envs: int) -> None:
+        """Refuse more mini-batches than there are steps in a rollout of `num_envs` environments.
+
+        Raises:
+            ConfigError: A mini-batch would be empty.
+        """
+        num_steps = num_envs * self.runner["num_steps_per_env"]
+        num_batches = self._read_runner("algorithm.num_mini_batches") or 1
+        if num_batches > num_steps:
             raise ConfigError(
-                "rl.runner.algorithm.symmetry_cfg: rsl-rl's own is not supported; rl.symmetry=true "
-                "learns from each step and its mirror image"
+                f"rl.runner.algorithm.num_mini_batches: expected at most {num_steps}, the steps of a "
+                f"rollout of {num_envs} environments, got {num_batches}"
             )
-        for path, bounds in RUNNER_BOUNDS.items():
-            value: Any = self.runner
-            for part in path.split("."):
-                value = value.get(part) if isinstance(value, dict) else None
-            if value is not None:  # rsl-rl has a default of its own
-                require_number(f"rl.runner.{path}", value, **bounds)
-        for name in ("actor", "critic"):
-            network = self.runner.get(name, {})
-            for width in network.get("hidden_dims", ()):
-                require_number(f"rl.runner.{name}.hidden_dims", width, least=1, whole=True)
-            if spread := (network.get("distribution_cfg") or {}).get("std_range"):
-                require_range(f"rl.runner.{name}.distribution_cfg.std_range", tuple(spread), 0)
+
+    def _read_runner(self, path: str) -> Any:
+        """Return a value of `runner`, as in `actor.hidden_dims`; `None` where it is not given."""
+        value: Any = self.runner
+        for part in path.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        return value
 
     def divergence(self, share_spent: float) -> float | None:
         """Return the `desired_kl` of updates when this share of the budget is spent."""
@@ -297,15 +309,10 @@ class Evaluation:
         video: Whether to render a video.
     """
 
-    episodes: int
-    seed: int
-    num_recorded: int
+    episodes: Count
+    seed: Index
+    num_recorded: Count
     video: bool
-
-    def check(self) -> None:
-        require_number("evaluation.episodes", self.episodes, least=1)
-        require_number("evaluation.seed", self.seed, least=0)
-        require_number("evaluation.num_recorded", self.num_recorded, least=1)
 
 
 def _drop_nulls(value: Any) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.kinematics import compute_tool_kinematics, solve_joint_step
 from brokk_rl.machine import Machine
 
 STEP_S = 0.1
@@ -49,9 +49,7 @@ def plan_approach_motion(
         if np.hypot(error_m[0], error_m[1]) > FUNNEL_M:
             error_m = error_m - HOVER_M * DOWN
         wanted = GAIN_1_S * np.concatenate([error_m, DOWN - arm.axis_in_base])
-        jacobian = np.concatenate([arm.jacobian, arm.turn]) * machine.max_speed
-        square = jacobian.T @ jacobian + DAMPING**2 * np.eye(len(q))
-        share = np.linalg.solve(square, jacobian.T @ wanted)
+        share = solve_joint_step(arm, wanted, machine.max_speed, DAMPING)
         share = share / max(1.0, float(np.abs(share).max()))
         q = np.clip(
             q + share * machine.max_speed * (step_s / num_parts), machine.lower, machine.upper

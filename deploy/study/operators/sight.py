@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from brokk_rl.contracts.operator import OperatorView
-from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.kinematics import compute_tool_kinematics, solve_joint_step
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.study.operators.traits import Range, Traits
@@ -105,7 +105,7 @@ class SightModel:
     def _solved(self, q: np.ndarray, goal_m: np.ndarray) -> np.ndarray:
         """Return joint positions that put the upright tool at `goal_m`, `(N, 3)`, within the limits, by the free joints."""
         machine, start = self._machine, q
-        free = ~machine.is_exclusive
+        free = (~machine.is_exclusive).astype(float)
         for _ in range(ROUNDS):
             at = compute_tool_kinematics(machine, q)
             step = goal_m - at.tip_in_base_m
@@ -113,11 +113,8 @@ class SightModel:
                 1.0, 0.6 / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-9)
             )
             tilt = np.clip(np.array([0.0, 0.0, -1.0]) - at.axis_in_base, -0.5, 0.5)
-            jacobian = np.concatenate((at.jacobian, at.turn), 1)[:, :, free]
-            square = np.swapaxes(jacobian, 1, 2) @ jacobian + DAMPING**2 * np.eye(int(free.sum()))
-            pull = np.einsum("nij,ni->nj", jacobian, np.concatenate((step, tilt), 1))
-            q = q.copy()
-            q[:, free] += np.linalg.solve(square, pull[..., None])[..., 0]
+            wanted = np.concatenate((step, tilt), 1)
+            q = q + solve_joint_step(at, wanted, free, DAMPING)
             q = np.clip(q, machine.lower + 0.05, machine.upper - 0.05)
         return np.where(np.isfinite(q), q, start)
 
