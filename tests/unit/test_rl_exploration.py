@@ -83,7 +83,7 @@ def test_a_schedule_for_another_distribution_is_refused() -> None:
 
 @pytest.mark.parametrize("over", [(0.6, 0.2), (-0.1, 0.5), (0.5, 1.1)])
 def test_shares_outside_of_the_budget_are_refused(over: tuple[float, float]) -> None:
-    with pytest.raises(ConfigError, match=r"rl\.exploration\.over"):
+    with pytest.raises(ConfigError, match=r"Exploration\.over"):
         Exploration(cap=(0.5, 0.1), over=over)
 
 
