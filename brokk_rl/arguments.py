@@ -17,9 +17,12 @@ from brokk_rl.errors import ConfigError, list_choices
 SWITCHES = {"--help", "--hydra-help", "--version", "--resolve", "--run", "--multirun"}
 SWITCHES |= {"-h", "-r", "-m", "--shell-completion", "-sc"}
 """Words with dashes that stand alone."""
+COMPLETION = {"--shell-completion", "-sc"}
 SETTINGS = {"--cfg", "--package", "--config-path", "--config-name", "--config-dir", "--info"}
 SETTINGS |= {"-c", "-p", "-cp", "-cn", "-cd", "-i"}
 """Words with dashes that a value follows."""
+SHOWN = ("job", "hydra", "all")
+"""Parts of the configuration that `--cfg` prints."""
 SWEEP = {"--multirun", "-m"}
 ROBOT_FILES = (".urdf", ".xml", ".mjcf", ".xacro")
 KEY = r"\+{0,2}[\w/]+(?:[.@:][\w:]+)*"
@@ -41,6 +44,8 @@ def read_arguments(words: Sequence[str]) -> list[str]:
         groups.setdefault(option.group, []).append(option.name)
     options, values = _split(words, groups)
     sweep = not SWEEP.isdisjoint(options)
+    if not COMPLETION.isdisjoint(options) and len(values) != 1:
+        raise ConfigError("completion of words: brokk -sc install=bash, or uninstall=bash")
     read = []
     for place, word in enumerate(values):
         if word[:1] == "~":
@@ -70,6 +75,8 @@ def _split(words: Sequence[str], groups: Mapping[str, list[str]]) -> tuple[list[
             if not rest:
                 raise ConfigError(f"{name} needs a value: brokk mode=train --cfg job")
             options.append(rest.pop(0))
+        if name in ("--cfg", "-c") and (part := options[-1].rpartition("=")[2]) not in SHOWN:
+            raise ConfigError(f"there is no --cfg {part}; {list_choices(part, SHOWN)}")
     return options, values
 
 

@@ -41,6 +41,8 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("--verbose",): ("there is no --verbose",),
     ("mode=train", "--seed=3"): ("seed=3",),
     ("mode=train", "--cfg"): ("--cfg needs a value",),
+    ("mode=train", "--cfg", "jobs"): ("there is no --cfg jobs", "'job'"),
+    ("-sc",): ("-sc install=bash",),
     ("evaluat",): ("did you mean mode=evaluate?",),
     ("arm.urdf",): ("brokk mode=check subject.model=arm.urdf",),
     ("mode=trian", "--help"): ("there is no mode=trian", "'train'"),
