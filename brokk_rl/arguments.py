@@ -100,7 +100,7 @@ def _explain_word(word: str, following: Sequence[str], groups: Mapping[str, list
     if following[:1] == ["="] or word == "=":
         return "a value is written without spaces around '=': mode=train"
     if word.endswith(ROBOT_FILES):
-        return f"a robot is read by mode=check: brokk mode=check subject.model={shlex.quote(word)}"
+        return explain_robot(word)
     if word in modes:
         return f"'{word}' is a mode: brokk mode={word}"
     if word in groups:
@@ -124,13 +124,11 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     if not value.strip():
         offered = groups.get(key)
         end = list_choices("", offered) if offered else f"{key}=<value>, or {key}=null for none"
+        if key == "policy":
+            end += "; or the folder of a run or of a policy"
         raise ConfigError(f"'{word}' has no value: {end}")
     if key in groups and value.endswith(ROBOT_FILES):
-        model = shlex.quote(value.lstrip("@"))
-        raise ConfigError(
-            f"{word}: expected an option or a YAML file, got a robot's model; mode=check makes the "
-            f"one from the other: brokk mode=check subject.model={model}"
-        )
+        raise ConfigError(f"{word}: expected an option or a YAML file; {explain_robot(value)}")
     try:
         override = OverridesParser.create().parse_override(word)
     except HydraException as error:
@@ -143,6 +141,14 @@ def _read_value(word: str, sweep: bool, groups: Mapping[str, list[str]]) -> str:
     if override.is_sweep_override() and not sweep:
         raise ConfigError(_explain_several(key, value, key in groups))
     return word
+
+
+def explain_robot(path: str) -> str:
+    """Return the command that makes an option of `machine` from a robot's model."""
+    return (
+        "mode=check makes a machine from a robot's model: "
+        f"brokk mode=check subject.model={shlex.quote(path.lstrip('@'))}"
+    )
 
 
 def _explain_several(key: str, value: str, is_group: bool) -> str:

@@ -24,6 +24,7 @@ from omegaconf.errors import (
 )
 
 from brokk_rl import extras, registry
+from brokk_rl.arguments import ROBOT_FILES, explain_robot
 from brokk_rl.errors import BrokkError, list_choices
 
 MISSING_SKIPPED = RunMode.MULTIRUN
@@ -141,6 +142,8 @@ def _explain_interpolation(error: InterpolationResolutionError) -> str:
 def _explain_bad_override(error: ConfigCompositionException) -> str:
     """Explain an override of a key that the configuration does not have."""
     text = str(error)
+    if lacking := re.search(r"must specify '([^']+)'", text):
+        return _explain_missing_choice(lacking[1])
     found = re.search(r"(?:In '([^']+)': )?Could not override '([^']+)'", text)
     if not found:
         text = "\n".join(filter(None, (text, str(error.__cause__ or ""))))
@@ -163,6 +166,12 @@ def _explain_bad_override(error: ConfigCompositionException) -> str:
     return f"{source} '{key}', which this mode does not have; `brokk mode=<mode> --help` lists what it has"
 
 
+def _explain_missing_choice(group: str) -> str:
+    names = [option.name for option in registry.list_options() if option.group == group]
+    path = "; or give the folder of a run or of a policy" if group == "policy" else ""
+    return f"{explain_missing_value(group)}; {list_choices('', names)}{path}"
+
+
 def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
     """Return what a configuration has in the place of a key that it does not have."""
     mode = f"mode={read_mode_name(cfg)}"
@@ -181,7 +190,10 @@ def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
     for option in registry.list_options():
         if option.name == key and option.group in groups:
             return f"'{key}' is an option: {option.group}={key}"
-    return f"'{parent or mode}' has no '{leaf}'; {list_choices(leaf, names if parent else {*names, *groups})}"
+    if value.endswith(ROBOT_FILES):
+        return f"{mode} has no '{leaf}'; {explain_robot(value)}"
+    choices = list_choices(leaf, names if parent else {*names, *groups})
+    return f"'{parent or mode}' has no '{leaf}'; {choices}; `brokk {mode} --help` lists all values"
 
 
 def _suggest(keys: Sequence[str], value: str) -> str:

@@ -226,11 +226,16 @@ def read_record(folder: Path) -> dict[str, Any] | None:
 
 
 def require_new_folder(folder: Path) -> None:
-    """Refuse a folder that holds a run.
+    """Refuse a folder that holds a run or that cannot be made.
 
     Raises:
-        StorageError: It does.
+        StorageError: It does, or its place is a file or may not be written.
     """
+    place = next(path for path in (folder, *folder.parents) if path.exists())
+    if not place.is_dir():
+        raise StorageError(f"{place} is a file. Give a folder with session.out=<folder>.")
+    if not os.access(place, os.W_OK):
+        raise StorageError(f"cannot write into {place}. Choose session.out=<folder>.")
     if before := read_record(folder):
         mode, outcome = before.get("mode", "?"), before.get("outcome", "?")
         raise StorageError(
