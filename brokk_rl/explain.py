@@ -134,9 +134,10 @@ def _explain_bad_choice(error: BaseException) -> str:
 
 
 def _explain_interpolation(error: InterpolationResolutionError) -> str:
-    key = error.full_key or error.key
+    typed = [argument for argument in sys.argv[1:] if "${" in argument]
+    place = error.full_key or ", ".join(typed)
     reason = str(error).splitlines()[0]
-    return f"{key}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
+    return f"{place}: {reason}. A text with a dollar sign before a brace is written \\${{…}}"
 
 
 def _explain_bad_override(error: ConfigCompositionException) -> str:

@@ -219,7 +219,7 @@ def read_record(folder: Path) -> dict[str, Any] | None:
     """Return the content of `session.json` in a run folder, `None` where there is none."""
     try:
         return json.loads((folder / RECORD).read_text())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         return None
     except ValueError as error:
         raise StorageError(f"{folder / RECORD} is not readable as JSON: {error}") from error

@@ -86,7 +86,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=compare", "compare.runs=[a#b]"): ("#", """'compare.runs=["a#b"]'"""),
     ("mode=compare", "compare.runs=[v{1}[2]]"): ("""'compare.runs=["v{1}[2]"]'""",),
     ("mode=compare", "compare.runs=[my run]"): ("'my run'",),
-    ("mode=compare", "compare.runs=[${x}]"): ("compare.runs[0]", "'x' not found", r"\${"),
+    ("mode=compare", "compare.runs=[${x}]"): ("compare.runs", "'x' not found", r"\${"),
     ("session.out=x/epoch=3,step=4",): ("= must be quoted", """'session.out="x/epoch=3,step=4"'"""),
     ("session.out=v{1}[2]",): ("""'session.out="v{1}[2]"'""",),
     ("session.out=it's",): ("'", r"""'session.out="it'"'"'s"'"""),
@@ -112,7 +112,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     (*COMPARE, "session.seed=abc"): ("session.seed: expected a whole number", "'abc'"),
     (*COMPARE, "session.seed=-1"): ("session.seed", "0 or more"),
     (*COMPARE, "session.device=gpu"): ("session.device", "cpu", "'gpu'"),
-    ("mode=board", "board.rows=0"): ("expected 2 or more columns and rows, got",),
+    ("mode=board", "board.rows=0"): ("expected a whole number of 2 or more, got 0",),
 }
 """A command, and parts of its message."""
 OWN_MODULES = {
