@@ -67,7 +67,7 @@ def register_options(arguments: Sequence[str]) -> None:
 
 
 def load_option(group: str, name: str, **fields: object) -> Any:
-    """Return the spec of one option, for tests and notebooks: `load_option("machine", "two_links")`.
+    """Return the spec of one option, for tests and notebooks: `load_option("machine", "brokk170")`.
 
     Args:
         group: Config group.

@@ -1,17 +1,18 @@
-"""Observation vector of the policy (paper, Table I), the same code in training and on the machine.
+"""Observation vectors of policies, the same code in training and on the machine.
 
-Order: borehole position (3), joint positions oldest sample first (H x J), commands oldest first
-(H x J): 133 numbers for five joints and 13 samples. A task whose wanted pitch differs from episode
-to episode appends it as one more number. A policy that proposes to a person appends its own
-proposals, oldest first (H x J): the history holds the commands that the person gave.
+A vector is a list of parts, each scaled by an approximate mean and standard deviation that follow
+from the configuration: a policy carries no hidden statistics.
 
-Each part is normalised with an approximate mean and standard deviation that follow from the
-configuration: a policy carries no hidden statistics.
-
+The vector of a task that moves the tool to a pose is the paper's, Table I: borehole position (3),
+joint positions oldest sample first (H x J), commands oldest first (H x J), 133 numbers for five
+joints and 13 samples. A task whose wanted pitch differs from episode to episode appends it. A
+policy that proposes to a person appends its own proposals, oldest first (H x J): the history holds
+the commands that the person gave.
 """
 
+import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,21 @@ import numpy as np
 from brokk_rl.bounds import require_number
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
+
+TARGET, PITCH, PROPOSALS = "target_in_base_m", "pitch_rad", "proposals"
+"""Names of parts of a tool-pose vector; the others are `q` and `u`."""
+ORDER = {
+    TARGET: "target_in_base_m (3)",
+    "q": "q oldest first (H x J)",
+    "u": "u oldest first (H x J)",
+    PITCH: "pitch_rad (1)",
+    PROPOSALS: "proposals oldest first (H x J)",
+}
+"""Words for these parts in a policy's contract."""
+TARGET_DISTANCE = "target.distance"
+"""Name of the horizontal distance of the target in a range table."""
+RangeTable = dict[str, tuple[float, float]]
+"""Lowest and highest value by name: `target.x`, `target.distance`, `pitch`, `q.<joint>`."""
 
 
 @spec
@@ -46,224 +62,157 @@ class TargetScaling:
             require_number("task.scaling.pitch_rad: standard deviation", self.pitch_rad[1], above=0)
 
 
-def compute_size(machine: Machine, with_pitch: bool = False, with_proposals: bool = False) -> int:
-    """Return the length of the observation vector, with pitch and proposals if wanted."""
-    return 3 + (2 + with_proposals) * machine.num_history * machine.num_joints + with_pitch
-
-
-class ObservationEncoder:
-    """Turns a history and a target into the policy's vector, and back.
-
-    Args:
-        machine: Gives the normalisation of joint positions (middle and quarter of the travel), rate
-            and order.
-        scaling: Normalisation of the target point.
-        constant: Makes an array of the kind and on the device of the inputs; `numpy.asarray` on the
-            machine.
-        concat: `numpy.concatenate` or `torch.cat`, called as `concat(parts, 1)`.
-        with_proposals: Whether the policy proposes to a person.
-    """
-
-    def __init__(
-        self,
-        machine: Machine,
-        scaling: TargetScaling,
-        constant: Callable[[np.ndarray], Any] = np.asarray,
-        concat: Callable[[tuple[Any, ...], int], Any] = np.concatenate,
-        with_proposals: bool = False,
-    ) -> None:
-        self.shape = (machine.num_history, machine.num_joints)
-        self._machine, self._scaling = machine, scaling
-        self.has_pitch = scaling.pitch_rad is not None
-        self.has_proposals = with_proposals
-        self.size = compute_size(machine, self.has_pitch, with_proposals)
-        self._concat = concat
-        self._target_mean_m = constant(np.array(scaling.target_mean_m, np.float32))
-        self._target_std_m = constant(np.array(scaling.target_std_m, np.float32))
-        self._pitch_mean_rad, self._pitch_std_rad = scaling.pitch_rad or (0.0, 1.0)
-        self._q_mean = constant(((machine.lower + machine.upper) / 2).astype(np.float32))
-        self._q_std = constant(((machine.upper - machine.lower) / 4).astype(np.float32))
-
-    def encode(
-        self, target_in_base_m: Any, q: Any, u: Any, pitch_rad: Any = None, proposed: Any = None
-    ) -> Any:
-        """Return the vector, shape `(N, size)`.
-
-        Args:
-            target_in_base_m: Estimated target point (the centre of the borehole's rim), shape `(N,
-                3)`.
-            q: Measured joint positions, oldest first, shape `(N, H, J)`, rad or m.
-            u: Commands in force, oldest first, shape `(N, H, J)`, in [-1, 1].
-            pitch_rad: Wanted pitch of the tool, shape `(N,)`; left out where the task fixes it.
-            proposed: Proposals so far, oldest first, shape `(N, H, J)`; left out where no person
-                stands between.
-        """
-        # the width is fixed and the batch is not: a length read here would be a constant of the
-        # exported graph
-        num = self.shape[0] * self.shape[1]
-        target = (target_in_base_m - self._target_mean_m) / self._target_std_m
-        joints = ((q - self._q_mean) / self._q_std).reshape(-1, num)
-        parts = (target, joints, u.reshape(-1, num))
-        if self.has_pitch:
-            parts = (*parts, ((pitch_rad - self._pitch_mean_rad) / self._pitch_std_rad)[:, None])
-        if self.has_proposals:
-            parts = (*parts, proposed.reshape(-1, num))
-        return self._concat(parts, 1)
-
-    def decode(self, vector: Any) -> tuple[Any, Any, Any]:
-        """Invert `encode`: returns target `(N, 3)` in m, positions and commands `(N, H, J)`."""
-        num = self.shape[0] * self.shape[1]
-        target = vector[:, :3] * self._target_std_m + self._target_mean_m
-        q = vector[:, 3 : 3 + num].reshape(-1, *self.shape) * self._q_std + self._q_mean
-        return target, q, vector[:, 3 + num : 3 + 2 * num].reshape(-1, *self.shape)
-
-    def decode_pitch(self, vector: Any) -> Any:
-        """Return the wanted pitch `(N,)` in rad, where `has_pitch`."""
-        return (
-            vector[:, 3 + 2 * self.shape[0] * self.shape[1]] * self._pitch_std_rad
-            + self._pitch_mean_rad
-        )
-
-    def decode_proposals(self, vector: Any) -> Any:
-        """Return the proposals, `(N, H, J)`, where `has_proposals`."""
-        return vector[:, -self.shape[0] * self.shape[1] :].reshape(-1, *self.shape)
-
-    def mirror(self, vector: Any, joint_signs: Any) -> Any:
-        """Return the vector that the mirrored machine sees, `(N, size)`; see `brokk_rl.symmetry`.
-
-        Args:
-            vector: The vector, `(N, size)`.
-            joint_signs: -1 for each joint that moves to the other side, else 1, `(J,)`.
-        """
-        target_m, q, u = self.decode(vector)
-        parts = (target_m[:, :1], -target_m[:, 1:2], target_m[:, 2:])
-        pitch_rad = self.decode_pitch(vector) if self.has_pitch else None
-        proposed = self.decode_proposals(vector) * joint_signs if self.has_proposals else None
-        target_m = self._concat(parts, 1)
-        return self.encode(target_m, q * joint_signs, u * joint_signs, pitch_rad, proposed)
-
-    def decode_inputs(self, vector: Any) -> dict[str, Any]:
-        """Return target, history, pitch and proposals of vectors in their units, by name."""
-        target_m, q, u = self.decode(vector)
-        inputs = {"target_in_base_m": target_m, "q": q, "u": u}
-        if self.has_pitch:
-            inputs["pitch_rad"] = self.decode_pitch(vector)
-        if self.has_proposals:
-            inputs["proposals"] = self.decode_proposals(vector)
-        return inputs
-
-    def describe(self) -> dict[str, Any]:
-        """Return order and scale of the vector as plain JSON data, for the contract of a policy."""
-        lower, upper = self._machine.lower, self._machine.upper
-        order = ["target_in_base_m (3)", "q oldest first (H x J)", "u oldest first (H x J)"]
-        pitch = (
-            {"pitch": {"mean_rad": self._pitch_mean_rad, "std_rad": self._pitch_std_rad}}
-            if self.has_pitch
-            else {}
-        )
-        order += ["pitch_rad (1)"] * self.has_pitch + [
-            "proposals oldest first (H x J)"
-        ] * self.has_proposals
-        return {
-            "size": self.size,
-            "order": order,
-            "target": {
-                "mean_m": list(self._scaling.target_mean_m),
-                "std_m": list(self._scaling.target_std_m),
-            },
-            "q": {"mean": ((lower + upper) / 2).tolist(), "std": ((upper - lower) / 4).tolist()},
-            "u": {"mean": 0.0, "std": 1.0},
-        } | pitch
-
-
 @dataclass(frozen=True)
 class ObservationPart:
-    """A part of the vector of a task made of terms.
+    """A part of a vector.
 
     Attributes:
-        name: Name of its term.
-        samples: Newest samples in the vector, oldest first.
-        width: Numbers of a sample.
-        mean: Subtracted.
-        std: By which the difference is divided.
+        name: Its name.
+        shape: Shape of its value; of a history the samples, oldest first, and their width.
+        mean: Subtracted; a number, or one for each column.
+        std: By which the difference is divided, likewise.
     """
 
     name: str
-    samples: int
-    width: int
-    mean: float
-    std: float
+    shape: tuple[int, ...]
+    mean: Any
+    std: Any
+
+    @property
+    def size(self) -> int:
+        """Numbers in the vector."""
+        return math.prod(self.shape)
 
 
-class PartsEncoder:
-    """Turns the samples of named parts into one vector, and back; numpy and torch.
+class ObservationEncoder:
+    """Turns the values of named parts into one vector, and back; numpy and torch.
 
     Args:
         parts: In the order of the vector.
+        constant: Makes an array of the kind and on the device of the inputs.
         concat: `numpy.concatenate` or `torch.cat`, called as `concat(parts, 1)`.
     """
 
     def __init__(
         self,
         parts: Sequence[ObservationPart],
+        constant: Callable[[np.ndarray], Any] = np.asarray,
         concat: Callable[[tuple[Any, ...], int], Any] = np.concatenate,
     ) -> None:
-        self.parts, self._concat = tuple(parts), concat
-        self.size = sum(part.samples * part.width for part in self.parts)
+        def convert(value: Any) -> Any:
+            return constant(np.array(value, np.float32)) if np.ndim(value) else float(value)
 
-    def encode(self, samples: Mapping[str, Any]) -> Any:
-        """Return the vector, `(N, size)`, of the samples by name, each `(N, samples, width)`."""
+        self.parts = {part.name: part for part in parts}
+        self.size = sum(part.size for part in parts)
+        self._concat = concat
+        self._scales = {part.name: (convert(part.mean), convert(part.std)) for part in parts}
+
+    @property
+    def has_target(self) -> bool:
+        """True for the vector of a task that moves the tool to a pose."""
+        return TARGET in self.parts
+
+    def encode(self, values: Mapping[str, Any]) -> Any:
+        """Return the vector, `(N, size)`, of values by name, each `(N, *shape)`."""
         scaled = []
-        for part in self.parts:
-            value = (samples[part.name] - part.mean) / part.std
-            scaled.append(value.reshape(-1, part.samples * part.width))
+        for name, part in self.parts.items():
+            mean, std = self._scales[name]
+            value = values[name]
+            if not _is_unscaled(part):
+                value = (value - mean) / std
+            # the width is fixed and the batch is not: a length read here would be a constant of
+            # the exported graph
+            scaled.append(value.reshape(-1, part.size))
         return self._concat(tuple(scaled), 1)
 
-    def decode_inputs(self, vector: Any) -> dict[str, Any]:
-        """Invert `encode`."""
-        inputs, begin = {}, 0
-        for part in self.parts:
-            end = begin + part.samples * part.width
-            value = vector[:, begin:end].reshape(-1, part.samples, part.width)
-            inputs[part.name], begin = value * part.std + part.mean, end
-        return inputs
+    def decode(self, vector: Any) -> dict[str, Any]:
+        """Invert `encode`: return the values of vectors in their units, by name."""
+        values, begin = {}, 0
+        for name, part in self.parts.items():
+            mean, std = self._scales[name]
+            value = vector[:, begin : begin + part.size].reshape(-1, *part.shape)
+            values[name] = value if _is_unscaled(part) else value * std + mean
+            begin += part.size
+        return values
 
     def describe(self) -> dict[str, Any]:
-        """Return the parts as plain JSON data, for the contract of a policy."""
-        order = [f"{part.name} ({part.samples} x {part.width})" for part in self.parts]
-        parts = [asdict(part) for part in self.parts]
+        """Return order and scale of the vector as plain JSON data, for the contract of a policy."""
+        if self.has_target:
+            return {"size": self.size} | _describe_pose_parts(self.parts)
+        order, parts = [], []
+        for name, part in self.parts.items():
+            samples, width = part.shape
+            order.append(f"{name} ({samples} x {width})")
+            sizes = {"name": name, "samples": samples, "width": width}
+            parts.append(sizes | {"mean": part.mean, "std": part.std})
         return {"size": self.size, "order": order, "parts": parts}
 
 
-TARGET_DISTANCE = "target.distance"
-"""Name of the horizontal distance of the target in a range table."""
-RangeTable = dict[str, tuple[float, float]]
-"""Lowest and highest value by name: `target.x`, `target.distance`, `pitch`, `q.<joint>`."""
+def _is_unscaled(part: ObservationPart) -> bool:
+    return np.ndim(part.mean) == 0 and (part.mean, part.std) == (0.0, 1.0)
+
+
+def list_pose_parts(
+    machine: Machine, scaling: TargetScaling, with_proposals: bool = False
+) -> list[ObservationPart]:
+    """Return the parts of the vector of a tool-pose task.
+
+    Args:
+        machine: Gives rate and order, and the normalisation of joint positions: middle and quarter
+            of the travel.
+        scaling: Normalisation of the target.
+        with_proposals: Whether the policy proposes to a person.
+    """
+    history = (machine.num_history, machine.num_joints)
+    middle = (machine.lower + machine.upper) / 2
+    quarter = (machine.upper - machine.lower) / 4
+    parts = [
+        ObservationPart(TARGET, (3,), scaling.target_mean_m, scaling.target_std_m),
+        ObservationPart("q", history, middle, quarter),
+        ObservationPart("u", history, 0.0, 1.0),
+    ]
+    if scaling.pitch_rad is not None:
+        parts.append(ObservationPart(PITCH, (), *scaling.pitch_rad))
+    if with_proposals:
+        parts.append(ObservationPart(PROPOSALS, history, 0.0, 1.0))
+    return parts
+
+
+def _describe_pose_parts(parts: Mapping[str, ObservationPart]) -> dict[str, Any]:
+    target, q = parts[TARGET], parts["q"]
+    description = {
+        "order": [ORDER[name] for name in parts],
+        "target": {"mean_m": list(target.mean), "std_m": list(target.std)},
+        "q": {"mean": q.mean.tolist(), "std": q.std.tolist()},
+        "u": {"mean": 0.0, "std": 1.0},
+    }
+    if PITCH in parts:
+        description["pitch"] = {"mean_rad": parts[PITCH].mean, "std_rad": parts[PITCH].std}
+    return description
 
 
 def measure_ranges(
-    encoder: "ObservationEncoder", vectors: np.ndarray, joints: tuple[str, ...]
+    encoder: ObservationEncoder, vectors: np.ndarray, joints: tuple[str, ...]
 ) -> RangeTable:
-    """Return the range of targets and positions, in rad and m, over observation vectors.
+    """Return the range of targets and positions, in rad and m, over vectors of a tool-pose task.
 
     Args:
         encoder: The encoder of the vectors, with numpy arrays.
         vectors: Observation vectors, `(B, size)`.
         joints: Names of the joints, `J`.
     """
-    target_m, q, _ = encoder.decode(vectors)
+    seen = encoder.decode(vectors)
+    target_m = seen[TARGET]
     values = {f"target.{letter}": target_m[:, axis] for axis, letter in enumerate("xyz")}
     values[TARGET_DISTANCE] = np.hypot(target_m[:, 0], target_m[:, 1])
-    if encoder.has_pitch:
-        values["pitch"] = encoder.decode_pitch(vectors)
+    if PITCH in seen:
+        values["pitch"] = seen[PITCH]
     for column, joint in enumerate(joints):
-        values[f"q.{joint}"] = q[:, :, column]
+        values[f"q.{joint}"] = seen["q"][:, :, column]
     return {name: (float(one.min()), float(one.max())) for name, one in values.items()}
 
 
-def restore_encoder(
-    machine: Machine, observation: Mapping[str, Any]
-) -> ObservationEncoder | PartsEncoder:
+def restore_encoder(machine: Machine, observation: Mapping[str, Any]) -> ObservationEncoder:
     """Return the numpy encoder that `observation` of a policy's contract describes.
 
     Args:
@@ -274,18 +223,16 @@ def restore_encoder(
         KeyError: A part of the description is missing.
     """
     if "parts" in observation:
-        names = ObservationPart.__dataclass_fields__
-        return PartsEncoder(
-            [
-                ObservationPart(**{name: part[name] for name in names})
-                for part in observation["parts"]
-            ]
-        )
+        parts = []
+        for one in observation["parts"]:
+            shape = (one["samples"], one["width"])
+            parts.append(ObservationPart(one["name"], shape, one["mean"], one["std"]))
+        return ObservationEncoder(parts)
     pitch = observation.get("pitch")
     scaling = TargetScaling(
         target_mean_m=observation["target"]["mean_m"],
         target_std_m=observation["target"]["std_m"],
         pitch_rad=(pitch["mean_rad"], pitch["std_rad"]) if pitch else None,
     )
-    proposals = any("proposals" in part for part in observation["order"])
-    return ObservationEncoder(machine, scaling, with_proposals=proposals)
+    with_proposals = ORDER[PROPOSALS] in observation["order"]
+    return ObservationEncoder(list_pose_parts(machine, scaling, with_proposals))

@@ -27,7 +27,7 @@ import yaml
 from brokk_rl import registry
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
+from brokk_rl.observation import measure_ranges, restore_encoder
 from brokk_rl.session import write_json
 
 if TYPE_CHECKING:
@@ -282,9 +282,9 @@ def write_golden_answers(
     if contract["observation"]:
         encoder = restore_encoder(machine, contract["observation"])
         golden["inputs"] = {}
-        for name, value in encoder.decode_inputs(observations[rows]).items():
+        for name, value in encoder.decode(observations[rows]).items():
             golden["inputs"][name] = np.asarray(value, float).tolist()
-        if isinstance(encoder, ObservationEncoder):
+        if encoder.has_target:
             ranges = measure_ranges(encoder, observations, machine.joint_names)
             whole["training_observations"] = {"count": len(observations), "ranges": ranges}
     write_json(folder / GOLDEN, golden)

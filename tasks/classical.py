@@ -14,6 +14,7 @@ follows Nakamura and Hanafusa (1986).
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 
 from brokk_rl.kinematics import Kinematics, ToolPose, multiply_small_matrices
@@ -73,11 +74,8 @@ class ClassicalController:
         self._exclusive = constant(machine.is_exclusive)
         # the joint whose distance to the target decides about reach: the first one behind the
         # exclusive joints (the paper's q3)
-        exclusive = []
-        for i, e in enumerate(machine.is_exclusive):
-            if e:
-                exclusive.append(i)
-        self.reach_joint = min(exclusive[-1] + 1, machine.num_joints - 1) if exclusive else 0
+        last = max(np.flatnonzero(machine.is_exclusive), default=-1)
+        self.reach_joint = int(min(last + 1, machine.num_joints - 1))
         age = torch.arange(machine.num_history - 1, -1, -1, dtype=torch.float32, device=device)
         self._period_s = machine.period_s
         self._in_flight = (config.in_flight_samples - age).clamp(0.0, 1.0)[

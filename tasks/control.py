@@ -11,10 +11,10 @@ from dataclasses import dataclass
 import torch
 
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, TargetScaling
+from brokk_rl.observation import PITCH, PROPOSALS, TARGET, ObservationEncoder, list_pose_parts
 from tasks.advice import LeverAdviser
 from tasks.classical import ClassicalController, ControllerGuidance
-from tasks.settings import ActionMapping, AdviceConfig, ClassicalConfig, PhaseSwitch
+from tasks.settings import ToolPoseTask
 
 ERROR_SCALES_M = (0.1, 0.02)
 """Distances at which the saturated copies of position errors resolve: approach and insertion.
@@ -48,43 +48,22 @@ class ToolPoseControl:
     """Path from an observation to a command; stateless.
 
     Args:
+        task: The spec.
         machine: The machine.
         device: Where to compute.
-        scaling: Normalisation of the target.
-        classical: The classical controller.
-        switch: Rule for the positioning phase.
-        action: Map from the policy's output to commands.
-        advice: Proposals for a person; `None` where the policy's commands are given as they are.
-        memory: Newest samples of history that the policy sees.
-        depth_m: How far the controller's target lies below that of the observation.
     """
 
-    def __init__(
-        self,
-        machine: Machine,
-        device: torch.device,
-        *,
-        scaling: TargetScaling,
-        classical: ClassicalConfig,
-        switch: PhaseSwitch,
-        action: ActionMapping,
-        advice: AdviceConfig | None,
-        memory: int,
-        depth_m: float,
-    ) -> None:
+    def __init__(self, task: ToolPoseTask, machine: Machine, device: torch.device) -> None:
         def to_constant(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        self.switch, self.action, self.memory = switch, action, memory
-        self.controller = ClassicalController(classical, machine, device)
-        self.adviser = LeverAdviser(advice, machine, device) if advice else None
-        self.encoder = ObservationEncoder(
-            machine, scaling, to_constant, torch.cat, with_proposals=self.adviser is not None
-        )
-        self.down = to_constant([0.0, 0.0, depth_m])
+        self.switch, self.action, self.memory = task.switch, task.action, task.memory
+        self.controller = ClassicalController(task.classical, machine, device)
+        self.adviser = LeverAdviser(task.advice, machine, device) if task.advice else None
+        parts = list_pose_parts(machine, task.scaling, with_proposals=self.adviser is not None)
+        self.encoder = ObservationEncoder(parts, to_constant, torch.cat)
+        self.down = to_constant([0.0, 0.0, task.aim_below_m])
         self.exclusive = to_constant(machine.is_exclusive).bool()
-        # see `compute_features`: two commands, three scales of four errors, pitch, reach, phase
-        self.num_features = 2 * machine.num_joints + 3 * 4 + 2 + 2
 
     def process(
         self,
@@ -112,8 +91,9 @@ class ToolPoseControl:
             q, u, target_m - self.down, pitch_rad, self.switch.reach_m, coming
         )
         positioning = self.switch.positioning(guidance)
+        values = {TARGET: target_m, "q": q, "u": u, PITCH: pitch_rad, PROPOSALS: proposed}
         return ControlInput(
-            vector=self.encoder.encode(target_m, q, u, pitch_rad, proposed),
+            vector=self.encoder.encode(values),
             features=compute_features(guidance, positioning, u[:, -1]),
             guidance=guidance,
             positioning=positioning,
@@ -259,13 +239,13 @@ class DeployedPolicy(torch.nn.Module):
 
     def forward(self, observation: torch.Tensor) -> torch.Tensor:
         """Return valve commands, `(B, J)` in [-1, 1]."""
-        control, encoder = self._control, self._control.encoder
-        target_m, q, u = encoder.decode(observation)
-        if encoder.has_pitch:
-            pitch_rad = encoder.decode_pitch(observation)
-        else:
+        control = self._control
+        values = control.encoder.decode(observation)
+        target_m, q, u = values[TARGET], values["q"], values["u"]
+        pitch_rad = values.get(PITCH)
+        if pitch_rad is None:
             pitch_rad = torch.full_like(target_m[:, 0], self._pitch_rad)
-        proposed = encoder.decode_proposals(observation) if encoder.has_proposals else None
+        proposed = values.get(PROPOSALS)
         seen = control.process(target_m, q, u, pitch_rad, proposed)
         # encoding again is not exact to the last bit: only where history was forgotten
         vector = seen.vector if control.memory < q.shape[1] else observation

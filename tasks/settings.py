@@ -1,22 +1,31 @@
-"""Specs that all tool-pose tasks share: arms, phases, action, controller and advice.
+"""Specs that all tool-pose tasks share: arms, phases, action, errors, controller and advice.
 
 This module needs no torch, so that a bad value is refused before torch is loaded.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal, Protocol
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Protocol
 
-from brokk_rl.bounds import require_number, require_range
+from annotated_types import Interval
+
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import mask_exclusive_joints
-from brokk_rl.spec import spec
+from brokk_rl.machine import Machine, mask_exclusive_joints
+from brokk_rl.observation import TargetScaling
+from brokk_rl.spec import Count, Finite, NonNegative, NonNegativeRange, Positive, spec
+from tasks.term_task import EpisodeTask
 
 if TYPE_CHECKING:
     import torch
 
-Expected = float | tuple[float, float]
+Expected = NonNegative | NonNegativeRange
 """A number, or the range [low, high] in which it lies."""
+DeadZone = Annotated[float, Interval(ge=0, le=0.99)]
+"""A part of the full command that gives no motion."""
+Uniform = Callable[[tuple[float, float]], "torch.Tensor"]
+"""Draws `(M,)` numbers between two bounds."""
 
 
 class SwitchInput(Protocol):
@@ -25,6 +34,90 @@ class SwitchInput(Protocol):
     reach_m: torch.Tensor
     reach_3d_m: torch.Tensor
     tip_z_m: torch.Tensor
+
+
+@dataclass
+class CandidateTargets:
+    """Candidate targets, `M` of them.
+
+    Attributes:
+        place_m: Coordinates of the target point in the base frame, three of `(M,)`.
+        pitch_rad: Wanted pitch of the tool, `(M,)`.
+        scene: Columns of the scene that are not the nominal ones; see `brokk_rl.sim.scene`.
+        object_z_m: Height of the top of the object, `(M,)`.
+    """
+
+    place_m: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
+    pitch_rad: torch.Tensor
+    scene: dict[str, torch.Tensor | float]
+    object_z_m: torch.Tensor
+
+
+@dataclass
+class PoseJudgement:
+    """Judgement of tool poses, `(N,)` each.
+
+    Attributes:
+        success: The strict criterion holds, bool.
+        paper_success: The paper's criterion holds, bool.
+        closeness: How near the task is to done, 0 to about 1.
+    """
+
+    success: torch.Tensor
+    paper_success: torch.Tensor
+    closeness: torch.Tensor
+
+
+@spec
+class ObservationNoise:
+    """Errors of the observation; drawn anew each episode unless said otherwise.
+
+    Stereo sees a target worse with the square of its distance d from the camera.
+
+    Attributes:
+        target_sample_m: Uniform error of the target in each sample and axis (±), at the camera.
+        target_sample_1_m: What d² adds to it.
+        target_bias_m: Length of the constant error of the target, uniform from 0, in a random
+            direction, at the camera.
+        target_bias_1_m: What d² adds to it.
+        camera_in_base_m: Where the camera is.
+        target_relative: Uniform error of each sample as a share of each coordinate (±); the paper's
+            5 %.
+        filter: `mean` gives the policy the mean of all estimates of the episode, as a tracker of a
+            fixed hole does; `none` each sample.
+        q_scale: Scale error of all measured positions (±).
+        q_scale_of: What `q_scale` scales. `position`: each position, as a wrong encoder would.
+            `motion`: the distance of earlier positions from the newest, as a machine does that is
+            faster or slower than its model.
+        u_scale: Scale error of all recorded commands (±).
+    """
+
+    target_sample_m: NonNegative
+    target_sample_1_m: NonNegative
+    target_bias_m: NonNegative
+    target_bias_1_m: NonNegative
+    camera_in_base_m: tuple[Finite, Finite, Finite]
+    target_relative: NonNegative
+    filter: Literal["none", "mean"]
+    q_scale: NonNegative
+    q_scale_of: Literal["position", "motion"]
+    u_scale: NonNegative
+
+    def measure_bias_m(self, target_m: torch.Tensor) -> torch.Tensor | float:
+        """Return the longest constant error of targets, `(N, 3)` in the base frame, as `(N, 1)`."""
+        return self._grow(self.target_bias_m, self.target_bias_1_m, target_m)
+
+    def measure_sample_m(self, target_m: torch.Tensor) -> torch.Tensor | float:
+        """Return the half width of the error of each sample and axis, `(N, 1)`."""
+        return self._grow(self.target_sample_m, self.target_sample_1_m, target_m)
+
+    def _grow(
+        self, near_m: float, growth_1_m: float, target_m: torch.Tensor
+    ) -> torch.Tensor | float:
+        if growth_1_m == 0.0:
+            return near_m
+        seen_m = target_m - target_m.new_tensor(self.camera_in_base_m)
+        return near_m + growth_1_m * seen_m.square().sum(1, keepdim=True)
 
 
 @spec
@@ -46,21 +139,10 @@ class AdviceConfig:
 
     delay_s: Expected
     lag_s: Expected
-    dead_zone: Expected
-    joints_at_once: int | tuple[int, int] | None
-    hold_s: float
-    settle_s: float
-
-    def check(self) -> None:
-        for name in ("delay_s", "lag_s", "dead_zone"):
-            require_number(f"task.advice.{name}", take_middle(getattr(self, name)), least=0)
-        require_number("task.advice.dead_zone", take_middle(self.dead_zone), most=0.99)
-        fewest = self.joints_at_once
-        if fewest is not None:
-            fewest = fewest[0] if isinstance(fewest, tuple) else fewest
-            require_number("task.advice.joints_at_once", fewest, least=1)
-        for name in ("hold_s", "settle_s"):
-            require_number(f"task.advice.{name}", getattr(self, name), least=0)
+    dead_zone: DeadZone | tuple[DeadZone, DeadZone]
+    joints_at_once: Count | tuple[Count, Count] | None
+    hold_s: NonNegative
+    settle_s: NonNegative
 
 
 @spec
@@ -88,31 +170,24 @@ class ClassicalConfig:
             over which it is slowed down.
     """
 
-    in_flight_samples: float
-    dead_band: float
-    gain_1_s: float
-    top_speed_m_s: float
-    top_rate_rad_s: float
+    in_flight_samples: NonNegative
+    dead_band: DeadZone
+    gain_1_s: Positive
+    top_speed_m_s: Positive
+    top_rate_rad_s: Positive
     straight: bool
-    damping: float
-    rest: float
-    creep: float
-    hover_m: float
-    funnel_m: tuple[float, float]
-    margin_rad: float
-    brake_s: float
+    damping: Positive
+    rest: NonNegative
+    creep: NonNegative
+    hover_m: NonNegative
+    funnel_m: tuple[NonNegative, NonNegative]
+    margin_rad: NonNegative
+    brake_s: Positive
 
     def check(self) -> None:
-        for name in ("gain_1_s", "top_speed_m_s", "top_rate_rad_s", "damping", "brake_s"):
-            require_number(f"task.classical.{name}", getattr(self, name), above=0)
-        for name in ("in_flight_samples", "rest", "creep", "hover_m", "margin_rad"):
-            require_number(f"task.classical.{name}", getattr(self, name), least=0)
-        require_number("task.classical.dead_band", self.dead_band, least=0, most=0.99)
-        outer, inner = self.funnel_m
-        if not outer > inner >= 0:
-            raise ConfigError(
-                f"task.classical.funnel_m: expected (outer, inner), got [{outer}, {inner}]"
-            )
+        outer_m, inner_m = self.funnel_m
+        if outer_m <= inner_m:
+            raise ConfigError(f"funnel_m: expected (outer, inner), got [{outer_m}, {inner_m}]")
 
 
 @spec
@@ -131,12 +206,8 @@ class PhaseSwitch:
     """
 
     rule: Literal["planar", "text", "equation"]
-    reach_m: tuple[float, float]
-    height_m: float
-
-    def check(self) -> None:
-        require_range("task.switch.reach_m", self.reach_m, least=0)
-        require_number("task.switch.height_m", self.height_m)
+    reach_m: NonNegativeRange
+    height_m: Finite
 
     def reach(self, guidance: SwitchInput) -> torch.Tensor:
         """Return the distance by which the rule decides, `(N,)`."""
@@ -166,12 +237,9 @@ class ActionMapping:
     """
 
     kind: Literal["direct", "residual"]
-    scale: float
+    scale: Positive
     mask: bool
     limits: bool
-
-    def check(self) -> None:
-        require_number("task.action.scale", self.scale, above=0)
 
     def command(
         self,
@@ -213,18 +281,83 @@ class ArmStarts:
         nearest_m: Horizontal distance from the slew axis that the tool point does not start within.
     """
 
-    margin_rad: float
-    floor_m: float
-    clearance_m: float
-    nearest_m: float
-
-    def check(self) -> None:
-        for name in ("margin_rad", "nearest_m"):
-            require_number(f"task.arms.{name}", getattr(self, name), least=0)
-        for name in ("floor_m", "clearance_m"):
-            require_number(f"task.arms.{name}", getattr(self, name))
+    margin_rad: NonNegative
+    floor_m: Finite
+    clearance_m: Finite
+    nearest_m: NonNegative
 
 
-def take_middle(value: Expected) -> float:
+@spec
+class ToolPoseTask(EpisodeTask):
+    """Move the tool to a pose: what all such tasks have.
+
+    Attributes:
+        arms: Where the arm may begin.
+        memory: Newest samples of history that the policy sees; the machine's `num_history` for all
+            of them.
+        advice: How to propose to a person who moves the levers; `null` where the policy's commands
+            are given as they are.
+        noise: Errors of the observation.
+        switch: When only the exclusive joints move.
+        action: How the policy's output becomes commands.
+        scaling: Normalisation of target point and pitch.
+        classical: The classical controller, baseline and base of residual actions.
+    """
+
+    arms: ArmStarts
+    memory: Count
+    advice: AdviceConfig | None
+    noise: ObservationNoise
+    switch: PhaseSwitch
+    action: ActionMapping
+    scaling: TargetScaling
+    classical: ClassicalConfig
+
+    process: ClassVar[str] = "tasks.tool_pose:ToolPoseProcess"
+    behaviour: ClassVar[tuple[str, ...]] = (
+        "memory",
+        "advice",
+        "noise.filter",
+        "switch",
+        "action",
+        "scaling",
+        "classical",
+    )
+    """Fields that a policy has learned with; see `brokk_rl.policy_folder`."""
+
+    def check_machine(self, machine: Machine) -> None:
+        """Refuse a memory that is longer than the machine's history."""
+        if self.memory > machine.num_history:
+            raise ConfigError(
+                f"task.memory: expected at most the {machine.num_history} samples of the history of "
+                f"machine '{machine.name}' (num_history), got {self.memory}; change one of them"
+            )
+
+    @property
+    def aim_below_m(self) -> float:
+        """Depth of the controller's target below that of the observation."""
+        return 0.0
+
+    @property
+    def fixed_pitch_rad(self) -> float:
+        """Wanted pitch, where the policy does not observe it."""
+        raise NotImplementedError
+
+    def draw_targets(self, uniform: Uniform) -> CandidateTargets:
+        """Draw targets."""
+        raise NotImplementedError
+
+    def judge(
+        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+    ) -> PoseJudgement:
+        """Judge tool poses, `(N, 3)` and `(N,)`, by what was drawn for their episodes."""
+        raise NotImplementedError
+
+    def describe_success(self) -> dict[str, float]:
+        """Return the bounds of the strict criterion by name, with units, for `policy.json`."""
+        raise NotImplementedError
+
+
+def take_middle(value: float | tuple[float, float]) -> float:
     """Return a number, or the middle of a range."""
     return sum(value) / 2 if isinstance(value, tuple) else value

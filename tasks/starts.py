@@ -2,22 +2,21 @@
 
 A start is kept only if the tool begins in the open and if, after the exclusive joints have brought
 the target into reach, the other joints reach the wanted pose within their limits. Checked once with
-the kinematics when a task is built, so that resets only pick rows.
+the kinematics when starts are drawn, so that resets only pick rows.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
+from brokk_rl.sim import scene
 from tasks.classical import REACH_DAMPING, ClassicalController
-from tasks.settings import ArmStarts
+from tasks.settings import ArmStarts, CandidateTargets, ToolPoseTask
 
 log = logging.getLogger(__name__)
 
@@ -43,96 +42,6 @@ NEAR_MARGIN_RAD = 0.08
 POSE_TOLERANCE_M, POSE_TOLERANCE_RAD = 0.01, 0.03
 """Errors up to which a pose counts as reached. Chosen by hand: the clearance of the hole, and a
 fraction of the tolerance of `goal_pose`."""
-
-
-@dataclass
-class CandidateTargets:
-    """Candidate targets; `M` of them.
-
-    Attributes:
-        target_m: Target point in the base frame, `(M, 3)`.
-        pitch_rad: Wanted pitch of the tool, `(M,)`.
-        scene: Scene around it, `(M, S)`; see `sim.scene`.
-        object_z_m: Height of the top of the object, `(M,)`.
-    """
-
-    target_m: torch.Tensor
-    pitch_rad: torch.Tensor
-    scene: torch.Tensor
-    object_z_m: torch.Tensor
-
-
-Uniform = Callable[[tuple[float, float]], torch.Tensor]
-"""Draws `(M,)` numbers between two bounds."""
-
-
-def draw_starts(
-    count: int,
-    seed: int,
-    draw: Callable[[Uniform], CandidateTargets],
-    arms: ArmStarts,
-    machine: Machine,
-    controller: ClassicalController,
-    reach_m: tuple[float, float],
-    depth_m: float,
-    task_name: str,
-    tally: DrawTally | None = None,
-) -> dict[str, torch.Tensor]:
-    """Return `count` starts from which the target can be reached.
-
-    Args:
-        count: Number of starts.
-        seed: The same seed gives the same starts.
-        draw: Draws targets.
-        arms: Where the arm may begin.
-        machine: The machine.
-        controller: Gives kinematics and reach.
-        reach_m: Good working range.
-        depth_m: How far below `target_m` the tool must get.
-        task_name: Name of the task, for messages.
-        tally: Counts the candidates; `None` makes one.
-
-    Returns:
-        `q`, `scene`, `target_m`, `target_pitch_rad`.
-
-    Raises:
-        ConfigError: Nearly none of the drawn starts can be done.
-    """
-    generator = torch.Generator().manual_seed(seed)
-    batch = max(BATCH_FACTOR * count, MIN_BATCH)
-
-    def uniform(bounds: tuple[float, float]) -> torch.Tensor:
-        return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
-
-    drawn: list[dict[str, torch.Tensor]] = []
-    tally = tally or DrawTally(task_name, count)
-    while tally.done < count:
-        targets = draw(uniform)
-        q, free = draw_arms(arms, machine, controller, targets.object_z_m, generator)
-        rows = {
-            "q": q,
-            "scene": targets.scene,
-            "target_m": targets.target_m,
-            "target_pitch_rad": targets.pitch_rad,
-        }
-        for first in range(0, batch, CHUNK):
-            inside = free[first : first + CHUNK]
-            part = {name: value[first : first + CHUNK][inside] for name, value in rows.items()}
-            deep = part["target_m"] - torch.tensor([0.0, 0.0, depth_m])
-            in_range, reached = try_targets(
-                controller,
-                machine,
-                part["q"],
-                deep,
-                part["target_pitch_rad"],
-                reach_m,
-                arms.margin_rad,
-            )
-            drawn.append({name: value[in_range & reached] for name, value in part.items()})
-            tally.add(inside, in_range, reached)
-            if tally.done >= count:
-                break
-    return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
 
 
 class DrawTally:
@@ -207,14 +116,76 @@ class DrawTally:
         )
 
 
+def draw_starts(
+    task: ToolPoseTask, machine: Machine, count: int, seed: int, tally: DrawTally | None = None
+) -> dict[str, torch.Tensor]:
+    """Return `count` starts from which the target can be reached.
+
+    Args:
+        task: Gives targets, arms and controller.
+        machine: The machine.
+        count: Number of starts.
+        seed: The same seed gives the same starts.
+        tally: Counts the candidates; `None` makes one.
+
+    Returns:
+        `q`, `scene`, `target_m`, `target_pitch_rad`.
+
+    Raises:
+        ConfigError: Nearly none of the drawn starts can be done.
+    """
+    controller = ClassicalController(task.classical, machine, torch.device("cpu"))
+    generator = torch.Generator().manual_seed(seed)
+    batch = max(BATCH_FACTOR * count, MIN_BATCH)
+    down_m = torch.tensor([0.0, 0.0, task.aim_below_m])
+
+    def draw_uniform(bounds: tuple[float, float]) -> torch.Tensor:
+        return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
+
+    drawn: list[dict[str, torch.Tensor]] = []
+    tally = tally or DrawTally(type(task).__name__, count)
+    while tally.done < count:
+        targets = task.draw_targets(draw_uniform)
+        q, free = draw_arms(task.arms, machine, controller, targets.object_z_m, generator)
+        rows = {"q": q} | _stack_targets(targets)
+        for first in range(0, batch, CHUNK):
+            inside = free[first : first + CHUNK]
+            part = {name: value[first : first + CHUNK][inside] for name, value in rows.items()}
+            _, in_range, reached = move_to_targets(
+                controller,
+                machine,
+                part["q"],
+                part["target_m"] - down_m,
+                part["target_pitch_rad"],
+                task.switch.reach_m,
+                task.arms.margin_rad,
+            )
+            drawn.append({name: value[in_range & reached] for name, value in part.items()})
+            tally.add(inside, in_range, reached)
+            if tally.done >= count:
+                break
+    return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
+
+
+def _stack_targets(targets: CandidateTargets) -> dict[str, torch.Tensor]:
+    """Return scene, target and pitch of candidates."""
+    scenes = scene.make_nominal_scenes(len(targets.pitch_rad))
+    for name, value in targets.scene.items():
+        scenes[:, scene.COLUMNS.index(name)] = value
+    return {
+        "scene": scenes,
+        "target_m": torch.stack(targets.place_m, 1),
+        "target_pitch_rad": targets.pitch_rad,
+    }
+
+
 def move_starts_near(
+    task: ToolPoseTask,
+    machine: Machine,
     start: dict[str, torch.Tensor],
     share: float,
     height_m: tuple[float, float],
     seed: int,
-    machine: Machine,
-    controller: ClassicalController,
-    reach_m: tuple[float, float],
 ) -> dict[str, torch.Tensor]:
     """Return starts of which the first part begins upright above its target.
 
@@ -222,19 +193,20 @@ def move_starts_near(
     (reverse curriculum, Florensa et al. 2017). Arms that do not get there stay as they are.
 
     Args:
+        task: Gives the controller.
+        machine: The machine.
         start: Starts, as `draw_starts` returns them.
         share: Part of the starts that are brought near.
         height_m: Heights of the tool point above `target_m`, (lowest, highest).
         seed: The same seed gives the same heights.
-        machine: The machine.
-        controller: Gives kinematics and reach.
-        reach_m: Good working range.
     """
+    controller = ClassicalController(task.classical, machine, torch.device("cpu"))
     count = round(share * len(start["q"]))
     generator = torch.Generator().manual_seed(seed)
     up = height_m[0] + (height_m[1] - height_m[0]) * torch.rand(count, 1, generator=generator)
     above = start["target_m"][:count] + up * torch.tensor([0.0, 0.0, 1.0])
     pitch_rad = start["target_pitch_rad"][:count]
+    reach_m = task.switch.reach_m
     q, good, reached = move_to_targets(
         controller, machine, start["q"][:count], above, pitch_rad, reach_m, NEAR_MARGIN_RAD
     )
@@ -266,27 +238,6 @@ def draw_arms(
     free &= tip[:, :2].norm(dim=1) > arms.nearest_m
     free &= (pose.joints_in_base_m[:, 2:, 2] > arms.floor_m).all(1)
     return q, free
-
-
-def try_targets(
-    controller: ClassicalController,
-    machine: Machine,
-    q: torch.Tensor,
-    target_m: torch.Tensor,
-    pitch_rad: torch.Tensor,
-    reach_m: tuple[float, float],
-    margin_rad: float,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Try to reach target poses from `q`, `(M, J)`; see `move_to_targets`.
-
-    Returns:
-        Whether the target came into the working range, `(M,)` bool, and whether the tool ended at
-        the wanted pose, `(M,)` bool.
-    """
-    _, good, reached = move_to_targets(
-        controller, machine, q, target_m, pitch_rad, reach_m, margin_rad
-    )
-    return good, reached
 
 
 def move_to_targets(

@@ -8,6 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from brokk_rl import extensions
+
+EXAMPLE = Path(__file__).parents[1] / "examples/my_package/my_package"
+
 
 def forget_package(name: str) -> None:
     """Forget the modules of a package that another test installed."""
@@ -32,3 +36,14 @@ def install_package(
     (about / "entry_points.txt").write_text(f"[brokk_rl.conf]\n{name} = {name}.conf\n")
     monkeypatch.syspath_prepend(str(folder))
     importlib.invalidate_caches()
+
+
+def install_example(folder: Path, monkeypatch: pytest.MonkeyPatch, **more: str) -> Path:
+    """Install `examples/my_package`, with `more` files by path, into a folder; return it."""
+    files = {}
+    for path in EXAMPLE.rglob("*.*"):
+        if path.suffix in (".py", ".yaml", ".xml"):
+            files[str(path.relative_to(EXAMPLE))] = path.read_text()
+    install_package(folder, "my_package", files | more, monkeypatch)
+    extensions.register_options([])
+    return folder

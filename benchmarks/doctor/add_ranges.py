@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from brokk_rl import extensions
-from brokk_rl.observation import ObservationEncoder, measure_ranges, restore_encoder
+from brokk_rl.observation import measure_ranges, restore_encoder
 from brokk_rl.policy_choice import restore_task
 from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
@@ -49,7 +49,7 @@ def measure(folder: Path) -> dict[str, object]:
             groups = loop.step(actor.act(groups.to_dict()))[0]
     stacked = np.concatenate(vectors)
     encoder = restore_encoder(machine, contract["observation"])
-    assert isinstance(encoder, ObservationEncoder), "a policy of a tool-pose task"
+    assert encoder.has_target, "a policy of a tool-pose task"
     ranges = measure_ranges(encoder, stacked, machine.joint_names)
     return {"count": len(stacked), "ranges": ranges}
 

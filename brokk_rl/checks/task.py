@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from brokk_rl import observation
 from brokk_rl.checks.exercise import (
     NUM_ENVS,
     build_rest_history,
@@ -23,6 +22,7 @@ from brokk_rl.checks.exercise import (
 from brokk_rl.contracts.task import FAULT, STEPS, SUCCESS, Task, TaskProcess
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
+from brokk_rl.observation import restore_encoder
 
 COMMAND_SIZES = (0.0, 0.5, 100.0)
 """Standard deviations of the random actions tried: rest, usual, and far beyond the commands'
@@ -159,13 +159,11 @@ def _check_deployment(
 ) -> None:
     description = process.describe()
     json.dumps(description)
-    sizes = [sum(part["samples"] * part["width"] for part in description.get("parts", ()))]
-    for proposals in (False, True):
-        sizes += [observation.compute_size(machine, pitch, proposals) for pitch in (False, True)]
     size = description["size"]
+    encoder = restore_encoder(machine, description)
     require(
-        size in sizes,
-        f"describe: a vector of {size} numbers, expected one of brokk_rl.observation, {sizes}",
+        encoder.size == size,
+        f"describe: a vector of {size} numbers, but its parts have {encoder.size}",
     )
     require(
         tuple(vector.shape) == (NUM_ENVS, size),

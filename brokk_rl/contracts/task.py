@@ -161,8 +161,7 @@ class TaskProcess(ABC):
     ) -> dict[str, torch.Tensor]:
         """Return the observation groups, each `(N, …)` float32; one of them is `policy`.
 
-        Called once a control step, after `step` and `reset`. The tensors are the task's own, and
-        the next call overwrites them.
+        Called once a control step, after `step` and `reset`.
 
         Args:
             history: Positions as sensors measure them, and the commands in force.

@@ -118,8 +118,8 @@ class Simulator(Protocol):
     """A spec in `conf/sim`: builds a world.
 
     `build` may take two more arguments. With `varied: tuple[Property, ...]` it returns a
-    `VariedWorld`, and events can be used with it. With `objects` it builds objects beside the block
-    (`brokk_rl.sim.objects`).
+    `VariedWorld`, and events can be used with it. With `site: Path | None` it builds what
+    an MJCF file holds beside the block.
     """
 
     def build(self, machine: Machine, device: torch.device, num_worlds: int | None = None) -> World:

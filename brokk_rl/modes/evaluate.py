@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import torch
@@ -11,7 +11,7 @@ import torch
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.target import TargetSensorSpec
-from brokk_rl.contracts.task import Task
+from brokk_rl.contracts.task import SUCCESS, Figure, Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -23,7 +23,7 @@ from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session, write_json
 from brokk_rl.sim.events import Event
-from brokk_rl.sim.objects import list_objects
+from brokk_rl.sim.scene import find_site
 from brokk_rl.sim.video import render_video
 from brokk_rl.spec import name_spec, spec
 
@@ -95,7 +95,7 @@ def evaluate_policies(
     """Evaluate policies from the same starts with the same noise.
 
     A policy that has a task of its own acts by it, the others by `config.task`. Writes
-    `evaluation.json` and `insertion.mp4`.
+    `evaluation.json` and `episode.mp4`.
 
     Args:
         config: The control loop.
@@ -113,6 +113,7 @@ def evaluate_policies(
     loops: dict[str, tuple[ControlLoop, dict[str, Any]]] = {}
     starts: Starts | None = None
     evaluated: dict[str, PolicyEvaluation] = {}
+    figures: dict[str, Figure] = {}
     for name, policy in policies.items():
         key = descriptions[name].fingerprint()
         if key not in loops:
@@ -132,6 +133,7 @@ def evaluate_policies(
         log.info("evaluating %s over %d episodes", name, evaluation.episodes)
         starts = starts or {key: value.clone() for key, value in loop.starts.items()}
         loop.load_state_dict(fresh)  # every policy meets the same machines and persons
+        figures |= loop.task.figures
         actor = policy.build(loop, session.seed)
         with ItemProgress(f"evaluating {name}", loop.task.max_episode_steps) as progress:
             evaluated[name] = evaluate_policy(
@@ -147,38 +149,35 @@ def evaluate_policies(
         "policy": first,
         "task": descriptions[first].to_json(),
         "tasks": {name: descriptions[name].fingerprint() for name in evaluated},
+        "figures": {name: asdict(figure) for name, figure in figures.items()},
         "policies": table,
     }
     write_json(session.folder / "evaluation.json", results)
-    _print_table(table)
+    _print_table(table, figures)
     if evaluation.video:
         recorded = evaluated[first].episodes
         shown = next((episode for episode in recorded if episode.success), recorded[0])
-        objects = list_objects(config.task, config.sim)
-        path = render_video(config.machine, shown, session.folder / "insertion.mp4", objects)
+        site = find_site(getattr(config.task, "scene", None), config.sim)
+        path = render_video(config.machine, shown, session.folder / "episode.mp4", site)
         if path:
             log.info("video of one episode: %s", path)
     return results
 
 
-def _print_table(table: dict[str, dict[str, Any]]) -> None:
+def _print_table(table: dict[str, dict[str, Any]], figures: dict[str, Figure]) -> None:
     """Print one row per policy; a figure that the task does not record is a dash."""
-    columns = (
-        ("strict success", lambda row: f"{row['success_strict']['mean']:.3f}"),
-        ("95 %", lambda row: "{:.3f} to {:.3f}".format(*row["success_strict"]["ci95"])),
-        ("paper's success", lambda row: f"{row['success_paper']['mean']:.3f}"),
-        ("time to success", lambda row: f"{row['time_to_insert_s']['median']:.1f} s"),
-        ("lateral error", lambda row: f"{1000 * row['lateral_error_m']:.1f} mm"),
-        ("peak force", lambda row: f"{row['peak_force_n']:.0f} N"),
-        ("valve travel", lambda row: f"{row['valve_travel']:.2f} /s"),
-    )
+    titles = ["policy"]
+    for name, figure in figures.items():
+        titles += [figure.title, "95 %"] if name == SUCCESS else [figure.title]
     rows = []
-    for name, row in table.items():
-        cells = []
-        for _, write in columns:
-            try:
-                cells.append(write(row))
-            except (KeyError, TypeError):  # not recorded, or no episode with success
-                cells.append(None)
-        rows.append([name, *cells])
-    print_table(["policy", *(title for title, _ in columns)], rows)
+    for policy, row in table.items():
+        cells: list[str | None] = [policy]
+        for name, figure in figures.items():
+            value = row.get(name)
+            if isinstance(value, dict):
+                value = value["mean" if "mean" in value else "median"]
+            cells.append(None if value is None else figure.word(value))
+            if name == SUCCESS:
+                cells.append("{:.3f} to {:.3f}".format(*row[name]["ci95"]))
+        rows.append(cells)
+    print_table(titles, rows)

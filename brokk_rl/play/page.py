@@ -16,6 +16,7 @@ import numpy as np
 import viser
 import viser.uplot as uplot
 
+from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.errors import BrokkError, ConfigError
 from brokk_rl.play.levers import KEY_STEP, GamepadLevers
 from brokk_rl.play.scene_view import SceneView
@@ -361,7 +362,8 @@ class PlayPage:
     def _show_figures(self, state: PlayState) -> None:
         """Show status and levers as they are."""
         finished = sum(state.endings.values())
-        share = f"{state.successes} of {finished} inserted" if finished else "no episode finished"
+        title = self._session.loop.task.figures[SUCCESS].title
+        share = f"{title}: {state.successes} of {finished}" if finished else "no episode finished"
         time_text = "**paused**" if state.paused else f"**{state.rate:.2f} × real time**"
         note = f" · {state.note}" if state.note else ""
         worlds = self._session.loop.num_envs

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import torch
 
-from brokk_rl.contracts.task import REWARD, SUCCESS, Policy
+from brokk_rl.contracts.task import REWARD, SUCCESS, Figure, Policy
 from brokk_rl.rl.loop import ControlLoop, Starts
 from brokk_rl.statistics import compute_wilson_interval
 
-SHARES = (SUCCESS, "success_paper")
-"""Figures of an episode that are 0 or 1: reported as a share with its interval."""
-TIME_TO_SUCCESS = "time_to_insert_s"
-"""Figure that counts only in episodes with success: reported as median and 95 % quantile."""
 TRAINING_ONLY = ("return", "length")
 """Figures of an episode that training logs and evaluation leaves out."""
 CHECKED_EVERY = 8
@@ -122,7 +118,7 @@ def evaluate_policy(
         if loop.sensor is not None:
             loop.sensor.attend(running.cpu().numpy())
         on_step()
-    summary = _summarize(figures, reason, loop.task.reasons)
+    summary = _summarize(figures, reason, loop.task.reasons, loop.task.figures)
     if loop.sensor is not None:
         summary["target"] = loop.sensor.summarize()
     return PolicyEvaluation(
@@ -132,20 +128,21 @@ def evaluate_policy(
 
 
 def _summarize(
-    figures: dict[str, torch.Tensor], reason: torch.Tensor, reasons: tuple[str, ...]
+    figures: dict[str, torch.Tensor],
+    reason: torch.Tensor,
+    reasons: tuple[str, ...],
+    words: Mapping[str, Figure],
 ) -> dict[str, Any]:
-    """Return the fields of `evaluation.json`; figures that the task does not have are left out."""
+    """Return the fields of `evaluation.json`; a figure without words is reported as its mean."""
     success = figures[SUCCESS].cpu().numpy() > 0
     summary: dict[str, Any] = {"episodes": len(success)}
-    for name in (*SHARES, *figures):
-        if name in summary or name in TRAINING_ONLY or name not in figures:
+    for name, value in figures.items():
+        if name in TRAINING_ONLY or name.startswith(REWARD):
             continue
-        if name.startswith(REWARD):
-            continue
-        values = figures[name].cpu().numpy()
-        if name in SHARES:
+        values, word = value.cpu().numpy(), words.get(name)
+        if word and word.unit == "share":
             summary[name] = _estimate_share(values > 0)
-        elif name == TIME_TO_SUCCESS:
+        elif word and word.of_success:
             summary[name] = _summarize_times(values[success])
         else:
             summary[name] = float(values.mean())

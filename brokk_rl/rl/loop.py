@@ -37,7 +37,7 @@ from brokk_rl.rl.settings import NearStarts
 from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.faults import FaultRecorder
-from brokk_rl.sim.objects import list_objects
+from brokk_rl.sim.scene import find_site
 
 Starts = dict[str, torch.Tensor]
 
@@ -86,8 +86,8 @@ class ControlLoopConfig:
             seed: Seed of the starts.
             starts: Starts of another control loop, in the place of drawn ones.
         """
-        objects = list_objects(self.task, self.sim)
-        more: dict[str, Any] = {"objects": objects} if objects else {}
+        site = find_site(getattr(self.task, "scene", None), self.sim)
+        more: dict[str, Any] = {"site": site} if site else {}
         if self.events:
             world: World = build_varied_world(
                 self.sim, self.events, self.machine, device, num_envs, **more

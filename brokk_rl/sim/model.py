@@ -6,7 +6,6 @@ cannot disagree.
 
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import mujoco
@@ -16,8 +15,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import find_packages, resolve_package_path
 from brokk_rl.sim.drive import add_drive, compute_inertia
-from brokk_rl.sim.objects import SceneObject
-from brokk_rl.sim.scene import add_block, add_objects
+from brokk_rl.sim.scene import add_block, add_site
 
 ASSETS = Path(__file__).parent / "assets"
 VISUAL_GROUP = 2
@@ -25,7 +23,7 @@ VISUAL_GROUP = 2
 
 
 def compile_model(
-    machine: Machine, timestep_s: float, visual: bool = False, objects: Sequence[SceneObject] = ()
+    machine: Machine, timestep_s: float, visual: bool = False, site: Path | None = None
 ) -> mujoco.MjModel:
     """Return the model of `machine` at a work site with a block.
 
@@ -34,7 +32,7 @@ def compile_model(
         timestep_s: Length of a substep.
         visual: Keep geoms, cameras and lights that only pictures need. The physics is the same
             without them, and faster.
-        objects: Objects beside the block.
+        site: MJCF of what stands beside the block.
 
     Raises:
         ConfigError: The MJCF is missing or its joints are not those of the machine.
@@ -42,7 +40,7 @@ def compile_model(
     spec = _read_mjcf(machine)
     _write_machine(spec, machine)
     add_block(spec, visual)
-    add_objects(spec, objects)
+    add_site(spec, site)
     _write_options(spec, timestep_s)
     if not visual:
         _remove_visuals(spec)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from pathlib import Path
 from typing import ClassVar
 
 import mujoco
@@ -14,7 +14,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model, mask_contact_sensors
 from brokk_rl.sim.model_features import check_simulated
-from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 
@@ -41,7 +40,7 @@ class NativeWorld:
         substeps: Physics steps per control period.
         num_threads: Threads; 0 takes all cores.
         varied: Properties of the machine that differ from world to world.
-        objects: Objects beside the block.
+        site: MJCF of what stands beside the block.
     """
 
     supports_graphs = False
@@ -56,10 +55,10 @@ class NativeWorld:
         substeps: int,
         num_threads: int,
         varied: tuple[Property, ...] = (),
-        objects: Sequence[SceneObject] = (),
+        site: Path | None = None,
     ) -> None:
         self.num_worlds, self.device = num_worlds, torch.device("cpu")
-        self.model = compile_model(machine, machine.period_s / substeps, objects=objects)
+        self.model = compile_model(machine, machine.period_s / substeps, site=site)
         check_simulated(self.model, machine.name, "native")
         self._batch = Batch(self.model, num_worlds, num_threads)
         self.substeps = substeps

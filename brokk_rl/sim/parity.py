@@ -7,8 +7,8 @@ MuJoCo Warp and from our kernels, and computes in double precision.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +17,6 @@ import torch
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.sim.native_world import NativeWorld
-from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.scene import COLUMNS, HOLE_RADIUS_BOUNDS_M, SCALE_BOUNDS, make_nominal_scenes
 
 if TYPE_CHECKING:
@@ -85,11 +84,7 @@ class ParityResult:
 
 
 def measure_parity(
-    world: World,
-    machine: Machine,
-    substeps: int,
-    seed: int = 0,
-    objects: Sequence[SceneObject] = (),
+    world: World, machine: Machine, substeps: int, seed: int = 0, site: Path | None = None
 ) -> ParityResult:
     """Return how far a simulator is from MuJoCo C; its worlds are reset and stepped.
 
@@ -98,9 +93,9 @@ def measure_parity(
         machine: Their machine.
         substeps: Physics steps per control period of these worlds.
         seed: For the random states and motion.
-        objects: Objects beside the block in these worlds.
+        site: MJCF of what stands beside the block in these worlds.
     """
-    reference = NativeWorld(machine, world.num_worlds, substeps, num_threads=0, objects=objects)
+    reference = NativeWorld(machine, world.num_worlds, substeps, num_threads=0, site=site)
     generator = torch.Generator().manual_seed(seed)
     q, scene = _draw_states(machine, world.num_worlds, generator)
     everywhere = torch.ones(world.num_worlds, dtype=torch.bool)
@@ -134,14 +129,14 @@ def measure_parity(
 
 
 def check_parity(
-    world: World, machine: Machine, substeps: int, objects: Sequence[SceneObject] = ()
+    world: World, machine: Machine, substeps: int, site: Path | None = None
 ) -> ParityResult:
     """Return how far a simulator is from MuJoCo C; its worlds are reset and stepped.
 
     Raises:
         ConfigError: It is too far.
     """
-    result = measure_parity(world, machine, substeps, objects=objects)
+    result = measure_parity(world, machine, substeps, site=site)
     if not result.is_alike:
         raise ConfigError(
             f"machine {machine.name}: sim=warp does not simulate it as MuJoCo C does: "

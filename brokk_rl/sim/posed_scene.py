@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -10,7 +10,6 @@ import torch
 
 from brokk_rl.machine import Machine
 from brokk_rl.sim.model import compile_model
-from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.scene import COLUMNS, ScenePlacement, build_visual_wall
 
 SHOWN_GROUPS = (0, 1, 2)
@@ -22,15 +21,15 @@ class PosedScene:
 
     Args:
         machine: The machine.
-        objects: Objects beside the block.
+        site: MJCF of what stands beside the block.
 
     Attributes:
         model: MuJoCo's model with the geoms, cameras and lights that only pictures need.
         data: Its state after the last `set_pose`.
     """
 
-    def __init__(self, machine: Machine, objects: Sequence[SceneObject] = ()) -> None:
-        self.model = compile_model(machine, machine.period_s, visual=True, objects=objects)
+    def __init__(self, machine: Machine, site: Path | None = None) -> None:
+        self.model = compile_model(machine, machine.period_s, visual=True, site=site)
         self.data = mujoco.MjData(self.model)
         self._placement = ScenePlacement(self.model, "cpu", torch.float64)
 

@@ -7,14 +7,18 @@ corners. The slabs serve as block and as wall of the hole, which halves the geom
 ring of eight walls.
 """
 
-from collections.abc import Sequence
+import inspect
 from dataclasses import dataclass
+from pathlib import Path
 
 import mujoco
 import numpy as np
 import torch
 
-from brokk_rl.sim.objects import SceneObject
+from brokk_rl.contracts.world import Simulator
+from brokk_rl.errors import ConfigError
+from brokk_rl.registry import resolve_package_path
+from brokk_rl.spec import name_spec
 
 COLUMNS = ("hole_x_m", "hole_y_m", "rim_z_m", "yaw_rad", "block_scale", "hole_radius_m")
 """Columns of a scene, `S` of them: centre of the rim in the base frame, turn of the block about the
@@ -48,6 +52,9 @@ WALL_OVERLAP_M = 0.002
 """Overlap of the visual wall with the slabs, so that no gap shows."""
 WALL_RECESS_M = 0.0003
 """Distance of the visual wall below the rim, so that their faces do not coincide."""
+
+SOLID_GROUP = 1
+"""Group of geoms that are seen and touched."""
 
 # contact bits: the chisel meets the real hole, all other links the block as if it had no hole
 _TOOL, _ARM = 1, 2
@@ -183,28 +190,50 @@ def add_block(spec: mujoco.MjSpec, visual: bool) -> None:
         _add_visuals(body)
 
 
-def add_objects(spec: mujoco.MjSpec, objects: Sequence[SceneObject]) -> None:
-    """Add objects that stand still; tool and arm meet them as they are drawn."""
-    for number, placed in enumerate(objects):
-        turn, tilt = np.zeros(4), np.zeros(4)
-        mujoco.mju_axisAngle2Quat(tilt, np.array([0.0, 1.0, 0.0]), placed.tilt_rad)
-        mujoco.mju_mulQuat(turn, np.array(_turn_about_z(placed.yaw_rad)), tilt)
-        body = spec.worldbody.add_body(name=f"object_{number}", pos=placed.place_m, quat=turn)
-        for half, center, axis in placed.list_boxes():
-            angle = float(np.linalg.norm(axis))
-            quat = np.zeros(4)
-            mujoco.mju_axisAngle2Quat(quat, axis / max(angle, 1e-12), angle)
-            body.add_geom(
-                type=mujoco.mjtGeom.mjGEOM_BOX,
-                size=half,
-                pos=center,
-                quat=quat,
-                contype=0,
-                conaffinity=_TOOL | _ARM,
-                friction=_FRICTION,
-                group=1,
-                material="concrete",
-            )
+def find_site(scene: str | None, sim: Simulator) -> Path | None:
+    """Return the MJCF file that a task names as its `scene`.
+
+    Args:
+        scene: A path, or `package:path`; `None` for nothing beside the block.
+        sim: Simulator that is to build it.
+
+    Raises:
+        ConfigError: There is no such file, or the simulator takes none.
+    """
+    if scene is None:
+        return None
+    path = resolve_package_path(scene)
+    if not path.is_file():
+        raise ConfigError(f"task.scene: expected an MJCF file, got {scene}; there is none")
+    if "site" not in inspect.signature(sim.build).parameters:
+        raise ConfigError(
+            f"task.scene: sim={name_spec(sim)} builds no scene; choose sim=native or sim=warp, or "
+            "task.scene=null"
+        )
+    return path
+
+
+def add_site(spec: mujoco.MjSpec, path: Path | None) -> None:
+    """Add what stands beside the block; tool and arm meet its geoms.
+
+    Raises:
+        ConfigError: MuJoCo cannot read the file, or something in it moves.
+    """
+    if path is None:
+        return
+    try:
+        site = mujoco.MjSpec.from_file(str(path))
+    except ValueError as error:
+        raise ConfigError(f"task.scene: {path} is no MJCF ({error})") from error
+    if site.joints or site.actuators:
+        raise ConfigError(
+            f"task.scene: what {path} holds must stand still; take its joints and actuators out"
+        )
+    for geom in site.geoms:
+        if geom.contype or geom.conaffinity:
+            geom.contype, geom.conaffinity = 0, _TOOL | _ARM
+            geom.group = SOLID_GROUP
+    spec.attach(site, prefix="site/", frame=spec.worldbody.add_frame())
 
 
 def _add_visuals(body: mujoco.MjsBody) -> None:

@@ -7,6 +7,7 @@ and a bad number is refused before.
 from __future__ import annotations
 
 import functools
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from brokk_rl.errors import DeviceError
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from brokk_rl.contracts.world import Property, World
     from brokk_rl.sim.native_world import NativeWorld
-    from brokk_rl.sim.objects import SceneObject
     from brokk_rl.sim.parity import ParityResult
     from brokk_rl.sim.warp_world import WarpWorld
 
@@ -43,7 +43,7 @@ class NativeSimulator:
         device: torch.device | str,
         num_worlds: int | None = None,
         varied: tuple[Property, ...] = (),
-        objects: tuple[SceneObject, ...] = (),
+        site: Path | None = None,
     ) -> NativeWorld:
         """Return the worlds; see `brokk_rl.contracts.world.Simulator`.
 
@@ -58,7 +58,7 @@ class NativeSimulator:
                 "choose sim=warp, or the CPU"
             )
         num = self.num_worlds if num_worlds is None else num_worlds
-        return NativeWorld(machine, num, self.substeps, self.num_threads, varied, objects)
+        return NativeWorld(machine, num, self.substeps, self.num_threads, varied, site)
 
 
 @spec
@@ -99,7 +99,7 @@ class WarpSimulator:
         device: torch.device | str,
         num_worlds: int | None = None,
         varied: tuple[Property, ...] = (),
-        objects: tuple[SceneObject, ...] = (),
+        site: Path | None = None,
     ) -> WarpWorld:
         """Return the worlds; see `brokk_rl.contracts.world.Simulator`.
 
@@ -121,9 +121,9 @@ class WarpSimulator:
         if device.type == "cuda" and device.index is None:
             device = torch.device("cuda", torch.cuda.current_device())
         if self.parity_worlds:
-            _check_parity(self, machine, device, objects)
+            _check_parity(self, machine, device, site)
         num = self.num_worlds if num_worlds is None else num_worlds
-        return self._make_world(machine, device, num, varied, objects)
+        return self._make_world(machine, device, num, varied, site)
 
     def _make_world(
         self,
@@ -131,7 +131,7 @@ class WarpSimulator:
         device: torch.device,
         num_worlds: int,
         varied: tuple[Property, ...],
-        objects: tuple[SceneObject, ...],
+        site: Path | None,
     ) -> WarpWorld:
         from brokk_rl.sim.warp_world import WarpWorld
 
@@ -147,7 +147,7 @@ class WarpSimulator:
             tolerance=self.tolerance,
             fused=self.fused,
             varied=varied,
-            objects=objects,
+            site=site,
         )
 
 
@@ -169,25 +169,22 @@ class AutoSimulator:
         device: torch.device | str,
         num_worlds: int | None = None,
         varied: tuple[Property, ...] = (),
-        objects: tuple[SceneObject, ...] = (),
+        site: Path | None = None,
     ) -> World:
         """Return the worlds on `device`; see `brokk_rl.contracts.world.Simulator`."""
         chosen = self.native if _is_cpu(device) else self.warp
-        return chosen.build(machine, device, num_worlds, varied, objects)
+        return chosen.build(machine, device, num_worlds, varied, site)
 
 
 @functools.lru_cache(maxsize=8)
 def _check_parity(
-    simulator: WarpSimulator,
-    machine: Machine,
-    device: torch.device,
-    objects: tuple[SceneObject, ...],
+    simulator: WarpSimulator, machine: Machine, device: torch.device, site: Path | None
 ) -> ParityResult:
     """Compare a simulator with MuJoCo C on a machine, once in a process."""
     from brokk_rl.sim.parity import check_parity
 
-    world = simulator._make_world(machine, device, simulator.parity_worlds, (), objects)
-    return check_parity(world, machine, simulator.substeps, objects)
+    world = simulator._make_world(machine, device, simulator.parity_worlds, (), site)
+    return check_parity(world, machine, simulator.substeps, site)
 
 
 def _is_cpu(device: torch.device | str) -> bool:

@@ -26,7 +26,6 @@ from brokk_rl.errors import StorageError
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
-from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.posed_scene import SHOWN_GROUPS, PosedScene
 from brokk_rl.sim.probe import find_renderer
 from brokk_rl.sim.scene import FAR_M
@@ -96,7 +95,7 @@ class RenderJob:
         scene: The scene, `(S,)`.
         target_m: Target of the tip, `(3,)` or `None`.
         path: The mp4 to write.
-        objects: Objects beside the block.
+        site: MJCF of what stands beside the block.
     """
 
     machine: Machine
@@ -106,7 +105,7 @@ class RenderJob:
     scene: np.ndarray
     target_m: np.ndarray | None
     path: Path
-    objects: tuple[SceneObject, ...] = ()
+    site: Path | None = None
 
     @property
     def stride(self) -> int:
@@ -129,7 +128,7 @@ class RenderJob:
 
 
 def render_video(
-    machine: Machine, episode: SimulatedEpisode, path: Path, objects: tuple[SceneObject, ...] = ()
+    machine: Machine, episode: SimulatedEpisode, path: Path, site: Path | None = None
 ) -> Path | None:
     """Write an mp4 to `path` and stills beside it.
 
@@ -158,7 +157,7 @@ def render_video(
             scene=np.asarray(episode.scene),
             target_m=None if episode.target_m is None else np.asarray(episode.target_m),
             path=draft,
-            objects=objects,
+            site=site,
         )
         if not _run_renderer(job, library):
             return None
@@ -258,11 +257,11 @@ class SceneRenderer:
 
     Args:
         machine: The machine.
-        objects: Objects beside the block.
+        site: MJCF of what stands beside the block.
     """
 
-    def __init__(self, machine: Machine, objects: tuple[SceneObject, ...] = ()) -> None:
-        self._posed = PosedScene(machine, objects)
+    def __init__(self, machine: Machine, site: Path | None = None) -> None:
+        self._posed = PosedScene(machine, site)
         self._renderers: dict[tuple[int, int], mujoco.Renderer] = {}
         self._option = mujoco.MjvOption()
         self._option.geomgroup[:] = [group in SHOWN_GROUPS for group in range(6)]
@@ -319,7 +318,7 @@ def draw_frames(job: RenderJob, steps: Iterable[int]) -> Iterator[np.ndarray]:
     split = width - CLOSE_WIDTH
     outline = {"stroke_width": 2, "stroke_fill": (40, 40, 40)}
     fixed = None if job.mark_m is None else _look_at(job.mark_m, TARGET_VIEW)
-    with SceneRenderer(job.machine, job.objects) as renderer:
+    with SceneRenderer(job.machine, job.site) as renderer:
         for step in steps:
             renderer.set_pose(job.q[step], job.scene)
             close = "close" if job.has_block else fixed

@@ -10,7 +10,8 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import mujoco
 import mujoco_warp as mjw
@@ -22,7 +23,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim.drive import DriveReferences
 from brokk_rl.sim.model import compile_model
 from brokk_rl.sim.model_features import check_simulated
-from brokk_rl.sim.objects import SceneObject
 from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 from brokk_rl.sim.warp_dynamics import ArmDynamics
@@ -147,7 +147,7 @@ class WarpWorld:
         tolerance: At which the solver stops.
         fused: Use our own kernels for dynamics, contact solver and integration.
         varied: Properties of the machine that differ from world to world.
-        objects: Objects beside the block.
+        site: MJCF of what stands beside the block.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class WarpWorld:
         tolerance: float,
         fused: bool,
         varied: tuple[Property, ...] = (),
-        objects: Sequence[SceneObject] = (),
+        site: Path | None = None,
     ) -> None:
         self.num_worlds, self.device = num_worlds, device
         self.supports_graphs = device.type == "cuda"
@@ -174,7 +174,7 @@ class WarpWorld:
                 name = kind.name or str(int(kind))
                 self.alarm_names[int(kind)] = BUFFERS.get(kind, f"the buffer {name} is full")
         self.substeps = substeps
-        self.model = compile_model(machine, machine.period_s / substeps, objects=objects)
+        self.model = compile_model(machine, machine.period_s / substeps, site=site)
         check_simulated(self.model, machine.name, "fused" if fused else "staged")
         wp.config.log_level = wp.LOG_WARNING
         wp.init()

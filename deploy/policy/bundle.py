@@ -18,7 +18,7 @@ import onnxruntime
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder, restore_encoder
+from brokk_rl.observation import PITCH, restore_encoder
 from brokk_rl.policy_folder import TaskDescription
 from brokk_rl.registry import resolve_package_path
 
@@ -63,7 +63,7 @@ class PolicyBundle:
                 "brokk_rl.contracts.task"
             )
         encoder = restore_encoder(machine, observation)
-        if not isinstance(encoder, ObservationEncoder):
+        if not encoder.has_target:
             raise CheckpointError(
                 f"{folder}: the machine's loop gives target, positions and commands, but the policy "
                 f"asks for {', '.join(observation['order'])}; run it in a loop of your own, as "
@@ -92,12 +92,12 @@ class PolicyBundle:
         Raises:
             ConfigError: `pitch_rad` contradicts the policy's task.
         """
-        if self.encoder.has_pitch and pitch_rad is None:
+        if PITCH in self.encoder.parts and pitch_rad is None:
             raise ConfigError(
                 "deploy.pitch_rad: the policy asks for the wanted pitch of the tool, got null; "
                 "give deploy.pitch_rad=<rad>, 1.57 for straight down"
             )
-        if pitch_rad is not None and not self.encoder.has_pitch:
+        if pitch_rad is not None and PITCH not in self.encoder.parts:
             raise ConfigError(
                 f"deploy.pitch_rad={pitch_rad} was asked for, but the policy's task fixes the pitch; "
                 "leave it out, or give a policy that asks for one"

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from brokk_rl.machine import Machine
+from brokk_rl.observation import PITCH, PROPOSALS, TARGET
 from deploy.guidance import LeverDisplay, LeverGuidance
 from deploy.policy.bundle import PolicyBundle
 from deploy.runtime.bus_process import TEXT
@@ -196,11 +197,15 @@ class PolicyAdviser:
 
     def _infer(self, target_m: np.ndarray) -> np.ndarray | None:
         """Return masked commands, `(J,)`; `None` where the policy's answer is not usable."""
-        encoder, history = self._bundle.encoder, self._history
-        pitch = np.array([self._config.pitch_rad or 0.0]) if encoder.has_pitch else None
-        proposed = history.proposed[None] if encoder.has_proposals else None
-        q, u = history.q[None], history.u[None]
-        observation = encoder.encode(target_m[None], q, u, pitch, proposed)
+        history = self._history
+        values = {
+            TARGET: target_m[None],
+            "q": history.q[None],
+            "u": history.u[None],
+            PITCH: np.array([self._config.pitch_rad or 0.0]),
+            PROPOSALS: history.proposed[None],
+        }
+        observation = self._bundle.encoder.encode(values)
         # A target of NaN would otherwise reach the network.
         if not np.isfinite(observation).all():
             return None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
+import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +15,10 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from omegaconf import OmegaConf
-from packages import forget_package, install_package
+from packages import EXAMPLE, install_example
 
 from brokk_rl import cli, extensions, registry
 from brokk_rl.build import build_quick_nodes
-from brokk_rl.modes.new import NewPackage, PackageRequest
 
 ROOT = Path(__file__).parents[2]
 NEWCOMERS = (ROOT / "README.md", *ROOT.glob("docs/tutorials/*.md"))
@@ -194,17 +194,12 @@ def write_option_files(overrides: list[str]) -> None:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A working directory that holds the project `mine` of `mode=new`, installed."""
+    """A working directory that holds `examples/my_package` as `mine`, installed."""
     site, projects = (tmp_path_factory.mktemp(name) for name in ("site", "projects"))
-    forget_package("mine")
-    NewPackage(new=PackageRequest(name="mine", folder=str(projects))).run()
-    package = projects / "mine/mine"
+    shutil.copytree(EXAMPLE.parent, projects / "mine")
+    made = {"conf/machine/arm.yaml": (EXAMPLE / "conf/machine/my_arm.yaml").read_text()}
     with pytest.MonkeyPatch.context() as patch:
-        files = {str(path.relative_to(package)): path.read_text() for path in package.rglob("*.*")}
-        # Made in the tutorial.
-        files["conf/machine/arm.yaml"] = files["conf/machine/two_links.yaml"]
-        install_package(site, "mine", files, patch)
-        extensions.register_options([])
+        install_example(site, patch, **made)  # the tutorial makes a machine
         patch.chdir(projects)
         with hydra.initialize_config_module("conf", version_base="1.3"):
             yield

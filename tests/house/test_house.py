@@ -46,7 +46,7 @@ def test_the_sources_keep(rule: Callable[[Mapping[str, str]], list[str]]) -> Non
 
 NOUNS = ("spec",)
 """Functions that are no verbs: the decorator of specs."""
-QUANTITIES = ("tasks.reward", "tasks.observations")
+QUANTITIES = ("tasks.reward", "tasks.observations", "tasks.termination", "tasks.figures")
 """Modules of terms, which are named by their quantity: users type these names."""
 
 

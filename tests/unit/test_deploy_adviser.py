@@ -29,13 +29,13 @@ ANSWER = np.array([0.5, 0.0, -0.4, 0.0, 0.1])
 class Encoder:
     """Remembers what it was given."""
 
-    size, has_pitch, has_proposals = 7, True, True
+    size = 7
 
     def __init__(self) -> None:
-        self.given: tuple[Any, ...] = ()
+        self.given: dict[str, Any] = {}
         self.observation = np.zeros((1, self.size))
 
-    def encode(self, *given: Any) -> np.ndarray:
+    def encode(self, given: dict[str, Any]) -> np.ndarray:
         self.given = given
         return self.observation
 
@@ -129,13 +129,13 @@ def test_an_advice_is_shown_asked_for_and_recorded(desk: Desk) -> None:
 def test_the_policy_is_given_target_history_pitch_and_proposals(desk: Desk) -> None:
     desk.advised()
     desk.go(2)
-    target, q, u, pitch, proposed = desk.bundle.encoder.given
-    assert target.tolist() == [[2.6, 0.1, 0.75]] and pitch.tolist() == [0.3]
-    assert q.shape == u.shape == proposed.shape == (1, NUM_HISTORY, NUM_JOINTS)
-    assert proposed[0, -2:].tolist() == [ANSWER.tolist()] * 2 and not proposed[0, 0].any()
-    desk.bundle.encoder.has_pitch = desk.bundle.encoder.has_proposals = False  # type: ignore[misc]
-    desk.go()
-    assert desk.bundle.encoder.given[3:] == (None, None)
+    given = desk.bundle.encoder.given
+    assert given["target_in_base_m"].tolist() == [[2.6, 0.1, 0.75]]
+    assert given["pitch_rad"].tolist() == [0.3]
+    for name in ("q", "u", "proposals"):
+        assert given[name].shape == (1, NUM_HISTORY, NUM_JOINTS)
+    proposed = given["proposals"][0]
+    assert proposed[-2:].tolist() == [ANSWER.tolist()] * 2 and not proposed[0].any()
 
 
 def test_the_first_call_is_made_before_anything_depends_on_it() -> None:
@@ -207,8 +207,9 @@ def test_an_answer_that_makes_no_sense_is_told_to_the_guard_at_once(
     assert not desk.advice.u.any()
     desk.bundle.answer = ANSWER
     assert desk.go() is AdviceStatus.VALID and desk.request.u.tolist() == ANSWER.tolist()
-    *_, proposed = desk.bundle.encoder.given
-    assert not proposed[0, -1].any(), "nothing was proposed in that period"
+    assert not desk.bundle.encoder.given["proposals"][0, -1].any(), (
+        "nothing was proposed in that period"
+    )
 
 
 @pytest.mark.parametrize("answer", [[1.0, 0, 0, 0, -1.0], [0, 1.0, 0, 0, 0], [1.0000009] + [0] * 4])

@@ -22,6 +22,7 @@ from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.export import Export
+from brokk_rl.observation import ObservationPart
 from brokk_rl.policy_choice import prepare_arguments, restore_task
 from brokk_rl.policy_folder import (
     TaskDescription,
@@ -220,7 +221,7 @@ def test_a_pitch_is_given_exactly_where_the_policy_asks_for_one(machine: Machine
     bundle.check_pitch(None)
     with pytest.raises(ConfigError, match=r"deploy\.pitch_rad=1\.2 was asked for"):
         bundle.check_pitch(1.2)
-    bundle.encoder.has_pitch = True
+    bundle.encoder.parts["pitch_rad"] = ObservationPart("pitch_rad", (), 0.0, 1.0)
     bundle.check_pitch(1.2)
     with pytest.raises(ConfigError, match="asks for the wanted pitch"):
         bundle.check_pitch(None)

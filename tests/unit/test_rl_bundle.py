@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.observation import ObservationEncoder
+from brokk_rl.observation import ObservationEncoder, list_pose_parts
 from brokk_rl.policy_folder import TOLERANCE, describe_policy, find_policy, write_policy
 from brokk_rl.rl import export
 from brokk_rl.rl.loop import ControlLoop
@@ -153,18 +153,19 @@ def test_on_the_machine_it_commands_what_it_did_in_the_simulator(
     session = onnxruntime.InferenceSession(
         made.folder / "policy.onnx", providers=["CPUExecutionProvider"]
     )
-    encoder = ObservationEncoder(machine, option("task", name).scaling)
+    encoder = ObservationEncoder(list_pose_parts(machine, option("task", name).scaling))
     loop, policy = made.loop, NetworkPolicy(made.actor, made.loop)
     loop.begin()
     off, rows = [], 0
     for _ in range(60):
         groups = dict(loop.get_observations().items())
-        recorded = [
-            loop.task.state[f"start.{key}"].numpy() for key in ("target_m", "target_pitch_rad")
-        ]
-        vector = encoder.encode(
-            recorded[0], loop.history.q.numpy(), loop.history.u.numpy(), recorded[1]
-        )
+        recorded = {
+            "target_in_base_m": loop.task.state["start.target_m"],
+            "q": loop.history.q,
+            "u": loop.history.u,
+            "pitch_rad": loop.task.state["start.target_pitch_rad"],
+        }
+        vector = encoder.encode({name: value.numpy() for name, value in recorded.items()})
         on_machine = session.run(None, {"observation": vector.astype(np.float32)})[0]
         with torch.no_grad():
             _, _, done, _ = loop.step(policy.act(groups))

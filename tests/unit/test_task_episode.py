@@ -17,8 +17,8 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from tasks import starts
 from tasks.classical import ClassicalController
-from tasks.reward import RewardCurriculum, RewardTerm
-from tasks.starts import try_targets
+from tasks.starts import move_to_targets
+from tasks.terms import ObservedTerm, RewardCurriculum, RewardTerm
 
 CPU = torch.device("cpu")
 TASKS = ("borehole_insertion", "goal_pose")
@@ -109,10 +109,9 @@ def test_a_draw_of_which_nothing_can_be_done_ends_with_the_reason(
     monkeypatch.setattr(starts, "MIN_CANDIDATES", 1024)
     task = option("task", "borehole_insertion")
     task = replace(task, hole=replace(task.hole, distance_m=distance_m))
-    with pytest.raises(
-        ConfigError, match="borehole_insertion: nearly no start can be done"
-    ) as told:
-        task.build(machine, 1, CPU)
+    process = task.build(machine, 1, CPU)
+    with pytest.raises(ConfigError, match="BoreholeInsertion: nearly no start can be") as told:
+        process.starts(1, 0)
     assert reason in str(told.value) and "0 of 1024 candidates" in str(told.value)
 
 
@@ -159,10 +158,10 @@ def test_a_draw_checked_in_parts_is_the_draw_checked_at_once(
 def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
     task = option("task", "goal_pose")
     controller = ClassicalController(task.classical, machine, CPU)
-    found = try_targets(
+    found = move_to_targets(
         controller, machine, torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), (1.7, 2.4), 0.1
     )
-    assert [part.shape for part in found] == [(0,), (0,)]
+    assert [part.shape for part in found] == [(0, 5), (0,), (0,)]
 
 
 def test_a_pitch_that_varies_must_be_told_to_the_policy() -> None:
@@ -172,18 +171,17 @@ def test_a_pitch_that_varies_must_be_told_to_the_policy() -> None:
 
 
 def judged(
-    machine: Machine, name: str, at_m: tuple[float, float, float], pitch_rad: float = torch.pi / 2
+    name: str, at_m: tuple[float, float, float], pitch_rad: float = torch.pi / 2
 ) -> tuple[bool, bool]:
     """Returns strict and paper's success of a tool at `at_m` from the target point, which wants to be met straight down."""
-    goal: Any = option("task", name).build(machine, 1, CPU)
     start = {
         "target_m": torch.tensor([[2.5, 0.5, 0.75]]),
         "target_pitch_rad": torch.tensor([torch.pi / 2]),
     }
-    verdict = goal.goal.judge(
+    verdict = option("task", name).judge(
         start["target_m"] + torch.tensor([at_m]), torch.tensor([pitch_rad]), start
     )
-    return bool(verdict["success"]), bool(verdict["paper_success"])
+    return bool(verdict.success), bool(verdict.paper_success)
 
 
 @pytest.mark.parametrize(
@@ -199,9 +197,9 @@ def judged(
     ],
 )
 def test_strict_insertion_needs_depth_inside_the_hole(
-    at_m: tuple[float, float, float], strict: bool, machine: Machine
+    at_m: tuple[float, float, float], strict: bool
 ) -> None:
-    assert judged(machine, "borehole_insertion", at_m)[0] is strict
+    assert judged("borehole_insertion", at_m)[0] is strict
 
 
 @pytest.mark.parametrize(
@@ -225,9 +223,9 @@ def test_strict_insertion_needs_depth_inside_the_hole(
     ],
 )
 def test_the_papers_success_needs_alignment_and_height(
-    at_m: tuple[float, float, float], turn_rad: float, paper: bool, machine: Machine
+    at_m: tuple[float, float, float], turn_rad: float, paper: bool
 ) -> None:
-    assert judged(machine, "borehole_insertion", at_m, torch.pi / 2 + turn_rad)[1] is paper
+    assert judged("borehole_insertion", at_m, torch.pi / 2 + turn_rad)[1] is paper
 
 
 @pytest.mark.parametrize(
@@ -244,20 +242,20 @@ def test_the_papers_success_needs_alignment_and_height(
     ],
 )
 def test_a_pose_is_reached_within_three_centimetres_and_a_twentieth_of_a_radian(
-    at_m: tuple[float, float, float], turn_rad: float, strict: bool, paper: bool, machine: Machine
+    at_m: tuple[float, float, float], turn_rad: float, strict: bool, paper: bool
 ) -> None:
-    assert judged(machine, "goal_pose", at_m, torch.pi / 2 + turn_rad) == (strict, paper)
+    assert judged("goal_pose", at_m, torch.pi / 2 + turn_rad) == (strict, paper)
 
 
 @pytest.mark.parametrize("name", TASKS)
-def test_closeness_grows_on_the_way_from_none_to_one(name: str, machine: Machine) -> None:
-    goal = option("task", name).build(machine, 1, CPU).goal  # type: ignore[attr-defined]
+def test_closeness_grows_on_the_way_from_none_to_one(name: str) -> None:
     depth_m = 0.14 if name == "borehole_insertion" else 0.0
     height_m = torch.linspace(2.0, -depth_m, 50)
     target = torch.tensor([[2.5, 0.0, 0.7]]).repeat(50, 1)
     tip = target + torch.stack((0 * height_m, 0 * height_m, height_m), 1)
     down = torch.full((50,), torch.pi / 2)
-    closeness = goal.judge(tip, down, {"target_m": target, "target_pitch_rad": down})["closeness"]
+    start = {"target_m": target, "target_pitch_rad": down}
+    closeness = option("task", name).judge(tip, down, start).closeness
     assert (
         (closeness.diff() > 0).all()
         and closeness[0] > 0
@@ -399,8 +397,8 @@ def estimates(stage: Stage, count: int) -> torch.Tensor:
     """Returns the errors of the first estimates of an episode, `(count, N, 3)`."""
     found = []
     for _ in range(count):
-        stage.process.observe(stage.history)
-        found.append(stage.process.state["estimate_m"] - stage.process.state["start.target_m"])
+        seen = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
+        found.append(seen["target_in_base_m"] - stage.process.state["start.target_m"])
         stage.step()
     return torch.stack(found)
 
@@ -441,6 +439,14 @@ def test_the_bias_is_constant_within_an_episode_and_bounded(machine: Machine) ->
     assert errors[0].mean(0).abs().max() < 0.001, "all directions alike"
 
 
+def test_a_camera_sees_a_target_worse_with_the_square_of_the_distance() -> None:
+    law = noise(target_bias_m=0.002, target_bias_1_m=1e-3, camera_in_base_m=(0.3, 0.45, 1.9))
+    ahead = torch.tensor([[0.3 + 2.0, 0.45, 1.9], [0.3, 0.45, 1.9 - 3.0]])
+    found = law.measure_bias_m(ahead)
+    torch.testing.assert_close(found, torch.tensor([[0.006], [0.011]]))  # 2 + 4 and 2 + 9 mm
+    assert law.measure_sample_m(ahead) == 0.0
+
+
 def test_the_papers_noise_is_a_share_of_each_coordinate(machine: Machine) -> None:
     torch.manual_seed(0)
     stage = Stage(machine, num_envs=512, noise=noise(target_relative=0.05))
@@ -454,8 +460,8 @@ def test_positions_and_commands_are_scaled_by_one_factor_an_episode(machine: Mac
     stage = Stage(machine, num_envs=256, noise=noise(q_scale=0.1, u_scale=0.1))
     stage.history.q.fill_(1.0)
     stage.history.u.fill_(0.5)
-    _, q, u = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
-    q_factor, u_factor = q.flatten(1), u.flatten(1) / 0.5
+    seen = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
+    q_factor, u_factor = seen["q"].flatten(1), seen["u"].flatten(1) / 0.5
     for factor in (q_factor, u_factor):
         middle = factor.median(1).values
         assert (factor - middle[:, None]).abs().max() < 1e-5, "all joints and samples alike"
@@ -470,7 +476,8 @@ def test_a_scale_of_the_motion_leaves_the_newest_position_as_it_is(machine: Mach
     torch.manual_seed(0)
     stage = Stage(machine, num_envs=64, noise=noise(q_scale=0.1, q_scale_of="motion"))
     stage.history.q.copy_(torch.linspace(0.4, 1.0, 13)[None, :, None].expand(64, 13, 5))
-    _, q, _ = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
+    seen = stage.process.control.encoder.decode(stage.process.observe(stage.history)["policy"])
+    q = seen["q"]
     assert torch.allclose(q[:, -1], torch.ones(64, 5), atol=1e-6)
     factor = (q[:, -1:] - q[:, :-1]) / (1.0 - stage.history.q[:, :-1])
     assert (factor - stage.process.state["q_scale"][:, None, None]).abs().max() < 1e-4
@@ -499,18 +506,51 @@ def test_penalties_grow_with_the_share_of_worlds_whose_last_episode_succeeded(
     assert stage.step().reward.tolist() == [0.25] * 4, "and falls again where they fail"
 
 
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"memory": 14}, r"task\.memory: expected at most the 13 samples .* got 14"),
+        ({"figures": {}}, "figures.success_strict: expected"),
+    ],
+)
+def test_values_that_do_not_fit_are_refused(
+    change: dict[str, Any], told: str, machine: Machine
+) -> None:
+    with pytest.raises(ConfigError, match=told):
+        replace(option("task", "borehole_insertion"), **change).build(machine, 1, CPU)
+
+
+def test_a_hole_that_is_narrower_than_the_chisel_is_refused() -> None:
+    task = option("task", "borehole_insertion")
+    with pytest.raises(ConfigError, match=r"hole.radius_m: expected more than the chisel's 0.04 m"):
+        replace(task, hole=replace(task.hole, radius_m=0.03))
+
+
+def test_terms_of_ones_own_extend_what_the_critic_sees(machine: Machine) -> None:
+    term = ObservedTerm(
+        function="tasks.observations:tool_pitch", samples=2, mean=1.0, std=0.5, noise=0.0, bias=0.0
+    )
+    stage = Stage(machine, privileged={"pitch": term})
+    plain = Stage(machine).process.observe(stage.history)["privileged"]
+    seen = stage.process.observe(stage.history)["privileged"]
+    pitch_rad = Kinematics(machine).pose(stage.start["q"]).pitch_rad
+    assert seen.shape[1] == plain.shape[1] + 2
+    torch.testing.assert_close(seen[:, -1], (pitch_rad - 1.0) / 0.5)
+    with pytest.raises(ConfigError, match=r"no mirror image.*task\.privileged"):
+        stage.process.mirror()
+
+
 def test_without_noise_the_policy_sees_the_truth(machine: Machine) -> None:
     stage = Stage(machine, "goal_pose", num_envs=4, noise=noise())
     vector = stage.process.observe(stage.history)["policy"]
-    target, q, _ = stage.process.control.encoder.decode(vector)
-    torch.testing.assert_close(target, stage.start["target_m"], rtol=0, atol=1e-6)
-    torch.testing.assert_close(q, stage.history.q, rtol=0, atol=1e-6)
-    torch.testing.assert_close(
-        stage.process.control.encoder.decode_pitch(vector),
-        stage.start["target_pitch_rad"],
-        rtol=0,
-        atol=1e-6,
-    )
+    seen = stage.process.control.encoder.decode(vector)
+    expected = {
+        "target_in_base_m": stage.start["target_m"],
+        "q": stage.history.q,
+        "pitch_rad": stage.start["target_pitch_rad"],
+    }
+    for part, value in expected.items():
+        torch.testing.assert_close(seen[part], value, rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", TASKS)

@@ -6,14 +6,15 @@ import json
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 import torch
 import training as runs
+from composed import option
 from hydra.utils import instantiate
-from kinematic import KinematicWorld
+from kinematic import Kinematic, KinematicWorld
 
 from brokk_rl.checks import check_task
 from brokk_rl.errors import CheckpointError, ConfigError
@@ -21,25 +22,18 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
-from brokk_rl.observation import ObservationEncoder, PartsEncoder, restore_encoder
+from brokk_rl.observation import restore_encoder
 from brokk_rl.policy_folder import apply_behaviour, describe_spec, describe_task
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session
+from brokk_rl.sim.scene import find_site, make_nominal_scenes
 from brokk_rl.spec import spec
 from deploy.policy.bundle import PolicyBundle
-from tasks.reward import RewardTerm
-from tasks.term_task import (
-    HeldCriterion,
-    JointAction,
-    ObservedTerm,
-    StartsNearHome,
-    TermState,
-    TermTask,
-    UniformCommand,
-)
-from tasks.term_task.process import compute_command
-from tasks.termination import Succeeded, TimeLimit
+from tasks.process import compute_command
+from tasks.step_state import StepState
+from tasks.term_task import JointAction, StartsNearHome, TermTask, UniformCommand
+from tasks.terms import FigureTerm, HeldCriterion, ObservedTerm, RewardTerm, TerminationTerm
 
 CPU = torch.device("cpu")
 SHIPPED = Path(__file__).parents[2] / "tasks" / "policies" / "borehole_insertion"
@@ -50,15 +44,15 @@ class Turn(TermTask):
     """Turn the first joint at a wanted speed."""
 
 
-def error(state: TermState) -> torch.Tensor:
-    return state.speed[:, 0] - state.command["speed"][:, 0]
+def error(state: StepState) -> torch.Tensor:
+    return state.speed[:, 0] - state.start["speed"][:, 0]
 
 
-def is_turning(state: TermState) -> torch.Tensor:
-    return error(state).abs() < 0.01
+def is_turning(state: StepState, tolerance: float) -> torch.Tensor:
+    return error(state).abs() < tolerance
 
 
-def penalty(state: TermState) -> torch.Tensor:
+def penalty(state: StepState) -> torch.Tensor:
     return -error(state).abs()
 
 
@@ -67,10 +61,20 @@ def term(function: str, **changes: Any) -> ObservedTerm:
     return ObservedTerm(function=function, **values | changes)
 
 
+def figure(function: str, title: str) -> FigureTerm:
+    return FigureTerm(
+        function=function, reduce="last", title=title, unit="share", factor=1.0, digits=2
+    )
+
+
+TIME = TerminationTerm(function="tasks.termination:time_limit", outcome="time")
+SUCCESS = TerminationTerm(function="tasks.termination:succeeded", outcome="success")
+
+
 def make(**changes: Any) -> Turn:
     fields: dict[str, Any] = {
         "episode_s": 0.5,
-        "scene": {},
+        "scene": None,
         "start": StartsNearHome(spread=0.2, margin=0.05),
         "command": {"speed": UniformCommand(lowest=(0.1,), highest=(0.2,))},
         "observation": {
@@ -82,8 +86,14 @@ def make(**changes: Any) -> Turn:
         "action": JointAction(scale=0.5, mask=True),
         "reward": {"penalty": RewardTerm(function=f"{__name__}:penalty", weight=2.0)},
         "curriculum": None,
-        "success": HeldCriterion(function=f"{__name__}:is_turning", share=0.5, after_s=0.1),
-        "termination": {"time_limit": TimeLimit()},
+        "success": HeldCriterion(
+            function=f"{__name__}:is_turning", params={"tolerance": 0.01}, share=0.5, after_s=0.1
+        ),
+        "figures": {
+            "success_strict": figure("tasks.figures:success", "turned"),
+            "held_share": figure("tasks.figures:held_share", "turning"),
+        },
+        "termination": {"time_limit": TIME},
     }
     return Turn(**fields | changes)
 
@@ -110,7 +120,7 @@ class Stage:
 
 @pytest.fixture
 def asked(machine: Machine) -> float:
-    return float(make().build(machine, 1, CPU).starts(1, 1)["command.speed"])
+    return float(make().build(machine, 1, CPU).starts(1, 1)["speed"])
 
 
 def test_it_keeps_the_contract_of_tasks(machine: Machine) -> None:
@@ -179,7 +189,7 @@ def test_success_needs_its_share_of_the_steps_that_count(machine: Machine, asked
 
 
 def test_success_may_end_the_episode(machine: Machine, asked: float) -> None:
-    ends = {"success": Succeeded(), "time_limit": TimeLimit()}
+    ends = {"success": SUCCESS, "time_limit": TIME}
     stage = Stage(machine, termination=ends)
     reasons = [int(stage.turn(asked).reason) for _ in range(6)]
     assert stage.process.reasons == ("success", "fault", "time_limit")
@@ -210,16 +220,10 @@ def test_the_contract_names_each_part_and_gives_the_vector_back(machine: Machine
     assert described["order"] == ["joints (3 x 5)", "error (1 x 1)"] and described["size"] == 16
     assert described["parts"][1]["function"] == f"{__name__}:error"
     encoder = restore_encoder(machine, described)
-    assert isinstance(encoder, PartsEncoder)
     vector = stage.first.numpy()
-    samples = encoder.decode_inputs(vector)
+    samples = encoder.decode(vector)
     assert samples["joints"].shape == (1, 3, 5) and samples["error"].shape == (1, 1, 1)
     np.testing.assert_allclose(encoder.encode(samples), vector, atol=1e-6)
-
-
-def test_the_shipped_policy_has_the_paper_s_encoder(machine: Machine) -> None:
-    contract = json.loads((SHIPPED / "policy.json").read_text())
-    assert isinstance(restore_encoder(machine, contract["observation"]), ObservationEncoder)
 
 
 def test_its_description_gives_the_same_terms_back() -> None:
@@ -242,8 +246,8 @@ def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(
         PolicyBundle(str(tmp_path), machine)
 
 
-def test_a_task_without_a_classical_controller_is_evaluated_without_that_rival(
-    machine: Machine, tmp_path: Path
+def test_a_task_without_a_classical_controller_is_evaluated_in_its_own_words(
+    machine: Machine, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     class Resting:
         def build(self, loop: Any, seed: int) -> Any:
@@ -255,17 +259,68 @@ def test_a_task_without_a_classical_controller_is_evaluated_without_that_rival(
     found = evaluate_policies(runs.plant(machine, make()), how, session, policies)
     assert list(found["policies"]) == list(found["tasks"]) == ["resting"]
     assert found["terminations"] == {"fault": 0, "time_limit": 4}
+    assert {one["title"] for one in found["figures"].values()} == {"turned", "turning"}
+    told = capsys.readouterr().out
+    assert "turned" in told and "paper" not in told and "valve" not in told
+
+
+SITE = """<mujoco><worldbody><geom type="box" pos="{0} {1} {2}" size=".5 .05 .3"/>{3}</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("name", ["native", pytest.param("warp", marks=pytest.mark.slow)])
+def test_the_tool_feels_a_wall_of_the_scene(name: str, machine: Machine, tmp_path: Path) -> None:
+    """q1 turns the arm to the left, and a wall stands in the way of the tool."""
+    q = torch.tensor(machine.home, dtype=torch.float32)[None]
+    x_m, y_m, z_m = Kinematics(machine).pose(q).tip_in_base_m[0].tolist()
+    path = tmp_path / "site.xml"
+    path.write_text(SITE.format(x_m, y_m + 0.25, z_m, ""))
+    simulator = option("sim", name, **({"parity_worlds": 0} if name == "warp" else {}))
+    scene = make_nominal_scenes(1)
+    scene[:, 0] = -20.0
+    forces, ends = [], []
+    for site in (None, find_site(str(path), simulator)):
+        world = simulator.build(machine, "cpu", 1, site=site)
+        world.reset(torch.ones(1, dtype=torch.bool), q, scene)
+        increment = torch.zeros(1, 5)
+        increment[0, 0] = 0.02
+        force_n = 0.0
+        for _ in range(15):
+            world.step(increment)
+            force_n = max(force_n, float(world.contact_force_n))
+        assert not world.faults.any()
+        forces.append(force_n)
+        ends.append(float(world.q[0, 0]))
+    assert forces[0] == 0.0 and forces[1] > 100.0
+    assert ends[1] < ends[0] - 0.05, "the wall holds the arm"
+
+
+def test_a_scene_that_cannot_be_built_is_refused(machine: Machine, tmp_path: Path) -> None:
+    path = tmp_path / "site.xml"
+    path.write_text(SITE.format(1, 1, 1, "<body><freejoint/><geom size='.1'/></body>"))
+    native: Any = option("sim", "native")
+    with pytest.raises(ConfigError, match="must stand still"):
+        native.build(machine, "cpu", 1, site=path)
+    path.write_text("<mujoco><nothing/></mujoco>")
+    with pytest.raises(ConfigError, match="is no MJCF"):
+        native.build(machine, "cpu", 1, site=path)
+    with pytest.raises(ConfigError, match=r"expected an MJCF file, got nowhere\.xml"):
+        find_site("nowhere.xml", native)
+    with pytest.raises(ConfigError, match="sim=kinematic builds no scene"):
+        find_site(str(path), cast(Any, Kinematic()))
 
 
 @pytest.mark.parametrize(
     ("change", "told"),
     [
         (lambda: term("tasks.observations:nothing"), "observation term .* cannot be found"),
-        (lambda: term("tasks.observations:commands", std=0.0), "std of the observation term"),
-        (lambda: UniformCommand(lowest=(0.0, 1.0), highest=(1.0,)), "as many lowest as highest"),
+        (lambda: term("tasks.observations:commands", std=0.0), "std: expected"),
+        (
+            lambda: UniformCommand(lowest=(0.0, 1.0), highest=(1.0,)),
+            "expected as many values as lowest",
+        ),
         (lambda: make(termination={}), "expected a time limit"),
         (lambda: make(observation={"error": None}), "expected one term or more"),
-        (lambda: make(episode_s=0.1), "task.episode_s"),
+        (lambda: make(episode_s=0.1), "episode_s: expected more than success.after_s"),
     ],
 )
 def test_a_bad_value_is_refused(change: Any, told: str) -> None:

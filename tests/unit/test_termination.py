@@ -2,79 +2,70 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import torch
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from tasks.managers import TerminationManager
 from tasks.step_state import StepState
-from tasks.termination import (
-    ContactForce,
-    EpisodeTerms,
-    JointLimit,
-    StartInContact,
-    Succeeded,
-    TerminationTerm,
-    TimeLimit,
-    TipLeft,
-    check_terminations,
-)
+from tasks.terms import TerminationTerm, check_terminations
 
 NOWHERE = torch.zeros(3, dtype=torch.bool)
 
 
-def state(**changes: Any) -> StepState:
+def state(q: torch.Tensor | None = None, **changes: Any) -> StepState:
     """Returns three environments in the middle of an episode in which nothing ends."""
-    fields: dict[str, Any] = {
-        name: torch.zeros(3) for name in ("pitch_rad", "contact_force_n", "peak_force_n", "steps")
-    }
-    fields |= {name: torch.zeros(3, 2) for name in ("q", "u", "u_before")}
+    names = ("pitch_rad", "contact_force_n", "peak_force_n", "steps", "age", "held_share")
+    fields: dict[str, Any] = {name: torch.zeros(3) for name in names}
+    fields |= {name: torch.zeros(3, 2) for name in ("u", "u_before")}
+    still = (torch.zeros(3, 2) if q is None else q)[:, None]
+    fields |= {"history": History(q=still, u=still), "start": {}, "kinematics": None}
     fields |= {"lower": -torch.ones(2), "upper": torch.ones(2), "tip_m": torch.zeros(3, 3)}
-    fields |= {"max_steps": 10} | dict.fromkeys(("is_first", "success", "failed"), NOWHERE)
+    fields |= {"max_steps": 10, "period_s": 0.05, "success": NOWHERE, "failed": NOWHERE}
     return StepState(**fields | changes)
 
 
-def drops(state: StepState) -> torch.Tensor:
-    return state.tip_m[:, 2] < -1.0
+def ends(name: str, outcome: Any = "failure", **params: Any) -> TerminationTerm:
+    return TerminationTerm(function=f"tasks.termination:{name}", params=params, outcome=outcome)
+
+
+SUCCESS, START, TIME = (
+    ends("succeeded", "success"),
+    ends("start_in_contact", "void"),
+    ends("time_limit", "time"),
+)
 
 
 @pytest.mark.parametrize(
     ("term", "changes"),
     [
-        (JointLimit(margin=0.1), {"q": torch.tensor([[0.0, 0.0], [0.0, -0.91], [0.89, 0.0]])}),
-        (ContactForce(largest_n=100.0), {"contact_force_n": torch.tensor([0.0, 101.0, 100.0])}),
+        (ends("joint_limit", margin=0.1), {"q": [[0.0, 0.0], [0.0, -0.91], [0.89, 0.0]]}),
+        (ends("contact_force", largest_n=100.0), {"contact_force_n": [0.0, 101.0, 100.0]}),
         (
-            TipLeft(x_m=(-1, 1), y_m=(-1, 1), z_m=(0, 2)),
-            {"tip_m": torch.tensor([[1.0, -1.0, 0.0], [0.0, 1.1, 0.5], [-1.0, 0.5, 2.0]])},
+            ends("tip_left", x_m=[-1, 1], y_m=[-1, 1], z_m=[0, 2]),
+            {"tip_m": [[1.0, -1.0, 0.0], [0.0, 1.1, 0.5], [-1.0, 0.5, 2.0]]},
         ),
-        (TimeLimit(), {"steps": torch.tensor([0.0, 10.0, 9.0])}),
-        (Succeeded(), {"success": torch.tensor([False, True, False])}),
-        (
-            StartInContact(),
-            {
-                "is_first": torch.tensor([True, True, False]),
-                "contact_force_n": torch.tensor([0.0, 1.0, 1.0]),
-            },
-        ),
-        (
-            TerminationTerm(function=f"{__name__}:drops", outcome="failure"),
-            {"tip_m": torch.tensor([[0.0, 0.0, -1.0], [0.0, 0.0, -1.1], [0.0, 0.0, 0.0]])},
-        ),
+        (TIME, {"steps": [0.0, 10.0, 9.0]}),
+        (SUCCESS, {"success": [False, True, False]}),
+        (START, {"age": [1.0, 1.0, 2.0], "contact_force_n": [0.0, 1.0, 1.0]}),
     ],
-    ids=lambda value: type(value).__name__,
+    ids=lambda value: getattr(value, "function", ""),
 )
 def test_a_term_holds_in_the_second_environment_only(term: Any, changes: dict[str, Any]) -> None:
-    assert term(state(**changes)).tolist() == [False, True, False]
+    here = state(**{name: torch.tensor(value) for name, value in changes.items()})
+    assert term.resolve()(here).tolist() == [False, True, False]
 
 
 def test_the_first_term_counts_and_time_counts_last() -> None:
-    terms = EpisodeTerms(
+    terms = TerminationManager(
         {
-            "time_limit": TimeLimit(),
-            "blow": ContactForce(largest_n=100.0),
+            "time_limit": TIME,
+            "blow": ends("contact_force", largest_n=100.0),
             "off": None,
-            "limit": JointLimit(margin=0.0),
+            "limit": ends("joint_limit", margin=0.0),
         }
     )
     assert terms.reasons == ("blow", "limit", "fault", "time_limit")
@@ -96,10 +87,8 @@ def test_the_first_term_counts_and_time_counts_last() -> None:
 
 
 def test_a_void_start_is_no_success_and_no_failure() -> None:
-    terms = EpisodeTerms(
-        {"success": Succeeded(), "start": StartInContact(), "time_limit": TimeLimit()}
-    )
-    here = state(is_first=~NOWHERE, success=~NOWHERE, contact_force_n=torch.tensor([1.0, 0.0, 0.0]))
+    terms = TerminationManager({"success": SUCCESS, "start": START, "time_limit": TIME})
+    here = state(age=torch.ones(3), success=~NOWHERE, contact_force_n=torch.tensor([1.0, 0.0, 0.0]))
     endings = terms.judge(here, NOWHERE)
     assert here.success.tolist() == [False, True, True] and not here.failed.any()
     assert endings.reason.tolist() == [1.0, 0.0, 0.0]
@@ -109,10 +98,9 @@ def test_a_void_start_is_no_success_and_no_failure() -> None:
 @pytest.mark.parametrize(
     ("terms", "told"),
     [
-        ({"success": Succeeded()}, "expected a time limit"),
+        ({"success": SUCCESS}, "expected a time limit"),
         ({"time_limit": None}, "expected a time limit"),
-        ({"odd": 3.0, "time_limit": TimeLimit()}, "termination.odd: float is no termination term"),
-        ({"fault": TimeLimit()}, "termination.fault: the simulator's own faults"),
+        ({"fault": TIME}, "termination.fault: the simulator's own faults"),
     ],
 )
 def test_a_list_that_cannot_end_an_episode_is_refused(terms: dict[str, Any], told: str) -> None:
@@ -123,11 +111,10 @@ def test_a_list_that_cannot_end_an_episode_is_refused(terms: dict[str, Any], tol
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (lambda: ContactForce(largest_n=0.0), "largest_n"),
-        (lambda: TipLeft(x_m=(1, 0), y_m=(0, 1), z_m=(0, 1)), "x_m of the termination TipLeft"),
-        (lambda: TerminationTerm(function="tasks.reward:nothing", outcome="void"), "cannot be fou"),
-        (lambda: TerminationTerm(function="tasks.reward:success", outcome=cast(Any, "end")), "out"),
-        (lambda: TerminationTerm(function="tasks.noise:ROOT", outcome="void"), "is no function"),
+        (lambda: ends("nothing"), "termination term .* cannot be found"),
+        (lambda: ends("TYPE_CHECKING"), "is no function"),
+        (lambda: ends("succeeded", "end"), "outcome: expected"),
+        (lambda: ends("joint_limit"), "missing a required argument: 'margin'"),
     ],
 )
 def test_a_bad_value_of_a_term_is_refused(make: Any, told: str) -> None:

@@ -26,7 +26,7 @@ from hydra.utils import instantiate
 
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from tasks.classical import ClassicalController, ControllerGuidance
-from tasks.process import ToolPoseProcess
+from tasks.tool_pose import ToolPoseProcess
 
 SEED = 20261123
 NUM_CANDIDATES, NUM_STARTS, NUM_ELITES = 32, 64, 6

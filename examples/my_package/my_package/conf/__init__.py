@@ -1,0 +1,1 @@
+"""Options of this package."""

@@ -1,0 +1,153 @@
+"""Inserting the chisel into a vertical borehole in a concrete block (the paper's task)."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, ClassVar
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.spec import Finite, NonNegativeRange, Positive, Range, spec
+from tasks.settings import CandidateTargets, PoseJudgement, ToolPoseTask, Uniform
+
+if TYPE_CHECKING:
+    import torch
+
+
+@spec
+class BoreholeRanges:
+    """Ranges of the borehole; uniform (lowest, highest).
+
+    Attributes:
+        distance_m: Horizontal distance of the rim's centre from the slew axis.
+        bearing_rad: Bearing of the hole from straight ahead.
+        rim_z_m: Height of the rim above the ground.
+        yaw_rad: Orientation of the block.
+        block_scale: Scale of the block's footprint.
+        radius_m: Radius of the hole.
+    """
+
+    distance_m: NonNegativeRange
+    bearing_rad: Range
+    rim_z_m: Range
+    yaw_rad: Range
+    block_scale: NonNegativeRange
+    radius_m: Positive
+
+
+@spec
+class InsertionCriteria:
+    """Criteria of an inserted chisel.
+
+    Attributes:
+        strict_depth_m: Depth of the tip below the rim, inside the hole.
+        chisel_radius_m: Radius of the chisel; the tip is inside when it is off axis by no more than
+            the clearance.
+        slack_m: Softness of contacts and the corners of the polygon that stands for the round hole.
+        paper_alignment: Both r^d and r^o at least this.
+        paper_height_m: Height of the tip below the rim at the paper's limit (0.7 m with a nominal
+            rim of 0.75 m).
+    """
+
+    strict_depth_m: Positive
+    chisel_radius_m: Positive
+    slack_m: Finite
+    paper_alignment: Positive
+    paper_height_m: Finite
+
+
+@spec
+class BoreholeInsertion(ToolPoseTask):
+    """Insert the 8 cm chisel into the 10 cm borehole of a concrete block.
+
+    Attributes:
+        depth_m: Depth below the rim of the target point (paper: 0.1 m; a little more makes the
+            controller pass the strict depth).
+        hole: Where the hole may be.
+        success: Criteria.
+    """
+
+    depth_m: Finite
+    hole: BoreholeRanges
+    success: InsertionCriteria
+
+    behaviour: ClassVar[tuple[str, ...]] = ("depth_m", *ToolPoseTask.behaviour)
+
+    def check(self) -> None:
+        super().check()
+        if self.hole.radius_m <= self.success.chisel_radius_m:
+            raise ConfigError(
+                f"hole.radius_m: expected more than the chisel's {self.success.chisel_radius_m:g} m "
+                f"(success.chisel_radius_m), got {self.hole.radius_m:g}; change one of them"
+            )
+
+    @property
+    def aim_below_m(self) -> float:
+        """The depth; see `ToolPoseTask`."""
+        return self.depth_m
+
+    @property
+    def fixed_pitch_rad(self) -> float:
+        """Straight down, rad (the paper's 1.57)."""
+        return math.pi / 2
+
+    def draw_targets(self, uniform: Uniform) -> CandidateTargets:
+        """Draw boreholes; see `ToolPoseTask`."""
+        hole = self.hole
+        distance, bearing = uniform(hole.distance_m), uniform(hole.bearing_rad)
+        x_m, y_m, z_m = distance * bearing.cos(), distance * bearing.sin(), uniform(hole.rim_z_m)
+        columns = {
+            "hole_x_m": x_m,
+            "hole_y_m": y_m,
+            "rim_z_m": z_m,
+            "yaw_rad": bearing + uniform(hole.yaw_rad),
+            "block_scale": uniform(hole.block_scale),
+            "hole_radius_m": hole.radius_m,
+        }
+        down = distance.new_full(distance.shape, self.fixed_pitch_rad)
+        return CandidateTargets((x_m, y_m, z_m), down, columns, z_m)
+
+    def judge(
+        self, tip_m: torch.Tensor, pitch_rad: torch.Tensor, start: dict[str, torch.Tensor]
+    ) -> PoseJudgement:
+        """Judge tool poses; see `ToolPoseTask`."""
+        rules, rim = self.success, start["target_m"]
+        lateral = (tip_m - rim)[:, :2].norm(dim=1)
+        below = rim[:, 2] - tip_m[:, 2]
+        inside = lateral <= self._clearance_m
+        target = rim.clone()
+        target[:, 2] -= self.depth_m
+        distance = (target - tip_m).norm(dim=1)
+        turn = (start["target_pitch_rad"] - pitch_rad).abs()
+        near = 1 / (1 + distance) >= rules.paper_alignment
+        aligned = near & (1 / (1 + turn) >= rules.paper_alignment)
+        return PoseJudgement(
+            success=inside & (below >= rules.strict_depth_m),
+            paper_success=aligned & (below >= rules.paper_height_m),
+            closeness=_measure_closeness(
+                distance, lateral, turn, below * inside / rules.strict_depth_m
+            ),
+        )
+
+    def describe_success(self) -> dict[str, float]:
+        """Return depth and lateral error; see `ToolPoseTask`."""
+        depth_m = self.success.strict_depth_m
+        return {"least_depth_below_target_m": depth_m, "largest_lateral_m": self._clearance_m}
+
+    @property
+    def _clearance_m(self) -> float:
+        """Distance from the hole's axis up to which the tip is inside."""
+        return self.hole.radius_m - self.success.chisel_radius_m + self.success.slack_m
+
+
+def _measure_closeness(
+    distance_m: torch.Tensor, lateral_m: torch.Tensor, turn_rad: torch.Tensor, inside: torch.Tensor
+) -> torch.Tensor:
+    """Return the closeness of an insertion, 0 to 1.
+
+    Sum of distance at three scales, alignment at three, and depth inside the hole.
+    """
+    approach = sum(1 / (1 + distance_m / scale) for scale in (1.0, 0.3, 0.1)) / 3
+    aligned = sum(1 / (1 + lateral_m / scale) for scale in (0.1, 0.03, 0.01)) / 3
+    upright = 1 / (1 + turn_rad / 0.2)
+    deep = inside.clamp(0.0, 1.0)
+    return 0.3 * approach + 0.3 * aligned * approach + 0.1 * upright + 0.3 * deep

@@ -1,0 +1,268 @@
+"""Episodes of a task that moves the tool to a pose.
+
+A classical controller stands beside the policy: it is the baseline, and the base on which the
+default policy learns a residual. A camera sees the target, with errors.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from dataclasses import asdict
+from typing import Any
+
+import torch
+
+from brokk_rl.errors import ConfigError
+from brokk_rl.history import History
+from brokk_rl.kinematics import Kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.observation import PITCH, PROPOSALS, TARGET
+from brokk_rl.symmetry import Mirror, compute_joint_signs
+from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
+from tasks.process import START, EpisodeProcess
+from tasks.settings import ToolPoseTask
+from tasks.starts import DrawTally, draw_starts, move_starts_near
+from tasks.step_state import ToolState
+from tasks.terms import ObservedTerm
+
+FORCE_SCALE_N, MAX_SCALED_FORCE = 2000.0, 5.0
+"""Scale and bound of forces in the critic's group: 10 kN, where reward terms saturate too."""
+NUM_SAME = 7
+"""Numbers of the critic's group behind the error of the estimate; see `_compute_privileged`."""
+
+
+class ToolPoseProcess(EpisodeProcess):
+    """Episodes with a target pose and a classical controller."""
+
+    def __init__(
+        self, task: ToolPoseTask, machine: Machine, num_envs: int, device: torch.device
+    ) -> None:
+        self.task, self.control = task, ToolPoseControl(task, machine, device)
+        self._sensed_m: torch.Tensor | None = None
+        super().__init__(task, machine, num_envs, device)
+
+    def _list_shapes(self) -> dict[str, tuple[int, ...]]:
+        joints = (self._machine.num_joints,)
+        shapes = super()._list_shapes() | {"closeness": ()}
+        # errors of this episode's observation, and the sum of the samples of the target
+        shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "q_scale": (), "u_scale": ()}
+        # what the next command needs of an observation
+        shapes |= {"positioning": (), "rule_reach_m": ()}
+        shapes |= {"base": joints, "lowest": joints, "highest": joints}
+        if self.control.adviser:
+            shapes["proposed"] = (self._machine.num_history, *joints)
+        return shapes
+
+    def _list_drawn_shapes(self) -> dict[str, tuple[int, ...]]:
+        return {"target_m": (3,), "target_pitch_rad": (), "closeness": ()}
+
+    def _list_groups(self) -> dict[str, dict[str, ObservedTerm | None]]:
+        return {"privileged": self.task.privileged}
+
+    def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
+        """Draw valid starts; see `TaskProcess.starts`."""
+        return self._judge_starts(draw_starts(self.task, self._machine, count, seed))
+
+    def count_starts(self, count: int, seed: int) -> dict[str, float]:
+        """Return shares of drawn candidates; see `TaskProcess.count_starts`."""
+        tally = DrawTally("", count)
+        with contextlib.suppress(ConfigError):  # nearly none can be done, as the shares say
+            draw_starts(self.task, self._machine, count, seed, tally)
+        return tally.get_shares()
+
+    def bring_near(
+        self, start: dict[str, torch.Tensor], share: float, height_m: tuple[float, float], seed: int
+    ) -> dict[str, torch.Tensor]:
+        """Return starts with some above their target; see `TaskProcess.bring_near`."""
+        start = {name: value.cpu() for name, value in start.items()}
+        moved = move_starts_near(self.task, self._machine, start, share, height_m, seed)
+        return self._judge_starts(moved)
+
+    def _judge_starts(self, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        pose = Kinematics(self._machine, "cpu").pose(start["q"])
+        verdict = self.task.judge(pose.tip_in_base_m, pose.pitch_rad, start)
+        return start | {"tip_m": pose.tip_in_base_m, "closeness": verdict.closeness}
+
+    def _draw_errors(self, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        noise = self.task.noise
+        uniform = torch.rand(len(start["q"]), 5, device=start["q"].device)
+        # a direction spread evenly over the sphere
+        turn, lift = uniform[:, 0] * (2 * math.pi), uniform[:, 1] * 2 - 1
+        flat = torch.sqrt(1 - lift.square())
+        bias = torch.stack((flat * turn.cos(), flat * turn.sin(), lift), 1) * uniform[:, 2:3]
+        return super()._draw_errors(start) | {
+            "bias_m": bias * noise.measure_bias_m(start["target_m"]),
+            "q_scale": 1 + noise.q_scale * (2 * uniform[:, 3] - 1),
+            "u_scale": 1 + noise.u_scale * (2 * uniform[:, 4] - 1),
+            "closeness": start["closeness"],
+        }
+
+    def move_target(self, mask: torch.Tensor, shift_m: torch.Tensor) -> None:
+        """Shift targets and what was estimated of them; see `TaskProcess.move_target`."""
+        state = self.state
+        shift_m = torch.where(mask[:, None], shift_m, 0.0)
+        state[f"{START}target_m"] += shift_m
+        state[f"{START}scene"][:, :3] += shift_m
+        # one sample came with the reset, and one with each step since
+        state["estimate_sum_m"] += (state["age"] + 1)[:, None] * shift_m
+
+    def command(self, action: torch.Tensor) -> torch.Tensor:
+        """Return masked commands or proposals; see `TaskProcess.command`."""
+        state = self.state
+        proposed = state.get("proposed")
+        u = self.control.command(
+            action,
+            state["base"],
+            state["lowest"],
+            state["highest"],
+            state["positioning"].bool(),
+            proposed,
+        )
+        if proposed is not None:
+            proposed.copy_(torch.cat((proposed[:, 1:], u[:, None]), 1))
+        return self._remember_command(u)
+
+    def _make_state(self, history: History, force_n: torch.Tensor) -> ToolState:
+        state, values = self.state, self._list_values(history, force_n)
+        start = values["start"]
+        verdict = self.task.judge(values["tip_m"], values["pitch_rad"], start)
+        values |= {
+            "success": verdict.success,
+            "target_m": start["target_m"] - self.control.down,
+            "target_pitch_rad": start["target_pitch_rad"],
+            "reach_m": state["rule_reach_m"],
+            "reach_range_m": self.task.switch.reach_m,
+            "positioning": state["positioning"].bool(),
+            "paper_success": verdict.paper_success,
+            "closeness": verdict.closeness,
+            "closeness_before": state["closeness"],
+        }
+        return ToolState(**values)
+
+    def _remember(self, seen: Any) -> None:
+        super()._remember(seen)
+        self.state["closeness"].copy_(seen.closeness)
+
+    def observe(
+        self, history: History, shift_m: torch.Tensor | None = None
+    ) -> dict[str, torch.Tensor]:
+        """Return `policy`, `guide` (`compute_features`) and `privileged` (for the critic only).
+
+        See `TaskProcess.observe`.
+        """
+        state = self.state
+        estimate_m = self._estimate_target(shift_m)
+        seen = self.control.process(
+            estimate_m,
+            self._scale_positions(history.q),
+            history.u * state["u_scale"][:, None, None],
+            state[f"{START}target_pitch_rad"],
+            state.get("proposed"),
+        )
+        guidance = seen.guidance
+        state["positioning"].copy_(seen.positioning)
+        state["rule_reach_m"].copy_(self.task.switch.reach(guidance))
+        state["base"].copy_(guidance.command)
+        state["lowest"].copy_(guidance.lowest)
+        state["highest"].copy_(guidance.highest)
+        privileged = self._compute_privileged(estimate_m)
+        if self._observed.encoders:
+            terms = self._observed.observe(self._make_state(history, state["contact_force_n"]))
+            privileged = torch.cat((privileged, terms["privileged"]), 1)
+        return {"policy": seen.vector, "guide": seen.features, "privileged": privileged}
+
+    def _estimate_target(self, shift_m: torch.Tensor | None) -> torch.Tensor:
+        """Return the sensed target, or draw a noisy sample and return the estimate, `(N, 3)`."""
+        noise, state = self.task.noise, self.state
+        if self._sensed_m is not None:
+            return self._sensed_m if shift_m is None else self._sensed_m + shift_m
+        true_m = state[f"{START}target_m"]
+        error = (2 * torch.rand_like(true_m) - 1) * noise.measure_sample_m(true_m)
+        if noise.target_relative:
+            error = error + (2 * torch.rand_like(true_m) - 1) * noise.target_relative * true_m
+        sample = true_m + state["bias_m"] + error
+        if shift_m is not None:
+            sample = sample + shift_m
+        state["estimate_sum_m"] += sample
+        if noise.filter == "none":
+            return sample
+        # the observation after the reset is the first sample
+        return state["estimate_sum_m"] / (state["age"] + 1)[:, None]
+
+    def _scale_positions(self, q: torch.Tensor) -> torch.Tensor:
+        """Return measured positions `(N, H, J)` with this episode's scale error."""
+        scale = self.state["q_scale"][:, None, None]
+        if self.task.noise.q_scale_of == "position":
+            return q * scale
+        newest = q[:, -1:]
+        return newest + (q - newest) * scale
+
+    def _compute_privileged(self, estimate_m: torch.Tensor) -> torch.Tensor:
+        """Return what only the critic sees, scaled to about 1, without the terms of the YAML.
+
+        Error of the estimate (3), scale errors (2), contact force and its peak, spent share of the
+        time limit, closeness, phase.
+        """
+        state = self.state
+        rest = (
+            (state["q_scale"] - 1) * 100,
+            (state["u_scale"] - 1) * 10,
+            (state["contact_force_n"] / FORCE_SCALE_N).clamp(max=MAX_SCALED_FORCE),
+            (state["peak_force_n"] / FORCE_SCALE_N).clamp(max=MAX_SCALED_FORCE),
+            state["steps"] / self.max_episode_steps,
+            state["closeness"],
+            state["positioning"],
+        )
+        error = (estimate_m - state[f"{START}target_m"]) * 100
+        return torch.cat((error, torch.stack(rest, 1)), 1)
+
+    def classical_action(self, groups: dict[str, torch.Tensor]) -> torch.Tensor:
+        """Return the classical controller's action; see `TaskProcess.classical_action`."""
+        command, action = groups["guide"][:, : self.num_actions], self.task.action
+        return torch.zeros_like(command) if action.kind == "residual" else command / action.scale
+
+    def describe(self) -> dict[str, Any]:
+        """Return the contract of the `policy` group; see `TaskProcess.describe`."""
+        task, description = self.task, self.control.encoder.describe()
+        description |= {"target_filter": task.noise.filter, "switch": asdict(task.switch)}
+        if task.advice:
+            description["advice"] = asdict(task.advice)
+        stop = {"success": task.describe_success()} | self._endings.describe()
+        return description | {"masked": task.action.mask, "stop": stop}
+
+    def deployable(self, network: torch.nn.Module) -> torch.nn.Module:
+        """Return the policy as one module; see `TaskProcess.deployable`."""
+        return DeployedPolicy(self.control, network, self.task.fixed_pitch_rad)
+
+    def mirror(self) -> Mirror:
+        """Return the mirror of observations and actions; see `TaskProcess.mirror`."""
+        if self._observed.encoders:
+            self.refuse("mirror", "of the terms in task.privileged; leave these out")
+        signs = self.state["u"].new_tensor(compute_joint_signs(self._machine))
+        # of a point only y changes sides
+        across = signs.new_tensor([1.0, -1.0, 1.0])
+        sides = {TARGET: across, "q": signs, "u": signs, PROPOSALS: signs, PITCH: signs.new_ones(1)}
+        factors, shifts = [], []
+        for name, part in self.control.encoder.parts.items():
+            factor = sides[name].repeat(part.size // len(sides[name]))
+            mean, std = torch.as_tensor(part.mean), torch.as_tensor(part.std)
+            shift = (sides[name] - 1) * (mean / std).to(signs)
+            factors.append(factor)
+            shifts.append(shift.repeat(part.size // len(shift)))
+        groups = {"policy": (torch.cat(factors), torch.cat(shifts))}
+        critic = torch.cat((across, signs.new_ones(NUM_SAME)))
+        for name, factor in {"guide": list_feature_signs(signs), "privileged": critic}.items():
+            groups[name] = factor, torch.zeros_like(factor)
+        return Mirror(groups, signs)
+
+    def take_estimate(self, target_m: torch.Tensor) -> None:
+        """Take estimated targets; see `TaskProcess.take_estimate`."""
+        self._sensed_m = target_m
+
+    def plan(
+        self, q: torch.Tensor, target_m: torch.Tensor, num_times: int, step_s: float
+    ) -> torch.Tensor:
+        """Return the controller's plan, `(N, T, J)`; see `TaskProcess.plan`."""
+        pitch_rad = self.state[f"{START}target_pitch_rad"]
+        return self.control.plan(q, target_m, pitch_rad, num_times, step_s)
