@@ -23,7 +23,8 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.observation import restore_encoder
-from brokk_rl.policy_folder import apply_behaviour, describe_spec, describe_task
+from brokk_rl.policy_choice import apply_behaviour
+from brokk_rl.policy_folder import describe_spec, describe_task
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session
