@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from brokk_rl.checks.exercise import require
 from brokk_rl.contracts.link import Link
 from brokk_rl.errors import BrokkError
 from brokk_rl.machine import Machine
@@ -22,30 +21,20 @@ def check_link(link: Link, machine: Machine, num_runs: int = 1) -> None:
     with link as open_link:
         first = open_link.read()
         shape = (num_runs, machine.num_joints) if num_runs > 1 else (machine.num_joints,)
-        require(
-            np.shape(first.q) == shape,
-            f"read: expected positions of shape {shape}, got {np.shape(first.q)}",
-        )
-        require(
-            bool(np.isfinite(np.asarray(first.q)).all()) and math.isfinite(first.t_s),
-            "read: positions or time are not finite",
-        )
-        sent = open_link.send(Command(np.zeros(shape)))
-        require(
-            np.array_equal(np.asarray(sent.u), np.zeros(shape)),
-            f"send: a standstill was sent as {sent.u}",
-        )
-        require(open_link.read().t_s >= first.t_s, "read: time runs backwards")
+        found = np.shape(first.q)
+        assert found == shape, f"read: expected positions of shape {shape}, got {found}"
+        is_finite = np.isfinite(np.asarray(first.q)).all() and math.isfinite(first.t_s)
+        assert is_finite, "read: positions or time are not finite"
+        sent = open_link.send(Command(np.zeros(shape))).u
+        text = f"send: a standstill was sent as {sent}"
+        assert np.array_equal(np.asarray(sent), np.zeros(shape)), text
+        assert open_link.read().t_s >= first.t_s, "read: time runs backwards"
         for name, value in getattr(open_link, "extra", dict)().items():
-            require(
-                np.shape(value) in ((), (num_runs,)),
-                f"extra: '{name}' has shape {np.shape(value)}, expected one number a machine",
-            )
+            text = f"extra: '{name}' has shape {np.shape(value)}, expected one number a machine"
+            assert np.shape(value) in ((), (num_runs,)), text
         try:
-            sent = open_link.send(Command(np.full(shape, np.nan)))
+            sent = open_link.send(Command(np.full(shape, np.nan))).u
         except BrokkError:
             return
-        require(
-            bool((np.asarray(sent.u) == 0).all()),
-            f"send: a command that is no number was sent as {sent.u}",
-        )
+        text = f"send: a command that is no number was sent as {sent}"
+        assert not np.asarray(sent).any(), text

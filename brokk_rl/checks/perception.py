@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from brokk_rl.checks.exercise import require
 from brokk_rl.contracts.vision import BoreholeFinder, FinderSpec, FrameDetections, HolePose
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
@@ -30,7 +29,7 @@ def check_finder(finder_spec: FinderSpec) -> None:
         AssertionError: a promise is broken; the message says which.
     """
     finder = finder_spec.build()
-    require(callable(getattr(finder, "find", None)), "build: the finder has no method find(frame)")
+    assert callable(getattr(finder, "find", None)), "build: the finder has no method find(frame)"
     generator = np.random.default_rng(0)
     hole = _draw_hole(generator)
     noise = replace(
@@ -61,49 +60,45 @@ def _draw_hole(generator: np.random.Generator) -> Frame:
 def _check_frame(finder: BoreholeFinder, frame: Frame) -> None:
     """Call `find` twice on copies of a frame and check both answers."""
     copy = replace(frame, color=frame.color.copy(), depth_m=frame.depth_m.copy())
-    found, again = _find(finder, copy), _find(finder, copy)
-    unchanged = np.array_equal(copy.color, frame.color)
-    unchanged &= np.array_equal(copy.depth_m, frame.depth_m, equal_nan=True)
-    require(unchanged, "find: changed the frame")
-    other_answer = "find: the same frame gives another answer"
-    require((found is None) == (again is None), other_answer)
-    if found is None or again is None:
-        return
-    require(len(found.holes) == len(again.holes), other_answer)
-    for hole, same in zip(found.holes, again.holes, strict=True):
+    found, again = _list_holes(finder, copy), _list_holes(finder, copy)
+    assert np.array_equal(copy.color, frame.color), "find: changed the frame"
+    is_kept = np.array_equal(copy.depth_m, frame.depth_m, equal_nan=True)
+    assert is_kept, "find: changed the frame"
+    assert len(found) == len(again), "find: the same frame gives another answer"
+    for hole, same in zip(found, again, strict=True):
         _check_hole(hole)
-        require(np.array_equal(hole.center_m, same.center_m), other_answer)
-    scores = [hole.score for hole in found.holes]
-    require(scores == sorted(scores, reverse=True), f"find: the surest first, got scores {scores}")
+        is_same = np.array_equal(hole.center_m, same.center_m)
+        assert is_same, "find: the same frame gives another answer"
+    scores = [hole.score for hole in found]
+    is_sorted = scores == sorted(scores, reverse=True)
+    assert is_sorted, f"find: the surest first, got scores {scores}"
 
 
-def _find(finder: BoreholeFinder, frame: Frame) -> FrameDetections | None:
-    """Return the answer of a finder, `None` where it refuses the frame."""
+def _list_holes(finder: BoreholeFinder, frame: Frame) -> list[HolePose]:
+    """Return the holes that a finder sees, none where it refuses the frame."""
     try:
         found = finder.find(frame)
     except FrameError:
-        return None
-    require(
-        isinstance(found, FrameDetections),
-        f"find: expected FrameDetections (brokk_rl.contracts.vision), got {type(found).__name__}",
-    )
-    return found
+        return []
+    kind = type(found).__name__
+    text = f"find: expected FrameDetections (brokk_rl.contracts.vision), got {kind}"
+    assert isinstance(found, FrameDetections), text
+    return list(found.holes)
 
 
 def _check_hole(hole: HolePose) -> None:
     center, axis = np.asarray(hole.center_m), np.asarray(hole.axis)
     is_point = center.shape == (3,) and bool(np.isfinite(center).all())
-    require(is_point, f"find: centre {center} is no point")
+    assert is_point, f"find: centre {center} is no point"
     is_unit = axis.shape == (3,) and abs(float(np.linalg.norm(axis)) - 1.0) < UNIT_TOLERANCE
-    require(is_unit, f"find: axis {axis} is not a unit vector")
-    require(hole.radius_m > 0, f"find: radius {hole.radius_m}")
-    require(0 <= hole.score <= 1, f"find: score {hole.score}, expected 0 to 1")
-    require(
-        hole.frame in ("camera", "base"), f"find: frame '{hole.frame}', expected camera or base"
-    )
+    assert is_unit, f"find: axis {axis} is not a unit vector"
+    assert hole.radius_m > 0, f"find: radius {hole.radius_m}"
+    assert 0 <= hole.score <= 1, f"find: score {hole.score}, expected 0 to 1"
+    frame = hole.frame
+    assert frame in ("camera", "base"), f"find: frame '{frame}', expected camera or base"
     for name in ("cov_m2", "axis_cov_rad2"):
         covariance = np.asarray(getattr(hole, name))
         is_symmetric = covariance.shape == (3, 3) and np.allclose(covariance, covariance.T)
-        require(is_symmetric, f"find: {name} is not symmetric")
+        assert is_symmetric, f"find: {name} is not symmetric"
         smallest = float(np.linalg.eigvalsh(covariance).min())
-        require(smallest >= NEGATIVE_VARIANCE, f"find: {name} has negative variances")
+        assert smallest >= NEGATIVE_VARIANCE, f"find: {name} has negative variances"

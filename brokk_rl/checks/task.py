@@ -11,12 +11,12 @@ import torch
 from brokk_rl.checks.exercise import (
     NUM_ENVS,
     build_rest_history,
+    check_in_place,
+    check_rows,
+    check_same,
     copy_tensors,
-    is_in_place,
     is_same,
     isolate_randomness,
-    require,
-    require_rows,
     view_tensors,
 )
 from brokk_rl.contracts.task import FAULT, STEPS, SUCCESS, Task, TaskProcess
@@ -30,7 +30,7 @@ range."""
 
 
 def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu") -> None:
-    """Check a task against `TaskProcess`, and against the optional contracts that it offers.
+    """Check a task against `TaskProcess`, and the optional methods that it offers.
 
     The arm does not move meanwhile: no simulator is needed.
 
@@ -44,41 +44,35 @@ def check_task(task: Task, machine: Machine, device: torch.device | str = "cpu")
         drawn = _check_starts(process, machine)
         start = {name: value.to(device) for name, value in drawn.items()}
         history = build_rest_history(machine, device, start["q"])
-        state_places, episode_places = view_tensors(process.state), view_tensors(process.episode)
+        places = view_tensors(process.state), view_tensors(process.episode)
 
         groups = _check_observation(process, history, start)
         _check_commands(process, machine, device)
         _check_optional(process, groups, machine)
         _check_episode(process, history, device)
-        require(
-            is_in_place(process.state, state_places)
-            and is_in_place(process.episode, episode_places),
-            "state, episode: a tensor moved or changed its shape; write it in place",
-        )
-        _check_reset_mask(process, start, device)
+        check_in_place(process.state, places[0], "state")
+        check_in_place(process.episode, places[1], "episode")
+        before = copy_tensors(process.state)
+        process.reset(torch.arange(NUM_ENVS, device=device) == 0, start)
+        for name, value in process.state.items():
+            text = f"reset: state '{name}' changed in environments outside the mask"
+            assert is_same(value[1:], before[name][1:]), text
 
 
 def _check_attributes(process: TaskProcess) -> None:
-    require(
-        process.num_actions > 0 and process.max_episode_steps > 0,
-        "num_actions and max_episode_steps: expected 1 or more",
-    )
-    require(
-        len(set(process.reasons)) == len(process.reasons) > 0,
-        f"reasons: expected different names, got {process.reasons}",
-    )
-    require(
-        FAULT in process.reasons,
-        f"reasons: expected '{FAULT}', for worlds that diverged, among {process.reasons}",
-    )
-    require_rows(process.state, "state")
-    require_rows(process.episode, "episode")
-    for mapping, name, text in (("state", STEPS, "control steps"), ("episode", SUCCESS, "success")):
+    sizes = (process.num_actions, process.max_episode_steps)
+    assert min(sizes) > 0, "num_actions and max_episode_steps: expected 1 or more"
+    reasons = process.reasons
+    assert len(set(reasons)) == len(reasons), f"reasons: expected different names, got {reasons}"
+    assert FAULT in reasons, f"reasons: expected '{FAULT}', for worlds that diverged, in {reasons}"
+    check_rows(process.state, "state")
+    check_rows(process.episode, "episode")
+    for mapping, name in (("state", STEPS), ("episode", SUCCESS)):
         value = getattr(process, mapping).get(name)
-        require(
-            value is not None and tuple(value.shape) == (NUM_ENVS,),
-            f"{mapping}: expected an entry '{name}' ({text} of the episode) of shape (N,)",
-        )
+        is_good = value is not None and value.shape == (NUM_ENVS,)
+        assert is_good, f"{mapping}: expected an entry '{name}' of shape (N,)"
+    unknown = process.figures.keys() - process.episode.keys()
+    assert not unknown, f"figures: there is no {', '.join(unknown)} in episode"
 
 
 def _check_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Tensor]:
@@ -86,19 +80,15 @@ def _check_starts(process: TaskProcess, machine: Machine) -> dict[str, torch.Ten
     start, again = process.starts(NUM_ENVS, 1), process.starts(NUM_ENVS, 1)
     other = process.starts(NUM_ENVS, 2)
     for name in ("q", "scene"):
-        require(name in start, f"starts: no '{name}' among {', '.join(start)}")
+        assert name in start, f"starts: no '{name}' among {', '.join(start)}"
+    check_rows(start, "starts")
     for name, value in start.items():
-        require(
-            len(value) == NUM_ENVS and bool(value.isfinite().all()),
-            f"starts: '{name}' is not finite for each of {NUM_ENVS} starts",
-        )
-        require(is_same(value, again[name]), f"starts: '{name}' differs for the same seed")
-    require(not is_same(start["q"], other["q"]), "starts: another seed gives the same arms")
+        assert value.isfinite().all(), f"starts: '{name}' is not finite"
+        assert is_same(value, again[name]), f"starts: '{name}' differs for the same seed"
+    assert not is_same(start["q"], other["q"]), "starts: another seed gives the same arms"
     q = start["q"].cpu().numpy()
-    require(
-        bool(((q >= machine.lower) & (q <= machine.upper)).all()),
-        "starts: an arm begins outside its joint limits",
-    )
+    inside = (q >= machine.lower) & (q <= machine.upper)
+    assert inside.all(), "starts: an arm begins outside its joint limits"
     return start
 
 
@@ -107,75 +97,50 @@ def _check_observation(
 ) -> dict[str, torch.Tensor]:
     """Check the observation after a reset; return copies of its groups."""
     everywhere = torch.ones(NUM_ENVS, dtype=torch.bool, device=start["q"].device)
-    torch.manual_seed(0)
-    process.reset(everywhere, start)
-    groups = copy_tensors(process.observe(history))
-    torch.manual_seed(0)
-    process.reset(everywhere, start)
-    again = process.observe(history)
-    require(
-        all(is_same(again[name], value) for name, value in groups.items()),
-        "reset, observe: the same seed gives another observation",
-    )
-    require("policy" in groups, f"observe: no group 'policy' among {', '.join(groups)}")
-    require_rows(groups, "observe")
+    found = []
+    for _ in range(2):
+        torch.manual_seed(0)
+        process.reset(everywhere, start)
+        found.append(copy_tensors(process.observe(history)))
+    groups, again = found
+    check_same(again, groups, "reset, observe: the same seed gives another observation")
+    assert "policy" in groups, f"observe: no group 'policy' among {', '.join(groups)}"
+    check_rows(groups, "observe")
     for name, value in groups.items():
-        require(
-            value.dtype == torch.float32 and bool(value.isfinite().all()),
-            f"observe: '{name}' is not finite float32",
-        )
+        is_good = value.dtype == torch.float32 and bool(value.isfinite().all())
+        assert is_good, f"observe: '{name}' is not finite float32"
     return groups
 
 
 def _check_commands(process: TaskProcess, machine: Machine, device: torch.device) -> None:
     for size in COMMAND_SIZES:
         u = process.command(size * torch.randn(NUM_ENVS, process.num_actions, device=device))
-        require(
-            tuple(u.shape) == (NUM_ENVS, machine.num_joints), f"command: got shape {tuple(u.shape)}"
-        )
-        require(
-            bool((u.abs() <= 1).all()),
-            "command: leaves [-1, 1]; actions of the policy arrive unclipped",
-        )
+        assert u.shape == (NUM_ENVS, machine.num_joints), f"command: got shape {tuple(u.shape)}"
+        text = "command: leaves [-1, 1]; actions of the policy arrive unclipped"
+        assert (u.abs() <= 1).all(), text
 
 
 def _check_optional(
     process: TaskProcess, groups: dict[str, torch.Tensor], machine: Machine
 ) -> None:
-    """Check the optional methods that the task offers."""
+    """Check the optional methods that need no particular target."""
     num_actions = process.num_actions
     if "classical_action" in process.offers:
-        action = process.classical_action(groups)
-        require(
-            tuple(action.shape) == (NUM_ENVS, num_actions),
-            f"classical_action: got shape {tuple(action.shape)}",
-        )
-    if "deployable" in process.offers:
-        _check_deployment(process, groups["policy"], machine, num_actions)
-
-
-def _check_deployment(
-    process: TaskProcess, vector: torch.Tensor, machine: Machine, num_actions: int
-) -> None:
-    description = process.describe()
+        shape = tuple(process.classical_action(groups).shape)
+        assert shape == (NUM_ENVS, num_actions), f"classical_action: got shape {shape}"
+    if "deployable" not in process.offers:
+        return
+    vector, description = groups["policy"], process.describe()
     json.dumps(description)
     size = description["size"]
-    encoder = restore_encoder(machine, description)
-    require(
-        encoder.size == size,
-        f"describe: a vector of {size} numbers, but its parts have {encoder.size}",
-    )
-    require(
-        tuple(vector.shape) == (NUM_ENVS, size),
-        f"observe: expected a policy vector of {size} numbers",
-    )
-    policy = process.deployable(_RestingNetwork(num_actions))
+    known = restore_encoder(machine, description).size
+    assert known == size, f"describe: a vector of {size} numbers, but its parts have {known}"
+    assert vector.shape == (NUM_ENVS, size), f"observe: expected a policy vector of {size} numbers"
     with torch.no_grad():
-        u = policy(vector)
-    require(
-        tuple(u.shape) == (NUM_ENVS, machine.num_joints) and bool((u.abs() <= 1).all()),
-        "deployable: expected commands (B, J) in [-1, 1] for policy vectors (B, O)",
-    )
+        u = process.deployable(_RestingNetwork(num_actions))(vector)
+    is_command = u.shape == (NUM_ENVS, machine.num_joints) and bool((u.abs() <= 1).all())
+    text = "deployable: expected commands (B, J) in [-1, 1] for policy vectors (B, O)"
+    assert is_command, text
 
 
 class _RestingNetwork(torch.nn.Module):
@@ -191,61 +156,27 @@ class _RestingNetwork(torch.nn.Module):
 
 def _check_episode(process: TaskProcess, history: History, device: torch.device) -> None:
     """Run to the time limit with an arm that never moves."""
-    world: Any = SimpleNamespace(
-        q=history.q[:, -1],
-        contact_force_n=torch.zeros(NUM_ENVS, device=device),
-        faults=torch.zeros(NUM_ENVS, dtype=torch.bool, device=device),
-    )
-    kept, timed_out = (
-        copy_tensors(vars(history)),
-        torch.zeros(NUM_ENVS, dtype=torch.bool, device=device),
-    )
-    terminated = timed_out.clone()
+    nowhere = torch.zeros(NUM_ENVS, dtype=torch.bool, device=device)
+    force_n = torch.zeros(NUM_ENVS, device=device)
+    world: Any = SimpleNamespace(q=history.q[:, -1], contact_force_n=force_n, faults=nowhere)
+    kept, over = copy_tensors(vars(history)), nowhere.clone()
     for _ in range(process.max_episode_steps):
         step = process.step(history, world)
-        for name in ("reward", "terminated", "timed_out", "reason"):
-            shape = tuple(getattr(step, name).shape)
-            require(shape == (NUM_ENVS,), f"step: '{name}' has shape {shape}")
-        require(bool(step.reward.isfinite().all()), "step: the reward is not finite")
-        require(
-            step.terminated.dtype == step.timed_out.dtype == torch.bool,
-            "step: terminated and timed_out must be bool",
-        )
-        require(
-            not bool((step.terminated & step.timed_out).any()),
-            "step: an episode both terminated and timed out",
-        )
+        for name, value in vars(step).items():
+            shape = tuple(value.shape)
+            assert shape == (NUM_ENVS,), f"step: '{name}' has shape {shape}"
+        assert step.reward.isfinite().all(), "step: the reward is not finite"
+        is_bool = step.terminated.dtype == step.timed_out.dtype == torch.bool
+        assert is_bool, "step: terminated and timed_out must be bool"
+        both = step.terminated & step.timed_out
+        assert not both.any(), "step: an episode both terminated and timed out"
         ended = step.terminated | step.timed_out
-        require(
-            bool(((step.reason >= 0) == ended).all()),
-            "step: reason must be -1 while the episode goes on, and its index where it ended",
-        )
-        require(
-            bool((step.reason < len(process.reasons)).all()),
-            "step: reason is no index into reasons",
-        )
+        text = "reason must be -1 while the episode goes on, and its index where it ended"
+        assert ((step.reason >= 0) == ended).all(), f"step: {text}"
+        is_index = step.reason < len(process.reasons)
+        assert is_index.all(), "step: reason is no index into reasons"
         process.observe(history)
-        timed_out |= step.timed_out
-        terminated |= step.terminated
-    require(
-        bool((timed_out | terminated).all()),
-        f"step: no time-out after max_episode_steps = {process.max_episode_steps}",
-    )
-    require(
-        all(is_same(value, kept[name]) for name, value in vars(history).items()),
-        "step, observe: changed the history",
-    )
-
-
-def _check_reset_mask(
-    process: TaskProcess, start: dict[str, torch.Tensor], device: torch.device
-) -> None:
-    """Check that a reset of environment 0 leaves the state of the others alone."""
-    before = copy_tensors(process.state)
-    only_first = torch.arange(NUM_ENVS, device=device) == 0
-    process.reset(only_first, start)
-    for name, value in process.state.items():
-        require(
-            is_same(value[1:], before[name][1:]),
-            f"reset: state '{name}' changed in environments outside the mask",
-        )
+        over |= ended
+    text = f"step: no time-out after max_episode_steps = {process.max_episode_steps}"
+    assert over.all(), text
+    check_same(vars(history), kept, "step, observe: changed the history")
