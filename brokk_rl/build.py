@@ -32,7 +32,8 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     """Return the mode of a composed configuration.
 
     Nodes whose classes do without torch are built first, so that their bad values are refused
-    before torch is loaded.
+    before torch is loaded. A spec with a method `check_machine` is asked whether it fits the
+    machine beside it.
 
     Args:
         values: The configuration as plain data, with `run`.
@@ -73,6 +74,13 @@ def build_quick_nodes(
                 late.append(key)
             except ConfigError as error:
                 refusals.append(error)
+        machine = built.get("machine")
+        for part in built.values():
+            if machine is not None and hasattr(part, "check_machine"):
+                try:
+                    part.check_machine(machine)
+                except ConfigError as error:
+                    refusals.append(error)
     if refusals:
         raise ConfigError("\n".join(map(str, refusals))) from refusals[0]
     return built, late

@@ -52,6 +52,7 @@ BAD = {
     ("task.episode_s=nan",): "task.episode_s: expected a finite number above 0, got nan",
     ("task.episode_s=inf",): "task.episode_s",
     ("task.memory=0",): "task.memory",
+    ("task.memory=14",): "task.memory: expected at most the 13 samples of the history of machine",
     ("task.hole.radius_m=0.03",): "task.hole.radius_m: expected more than the chisel's 0.04 m",
     ("task.termination.joint_limit.params.margin=wide",): "params.margin of the termination term",
     ("+task.reward.progress.params.scale=1",): "expected none, got scale",
