@@ -176,6 +176,9 @@ def _explain_missing_choice(group: str) -> str:
 def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
     """Return what a configuration has in the place of a key that it does not have."""
     mode = f"mode={read_mode_name(cfg)}"
+    if isinstance(table := OmegaConf.select(cfg, key, default=None), DictConfig):
+        fields = [str(field) for field in table if field != "_target_"]
+        return f"'{key}' is a table, whose values are given as {key}.<name>=…; {list_choices(value, fields)}"
     parent, _, leaf = key.rpartition(".")
     keys = _find_keys(cfg, leaf)
     groups = [str(k) for k in cfg.hydra.runtime.choices if not str(k).startswith("hydra")]
@@ -255,6 +258,7 @@ def _compose_without_missing(chosen: list[str]) -> DictConfig:
 def list_sources() -> list[tuple[str, Path]]:
     """Return package and file of each option that the command line chooses, as they are composed."""
     files = {f"{option.group}/{option.name}": option.path for option in registry.list_options()}
+    files |= {path.stem: path for path in registry.find_packages()[registry.CORE].glob("*.yaml")}
     found = []
     with hydra.initialize_config_module("conf", version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()

@@ -89,6 +89,18 @@ def load_option(group: str, name: str, **fields: object) -> Any:
     return build_node(OmegaConf.to_container(cfg.subject, resolve=True), group)
 
 
+def load_part(name: str) -> Any:
+    """Return the spec of a part that has no other options: `load_part("session")`.
+
+    Raises:
+        ConfigError: A value is refused.
+    """
+    from brokk_rl.build import build_node
+
+    path = registry.find_packages()[registry.CORE] / f"{name}.yaml"
+    return build_node(yaml.safe_load(path.read_text()), name)
+
+
 def load_mode(*words: str) -> Any:
     """Return the mode of a command, for tests and programs: `load_mode("mode=evaluate", "sim=native")`.
 

@@ -327,7 +327,7 @@ def describe_hint(hint: Any) -> str:
         if origin is list or arguments[-1] is ...:
             return f"a list, each item {one}"
         return f"a list of {len(arguments)}, each {one}"
-    if origin is dict:
+    if origin is dict and arguments[1] is not Any:
         return f"a table, each value {describe_hint(arguments[1])}"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
     words |= {type(None): "null", Any: "a value", tuple: "a list", list: "a list", dict: "a table"}

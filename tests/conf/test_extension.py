@@ -73,7 +73,7 @@ class Show:
 '''
 MODE = """# @package _global_
 defaults:
-  - /session: default
+  - /session@session
   - /actuator: sticky
   - /task: wave
   - /perception: dowser

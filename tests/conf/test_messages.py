@@ -59,7 +59,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=list", "list.group=actuatr"): ("did you mean 'actuator'?",),
     ("mode=list", "session.seed=1"): ("'mode=list' has no 'session'",),
     ("mode=list", "experiment=nothing"): ("there is no", "experiment"),
-    (*COMPARE, "session=other"): ("there is no session=other", "default"),
+    (*COMPARE, "session=other"): ("session.<name>=", "seed"),
     ("effect=[backlash",): ("do not match", "'effect=[backlash]'"),
     ("effect=backlash,lag",): ("a list: 'effect=[backlash,lag]'",),
     ("tracking=wandb,",): ("Write tracking=wandb",),

@@ -67,7 +67,7 @@ BAD = {
     ("task.reward.success.weight=inf",): "task.reward.success.weight",
     ("task=goal_pose", "task.episode_s=0"): "task.episode_s",
     ("task=goal_pose", "task.tolerance.strict_distance_m=0"): "task.tolerance.strict_distance_m",
-    ("sim=native", "sim.num_worlds=0"): "sim: expected num_worlds",
+    ("sim=native", "sim.num_worlds=0"): "sim.num_worlds: expected",
     ("mode=evaluate", "evaluation.episodes=-5"): "evaluation.episodes",
     ("mode=evaluate", "task.episode_s=-5"): "task.episode_s",
     (

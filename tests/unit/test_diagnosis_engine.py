@@ -20,6 +20,7 @@ from actuators.effects.speed import Compliance, FlowGain
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Effect
 from brokk_rl.errors import RecordingError
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import answer, baseline, case, effect_library, effects_file, reference_effects
@@ -58,7 +59,7 @@ def diagnosed(
 ) -> Answer:
     given = GapCase(axis, reference, driven(axis, effects, 2, 100.0, 2))
     base = baseline.fit_baseline(given, option("fit", "valve"), folder, 0, CPU)
-    thresholds, generator = option("thresholds", "default"), np.random.default_rng(0)
+    thresholds, generator = load_part("thresholds"), np.random.default_rng(0)
     excitations = {"levels": option("excitation", "levels")}
     certainty = option("certainty", "default")
     work = DiagnosisPipeline(
@@ -69,7 +70,7 @@ def diagnosed(
         certainty,
         thresholds,
         excitations,
-        option("curve_fit", "valve"),
+        load_part("curve_fit"),
         generator,
     )
     outcome = work.run(lambda doing, done: None)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from composed import option
 from gaps import reach, recording
 
 from actuators.recordings.inspection import InspectionThresholds
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from diagnosis import effect_library, gates, report_checks, verdict
 from diagnosis.answer import Answer, Ranked, Selected, Where
@@ -27,7 +27,7 @@ from diagnosis.search import EffectSet
 
 @pytest.fixture(scope="module")
 def thresholds() -> InspectionThresholds:
-    return option("thresholds", "default")
+    return load_part("thresholds")
 
 
 def by_name(found: list[Gate]) -> dict[str, Gate]:

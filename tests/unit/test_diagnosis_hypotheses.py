@@ -11,6 +11,7 @@ import pytest
 from composed import option
 
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from diagnosis import hypotheses
 from diagnosis.detection import DetectionResult
 from diagnosis.gap import GapClosure
@@ -108,7 +109,7 @@ def closure(ratio: float) -> GapClosure:
 
 
 def test_an_effect_is_a_hypothesis_on_the_joints_that_show_it() -> None:
-    prices = option("prices", "default")
+    prices = load_part("prices")
     result = findings(0.5)
     (lag, none, unknown) = hypotheses.list_hypotheses(
         result, closure(3.0), prices, frozenset[str]()
@@ -123,7 +124,7 @@ def test_an_effect_is_a_hypothesis_on_the_joints_that_show_it() -> None:
 
 
 def test_noise_makes_no_hypothesis_but_a_shared_effect_stays_on_all_joints_that_feel_it() -> None:
-    prices = option("prices", "default")
+    prices = load_part("prices")
     names = [
         one.name
         for one in hypotheses.list_hypotheses(findings(0.0), closure(1.0), prices, frozenset())
@@ -140,7 +141,7 @@ def choice_of(verdict: str, name: str) -> Choice:
 
 @pytest.mark.parametrize("verdict", ["none", "unknown"])
 def test_no_effect_is_kept_beside_another_verdict(weights: ProbabilityModel, verdict: str) -> None:
-    prices: Penalties = option("prices", "default")
+    prices: Penalties = load_part("prices")
     kept = hypotheses.apply_choice(
         findings(0.5, ("lag",)), choice_of(verdict, "lag"), prices, weights
     )
@@ -151,7 +152,7 @@ def test_no_effect_is_kept_beside_another_verdict(weights: ProbabilityModel, ver
 def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
     weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch, shown: float, unknown: bool
 ) -> None:
-    prices: Penalties = option("prices", "default")
+    prices: Penalties = load_part("prices")
     one = SimpleNamespace(kind=SimpleNamespace(name="link_length", stage="kinematics"))
     result = dataclasses.replace(findings(0.5, ("lag",)), detected=cast(Any, [one]))
     monkeypatch.setattr(hypotheses.decision, "read_detected_signs", lambda *_: {})
@@ -165,7 +166,7 @@ def test_what_tool_points_show_for_sure_is_told_beside_an_unknown_cause(
 def test_the_searched_set_stays_where_it_holds_the_likeliest_effect(
     weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    prices: Penalties = option("prices", "default")
+    prices: Penalties = load_part("prices")
     searched = dataclasses.replace(findings(0.5, ("lag",)), fitted=cast(Any, "searched"))
     monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
     kept = hypotheses.apply_choice(searched, choice_of("effects", "lag"), prices, weights)
@@ -186,7 +187,7 @@ def test_a_set_that_explains_half_as_much_again_is_told(
     weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch, left: float, kept: bool
 ) -> None:
     """No effect alone explains a large gap, so that the likeliest one need not be part of the cause."""
-    prices: Penalties = option("prices", "default")
+    prices: Penalties = load_part("prices")
     result = findings(0.5, ("lag", "play"))
     z = np.full((2, 800), 3.0)
     result = dataclasses.replace(
@@ -204,7 +205,7 @@ def test_a_set_that_explains_half_as_much_again_is_told(
 def test_of_effects_that_cannot_be_told_apart_the_searched_one_is_named(
     weights: ProbabilityModel, monkeypatch: pytest.MonkeyPatch, play: float, kept: bool
 ) -> None:
-    prices: Penalties = option("prices", "default")
+    prices: Penalties = load_part("prices")
     searched = dataclasses.replace(findings(0.5, ("dead_band",)), fitted=cast(Any, "searched"))
     monkeypatch.setattr(hypotheses.decision, "drop_unlikely_effects", lambda found, *_: found)
     monkeypatch.setattr(hypotheses, "fit_set", lambda *_: "anew")

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from composed import option
 
 from brokk_rl.errors import RecordingError
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import answer as outcome
@@ -51,7 +51,7 @@ def seen(machine: Machine) -> tuple[Outcome, Survey]:
         runs(machine, 3, 0, 1.01),
         runs(machine, 6, 1, 1.0),
     )
-    thresholds = option("thresholds", "default")
+    thresholds = load_part("thresholds")
     found = examine_gap(
         before,
         floor,

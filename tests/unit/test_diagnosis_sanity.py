@@ -6,17 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from composed import option
 from gaps import DELAY, recording
 
 from actuators.recordings.inspection import InspectionThresholds
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from diagnosis.sanity import TEXTS, RecordingRemark, examine_recordings
 
 
 @pytest.fixture(scope="module")
 def thresholds() -> InspectionThresholds:
-    return option("thresholds", "default")
+    return load_part("thresholds")
 
 
 def named(remarks: list[RecordingRemark]) -> dict[str, RecordingRemark]:

@@ -13,6 +13,7 @@ import pytest
 from composed import option
 
 from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from diagnosis import decision, effect_library, hypotheses
 from diagnosis.detection import DetectionResult
@@ -38,7 +39,7 @@ SIZES = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 
 @pytest.fixture
 def prices() -> Penalties:
-    return option("prices", "default")
+    return load_part("prices")
 
 
 @pytest.fixture

@@ -276,7 +276,7 @@ def test_the_whole_question_hands_on_the_simulator(tmp_path: Path) -> None:
     asked = why.Why(
         session=Session(out=str(tmp_path), seed=0, device="cpu"),
         machine=make_machine("hinge"),
-        evaluation=api._load_option("evaluation", "default"),
+        evaluation=api.extensions.load_part("evaluation"),
         log="log.parquet",
         policy_path="policy",
         simulator=name,

@@ -12,6 +12,7 @@ from composed import option
 from actuators.effects.command import DeadBand, Saturation
 from actuators.effects.speed import Asymmetry, FlowGain, Lag
 from brokk_rl.contracts.actuator import Effect
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Dimension, Machine
 from diagnosis import effect_library
 from diagnosis.baseline import compare_simulator, fit_covariances
@@ -33,7 +34,7 @@ def measured(axis: Machine, effects: dict[str, Effect]) -> SpeedCurves:
     """Returns the curves of the plant with effects beside those of the plant as it was."""
     recordings = driven(axis, effects, 3, 120.0, 5)
     field = compare_simulator(PLANT, [(one, 0.0) for one in recordings], axis, 0)
-    return measure_curves(field, [], axis, option("curve_fit", "valve"), np.random.default_rng(0))
+    return measure_curves(field, [], axis, load_part("curve_fit"), np.random.default_rng(0))
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +95,7 @@ def test_a_side_that_is_hardly_commanded_shows_no_effect(wide: Machine, returns_
     if returns_s:
         recordings += driven(wide, put, 1, returns_s, 6)
     field = compare_simulator(PLANT, [(one, 0.0) for one in recordings], wide, 0)
-    curves = measure_curves(field, [], wide, option("curve_fit", "valve"), np.random.default_rng(0))
+    curves = measure_curves(field, [], wide, load_part("curve_fit"), np.random.default_rng(0))
     found = curves.joints["q3"].estimates()
     assert found["dead_band_retract"] is None and found["retract_gain"] is None
     extend = found["dead_band_extend"]

@@ -17,6 +17,7 @@ from kinematic import Kinematic
 from brokk_rl.checks import check_task
 from brokk_rl.contracts.task import OPTIONAL, TaskProcess, Transition
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.modes.export import Export
 from brokk_rl.modes.train import Train
@@ -138,7 +139,7 @@ def test_a_task_without_optional_contracts_trains_and_is_not_exported(
         "follower": option("follower", "none"),
         "rl": make_training(),
     }
-    evaluation = replace(option("evaluation", "default"), episodes=4, num_recorded=1, video=False)
+    evaluation = replace(load_part("evaluation"), episodes=4, num_recorded=1, video=False)
     train = Train(
         **parts, effect={}, event={}, tracking=NoTracking(), evaluation=evaluation, policy=None
     )

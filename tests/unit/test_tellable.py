@@ -21,6 +21,7 @@ from actuators.recordings.preview_report import run_preview
 from actuators.scales import choose_horizon_s
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from diagnosis import effect_library, tellable
@@ -58,7 +59,7 @@ def preview(effects: Sequence[str] | None = EFFECTS, **changes: Any) -> Tellable
     fields = {
         "actuator": PLANT,
         "effects": None if effects is None else tuple(effects),
-        "prices": option("prices", "default"),
+        "prices": load_part("prices"),
         "error": NOISY,
         "excitations": {},
         "num_windows": 400,
@@ -114,7 +115,7 @@ def play(
 
 def search(residuals: Residuals, machine: Machine) -> set[str]:
     """Returns the names that the search of a diagnosis chooses."""
-    penalties = option("prices", "default")
+    penalties = load_part("prices")
     kinds = effect_library.load_effects(machine, EFFECTS)
     shapes: list[dict[str, list[Response]]] = [{}]
     for kind in kinds:
@@ -331,7 +332,7 @@ def test_the_shipped_preview_is_that_of_the_search() -> None:
     with initialize_config_module("conf", version_base="1.3"):
         cfg = compose("config", overrides=["mode=collect"])
     shipped = instantiate(cfg.preview, _convert_="all")
-    assert shipped.prices == option("prices", "default")
+    assert shipped.prices == load_part("prices")
     assert list(shipped.excitations) == [
         "levels",
         "sine",
