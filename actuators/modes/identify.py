@@ -8,8 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.table import Table
+from rich.text import Text
 
 from actuators import open_loop
 from actuators.contracts import ActuatorFit
@@ -25,6 +24,7 @@ from actuators.identify.results import (
 from actuators.identify.stages import FitStage, FittedModel, fit_or_restore, list_recordings
 from actuators.recordings.split import check_commanded, group_by_run, split_runs
 from brokk_rl import record
+from brokk_rl.console_table import TableCell, print_table, print_text
 from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -231,14 +231,7 @@ def _limit_threads(count: int) -> Iterator[None]:
 
 def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder: Path) -> None:
     horizons = list(result["overall"][result["model"]])
-    table = Table(
-        title="error at the end of free runs on unseen runs (RMSE, rad or m; last rows: % of travel)",
-        box=None,
-    )
-    for column in ("joint", "model", *(f"{horizon} s" for horizon in horizons), "dead time"):
-        table.add_column(
-            column, justify="left" if column in ("joint", "model") else "right", no_wrap=True
-        )
+    table: list[list[TableCell]] = []
     blocks = [
         (joint, models, "rmse", 4, result["delay_s"][joint])
         for joint, models in result["joints"].items()
@@ -248,25 +241,25 @@ def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder:
         ("all joints", result["overall"], "percent", 2, None),
     ):
         for row, name in enumerate(models):
-            cells = []
+            cells: list[TableCell] = []
             for horizon in horizons:
                 given = {}
                 for other, rows in models.items():
                     if rows[horizon]:
                         given[other] = rows[horizon][key]
-                text = f"{given[name]:.{digits}f}" if given else "–"
-                cells.append(
-                    f"[bold]{text}[/]" if given and given[name] == min(given.values()) else text
-                )
-            table.add_row(
-                "" if row else joint,
-                name,
-                *cells,
-                "" if row or delay is None else f"{delay['value']:.2f} s",
-            )
-    console = Console()
-    console.print(table)
+                if not given:
+                    cells.append(None)
+                    continue
+                style = "bold" if given[name] == min(given.values()) else ""
+                cells.append(Text(f"{given[name]:.{digits}f}", style))
+            after = "" if row or delay is None else f"{delay['value']:.2f} s"
+            table.append(["" if row else joint, name, *cells, after])
+    print_table(
+        ("joint", "model", *(f"{horizon} s" for horizon in horizons), "dead time"),
+        table,
+        "error at the end of free runs on unseen runs (RMSE, rad or m; last rows: % of travel)",
+    )
     for finding in findings:
         if finding is findings[0] or finding.tone in ("bad", "warn"):
-            console.print(finding.text, style=TONES[finding.tone], highlight=False)
-    console.print(f"report: {folder / page.PAGE}", highlight=False)
+            print_text(finding.text, TONES[finding.tone])
+    print_text(f"report: {folder / page.PAGE}")

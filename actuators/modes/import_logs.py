@@ -7,10 +7,6 @@ import re
 from dataclasses import asdict
 from pathlib import Path
 
-from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
-
 from actuators.recordings import conversion, log_guess, map_draft
 from actuators.recordings.clock_guess import Guess
 from actuators.recordings.column_guess import CommandKind, GivenColumns
@@ -18,6 +14,7 @@ from actuators.recordings.column_names import UNITS, read_unit
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
 from actuators.recordings.map_draft import Draft
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.report import Report
@@ -118,7 +115,7 @@ class ImportLogs:
                 f"brokk mode=diagnose machine={machine} 'diagnosis.field={place}/*' {simulator}"
             )
             for text in ("then:", command):
-                Console().print(text, markup=False, highlight=False, soft_wrap=True)
+                print_text(text)
             return
         paths = conversion.find_logs(self.log.input)
         given = GivenColumns(
@@ -208,13 +205,9 @@ def _write_page(draft: Draft, guesses: list[Guess], folder: Path, command: str) 
 
 
 def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
-    console = Console()
-    table = Table(box=None, padding=(0, 1, 0, 0))
-    for name in HEAD:
-        table.add_column(name, overflow="fold")
+    rows = []
     for guess in guesses:
-        cells = (guess.subject, guess.value, guess.sureness, guess.reason)
-        table.add_row(*map(escape, cells))  # `position[foot]` is no style
-    console.print(table)
+        rows.append((guess.subject, guess.value, guess.sureness, guess.reason))
+    print_table(HEAD, rows)
     for text in (*draft.remarks, _summarise(draft, guesses), f"look at {folder / PAGE_FILE}, then:", command):  # fmt: skip
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        print_text(text)

@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from actuators.identify import dead_time
 from actuators.recordings import inspection_picture, preview_report
@@ -24,6 +22,7 @@ from actuators.recordings.inspection import (
 from actuators.recordings.preview import EffectPreview, PreviewResult
 from brokk_rl import record
 from brokk_rl.commands import view_recordings
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.plot import make_figure
@@ -259,28 +258,18 @@ class Inspect:
         ]
 
     def _show(self, result: dict[str, Any], inspected: Sequence[InspectedFile]) -> None:
-        console = Console()
         tables = {
             "recordings": (FILES, [_format_file_row(one) for one in inspected]),
             "joints, all recordings": self._figures(result),
             "findings": self._counts(result),
         }
         for title, (head, rows) in tables.items():
-            table = Table(title=title, box=None, padding=(0, 1, 0, 0), title_justify="left")
-            for name in head:
-                table.add_column(
-                    name, justify="left" if name in ("file", "joint") else "right", overflow="fold"
-                )
-            for row in rows:
-                table.add_row(*row)
-            console.print(table)
+            print_table(head, rows, title)
         for one in inspected:
             for breach in one.breaches:
-                console.print(
-                    f"{one.path}: {breach}", markup=False, highlight=False, soft_wrap=True
-                )
+                print_text(f"{one.path}: {breach}")
         for remark in result["remarks"]:
-            console.print(remark, markup=False, highlight=False, soft_wrap=True)
+            print_text(remark)
 
     def _page(
         self,

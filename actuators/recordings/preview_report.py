@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
 from actuators.recordings.preview import EffectLimit, EffectPreview, PreviewResult
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import SHARE, ItemProgress
@@ -117,7 +116,6 @@ def list_remarks(result: PreviewResult) -> list[str]:
 
 def show_preview(result: PreviewResult, machine: Machine) -> None:
     """Print the tables."""
-    console = Console()
     untold = [one for one in result.limits if not one.is_told and one.shows_in != "tool points"]
     title = (
         f"effects that {result.minutes:.1f} minutes of these motions would tell "
@@ -127,16 +125,10 @@ def show_preview(result: PreviewResult, machine: Machine) -> None:
         title: describe_effects(result, machine),
         "pairs": describe_pairs(result),
     }.items():
-        if not rows:
-            continue
-        table = Table(title=name, box=None, padding=(0, 1, 0, 0), title_justify="left")
-        for column in head:
-            table.add_column(column, overflow="fold", no_wrap=column in machine.joint_names)
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
+        if rows:
+            print_table(head, rows, name)
     for remark in (EXPLANATION, *list_remarks(result)):
-        console.print(remark, markup=False, highlight=False, soft_wrap=True)
+        print_text(remark)
 
 
 def measure_picture_height(machine: Machine) -> float:

@@ -9,10 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from brokk_rl import record
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -151,24 +150,19 @@ class ChangeSimulator:
 def _print(
     told: dict[str, Any], ranges: Sequence[simulator_changes.RandomisationRange], folder: Path
 ) -> None:
-    console = Console()
     if told["changes"]:
-        table = Table("finding", "joint", "attribute", "before", "after", box=None)
+        rows = []
         for one in told["changes"]:
-            table.add_row(
-                one["effect"],
-                one["joint"],
-                f"{one['element']} {one['attribute']}",
-                f"{one['before']:.4g}",
-                f"{one['after']:.4g}",
-            )
-        console.print(table)
+            changed = f"{one['element']} {one['attribute']}"
+            numbers = (f"{one['before']:.4g}", f"{one['after']:.4g}")
+            rows.append((one["effect"], one["joint"], changed, *numbers))
+        print_table(("finding", "joint", "attribute", "before", "after"), rows)
     for name, reason in told["not_in_the_file"].items():
-        console.print(f"not in {MJCF_FILE}: {name}: {reason}", highlight=False, markup=False)
+        print_text(f"not in {MJCF_FILE}: {name}: {reason}")
     for joint, before in told["replay"].get("before", {}).items():
         after = told["replay"]["after"][joint]
-        console.print(f"{joint}: error {before:.4g}, with the changes {after:.4g}", highlight=False)
+        print_text(f"{joint}: error {before:.4g}, with the changes {after:.4g}")
     for name in dict.fromkeys(one.effect for one in ranges):
         first = next(one for one in ranges if one.effect == name)
-        console.print(f"{name}: {simulator_changes.describe_cost(first)}", highlight=False)
-    console.print(f"written: {folder}", highlight=False)
+        print_text(f"{name}: {simulator_changes.describe_cost(first)}")
+    print_text(f"written: {folder}")

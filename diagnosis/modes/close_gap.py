@@ -8,10 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from brokk_rl.comparison import EVALUATION
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
@@ -199,13 +197,12 @@ def _describe_plant(plant: ControlLoopConfig) -> str:
 
 
 def _show(found: dict[str, Any], folder: Path) -> None:
-    console = Console()
-    view = Table(
-        "strict success", *(retraining.PLANT_NAMES[plant] for plant in retraining.PLANTS), box=None
-    )
+    rows = []
     for policy, shares in found["success"].items():
         name = retraining.POLICY_NAMES.get(policy, policy)
-        view.add_row(name, *(retraining.format_rate(shares[plant]) for plant in retraining.PLANTS))
-    console.print(retraining.write_headline(found)[0], style="bold", highlight=False)
-    console.print(view)
-    console.print(f"report: {folder / retraining.REPORT_FILE}", highlight=False)
+        rates = (retraining.format_rate(shares[plant]) for plant in retraining.PLANTS)
+        rows.append([name, *rates])
+    print_text(retraining.write_headline(found)[0], "bold")
+    plants = (retraining.PLANT_NAMES[plant] for plant in retraining.PLANTS)
+    print_table(["strict success", *plants], rows)
+    print_text(f"report: {folder / retraining.REPORT_FILE}")

@@ -9,12 +9,11 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from actuators.contracts import ActuatorFit
 from actuators.identify.curve_fit import ValveCurveFit
 from actuators.recordings.inspection import InspectionThresholds
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, Excitation
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -196,8 +195,7 @@ class Diagnose:
 
 
 def _print_answer(found: Answer, folder: Path) -> None:
-    console = Console()
-    table = Table("effect", "joints", "probability", "numbers", "closes", "same as", box=None)
+    rows = []
     for one in found.selected:
         told = []
         for name, values in one.parameters.items():
@@ -206,24 +204,16 @@ def _print_answer(found: Answer, folder: Path) -> None:
                     f"{name} {joint} {' ('.join(report.format_estimate(value, 1.0, '.4g'))})"
                 )
         closes = f"{100 * one.gap_closed.mean:.0f} %" if one.gap_closed else ""
-        table.add_row(
-            one.effect,
-            " ".join(one.joints),
-            f"{one.probability:.2f}",
-            "\n".join(told),
-            closes,
-            " ".join(one.same_as),
-        )
-    console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False)
+        joints, others = " ".join(one.joints), " ".join(one.same_as)
+        chance = f"{one.probability:.2f}"
+        rows.append((one.effect, joints, chance, "\n".join(told), closes, others))
+    print_text(f"{found.verdict}: {found.reason}", "bold")
     if found.selected:
-        console.print(table)
+        print_table(("effect", "joints", "probability", "numbers", "closes", "same as"), rows)
     for line in report_checks.list_failed_gates(found.gates):
-        console.print(line, highlight=False)
+        print_text(line)
     for one in found.selected:
         for line in (report_checks.describe_bounds(one), report_checks.describe_edit(one)):
             if line:
-                console.print(line, highlight=False)
-    console.print(
-        f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}",
-        highlight=False,
-    )
+                print_text(line)
+    print_text(f"report: {folder / report.REPORT_FILE}, answer: {folder / answer.ANSWER_FILE}")

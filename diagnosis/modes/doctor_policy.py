@@ -6,10 +6,8 @@ import logging
 from collections.abc import Sequence
 from pathlib import Path
 
-from rich.console import Console
-from rich.table import Table
-
 from brokk_rl import record
+from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, Effect
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -113,23 +111,16 @@ def name_policies(folders: Sequence[str]) -> list[str]:
 
 def print_answer(found: DoctorAnswer, folder: Path) -> None:
     """Show the verdict and the mistakes."""
-    console = Console()
-    console.print(f"{found.verdict}: {found.reason}", style="bold", highlight=False, markup=False)
+    print_text(f"{found.verdict}: {found.reason}", "bold")
     if found.findings:
-        table = Table("kind", "field", "shows", "rows explained", box=None)
+        rows = []
         for one in found.findings:
-            table.add_row(
-                one.kind,
-                one.field,
-                f"{one.begin_s:.2f} to {one.end_s:.2f} s",
-                f"{one.explained:.1%}",
-            )
-        console.print(table)
+            shown = f"{one.begin_s:.2f} to {one.end_s:.2f} s"
+            rows.append((one.kind, one.field, shown, f"{one.explained:.1%}"))
+        print_table(("kind", "field", "shows", "rows explained"), rows)
         for line in page.describe_remedies(found.findings):
-            console.print(line, highlight=False, markup=False)
+            print_text(line)
     for run in found.runs:
         for line in (*run.cannot_tell, *run.notes):
-            console.print(f"not judged: {line}", highlight=False, markup=False)
-    console.print(
-        f"page: {folder / page.PAGE_FILE}, answer: {folder / doctor.ANSWER_FILE}", highlight=False
-    )
+            print_text(f"not judged: {line}")
+    print_text(f"page: {folder / page.PAGE_FILE}, answer: {folder / doctor.ANSWER_FILE}")

@@ -15,9 +15,9 @@ from typing import Any
 
 import torch
 import yaml
-from rich.console import Console
 
 from brokk_rl import record, registry
+from brokk_rl.console_table import print_text
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.rl.settings import Evaluation
@@ -127,13 +127,12 @@ class Why:
         record.read_recordings(self.log, self.machine)
 
     def _print(self, result: WhyResult) -> None:
-        console = Console(highlight=False, markup=False)
-        console.print(result.title, style="bold")
-        console.print(why_answer.write_summary(result))
+        print_text(result.title, "bold")
+        print_text(why_answer.write_summary(result))
         for step in (*why_answer.list_changes(result), *why_answer.list_records(result)):
             for line in filter(None, step):
-                console.print(line, soft_wrap=True)
-        console.print(f"page: {self.session.folder / WHY_PAGE}", style="bold")
+                print_text(line)
+        print_text(f"page: {self.session.folder / WHY_PAGE}", "bold")
 
     def _try_to_play(self, stages: Mapping[str, StoryStage]) -> None:
         """Run stages whose failure leaves the rest of the page true."""

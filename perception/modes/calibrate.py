@@ -6,9 +6,8 @@ import logging
 from typing import Any
 
 import yaml
-from rich.console import Console
-from rich.table import Table
 
+from brokk_rl.console_table import print_table
 from brokk_rl.errors import FrameError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_text
@@ -66,29 +65,29 @@ class Calibrate:
 
 
 def _show(content: dict[str, Any]) -> None:
-    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+    rows: list[tuple[str, str]] = []
     place = ", ".join(f"{row[3]:.4f}" for row in content["T_base_cam"][:3])
-    table.add_row("verdict", content["verdict"]["status"])
-    table.add_row("camera in the base frame", f"({place}) m")
+    rows.append(("verdict", content["verdict"]["status"]))
+    rows.append(("camera in the base frame", f"({place}) m"))
     work = content["point_std_m"]
-    table.add_row(f"uncertainty at {work['at_m']:g} m", f"±{1000 * work['std_m']:.1f} mm")
+    rows.append((f"uncertainty at {work['at_m']:g} m", f"±{1000 * work['std_m']:.1f} mm"))
     residual = content["residual"]
     turn = "" if residual["rms_rad"] is None else f", {residual['rms_rad']:.4f} rad"
-    table.add_row("residual", f"{1000 * residual['rms_m']:.1f} mm{turn}")
-    table.add_row("poses", f"{content['num_used']} used, {content['num_left_out']} left out")
+    rows.append(("residual", f"{1000 * residual['rms_m']:.1f} mm{turn}"))
+    rows.append(("poses", f"{content['num_used']} used, {content['num_left_out']} left out"))
     for one in content["poses"]:
         if one["left_out"]:
-            table.add_row("  left out", f"{one['name']}: {one['left_out']}")
+            rows.append(("  left out", f"{one['name']}: {one['left_out']}"))
     for name, zero in (content.get("joint_zeros") or {}).items():
         if abs(zero["mean"]) > ZERO_SIGMAS * zero["std"]:
-            table.add_row(f"zero of {name}", f"{zero['mean']:+.4f} ± {zero['std']:.4f} rad")
+            rows.append((f"zero of {name}", f"{zero['mean']:+.4f} ± {zero['std']:.4f} rad"))
     if disparity := content.get("disparity"):
         error_px = disparity["error_px"][0]
-        table.add_row("error of the disparity", f"{error_px:+.3f} ± {disparity['std_px']:.3f} px")
+        rows.append(("error of the disparity", f"{error_px:+.3f} ± {disparity['std_px']:.3f} px"))
     if clock := content.get("clock"):
         trust = "" if clock["trusted"] else ", not trusted: too little motion"
         offset = f"{clock['offset_s']:+.3f} s (correlation {clock['correlation']:.2f}{trust})"
-        table.add_row("camera's clock", offset)
+        rows.append(("camera's clock", offset))
     for one in content["missing"]:
-        table.add_row("missing", one)
-    Console().print(table)
+        rows.append(("missing", one))
+    print_table((), rows)

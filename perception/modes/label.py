@@ -5,9 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
+from brokk_rl.console_table import print_table
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from perception.label.labeller import BlockLabelling
@@ -40,14 +38,14 @@ class Label:
 
 
 def _show(result: dict[str, Any]) -> None:
-    table = Table(
-        title=f"{result['num_labelled']} of {len(result['frames'])} frames labelled", box=None
-    )
-    for name in ("frame", "board [px]", "outline [px]", "depth agrees", "left out because"):
-        table.add_column(name, justify="left" if name in ("frame", "left out because") else "right")
+    rows = []
     for name, entry in result["frames"].items():
-        board = f"{entry['board_px']:.2f}" if entry["board_px"] is not None else "–"
-        outline = f"{entry['outline_px']:.2f}" if entry["outline_px"] is not None else "–"
-        share = "–" if entry["depth_share"] is None else f"{entry['depth_share']:.0%}"
-        table.add_row(name, board, outline, share, entry["left_out"] or "")
-    Console().print(table)
+        board = None if entry["board_px"] is None else f"{entry['board_px']:.2f}"
+        outline = None if entry["outline_px"] is None else f"{entry['outline_px']:.2f}"
+        share = None if entry["depth_share"] is None else f"{entry['depth_share']:.0%}"
+        rows.append((name, board, outline, share, entry["left_out"] or ""))
+    print_table(
+        ("frame", "board [px]", "outline [px]", "depth agrees", "left out because"),
+        rows,
+        f"{result['num_labelled']} of {len(result['frames'])} frames labelled",
+    )

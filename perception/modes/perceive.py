@@ -14,9 +14,8 @@ from statistics import median
 from typing import Any, Literal
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
+from brokk_rl.console_table import print_table
 from brokk_rl.contracts.vision import (
     BoreholeFinder,
     Ellipse,
@@ -229,26 +228,25 @@ class Perceive:
         for entry in entries:
             if entry.found:
                 used.append(entry.found)
-        table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
-        table.add_row("frames", f"{len(used)} used, {len(entries) - len(used)} refused")
+        rows = [("frames", f"{len(used)} used, {len(entries) - len(used)} refused")]
         if self.perceive.until == "ellipses":
-            table.add_row("ellipses", str(sum(len(one.ellipses) for one in used)))
+            rows.append(("ellipses", str(sum(len(one.ellipses) for one in used))))
         else:
             num_holes = sum(len(one.holes) for one in used)
-            table.add_row("holes", f"{num_holes} in {sum(bool(one.holes) for one in used)} frames")
+            rows.append(("holes", f"{num_holes} in {sum(bool(one.holes) for one in used)} frames"))
             counts: Counter[str] = Counter()
             for one in used:
                 counts.update(
                     f"{rejection.stage}: {rejection.reason}" for rejection in one.rejected
                 )
             for reason, count in counts.most_common():
-                table.add_row("refused", f"{count} × {reason}")
+                rows.append(("refused", f"{count} × {reason}"))
             target = next((entry.target for entry in reversed(entries) if entry.target), None)
             if target is not None:
-                table.add_row("target", _format_target(target[0]))
+                rows.append(("target", _format_target(target[0])))
         for stage in used[0].ms if used else ():
-            table.add_row(f"ms, {stage}", f"{median(one.ms.get(stage, 0.0) for one in used):.0f}")
-        Console().print(table)
+            rows.append((f"ms, {stage}", f"{median(one.ms.get(stage, 0.0) for one in used):.0f}"))
+        print_table((), rows)
 
 
 def _require_whole_picture_finder(finder: BoreholeFinder) -> WholePictureFinder:

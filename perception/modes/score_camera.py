@@ -16,10 +16,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import yaml
 from annotated_types import MinLen
-from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
+from brokk_rl.console_table import print_table
 from brokk_rl.contracts.vision import FinderSpec, FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session, write_json
@@ -204,15 +203,14 @@ def _add_row(path: Path, row: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _show(rows: list[dict[str, Any]]) -> None:
-    table = Table(box=None)
-    for name in ("kind", "session", "frames", "found", "no hole", "median", "95 %", "inside 3 σ"):
-        table.add_column(name, justify="left" if name in ("kind", "session") else "right")
+    cells = []
     for row in rows:
         errors = []
         for key in ("position_m_median", "position_m_p95"):
-            errors.append("–" if row[key] is None else f"{1000 * row[key]:.1f} mm")
+            errors.append(None if row[key] is None else f"{1000 * row[key]:.1f} mm")
         found = f"{row['found']} of {row['holes']}"
         inside = f"{row['inside_3_sigma']} of {row['found']}"
         frames, false = str(row["frames"]), str(row["false"])
-        table.add_row(row["kind"], row["name"], frames, found, false, *errors, inside)
-    Console().print(table)
+        cells.append((row["kind"], row["name"], frames, found, false, *errors, inside))
+    head = ("kind", "session", "frames", "found", "no hole", "median", "95 %", "inside 3 σ")
+    print_table(head, cells)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
+from brokk_rl.console_table import print_table
 from brokk_rl.errors import ConfigError
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
@@ -56,20 +54,12 @@ class TrainPerception:
 
 
 def _show(result: dict[str, Any]) -> None:
-    table = Table(title="on unseen frames", box=None)
-    for name in (
-        "condition",
-        "frames",
-        "overlap of blocks",
-        "overlap of mouths",
-        "mouths found",
-        "false mouths a frame",
-    ):
-        table.add_column(name, justify="left" if name == "condition" else "right")
+    rows = []
     for name, row in result["conditions"].items():
-        shares = (
-            "–" if row[key] is None else f"{row[key]:.3f}"
-            for key in ("block", "mouth", "found", "false")
-        )
-        table.add_row(name, str(row["frames"]), *shares)
-    Console().print(table)
+        shares = []
+        for key in ("block", "mouth", "found", "false"):
+            shares.append(None if row[key] is None else f"{row[key]:.3f}")
+        rows.append([name, str(row["frames"]), *shares])
+    overlaps = ("overlap of blocks", "overlap of mouths")
+    head = ("condition", "frames", *overlaps, "mouths found", "false mouths a frame")
+    print_table(head, rows, "on unseen frames")
