@@ -150,12 +150,9 @@ class PlacedRig(StereoRig):
     axis_px: tuple[float, float]
 
     def check(self) -> None:
-        StereoRig.check(self)
         # Its radial shift is that of a whole picture, which a part does not know.
         if not self.error.is_none:
-            raise ConfigError(
-                "rig.error: a part of the picture is rendered for rig/error=none only"
-            )
+            raise ConfigError("error: a part of the picture is rendered for rig/error=none only")
 
     @property
     def left(self) -> Pinhole:
