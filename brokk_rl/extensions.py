@@ -124,8 +124,12 @@ def read_values(cfg: DictConfig) -> tuple[dict[str, Any], set[str]]:
     actuator that it simulates, which is chosen like any other.
 
     Raises:
-        ConfigError: A value that must be given is not.
+        ConfigError: A value that must be given is not, or no class of a mode is named.
     """
+    if "run" not in cfg:
+        raise ConfigError(
+            "there is no mode to run: expected run: <module>.<class> in its YAML file"
+        )
     if missing := OmegaConf.missing_keys(cfg) - {"session.out"}:
         raise ConfigError(explain_missing_value(min(missing)))
     shared = set()

@@ -20,7 +20,7 @@ import numpy as np
 
 from brokk_rl import distributed
 from brokk_rl.errors import BrokkError, ConfigError, DeviceError, StorageError
-from brokk_rl.spec import spec
+from brokk_rl.spec import Index, spec
 
 if TYPE_CHECKING:
     import torch
@@ -52,18 +52,16 @@ class Session:
     """
 
     out: str
-    seed: int
+    seed: Index
     device: str
 
     def check(self) -> None:
-        if self.seed < 0:
-            raise ConfigError(f"session.seed: expected 0 or more, got {self.seed}")
         kind, _, index = self.device.partition(":")
         if kind not in ("auto", "cpu", "cuda") or (
             index and (kind != "cuda" or not index.isdigit())
         ):
             raise ConfigError(
-                f"session.device: expected auto, cpu, cuda or cuda:<index>, got '{self.device}'"
+                f"device: expected auto, cpu, cuda or cuda:<index>, got '{self.device}'"
             )
 
     @property

@@ -78,7 +78,7 @@ defaults:
   - /task: wave
   - /perception: dowser
   - _self_
-_target_: mine.parts.Show
+run: mine.parts.Show
 fails: not
 """
 
