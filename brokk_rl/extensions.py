@@ -7,7 +7,7 @@ effect; the command calls `register_options`.
 """
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,18 +52,14 @@ def register_options(arguments: Sequence[str]) -> None:
         ConfigError: Two packages offer the same option, of which Hydra would silently take the
             first; or a file is invalid.
     """
-    options = registry.list_options()
+    groups = {option.group for option in registry.list_options()}
     Plugins.instance().register(Extensions)
-    groups = {option.group for option in options}
     for argument in arguments:
         override = GROUP.fullmatch(argument)
         if override and override["group"] in groups:
             for found in FILE.finditer(override["value"]):
-                _offer_file(
-                    override["group"],
-                    (found["double"] or found["single"] or found["plain"]).strip(),
-                    options,
-                )
+                name = found["double"] or found["single"] or found["plain"]
+                _offer_file(override["group"], name.strip())
 
 
 def load_option(group: str, name: str, **fields: object) -> Any:
@@ -78,7 +74,7 @@ def load_option(group: str, name: str, **fields: object) -> Any:
         ConfigError: There is no such option or file, or it is not valid.
     """
     register_options([f"{group}={name}"])
-    known = {option.name for option in registry.list_options() if option.group == group}
+    known = {option.name for option in registry.list_options(group)}
     if not name.startswith("@") and name not in known:
         raise ConfigError(f"there is no {group}={name}; {list_choices(name, known)}")
     changes = [f"subject.{field}={value}" for field, value in fields.items()]
@@ -141,18 +137,16 @@ def read_values(cfg: DictConfig) -> tuple[dict[str, Any], set[str]]:
     return values, shared
 
 
-def _offer_file(group: str, name: str, options: Sequence[registry.Option]) -> None:
+def _offer_file(group: str, name: str) -> None:
     """Put the file `name` into Hydra's store as the option `@<name>` of `group`."""
-    node, package = _read(group, name, options)
+    node, package = _read(group, name)
     folder, _, stem = f"@{name}".rpartition("/")
     ConfigStore.instance().store(
         stem, node, "/".join(filter(None, (group, folder))), package, provider="file"
     )
 
 
-def _read(
-    group: str, name: str, options: Sequence[registry.Option]
-) -> tuple[dict[str, Any], str | None]:
+def _read(group: str, name: str) -> tuple[dict[str, Any], str | None]:
     """Return the content of an option file and its package, `None` for the package of its group.
 
     A file may come from somebody else, so it holds plain values only. Each `_target_` must be one
@@ -181,30 +175,19 @@ def _read(
     beside = Path(name).expanduser().parent / str(node.get("mjcf"))
     if group == "machine" and beside.is_file():
         node["mjcf"] = str(beside.resolve())
-    mine = {
-        str(shipped["_target_"]): package
-        for shipped, package in _iterate_shipped(options, group)
-        if "_target_" in shipped
-    }
-    ours = {
-        str(target)
-        for shipped, _ in _iterate_shipped(options)
-        for place, target in registry.iterate_leaves(shipped)
-        if place[-1] == "_target_"
-    }
-    package = _find_package(
-        where, group, text, node, mine, {package for _, package in _iterate_shipped(options, group)}
-    )
+    packages = _read_packages(group)
+    package = _find_package(where, group, text, node, packages)
     for place, target in registry.iterate_leaves(node):
-        if place[-1] == "_target_":
-            # the option itself, or those of a file that holds several by name
-            itself = package != EVERYWHERE and len(place) == (1 if "_target_" in node else 2)
-            known = set(mine) if itself else ours
-            if target not in known:
-                kind = f"no {group}" if itself else "nothing of ours"
-                raise ConfigError(
-                    f"{where}: '{'.'.join(place)}: {target}' is {kind}; {list_choices(str(target), known)}"
-                )
+        if place[-1] != "_target_":
+            continue
+        # the option itself, or those of a file that holds several by name
+        itself = package != EVERYWHERE and len(place) == (1 if "_target_" in node else 2)
+        known = packages.keys() if itself else registry.list_targets()
+        if target not in known:
+            kind = f"no {group}" if itself else "nothing of ours"
+            raise ConfigError(
+                f"{where}: '{'.'.join(place)}: {target}' is {kind}; {list_choices(str(target), known)}"
+            )
     return {str(key): value for key, value in node.items()}, package
 
 
@@ -227,32 +210,27 @@ def _check_plain(where: str, place: tuple[str, ...], value: Any) -> None:
 
 
 def _find_package(
-    where: str,
-    group: str,
-    text: str,
-    node: dict[Any, Any],
-    mine: dict[str, str | None],
-    used: set[str | None],
+    where: str, group: str, text: str, node: dict[Any, Any], packages: dict[str, str | None]
 ) -> str | None:
     """Return the config package of a file: as stated, else that of an option with its target."""
-    stated = PACKAGE.search(text)
-    if stated:
+    used = set(packages.values())
+    if stated := PACKAGE.search(text):
         if stated[1] not in used | {group, "_group_"} and not stated[1].startswith(f"{group}."):
             raise ConfigError(
                 f"{where}: '# @package {stated[1]}' lies outside '{group}'; leave that line out"
             )
         return stated[1]
     if "_target_" in node:
-        return mine.get(str(node["_target_"]))
+        return packages.get(str(node["_target_"]))
     return EVERYWHERE if used == {EVERYWHERE} else None
 
 
-def _iterate_shipped(
-    options: Sequence[registry.Option], group: str | None = None
-) -> Iterator[tuple[dict[Any, Any], str | None]]:
-    """Yield content and stated package of each option, of one group or of all."""
-    for option in options:
-        if group in (None, option.group):
-            text = option.path.read_text()
-            stated = PACKAGE.search(text)
-            yield yaml.safe_load(text) or {}, stated[1] if stated else None
+def _read_packages(group: str) -> dict[str, str | None]:
+    """Return the config package that each option of a group states, by its target or its name."""
+    packages = {}
+    for option in registry.list_options(group):
+        text = option.path.read_text()
+        target = re.search(r"^_target_: *([\w.]+)", text, re.MULTILINE)
+        stated = PACKAGE.search(text)
+        packages[target[1] if target else option.name] = stated[1] if stated else None
+    return packages
