@@ -17,9 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from brokk_rl.bounds import require_number
 from brokk_rl.machine import Machine
-from brokk_rl.spec import spec
+from brokk_rl.spec import Finite, Positive, spec
 
 TARGET, PITCH, PROPOSALS = "target_in_base_m", "pitch_rad", "proposals"
 """Names of parts of a tool-pose vector; the others are `q` and `u`."""
@@ -48,18 +47,9 @@ class TargetScaling:
             episode to episode and so belongs to the vector; `null` where the task fixes it.
     """
 
-    target_mean_m: tuple[float, float, float]
-    target_std_m: tuple[float, float, float]
-    pitch_rad: tuple[float, float] | None
-
-    def check(self) -> None:
-        for index, std_m in enumerate(self.target_std_m):
-            require_number(f"task.scaling.target_std_m[{index}]", std_m, above=0)
-        for index, mean_m in enumerate(self.target_mean_m):
-            require_number(f"task.scaling.target_mean_m[{index}]", mean_m)
-        if self.pitch_rad is not None:
-            require_number("task.scaling.pitch_rad: mean", self.pitch_rad[0])
-            require_number("task.scaling.pitch_rad: standard deviation", self.pitch_rad[1], above=0)
+    target_mean_m: tuple[Finite, Finite, Finite]
+    target_std_m: tuple[Positive, Positive, Positive]
+    pitch_rad: tuple[Finite, Positive] | None
 
 
 @dataclass(frozen=True)

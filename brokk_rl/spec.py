@@ -323,10 +323,12 @@ def describe_hint(hint: Any) -> str:
     if origin is Literal:
         return "one of " + ", ".join(map(repr, arguments))
     if origin in (tuple, list) and arguments:
-        one = describe_hint(arguments[0])
         if origin is list or arguments[-1] is ...:
-            return f"a list, each item {one}"
-        return f"a list of {len(arguments)}, each {one}"
+            return f"a list, each item {describe_hint(arguments[0])}"
+        items = list(map(describe_hint, arguments))
+        if len(set(items)) == 1:
+            return f"a list of {len(items)}, each {items[0]}"
+        return f"a list of {', '.join(items)}"
     if origin is dict and arguments[1] is not Any:
         return f"a table, each value {describe_hint(arguments[1])}"
     words = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
