@@ -298,7 +298,8 @@ class KinematicTree:
         is_short = depths[0] < max(len(chain), 2)
         if GRIPPER.search(f"{self.name(ranked[0])} {body}") and is_short:
             return len(chain) > 1 or len(ranked) > 1
-        return len(ranked) > 1 and depths[0] == depths[1] and is_short
+        is_alike = len(ranked) > 1 and depths[0] == depths[1]
+        return is_alike and is_short and len(chain) > 1
 
     def _choose_branch(self, chain: list[int], ranked: list[int]) -> int:
         """Return the joint with which the chain goes on.

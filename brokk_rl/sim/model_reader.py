@@ -19,7 +19,7 @@ import mujoco
 import numpy as np
 import trimesh
 
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.sim.model_source import (
     SMALLEST_KG,
     SMALLEST_KG_M2,
@@ -35,6 +35,8 @@ FASTEST = {"hinge": 30.0, "slide": 10.0}
 """Speed beyond which a limit is a placeholder, rad/s and m/s: no joint of an arm is as fast."""
 DENSITY_KG_M3 = 2700.0
 """Density of aluminium, for the inertia of a link that has none."""
+LARGEST_M = 5.0
+"""Radius of gyration of a link beyond which its inertia has another unit; a crane's boom has 3 m."""
 MOST_FACES = 200_000
 """Faces that MuJoCo reads of an STL."""
 NUMBERS = {
@@ -105,6 +107,7 @@ class _UrdfReader:
         """Return the source."""
         for part in (*self._root.findall("link"), *self._root.findall("joint")):
             self._check_numbers(part)
+        self._check_names()
         for link in self._root.findall("link"):
             self._correct_inertia(link)
             for shape in (*link.findall("visual"), *link.findall("collision")):
@@ -141,6 +144,25 @@ class _UrdfReader:
             f"`xacro {self._path.name} > robot.urdf` and give robot.urdf"
         )
 
+    def _check_names(self) -> None:
+        """Raise an error where a name repeats, or a joint hangs on a link that there is not."""
+        links = [link.get("name", "") for link in self._root.findall("link")]
+        joints = self._root.findall("joint")
+        for names in (links, [joint.get("name", "") for joint in joints]):
+            repeated = {name for name in names if names.count(name) > 1}
+            if repeated:
+                raise _refuse(self._path, f"the name '{min(repeated)}' repeats; rename one")
+        for joint in joints:
+            for end in ("parent", "child"):
+                element = joint.find(end)
+                name = "" if element is None else element.get("link", "")
+                if name not in links:
+                    raise _refuse(
+                        self._path,
+                        f"joint '{joint.get('name')}': there is no {end} link '{name}'; "
+                        f"{list_choices(name, links)}",
+                    )
+
     def _check_number(self, element: ElementTree.Element, key: str, text: str, where: str) -> None:
         if not text.strip():
             if key not in OPTIONAL:
@@ -169,6 +191,8 @@ class _UrdfReader:
                 self._path, f'{where}: {key}="{text}" of <{element.tag}> is not finite; change it'
             )
         element.set(key, " ".join(words))
+        if key == "rpy" and max(map(abs, values)) > 2.0 * math.pi:
+            self._source.note(where, f'rpy="{text}" is doubted: expected rad; degrees?')
 
     def _correct_inertia(self, link: ElementTree.Element) -> None:
         """Give a link an inertia that a body can have, or raise an error that names it."""
@@ -204,6 +228,10 @@ class _UrdfReader:
             self._source.note(f"link '{name}'", describe_balance(principal, "ixx to izz"))
             axes = np.linalg.eigh(tensor)[1]
             tensor = axes @ np.diag(balance_inertia(principal)) @ axes.T
+        if math.sqrt(principal[2] / mass_kg) > LARGEST_M:
+            self._source.note(
+                f"link '{name}'", f"{principal[2]:.3g} kg m² at {mass_kg:g} kg are doubted: units?"
+            )
         for old in (mass, inertia):
             if old is not None:
                 inertial.remove(old)
@@ -257,7 +285,8 @@ class _UrdfReader:
             joint.remove(limit)
         mimic = joint.find("mimic")
         if mimic is not None:
-            self._source.followers[name] = mimic.get("joint", "")
+            joint.remove(mimic)
+            self._source.followers[name] = mimic.get("joint", "an unnamed joint")
         if kind in ("floating", "planar"):
             joint.set("type", "fixed")
             self._source.note(
@@ -269,9 +298,8 @@ class _UrdfReader:
         given = {} if limit is None else {key: float(limit.get(key, "nan")) for key in OPTIONAL}
         found = JointLimits()
         self._source.limits[name] = found
-        ends = (given.get("lower", math.nan), given.get("upper", math.nan))
-        if kind != "continuous" and not np.isnan(ends).all():
-            travel = (float(np.nan_to_num(ends[0])), float(np.nan_to_num(ends[1])))
+        if kind != "continuous" and limit is not None and {"lower", "upper"} & limit.attrib.keys():
+            travel = (float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0)))
             set_travel(found, travel, shape, name, self._source)
         found.speed = self._choose_limit(given, "velocity", name)
         found.effort = self._choose_limit(given, "effort", name)

@@ -16,9 +16,14 @@ KINDS: dict[int, Literal["hinge", "slide"]] = {
     int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
 }
 """Joints of which a machine is made."""
-TURNS = 2.0
-"""Turns in one direction beyond which limits of a hinge are taken for degrees; joints of arms end at
-two turns at most."""
+DOUBTED = {
+    "hinge": (4.0 * math.pi + 0.1, "rad", "degrees", math.pi / 180.0),
+    "slide": (30.0, "m", "mm", 1e-3),
+}
+"""Limit beyond which the unit is doubted, the unit, the one that is likely, and its factor: joints of
+arms end at two turns, and axes of portals at some 20 m."""
+NARROW_RAD = 0.12
+"""Travel of a hinge below which radians may have been read as degrees: π becomes 0.055."""
 SMALLEST_KG, SMALLEST_KG_M2 = 1e-6, 1e-9
 """Mass and inertia of frames, which MuJoCo wants to be positive."""
 
@@ -79,14 +84,17 @@ def set_travel(
     if lower == upper or not np.isfinite(travel).all():
         source.note(name, f"limits of {travel[0]:g} and {travel[1]:g} are none.")
         return
-    if kind == "hinge" and max(-lower, upper) > TURNS * 2.0 * math.pi + 0.1:
+    bound, unit, wrong, factor = DOUBTED[kind]
+    if max(-lower, upper) > bound:
         found.is_doubted = True
         source.note(
             name,
-            f"limits of {lower:g} to {upper:g} rad are doubted and read as degrees: "
-            f"{math.radians(lower):.4g} to {math.radians(upper):.4g} rad. Write them in rad.",
+            f"limits of {lower:g} to {upper:g} {unit} are doubted and read as {wrong}: "
+            f"{factor * lower:.4g} to {factor * upper:.4g} {unit}. Write them in {unit}.",
         )
-        lower, upper = math.radians(lower), math.radians(upper)
+        lower, upper = factor * lower, factor * upper
+    elif kind == "hinge" and upper - lower < NARROW_RAD:
+        source.note(name, f"limits of {lower:.3g} to {upper:.3g} rad are narrow: degrees or rad?")
     found.travel = (lower, upper)
 
 

@@ -150,6 +150,8 @@ def edit(old: str, new: str) -> str:
         ),
         (edit(INERTIA, INERTIA.replace("1", "9")), -2.0, 2.0, 0.5, "'mast': an inertia that no body"),
         (edit(INERTIA, ""), -2.0, 2.0, 0.5, "'mast': no inertia"),
+        (edit('upper="0.8"', 'upper="800"'), -2.0, 2.0, 0.5, "reach: limits of 0 to 800 m are doubted"),
+        (edit('rpy="0.2 0 0"', 'rpy="0 90 0"'), -2.0, 2.0, 0.5, "joint 'lift': rpy"),
     ],
 )  # fmt: skip
 def test_odd_numbers_of_a_urdf_are_read_with_a_remark(
@@ -173,6 +175,8 @@ BALL = '<geom size="0.1"/>'
         ('<sdf version="1.6"/>', "expected a URDF"),
         (edit('velocity="0.5"', 'velocity="${max}"'), r"joint 'slew'.*xacro"),
         (edit('xyz="0 0 0.3"', 'xyz="0 0 a"'), "joint 'slew'.*is no number"),
+        (edit('<child link="beam"/>', '<child link="bean"/>'), "joint 'lift'.*did you mean 'beam'"),
+        (edit('name="lift"', 'name="slew"'), "the name 'slew' repeats"),
         (edit('<mass value="40"/>', '<mass value="-40"/>'), "link 'mast'.*mass of -40"),
         (edit(INERTIA, INERTIA.replace('"1"', '"-1"')), "link 'mast' has a principal inertia"),
         (edit('<mass value="40"/>', "").replace('<mass value="2"/>', ""), "'mast'.*has no mass"),
