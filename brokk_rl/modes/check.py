@@ -188,8 +188,11 @@ class Check:
         _show(machine, found)
         if is_new:
             file = folder / f"{machine.name}.yaml"
-            log.info("machine: %s, beside its MJCF; meshes in a folder of their own", file)
-            print_text(f"next, with a task: brokk mode=check machine=@{file} task=… actuator=lag")
+            log.info("machine: %s, beside its MJCF and meshes", file)
+            actuator = "servo" if machine.interface == "position" else "lag"
+            print_text(
+                f"next, with a task: brokk mode=check machine=@{file} task=… actuator={actuator}"
+            )
         log.info("report: %s", folder / "check.html")
 
     def _import_model(self) -> tuple[Machine, list[str]]:

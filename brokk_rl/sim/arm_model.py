@@ -136,13 +136,14 @@ class ArmModel:
         foot_m = np.array([*data.xpos[root, :2], 0.0])
         forward = data.xmat[root].reshape(3, 3)[:, 0]
         yaw = math.atan2(forward[1], forward[0]) if np.hypot(*forward[:2]) > 0.5 else 0.0
-        if not (foot_m.any() or abs(yaw) > 1e-9):
+        if np.allclose((*foot_m, yaw), 0.0, atol=1e-6):
             return
         turn = np.array(
             [[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
         )
         self.remarks.append(
-            f"The robot stands at x {foot_m[0]:.3g}, y {foot_m[1]:.3g} m in the model; its foot is the origin here."
+            f"The robot stands at x {foot_m[0]:.3g}, y {foot_m[1]:.3g} m, turned by {yaw:.3g} rad; its foot is the "
+            "origin here, and it looks along x."
         )
         for name in ("xanchor", "xipos", "geom_xpos", "site_xpos", "xpos"):
             points = getattr(data, name)

@@ -18,7 +18,7 @@ from brokk_rl.sim.model_source import KINDS, JointLimits
 from brokk_rl.spec import restore_spec
 
 HYDRAULIC_NAMES = re.compile("boom|stick|bucket|dipper|cylinder", re.IGNORECASE)
-"""Names of joints of machines that are moved by cylinders."""
+"""Names of joints and links of machines that are moved by cylinders."""
 NUM_POSES = 512
 """Random poses in which weights and the fastest mode are looked for."""
 SUBSTEPS = 5
@@ -161,7 +161,10 @@ class _MachineDescription:
     def _choose_drive(self) -> str:
         if self._choices.drive != "auto":
             return self._choices.drive
-        names = [self._arm.model.joint(joint).name for joint in self._arm.chain]
+        model, names = self._arm.model, []
+        for joint in self._arm.chain:
+            link = model.body(int(model.jnt_bodyid[joint])).name
+            names.append(f"{model.joint(joint).name} {link}")
         is_named = sum(bool(HYDRAULIC_NAMES.search(name)) for name in names) > 1
         return "hydraulic" if is_named or self._arm.tree.has_cylinders else "electric"
 
