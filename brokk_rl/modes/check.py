@@ -259,8 +259,9 @@ class Check:
         except BrokkError as error:
             found.unfit.append(str(error))
         try:
-            if fault := try_machine(machine, self.sim, actuator, num, drawn):
-                found.problems.append(fault)
+            fault, is_endured = try_machine(machine, self.sim, actuator, num, drawn)
+            if fault:
+                (found.missing if is_endured else found.problems).append(fault)
         except BrokkError as error:
             found.problems.append(str(error))
 

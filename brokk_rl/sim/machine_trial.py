@@ -19,6 +19,9 @@ from brokk_rl.sim.scene import make_empty_scenes
 
 TRIAL_S = 1.0
 """Simulated time, s: commands of full size reach the ends of travel in it."""
+MOST_FAULTS = 5e-4
+"""Share of control steps that may end in a fault: half of what a training endures
+(`rl.max_fault_rate`)."""
 
 
 def try_machine(
@@ -27,8 +30,10 @@ def try_machine(
     actuator: ActuatorModel | None,
     num_worlds: int,
     drawn: dict[str, torch.Tensor] | None,
-) -> str | None:
-    """Simulate a second; return what diverged and what to change, `None` where nothing did.
+) -> tuple[str | None, bool]:
+    """Simulate a second; return what diverged and what to change, and whether a training endures it.
+
+    Nothing diverged where the text is `None`.
 
     Half of the worlds get new random commands in each period, as a policy at the start of a
     training gives them, the other half full commands that stay.
@@ -76,16 +81,19 @@ def try_machine(
             recorder.record(increment, torch.zeros(num_worlds))
             history.push_q(world.q)
     if not recorder.is_held.any():
-        return None
+        return None, True
     num_faults, is_inside = int(recorder.is_held.sum()), is_touching[recorder.is_held]
+    is_endured = num_faults <= MOST_FAULTS * num_worlds * math.ceil(TRIAL_S / machine.period_s)
     (fault,) = recorder.fetch(1)
     said = f"{num_faults} of {num_worlds} worlds diverged in a simulated second: {fault.cause}. "
     if is_inside[0]:
-        return said + (
+        said += (
             "It began in contact with the block, the ground or itself: let the task draw other starts, "
             "or take block and ground away (scene: brokk_rl.sim.scene.make_empty_scenes)"
         )
-    return said + _suggest_stiffness(machine, world.model, q.numpy())
+    else:
+        said += _suggest_stiffness(machine, world.model, q.numpy())
+    return said, is_endured
 
 
 def _suggest_stiffness(machine: Machine, model: mujoco.MjModel, poses: np.ndarray) -> str:

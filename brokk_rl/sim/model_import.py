@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 
 from brokk_rl.machine import Machine
-from brokk_rl.sim.arm_model import ArmModel, ModelChoices, normalise_axis
+from brokk_rl.sim.arm_model import TIP, ArmModel, ModelChoices, normalise_axis
 from brokk_rl.sim.drive import FASTEST_MODE, compute_inertia, find_fastest_mode
 from brokk_rl.sim.model_source import KINDS, JointLimits
 from brokk_rl.spec import restore_spec
@@ -23,6 +23,10 @@ NUM_POSES = 512
 """Random poses in which weights and the fastest mode are looked for."""
 SUBSTEPS = 5
 """Substeps of a control period, as in `sim=native`."""
+GUESSED_TRAVEL = {"hinge": (-math.pi, math.pi), "slide": (-1.0, 1.0)}
+"""Ends of travel where the file has none, rad and m: one turn, and the length of an arm."""
+CLEARANCE_M = 0.02
+"""Height of all that touches above the ground at home."""
 UNITS = {"hinge": "rad", "slide": "m"}
 
 
@@ -138,21 +142,47 @@ class _MachineDescription:
         return ImportedMachine(values, mjcf, meshes, self._remarks)
 
     def _measure_poses(self, made: mujoco.MjModel) -> None:
-        """Measure weights and inertias of the arm, and its fastest mode with equal drives."""
+        """Measure weights and inertias of the arm, its home, and its fastest mode with equal drives."""
         data, generator = mujoco.MjData(made), np.random.default_rng(0)
-        mujoco.mj_forward(made, data)
-        travel = [self._get_limits(row).travel or (-np.pi, np.pi) for row in range(made.nq)]
-        lower, upper = (
-            np.array(travel).T - self._arm.model.qpos0[self._arm.model.jnt_qposadr[self._arm.chain]]
-        )
+        lower, upper = np.array([self._get_travel(row) for row in range(made.nq)]).T
         poses = generator.uniform(lower, upper, (NUM_POSES, made.nq))
-        self._inertia = compute_inertia(made, np.zeros(made.nq)).diagonal()
-        self._mode_rad_s, _ = find_fastest_mode(made, self._inertia, poses)
+        poses[0] = self._read_home(lower, upper)
+        lowest_m = np.zeros(len(poses))
         self._weights = np.zeros(made.nv)
-        for pose in poses:
+        touching = np.flatnonzero(made.geom_contype)
+        for number, pose in enumerate(poses):
             data.qpos[:] = pose
             mujoco.mj_forward(made, data)
             self._weights = np.maximum(self._weights, np.abs(data.qfrc_bias))
+            bottom_m = data.geom_xpos[touching, 2] - made.geom_rbound[touching]
+            lowest_m[number] = min(*data.xpos[1:, 2], data.site(TIP).xpos[2], *bottom_m)
+        self._home = poses[0]
+        if lowest_m[0] < CLEARANCE_M and lowest_m.max() >= CLEARANCE_M:
+            away = (((poses - poses[0]) / (upper - lower)) ** 2).sum(1)
+            self._home = poses[np.where(lowest_m >= CLEARANCE_M, away, np.inf).argmin()]
+            self._remarks.append(
+                "At zero the arm reaches into the ground; home is the nearest of some random poses above it."
+            )
+        self._inertia = compute_inertia(made, self._home).diagonal()
+        self._mode_rad_s, _ = find_fastest_mode(made, self._inertia, poses)
+
+    def _read_home(self, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+        """Return the first keyframe of the model, else zero or the middle of the travel, `(J,)`."""
+        model, chain = self._arm.model, self._arm.chain
+        middle = np.where((lower <= 0.0) & (upper >= 0.0), 0.0, (lower + upper) / 2.0)
+        if not model.nkey:
+            return middle
+        places = model.jnt_qposadr[chain]
+        return np.clip(model.key_qpos[0, places] - model.qpos0[places], lower, upper)
+
+    def _get_travel(self, row: int) -> tuple[float, float]:
+        """Return the ends of travel of a joint seen from zero; a guess where the model has none."""
+        joint = self._arm.chain[row]
+        kind = KINDS[int(self._arm.model.jnt_type[joint])]
+        zero = float(self._arm.model.qpos0[self._arm.model.jnt_qposadr[joint]])
+        if travel := self._get_limits(row).travel:
+            return travel[0] - zero, travel[1] - zero
+        return GUESSED_TRAVEL[kind]
 
     def _get_limits(self, row: int) -> JointLimits:
         name = self._arm.model.joint(self._arm.chain[row]).name
@@ -172,12 +202,10 @@ class _MachineDescription:
         """Return a joint and its link as plain data."""
         model, joint, source = self._arm.model, self._arm.chain[row], self._path.name
         name, kind = self._arm.names[row], KINDS[int(model.jnt_type[joint])]
-        limits, zero = self._get_limits(row), model.qpos0[model.jnt_qposadr[joint]]
-        if limits.travel:
-            lower, upper = (float(value - zero) for value in limits.travel)
-            travel = (source, "low" if limits.is_doubted else "high")
-        else:
-            lower, upper = (-math.pi, math.pi) if kind == "hinge" else (-1.0, 1.0)
+        limits = self._get_limits(row)
+        lower, upper = self._get_travel(row)
+        travel = (source, "low" if limits.is_doubted else "high")
+        if not limits.travel:
             travel = (f"guess: {source} has no limits", "low")
             self._guess("limits", name, f"{lower:.4g} to {upper:.4g} {UNITS[kind]}")
         speed = limits.speed or self._drive.speed[kind]
@@ -188,14 +216,13 @@ class _MachineDescription:
             self._guess("force limit", name, FORCE_GUESS)
         mass_kg, com_m, _ = self._arm.sum_masses(row)
         origin_m = self._arm.anchors[row] - (self._arm.anchors[row - 1] if row else 0.0)
-        home = 0.0 if lower <= 0.0 <= upper else (lower + upper) / 2.0
         return {
             "name": name,
             "part": None,
             "kind": kind,
             "lower": _make_dimension(lower, *travel),
             "upper": _make_dimension(upper, *travel),
-            "home": float(f"{home:.6g}"),
+            "home": float(np.clip(float(f"{self._home[row]:.4g}"), lower, upper)),
             "max_speed": _make_dimension(speed, f"velocity limit in {source}", "medium")
             if limits.speed
             else _make_dimension(speed, "guess", "low"),

@@ -249,6 +249,14 @@ def test_the_arm_is_found_among_other_joints(
     assert {one.command for one in machine.joints} == {"valve" if LOOP in text else "velocity"}
 
 
+def test_home_is_above_the_ground(tmp_path: Path) -> None:
+    low = nest("a", "b").replace('pos="0.5 0 0"', 'pos="0 0 0.05"', 1)
+    machine = read(SCENE.format(low, ""), tmp_path).build()
+    assert machine.home[0] < 0.0, "a positive turn about y lowers the arm"
+    text = SCENE.format(low, '<keyframe><key qpos="-0.5 0.1"/></keyframe>')
+    assert read(text, tmp_path).build().home == pytest.approx([-0.5, 0.1])
+
+
 def test_an_unknown_joint_is_answered_with_the_nearest(urdf: Path) -> None:
     with pytest.raises(ConfigError, match="did you mean 'lift'"):
         import_model(urdf, "arm", ModelChoices(chain=("left",)))
@@ -361,7 +369,7 @@ def test_drives_that_are_too_stiff_are_named_with_a_stiffness_that_is_not(machin
         strong = dataclasses.replace(machine, joints=tuple(joints))
         q = torch.tensor(machine.home, dtype=torch.float32).repeat(64, 1)
         drawn = {"q": q, "scene": make_empty_scenes(64)}
-        return try_machine(strong, option("sim", "native"), None, 64, drawn)
+        return try_machine(strong, option("sim", "native"), None, 64, drawn)[0]
 
     text = simulate(1e8)
     assert text and "q4 swings fastest" in text
