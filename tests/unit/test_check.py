@@ -204,7 +204,7 @@ def test_a_model_that_cannot_be_read_is_refused_by_name(
 def nest(*names: str, inside: str = "") -> str:
     text = inside
     for name in reversed(names):
-        kind = 'type="slide" range="0 0.4"' if name.startswith("slide") else 'range="-1 1"'
+        kind = 'type="slide" range="0 0.4"' if name.startswith("slide") else 'range="-60 60"'
         text = f'<body name="{name}_link" pos="0.5 0 0"><joint name="{name}" axis="0 1 0" {kind}/>{BALL}{text}</body>'
     return text
 
