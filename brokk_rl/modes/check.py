@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-import yaml
 
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator
@@ -33,11 +32,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-CLASSES = {
-    frozenset({"value", "source", "confidence"}): "Dimension",
-    frozenset({"axis", "origin_m", "mass_kg", "com_m", "yield_force", "stiffness"}): "Body",
-}
-"""Class of a table of a machine's file by its keys; the others are the machine and its joints."""
 JOINT_COLUMNS = {
     "lower": "lower",
     "upper": "upper",
@@ -215,10 +209,7 @@ class Check:
         folder = self.session.folder
         _write_meshes(folder, imported.meshes)
         write_text(folder / f"{name}.xml", imported.mjcf)
-        values = yaml.safe_dump(
-            _add_targets(imported.values), sort_keys=False, width=160, default_flow_style=None
-        )
-        write_text(folder / f"{name}.yaml", f"# {name}, made of {path.name}.\n{values}")
+        write_text(folder / f"{name}.yaml", imported.format_yaml())
         mjcf = str((folder / f"{name}.xml").resolve())
         return dataclasses.replace(imported.build(), mjcf=mjcf), imported.remarks
 
@@ -489,14 +480,3 @@ def _draw_workspace(machine: Machine, found: MachineCheck) -> Figure | None:
     top.set(title="from above", xlabel="x, m", ylabel="y, m")
     side.legend(frameon=False, fontsize=8)
     return figure
-
-
-def _add_targets(values: Any) -> Any:
-    """Return a machine's plain data with the class of each table, as its YAML has them."""
-    if isinstance(values, list):
-        return [_add_targets(value) for value in values]
-    if not isinstance(values, dict):
-        return values
-    name = CLASSES.get(frozenset(values), "Machine" if "joints" in values else "Joint")
-    target = {"_target_": f"brokk_rl.machine.{name}"}
-    return target | {key: _add_targets(value) for key, value in values.items()}

@@ -10,6 +10,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+import yaml
 
 from brokk_rl.machine import Machine
 from brokk_rl.sim.arm_model import TIP, ArmModel, ModelChoices, normalise_axis
@@ -28,6 +29,13 @@ GUESSED_TRAVEL = {"hinge": (-math.pi, math.pi), "slide": (-1.0, 1.0)}
 CLEARANCE_M = 0.02
 """Height of all that touches above the ground at home."""
 UNITS = {"hinge": "rad", "slide": "m"}
+
+
+CLASSES = {
+    frozenset({"value", "source", "confidence"}): "Dimension",
+    frozenset({"axis", "origin_m", "mass_kg", "com_m", "yield_force", "stiffness"}): "Body",
+}
+"""Class of a table of a machine's file by its keys; the others are the machine and its joints."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +94,13 @@ class ImportedMachine:
     def build(self) -> Machine:
         """Return the machine."""
         return restore_spec(Machine, self.values)
+
+    def format_yaml(self) -> str:
+        """Return the text of the machine's file."""
+        text = yaml.safe_dump(
+            _add_targets(self.values), sort_keys=False, width=160, default_flow_style=None
+        )
+        return f"# {self.values['title']}.\n{text}"
 
 
 def import_model(path: Path, name: str, choices: ModelChoices | None = None) -> ImportedMachine:
@@ -301,3 +316,14 @@ class _MachineDescription:
 
 def _make_dimension(value: float, source: str, confidence: str) -> dict[str, Any]:
     return {"value": float(f"{float(value):.6g}"), "source": source, "confidence": confidence}
+
+
+def _add_targets(values: Any) -> Any:
+    """Return a machine's plain data with the class of each table, as its YAML has them."""
+    if isinstance(values, list):
+        return [_add_targets(value) for value in values]
+    if not isinstance(values, dict):
+        return values
+    name = CLASSES.get(frozenset(values), "Machine" if "joints" in values else "Joint")
+    target = {"_target_": f"brokk_rl.machine.{name}"}
+    return target | {key: _add_targets(value) for key, value in values.items()}
