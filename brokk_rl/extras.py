@@ -41,6 +41,14 @@ EXTRA_OF_MODULE = (
 """The extra that all of a package's own work needs; the first prefix that fits decides."""
 
 
+def read_metadata() -> metadata.PackageMetadata | None:
+    """Return the metadata of the installed distribution; `None` where the sources run uninstalled."""
+    try:
+        return metadata.metadata(DISTRIBUTION)
+    except metadata.PackageNotFoundError:
+        return None
+
+
 def read_extras(lines: list[str] | None = None) -> dict[str, list[Requirement]]:
     """Return the requirements of each extra, those of the base under the empty name.
 
@@ -51,10 +59,8 @@ def read_extras(lines: list[str] | None = None) -> dict[str, list[Requirement]]:
             installed one, which are none where the sources run uninstalled.
     """
     if lines is None:
-        try:
-            lines = metadata.requires(DISTRIBUTION) or []
-        except metadata.PackageNotFoundError:
-            return {}
+        about = read_metadata()
+        lines = (about.get_all("Requires-Dist") if about else None) or []
     stated: dict[str, list[Requirement]] = {"": []}
     for line in lines:
         requirement = Requirement(line)
@@ -87,15 +93,14 @@ def find_extra(
     """
     top = module.partition(".")[0]
     wanted = canonicalize_name(DISTRIBUTION_NAMES.get(top, top))
-    holding = []
-    stated = read_extras() if extras is None else extras
-    for extra, requirements in stated.items():
+    holding = {}
+    for extra, requirements in (read_extras() if extras is None else extras).items():
         if extra and wanted in {canonicalize_name(one.name) for one in requirements}:
-            holding.append(extra)
+            holding[extra] = len(requirements)
     for prefix, extra in EXTRA_OF_MODULE:
         if importer.startswith(prefix) and extra in holding:
             return extra
-    return min(holding, key=lambda one: len(stated[one]), default=None)
+    return min(holding, key=lambda extra: holding[extra], default=None)
 
 
 def explain_missing_module(module: str, importer: str) -> str | None:

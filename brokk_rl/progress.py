@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Iterable, Iterator
 from typing import Any, Self, TypeVar
 
@@ -34,13 +33,13 @@ class ItemProgress:
     """Progress over a number of items, or of a share that grows to 1.
 
     Args:
-        title: What is done.
+        title: Work that is done.
         total: Number of items, or `SHARE`; `None` where nobody knows it.
         quiet: Show nothing: of several processes the first shows it for all.
     """
 
     def __init__(self, title: str, total: float | None, quiet: bool = False) -> None:
-        columns = (
+        self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
             TaskProgressColumn() if total == SHARE else MofNCompleteColumn(),
@@ -48,62 +47,55 @@ class ItemProgress:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-        )
-        # Tables and figures go to stdout; whoever redirects them still sees the bar.
-        self._bar = Progress(
-            *columns,
+            # Tables and figures go to stdout; whoever redirects them still sees the bar.
             # A notebook without ipywidgets would get a warning for each bar.
             console=Console(stderr=True, force_jupyter=False),
             transient=True,
             speed_estimate_period=SPEED_WINDOW_S,
             disable=quiet,
         )
-        self._task = self._bar.add_task(title, total=total, note="")
-        self._title, self._note, self._total, self._quiet = title, "", total, quiet
-        self._done, self._known = 0.0, 0.0
-        self._begun_s, self._told_s = time.monotonic(), time.monotonic()
+        self._bar.add_task(title, total=total, note="")
+        self._is_logged = not quiet and not self._bar.console.is_terminal
+        self._told_s = self._bar.get_time()
 
     def skip(self, count: float = 1) -> None:
         """Count items that were done before: they say nothing about the speed."""
-        self._known += count
-        self._done += count
-        # a new start of the clock: the bar's speed is that of the items of this run
-        self._bar.reset(self._task, total=self._total, completed=self._done)  # pyright: ignore[reportArgumentType]
+        task = self._bar.tasks[0]
+        # Resets the clock: the speed is that of the items of this run.
+        self._bar.reset(task.id, completed=task.completed + count, note="")  # pyright: ignore[reportArgumentType]
 
     def advance(self, count: float = 1) -> None:
         """Count items that are done."""
-        self.reach(self._done + count)
+        self.reach(self._bar.tasks[0].completed + count)
 
     def reach(self, done: float, title: str | None = None, note: str | None = None) -> None:
         """Set what is done so far; less than before is not shown, since a step may be repeated.
 
         Args:
-            done: Items or share.
-            title: What is done now; `None` leaves it.
+            done: Items or share, at most the total.
+            title: Work that is done now; `None` leaves it.
             note: Figures to show beside it; `None` leaves them.
         """
-        self._done = max(self._done, done)
-        self._title = self._title if title is None else title
-        self._note = self._note if note is None else note
-        self._bar.update(self._task, completed=self._done, description=self._title, note=self._note)
-        now_s = time.monotonic()
-        hidden = not self._bar.console.is_terminal and not self._quiet
-        if hidden and now_s - self._told_s > LINE_EVERY_S:
-            self._told_s = now_s
-            told = ", ".join(filter(None, (self.describe(now_s - self._begun_s), self._note)))
-            log.info("%s: %s", self._title, told)
+        task = self._bar.tasks[0]
+        done = max(task.completed, done if task.total is None else min(done, task.total))
+        fields = {} if note is None else {"note": note}
+        self._bar.update(task.id, completed=done, description=title, **fields)
+        if self._is_logged and self._bar.get_time() - self._told_s > LINE_EVERY_S:
+            self._told_s = self._bar.get_time()
+            log.info("%s: %s", task.description, self.describe())
 
-    def describe(self, elapsed_s: float) -> str:
-        """Return what is done and how long the rest takes, in words."""
-        fresh = self._done - self._known
-        if self._total == SHARE:
-            text = f"{self._done:.0%}"
+    def describe(self) -> str:
+        """Return what is done, how long the rest takes and the note, in words."""
+        task = self._bar.tasks[0]
+        if task.total == SHARE:
+            parts = [f"{task.percentage:.0f}%"]
+        elif task.total is None:
+            parts = [f"{task.completed:g}"]
         else:
-            text = f"{self._done:g}" + ("" if self._total is None else f" of {self._total:g}")
-        if not fresh or self._total is None:
-            return text
-        left_s = elapsed_s / fresh * (self._total - self._done)
-        return f"{text}, about {left_s / 60.0:.0f} min left"
+            parts = [f"{task.completed:g} of {task.total:g}"]
+        if task.time_remaining is not None and not task.finished:
+            parts.append(f"about {task.time_remaining / 60.0:.0f} min left")
+        return ", ".join(filter(None, (*parts, task.fields["note"])))
 
     def __enter__(self) -> Self:
         self._bar.__enter__()
@@ -118,11 +110,10 @@ def track_items(items: Iterable[Item], title: str, total: int | None = None) -> 
 
     Args:
         items: The items; without a length give `total`.
-        title: What is done.
+        title: Work that is done.
         total: Number of items, `None`: their length.
     """
-    count = total if total is not None else len(items)  # type: ignore[arg-type]
-    with ItemProgress(title, count) as progress:
+    with ItemProgress(title, len(items) if total is None else total) as progress:  # type: ignore[arg-type]
         for item in items:
             yield item
             progress.advance()

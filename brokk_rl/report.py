@@ -14,42 +14,29 @@ taken as markup. The page forbids itself scripts and any request. Figures are dr
 from __future__ import annotations
 
 import base64
-import io
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 from urllib.parse import quote
 
 from jinja2 import Environment, FileSystemLoader, Template
+from matplotlib.figure import Figure
 
+from brokk_rl.console_table import MISSING, is_numeric
 from brokk_rl.errors import StorageError
-from brokk_rl.parallel import map_parallel
+from brokk_rl.plot import draw_png
 from brokk_rl.session import write_text
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 Tone = Literal["good", "bad", "warn", "plain"]
 TEMPLATE_FILE = "report.html.jinja"
-MISSING = "–"
-"""Text of a missing value."""
-PICTURE_TYPES = {
-    ".png": "image/png",
-    ".svg": "image/svg+xml",
-    ".jpg": "image/jpeg",
-    ".jpeg": "image/jpeg",
-}
-NUMBER = re.compile(r"\s*[<>±≈]?\s*[-+−]?\d")
-"""Start of a text that counts as a number."""
+PNG = "image/png"
+PICTURE_TYPES = {".png": PNG, ".svg": "image/svg+xml", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 BEST_MARK = "▸ "
 """Mark before the best of a kind; before, so that numbers stay aligned at the right."""
-DPI = 150
-"""Resolution of figures, dots an inch: sharp in print at page width; chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -78,10 +65,6 @@ class Cell:
         return BEST_MARK + text if self.best else text
 
 
-Block = dict[str, Any]
-"""An element of a report as the template takes it: its `kind` and the values to show."""
-
-
 class Report:
     """A report that grows from top to bottom.
 
@@ -93,38 +76,31 @@ class Report:
 
     def __init__(self, title: str, summary: str = "", tone: Tone = "plain") -> None:
         self._title = title
-        self._blocks: list[Block] = []
-        self._figures: list[tuple[Block, Figure]] = []
-        if summary:
-            self.add_text(summary, tone, "summary")
+        self._blocks: list[dict[str, Any]] = []
+        self.add_text(summary, tone, "summary")
 
     def add_heading(self, text: str, level: int = 2) -> None:
         """Begin a section (level 2) or a part of one (level 3)."""
-        self._blocks.append({"kind": "heading", "text": text, "level": level})
+        self._add("heading", text=text, level=level)
 
     def add_text(self, text: str, tone: Tone = "plain", style: str = "") -> None:
         """Add paragraphs, separated by empty lines; `tone` sets them apart."""
-        classes = " ".join(name for name in (style, tone) if name not in ("", "plain"))
+        classes = f"{style} {tone}".replace("plain", "").strip()
         for paragraph in text.split("\n\n"):
             if paragraph.strip():
-                self._blocks.append(
-                    {"kind": "paragraph", "text": paragraph.strip(), "classes": classes}
-                )
+                self._add("paragraph", text=paragraph.strip(), classes=classes)
 
     def add_list(self, texts: Sequence[str]) -> None:
         """Add a list of short texts."""
-        self._blocks.append({"kind": "list", "texts": list(texts)})
+        self._add("list", texts=texts)
 
     def add_links(self, files: Mapping[str, str]) -> None:
         """Add links to files beside the page: text and path, relative to the page's folder."""
-        links = []
-        for text, path in files.items():
-            links.append({"text": text, "address": quote(path)})
-        self._blocks.append({"kind": "links", "links": links})
+        self._add("links", links={text: quote(path) for text, path in files.items()})
 
     def add_code(self, text: str) -> None:
         """Add commands or a file unchanged."""
-        self._blocks.append({"kind": "code", "text": text})
+        self._add("code", text=text)
 
     def add_table(
         self,
@@ -148,32 +124,15 @@ class Report:
             if len(row) != len(columns):
                 raise ValueError(f"expected {len(columns)} cells a row, got {len(row)}: {row}")
         numeric = []
-        for i in range(len(columns)):
-            numeric.append(_is_numeric([row[i].value for row in cells]))
-        shown = []
-        for row in cells:
-            shown.append(
-                [
-                    _prepare_cell(cell, is_number, digits)
-                    for cell, is_number in zip(row, numeric, strict=True)
-                ]
-            )
-        heads = []
-        for name, is_number in zip(columns, numeric, strict=True):
-            heads.append({"name": name, "is_number": is_number})
-        self._blocks.append(
-            {
-                "kind": "table",
-                "columns": heads,
-                "has_head": any(columns),
-                "rows": shown,
-                "caption": caption,
-            }
+        for column in range(len(columns)):
+            numeric.append(is_numeric([row[column].value for row in cells]))
+        self._add(
+            "table", columns=columns, rows=cells, numeric=numeric, caption=caption, digits=digits
         )
 
-    def add_facts(self, facts: dict[str, str | float | None]) -> None:
+    def add_facts(self, facts: Mapping[str, str | float | None]) -> None:
         """Add names and their values, one a line."""
-        self.add_table(["", ""], [[name, Cell(value)] for name, value in facts.items()])
+        self.add_table(["", ""], list(facts.items()))
 
     def add_picture(self, source: Figure | Path, caption: str = "", description: str = "") -> None:
         """Add a picture; its data become part of the page.
@@ -184,39 +143,24 @@ class Report:
             description: Content for those who cannot see it; the caption where it is empty.
 
         Raises:
-            StorageError: the file cannot be read.
+            StorageError: The file cannot be read.
         """
-        block: Block = {
-            "kind": "picture",
-            "address": "",
-            "description": description or caption,
-            "caption": caption,
-        }
-        if isinstance(source, Path):
-            block["address"] = _embed(*_read_picture(source))
-        else:
-            self._figures.append((block, source))
-        self._blocks.append(block)
+        kind, data = _read_picture(source) if isinstance(source, Path) else (PNG, draw_png(source))
+        address = f"data:{kind};base64,{base64.b64encode(data).decode()}"
+        self._add("picture", address=address, description=description or caption, caption=caption)
 
     @contextmanager
     def add_details(self, summary: str, is_open: bool = False) -> Iterator[None]:
         """Fold everything that is added within the block behind a line; printed in full."""
-        outer, inner = self._blocks, []
-        self._blocks = inner
+        outer, self._blocks = self._blocks, []
         try:
             yield
         finally:
-            outer.append(
-                {"kind": "details", "summary": summary, "is_open": is_open, "blocks": inner}
-            )
-            self._blocks = outer
+            inner, self._blocks = self._blocks, outer
+            self._add("details", summary=summary, is_open=is_open, blocks=inner)
 
     def render(self) -> str:
-        """Return the whole page; figures are drawn now, as each takes half a second."""
-        drawn = map_parallel(lambda one: _draw_png(one[1]), self._figures)
-        for (block, _), picture in zip(self._figures, drawn, strict=True):
-            block["address"] = _embed(*picture)
-        self._figures.clear()
+        """Return the whole page."""
         made = f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"
         return _load_template().render(title=self._title, blocks=self._blocks, made=made)
 
@@ -224,7 +168,7 @@ class Report:
         """Write the page in one step: readers see the old file or the whole new one.
 
         Raises:
-            StorageError: it could not be written.
+            StorageError: It could not be written.
         """
         try:
             write_text(path, self.render())
@@ -233,27 +177,14 @@ class Report:
                 f"cannot write {path}: {error.strerror or error}; nothing was left behind"
             ) from error
 
-
-def write_picture(figure: Figure, path: Path) -> None:
-    """Write a figure as a PNG file.
-
-    Raises:
-        StorageError: it could not be written; nothing was left behind.
-    """
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        temporary.write_bytes(_draw_png(figure)[1])
-        temporary.replace(path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise StorageError(f"cannot write {path}: {error.strerror or error}") from error
+    def _add(self, kind: str, **values: Any) -> None:
+        """Add an element as the template takes it."""
+        self._blocks.append({"kind": kind, **values})
 
 
 @cache
 def _load_template() -> Template:
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent), autoescape=True, trim_blocks=False
-    )
+    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
     return environment.get_template(TEMPLATE_FILE)
 
 
@@ -266,29 +197,3 @@ def _read_picture(path: Path) -> tuple[str, bytes]:
         return kind, path.read_bytes()
     except OSError as error:
         raise StorageError(f"cannot read picture {path}: {error.strerror or error}") from error
-
-
-def _embed(kind: str, data: bytes) -> str:
-    """Return an address that holds the data itself."""
-    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
-
-
-def _draw_png(figure: Figure) -> tuple[str, bytes]:
-    """Return media type and data of a matplotlib figure."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=DPI)
-    return PICTURE_TYPES[".png"], buffer.getvalue()
-
-
-def _is_numeric(values: Sequence[str | float | None]) -> bool:
-    """Return whether a column holds numbers, or texts that begin like one."""
-    given = [value for value in values if value is not None and value != MISSING]
-    return bool(given) and all(not isinstance(value, str) or NUMBER.match(value) for value in given)
-
-
-def _prepare_cell(cell: Cell, is_number: bool, digits: int) -> Block:
-    """Return a cell as the template takes it."""
-    classes = " ".join(
-        name for name, given in (("number", is_number), ("best", cell.best)) if given
-    )
-    return {"text": cell.format(digits), "note": cell.note, "classes": classes}

@@ -16,7 +16,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy import stats
 
-from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, remove_frame
+from brokk_rl.plot import BLUE, GREY, RED, add_legend, make_figure, remove_frame, save_figure
 from brokk_rl.report import Cell, Report, Tone
 from brokk_rl.statistics import compute_wilson_interval
 
@@ -169,7 +169,7 @@ def write_report(found: Mapping[str, Any], folder: Path) -> None:
     text, tone = write_headline(found)
     page = Report("Success of the policy before and after retraining", text, tone)
     figure = draw_success(found)
-    figure.savefig(folder / PICTURE_FILE, dpi=150)
+    save_figure(figure, folder / PICTURE_FILE)
     page.add_picture(
         figure,
         "Share of episodes that end in strict success, with Wilson's 95 % intervals; all meet the same starts.",

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from brokk_rl.plot import BLUE, GREY, ORANGE, add_legend, make_figure
-from brokk_rl.report import DPI, MISSING, Cell, Report
+from brokk_rl.console_table import MISSING
+from brokk_rl.plot import BLUE, GREY, ORANGE, add_legend, make_figure, save_figure
+from brokk_rl.report import Cell, Report
 from brokk_rl.session import write_text
 
 REPORT_FILE = "exam.html"
@@ -154,7 +155,7 @@ def _add_candidate(page: Report, folder: Path, name: str, table: Mapping[str, An
     for stem, figure in drawings.items():
         if figure is not None:
             path = folder / f"{stem}_{name}.png"
-            figure.savefig(path, dpi=DPI)
+            save_figure(figure, path)
             page.add_picture(path, CAPTIONS[stem])
     columns = ["right", "wrong", "missed", "precision", "recall", "f1", "parameter_error"]
     rows = []

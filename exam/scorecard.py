@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from actuators import open_loop
+from brokk_rl.console_table import MISSING
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.report import MISSING, Cell, Report
+from brokk_rl.report import Cell, Report
 from brokk_rl.session import write_json, write_text
 from exam.real_cases import KnownCauses
 

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import pyplot as plt
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from actuators.excite.player import Sample
@@ -15,6 +16,7 @@ from actuators.recordings.preview import PreviewResult
 from actuators.recordings.preview_report import draw_preview, measure_picture_height
 from brokk_rl.contracts.actuator import Segment
 from brokk_rl.machine import Machine
+from brokk_rl.plot import make_figure, remove_frame, save_figure
 
 BEFORE, PLAYING, AWAY, AFTER = range(4)
 """On the way to the start of a segment and resting there; in its program; brought home meanwhile;
@@ -179,7 +181,7 @@ def draw_plan(
     heights = [1.0 + 1.65 * rows]
     if preview:
         heights.append(measure_picture_height(machine))
-    whole = plt.figure(figsize=(17, sum(heights)), layout="constrained")
+    whole = make_figure(17, sum(heights))
     parts = whole.subfigures(len(heights), 1, height_ratios=heights, squeeze=False)[:, 0]
     figure = parts[0]
     axes = figure.subplots(rows + 1, 1, sharex=True, height_ratios=ratios)
@@ -198,7 +200,7 @@ def draw_plan(
         for span in spans:
             axis.axvspan(span["start"], span["end"], color=span["color"], alpha=0.13, linewidth=0)
         axis.grid(axis="x", alpha=0.25)
-        axis.spines[["top", "right"]].set_visible(False)
+        remove_frame(axis)
     axes[-1].set_xlabel("time, minutes")
     axes[0].set_xlim(0.0, max(plan.run_s / 60.0, float(minutes[-1])))
     others = (
@@ -215,8 +217,7 @@ def draw_plan(
         frameon=False,
         fontsize=9,
     )
-    whole.savefig(path, dpi=110)
-    plt.close(whole)
+    save_figure(whole, path)
 
 
 def _find_spans(plan: ExcitationPlan, track: PlanTrack) -> list[dict[str, Any]]:
@@ -250,7 +251,7 @@ def _find_spans(plan: ExcitationPlan, track: PlanTrack) -> list[dict[str, Any]]:
     return found
 
 
-def _draw_segments(axis: plt.Axes, spans: list[dict[str, Any]]) -> None:
+def _draw_segments(axis: Axes, spans: list[dict[str, Any]]) -> None:
     """Draw the strip of segments on top, with the names that find room."""
     whole = spans[-1]["end"]
     for span in spans:
@@ -288,7 +289,7 @@ def _draw_segments(axis: plt.Axes, spans: list[dict[str, Any]]) -> None:
 
 
 def _draw_joint(
-    axis: plt.Axes, minutes: np.ndarray, q: np.ndarray, u: np.ndarray, machine: Machine, joint: int
+    axis: Axes, minutes: np.ndarray, q: np.ndarray, u: np.ndarray, machine: Machine, joint: int
 ) -> None:
     """Draw command (grey; full is half the height), position and stops of one joint."""
     lower, upper, alone = machine.lower[joint], machine.upper[joint], machine.is_exclusive[joint]
@@ -325,7 +326,7 @@ def _build_legend(plan: ExcitationPlan, machine: Machine) -> list[Any]:
     if any(segment.repeat_of for segment in plan.runs[0]):
         handles.append(Patch(facecolor="white", edgecolor="black", hatch="////", label="repeat"))
     handles.append(Patch(facecolor=WAY, label="way to the start, rest"))
-    handles.append(plt.Line2D([], [], color="black", label="predicted position"))
+    handles.append(Line2D([], [], color="black", label="predicted position"))
     handles.append(Patch(facecolor="#8c8c8c", alpha=0.6, label="command (full: to the stops)"))
     if machine.is_exclusive.any():
         names = ", ".join(
@@ -336,5 +337,5 @@ def _build_legend(plan: ExcitationPlan, machine: Machine) -> list[Any]:
         handles.append(
             Patch(facecolor=ALONE, alpha=0.6, label=f"command of {names}: never with others")
         )
-    handles.append(plt.Line2D([], [], color="#b00020", linestyle=(0, (5, 3)), label="stop"))
+    handles.append(Line2D([], [], color="#b00020", linestyle=(0, (5, 3)), label="stop"))
     return handles

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from actuators.identify.results import HOLD, LINEAR, VerdictSentence
 from actuators.identify.scores import REGIMES
-from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
-from brokk_rl.report import DPI, Cell, Report
+from brokk_rl.plot import save_figure
+from brokk_rl.report import Cell, Report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,12 +31,7 @@ def write_page(
         StorageError: something could not be written.
     """
     for stem, figure in drawings.items():
-        try:
-            figure.savefig(folder / f"{stem}.png", dpi=DPI)
-        except OSError as error:
-            raise StorageError(
-                f"cannot write {folder / f'{stem}.png'}: {error.strerror or error}"
-            ) from error
+        save_figure(figure, folder / f"{stem}.png")
     page = Report(
         f"{result['model']}, actuator model of {machine.name}", findings[0].text, findings[0].tone
     )

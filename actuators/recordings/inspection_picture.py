@@ -9,6 +9,7 @@ import numpy as np
 
 from actuators.recordings.inspection import KINDS, Inspection, RecordingFinding
 from brokk_rl.machine import Machine
+from brokk_rl.plot import make_figure, save_figure
 from brokk_rl.record import Breach, Recording
 
 if TYPE_CHECKING:
@@ -47,10 +48,8 @@ def draw_recording(
     breaches: Sequence[Breach],
 ) -> None:
     """Draw commands, positions, findings (shaded) and breaches (lines) as PNG."""
-    from matplotlib.figure import Figure
-
     count = machine.num_joints
-    figure = Figure(figsize=(14, 1.1 + 1.7 * count), layout="constrained")
+    figure = make_figure(14, 1.1 + 1.7 * count)
     axes = figure.subplots(count, 1, sharex=True, squeeze=False)[:, 0]
     t_s = recording.t_s
     begin_s, span_s = float(np.nanmin(t_s)), max(float(np.nanmax(t_s) - np.nanmin(t_s)), 1e-9)
@@ -91,14 +90,12 @@ def draw_recording(
         {finding.kind for finding in inspection.findings},
         any(breach.row is not None for breach in breaches),
     )
-    figure.savefig(path, dpi=100)
+    save_figure(figure, path)
 
 
 def draw_overview(path: Path, lines: Mapping[str, OverviewRow]) -> None:
     """Draw one line a recording with its findings; writes a PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(12, 1.2 + 0.26 * len(lines)), layout="constrained")
+    figure = make_figure(12, 1.2 + 0.26 * len(lines))
     axis = figure.subplots()
     longest_s = max((line.duration_s for line in lines.values()), default=0.0) or 1.0
     for place, line in enumerate(lines.values()):
@@ -123,7 +120,7 @@ def draw_overview(path: Path, lines: Mapping[str, OverviewRow]) -> None:
     _add_legend(
         figure, {finding.kind for line in lines.values() for finding in line.findings}, False
     )
-    figure.savefig(path, dpi=100)
+    save_figure(figure, path)
 
 
 def _add_legend(figure: "Figure", kinds: set[str], has_breaches: bool) -> None:

@@ -19,7 +19,7 @@ from brokk_rl.errors import BrokkError, ConfigError, StorageError
 from brokk_rl.gravity import Gravity
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Dimension, Machine
-from brokk_rl.plot import BLUE, GREY, ORANGE, make_figure, remove_frame
+from brokk_rl.plot import BLUE, GREY, ORANGE, make_figure, remove_frame, save_figure
 from brokk_rl.report import Report
 from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.spec import Count, name_spec, spec
@@ -177,7 +177,7 @@ class Check:
         write_json(folder / "check.json", facts)
         picture = _draw_workspace(machine, found)
         if picture:
-            picture.savefig(folder / "workspace.png", dpi=130)
+            save_figure(picture, folder / "workspace.png")
         _write_report(machine, found, facts, folder)
         _show(machine, found)
         if is_new:

@@ -6,7 +6,7 @@ import logging
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -27,6 +27,9 @@ from brokk_rl.session import Session
 from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec
 
+if TYPE_CHECKING:
+    from brokk_rl.play.page import PlayPage
+
 log = logging.getLogger(__name__)
 
 POLICY, CLASSICAL = "policy", "classical"
@@ -37,18 +40,6 @@ FRAME_S = 1 / 30
 """Time between two pictures, s. Chosen by hand for the eye."""
 RATE_S = 30.0
 """Time between two lines about the rate, s; the first comes after a tenth of it. By hand."""
-
-
-class Viewer(Protocol):
-    """Page or window of a session."""
-
-    def update(self) -> bool:
-        """Do what the person has asked for and show the state; false when the person has left."""
-        ...
-
-    def close(self) -> None:
-        """End it."""
-        ...
 
 
 @spec
@@ -64,7 +55,7 @@ class Play:
         event: Changes of the simulated machine, by name.
         follower: Who stands between policy and machine.
         policy: The policy; that of a running training is loaded anew with each checkpoint.
-        play: Viewer, worlds and pace.
+        play: Page, worlds and pace.
     """
 
     machine: Machine
@@ -83,24 +74,21 @@ class Play:
         Raises:
             ConfigError: The port is taken, or a driver or device is missing.
             CheckpointError: There is no policy, or it is of another machine or task.
-            DeviceError: There is no display for a window, or no such GPU.
+            DeviceError: There is no such GPU.
         """
-        settings = self.play
+        from brokk_rl.play.page import PlayPage, require_free_port
+
         gamepad = self._open_gamepad()
-        if settings.viewer == "browser":
-            from brokk_rl.play.page import require_free_port
-
-            require_free_port(settings.port)
-        else:
-            from brokk_rl.sim.window import require_display
-
-            require_display()
+        port = self.play.port
+        require_free_port(port)
         session, watch = self._build_session()
-        viewer = _open_viewer(session, settings, gamepad)
+        page = PlayPage(session, port, gamepad)
+        log.info("open http://localhost:%d in a browser; end with Ctrl-C", port)
+        log.info("over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", port, port)
         try:
-            _drive(session, viewer, watch, settings.seconds)
+            _drive(session, page, watch, self.play.seconds)
         finally:
-            viewer.close()
+            page.close()
             if gamepad is not None:
                 gamepad.close()
 
@@ -178,28 +166,10 @@ def _describe(watch: CheckpointWatch) -> str:
     return f"{watch.loaded.parent.name}/{watch.loaded.name}"
 
 
-def _open_viewer(
-    session: PlaySession, settings: PlaySettings, gamepad: GamepadLevers | None
-) -> Viewer:
-    """Open page or window, and say where it is."""
-    if settings.viewer == "window":
-        from brokk_rl.play.window_view import WindowView
-
-        return WindowView(session, gamepad)
-    from brokk_rl.play.page import PlayPage
-
-    page = PlayPage(session, settings.port, gamepad)
-    log.info("open http://localhost:%d in a browser; end with Ctrl-C", page.port)
-    log.info(
-        "over ssh: ssh -L %d:localhost:%d <this computer>, then the same link", page.port, page.port
-    )
-    return page
-
-
 def _drive(
-    session: PlaySession, viewer: Viewer, watch: CheckpointWatch | None, seconds: float | None
+    session: PlaySession, page: PlayPage, watch: CheckpointWatch | None, seconds: float | None
 ) -> None:
-    """Simulate at the wanted pace and show it, until the person or the time ends it."""
+    """Simulate at the wanted pace and show it, until the time ends it."""
     begun_s = last_s = time.monotonic()
     report_s = begun_s + RATE_S / 10
     with torch.no_grad():
@@ -207,23 +177,15 @@ def _drive(
             now_s = time.monotonic()
             session.advance(now_s - last_s)
             last_s = now_s
-            if not viewer.update():
-                return
+            page.update()
             if watch is not None and (policy := watch.poll()) is not None:
                 session.replace_policy(POLICY, policy, _describe(watch))
                 log.info("playing %s", _describe(watch))
             if now_s >= report_s:
                 report_s = now_s + RATE_S
-                _report_rate(session)
+                state = session.read()
+                steps = round(state.rate / session.machine.period_s)
+                worlds = session.loop.num_envs
+                text = "%.2f times real time, %d control steps/s in each of %d worlds"
+                log.info(text, state.rate, steps, worlds)
             time.sleep(max(0.0, FRAME_S - (time.monotonic() - now_s)))
-
-
-def _report_rate(session: PlaySession) -> None:
-    state = session.read()
-    if not state.paused:
-        log.info(
-            "%.2f times real time, %d control steps/s in each of %d worlds",
-            state.rate,
-            round(state.rate / session.machine.period_s),
-            session.loop.num_envs,
-        )

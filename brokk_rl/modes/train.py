@@ -27,6 +27,7 @@ from brokk_rl.policy_folder import (
 )
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.logger import (
+    LEVELS,
     PROGRESS,
     NoTracking,
     Tracker,
@@ -45,7 +46,6 @@ from brokk_rl.rl.policy import (
 )
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
-from brokk_rl.rl.success_sweep import LEVELS
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec

@@ -3,29 +3,29 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-import trimesh
 import viser
+from mjviser import ViserMujocoScene
+from mjviser.conversions import merge_geoms
 
 from brokk_rl.machine import Machine
 from brokk_rl.play.session import PlayState
+from brokk_rl.sim.posed_scene import PosedScene
 from brokk_rl.sim.scene import FAR_M
-from brokk_rl.sim.shapes import MachineMesh, build_drilled_block
 
 SPACING_M = (9.0, 6.5)
 """Distance of neighbouring worlds along x and y. Chosen by hand: arms of two do not meet."""
-CONCRETE, HOLE, TRUE, SEEN = ((186, 184, 178), (52, 50, 48), (230, 90, 40), (40, 120, 220))
-"""Colours of the block, its hole's bottom, the true target, and the policy's estimate."""
+TRUE, SEEN = (230, 90, 40), (40, 120, 220)
+"""Colours of the true target and of the policy's estimate."""
 CAMERA_M, LOOK_AT_M = (4.9, -5.4, 3.3), (1.3, 0.0, 0.8)
 """Place of the camera and what it looks at, for one world. Chosen by hand for the eye."""
-MARK_M = 0.025
-"""Radius of the ball at a target, m. Chosen by hand for the eye."""
+MARK_M = 0.05
+"""Diameter of the mark at a target, m. Chosen by hand for the eye."""
 
 
 class SceneView:
-    """Everything in the scene; one batch of triangles draws a link of all worlds.
+    """Everything in the scene; mjviser draws a link of all worlds at once.
 
     Args:
         server: Browser's server.
@@ -37,70 +37,56 @@ class SceneView:
     def __init__(
         self, server: viser.ViserServer, machine: Machine, num_worlds: int, can_move: bool
     ) -> None:
-        self._server, self._num = server, num_worlds
-        self._machine_mesh = MachineMesh(machine)
+        self._server, self._num_worlds = server, num_worlds
+        self._posed = PosedScene(machine)
         self._offsets = place_worlds(num_worlds)
-        self._links: list[tuple[int, Any]] = []
-        self._blocks: dict[int, tuple[tuple[float, float], Any]] = {}
-        self._dragging = False
+        self._blocks: dict[int, tuple[np.ndarray, viser.GlbHandle]] = {}
+        self._is_dragged = False
+        model = self._posed.model
+        # mjviser draws once what is welded to the ground; a base stands in every world.
+        model.body_weldid[1:] = np.arange(1, model.nbody)
+        # Blocks differ between worlds and are drawn one by one: the shared one is transparent.
+        model.geom_rgba[self._posed.block_geoms, 3] = 0.0
+        self._machines = ViserMujocoScene(server, model, num_worlds)
+        self._machines.camera_tracking_enabled = False
+        model.geom_rgba[self._posed.block_geoms, 3] = 1.0
         self._set_up_stage()
-        still = np.tile((1.0, 0.0, 0.0, 0.0), (num_worlds, 1))
-        for number, shape in enumerate(self._machine_mesh.shapes):
-            handle = server.scene.add_batched_meshes_simple(
-                f"/machine/{number}",
-                shape.vertices,
-                shape.faces,
-                still,
-                self._offsets,
-                batched_colors=np.array(shape.color),
-                lod="off",
+        self._marks = {}
+        for name, color in (("target", TRUE), ("estimate", SEEN)):
+            self._marks[name] = server.scene.add_point_cloud(
+                f"/{name}",
+                self._offsets.astype(np.float32),
+                color,
+                point_size=MARK_M,
+                point_shape="circle",
+                precision="float32",
+                visible=False,
             )
-            self._links.append((shape.body, handle))
-        self._marks = {
-            name: server.scene.add_batched_meshes_trimesh(
-                f"/{name}", _make_ball(color), still, self._offsets, lod="off", visible=False
+        self.handle: viser.TransformControlsHandle | None = None
+        if can_move:
+            self.handle = server.scene.add_transform_controls(
+                "/hole", scale=0.55, disable_rotations=True, depth_test=False, opacity=0.85
             )
-            for name, color in (("target", TRUE), ("estimate", SEEN))
-        }
-        self.handle = (
-            server.scene.add_transform_controls(
-                "/hole",
-                scale=0.55,
-                disable_rotations=True,
-                depth_test=False,
-                opacity=0.85,
-                position=tuple(self._offsets[0]),
-            )
-            if can_move
-            else None
-        )
 
     def draw(self, state: PlayState) -> None:
         """Show a state."""
-        offsets = self._offsets
-        positions, turns = self._machine_mesh.compute_poses(state.q[: self._num])
-        for body, link in self._links:
-            if self._machine_mesh.is_moving(body):
-                link.batched_positions = (positions[:, body] + offsets).astype(np.float32)
-                link.batched_wxyzs = turns[:, body].astype(np.float32)
+        places, turns = self._posed.locate_bodies(state.q[: self._num_worlds])
+        self._machines.update_from_arrays(places + self._offsets[:, None], turns)
         for name, points in (("target", state.target_m), ("estimate", state.estimate_m)):
             mark = self._marks[name]
             mark.visible = points is not None
             if points is not None:
-                mark.batched_positions = (points[: self._num] + offsets).astype(np.float32)
+                mark.points = (points[: self._num_worlds] + self._offsets).astype(np.float32)
         if state.scene is not None:
-            for index, row in enumerate(state.scene[: self._num]):
-                self._draw_block(index, row)
-        if self.handle is not None and state.target_m is not None and not self._dragging:
-            place = tuple(
-                state.target_m[state.selected] + offsets[min(state.selected, self._num - 1)]
-            )
-            if not np.allclose(place, self.handle.position, atol=1e-4):
-                self.handle.position = place
+            for world, scene in enumerate(state.scene[: self._num_worlds]):
+                self._draw_block(world, scene)
+        if self.handle is not None and state.target_m is not None and not self._is_dragged:
+            offset = self._offsets[min(state.selected, self._num_worlds - 1)]
+            self.handle.position = tuple(state.target_m[state.selected] + offset)
 
     def hold_handle(self, held: bool) -> None:
         """Set whether a person drags the handle; the program does not move it meanwhile."""
-        self._dragging = held
+        self._is_dragged = held
 
     def read_handle(self, world: int) -> np.ndarray:
         """Return the place of the handle in the base frame of a world, `(3,)`."""
@@ -112,7 +98,6 @@ class SceneView:
         scene = self._server.scene
         scene.set_up_direction("+z")
         scene.configure_environment_map("park", environment_intensity=0.9)
-        extent = np.ptp(self._offsets, axis=0)
         scene.add_grid(
             "/ground",
             width=60.0,
@@ -128,7 +113,7 @@ class SceneView:
             position=(0.0, 0.0, -0.002),
         )
         camera = self._server.initial_camera
-        middle = self._offsets.mean(0)
+        middle, extent = self._offsets.mean(0), np.ptp(self._offsets, axis=0)
         away = 1.0 + float(np.hypot(*extent[:2])) / 9.0
         camera.position = tuple(np.array(CAMERA_M) * away + middle)
         camera.look_at = tuple(np.array(LOOK_AT_M) + middle)
@@ -136,31 +121,18 @@ class SceneView:
 
     def _draw_block(self, world: int, scene: np.ndarray) -> None:
         """Put the block of a world in its place; its shape is sent anew only where it differs."""
-        x, y, rim_z, yaw, scale, radius = scene
-        near = float(np.hypot(x, y)) < FAR_M
-        key = (round(float(scale), 4), round(float(radius), 4))
-        if not near:
-            if world in self._blocks:
-                self._blocks[world][1].visible = False
+        before, handle = self._blocks.get(world, (None, None))
+        if before is not None and np.array_equal(before, scene):
             return
-        place = tuple(np.array([x, y, rim_z]) + self._offsets[world])
-        turn = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
-        if world not in self._blocks or self._blocks[world][0] != key:
-            vertices, faces = build_drilled_block(float(scale), float(radius))
-            handle = self._server.scene.add_mesh_simple(
-                f"/block/{world}",
-                vertices.astype(np.float32),
-                faces.astype(np.uint32),
-                color=CONCRETE,
-                side="double",
-                position=place,
-                wxyz=turn,
-            )
-            self._blocks[world] = key, handle
-        handle = self._blocks[world][1]
-        handle.visible = True
-        if not np.allclose(handle.position, place, atol=1e-5):
-            handle.position, handle.wxyz = place, turn
+        if handle is None or before is None or not np.array_equal(before[4:], scene[4:]):
+            self._posed.set_scene(scene)
+            mesh = merge_geoms(self._posed.model, self._posed.block_geoms)
+            handle = self._server.scene.add_mesh_trimesh(f"/block/{world}", mesh)
+        x, y, rim_z, yaw = scene[:4]
+        handle.position = tuple(np.array([x, y, rim_z]) + self._offsets[world])
+        handle.wxyz = (math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2))
+        handle.visible = math.hypot(x, y) < FAR_M
+        self._blocks[world] = scene.copy(), handle
 
 
 def place_worlds(num_worlds: int) -> np.ndarray:
@@ -171,9 +143,3 @@ def place_worlds(num_worlds: int) -> np.ndarray:
     places[:, 0] = index // columns * -SPACING_M[0]
     places[:, 1] = index % columns * SPACING_M[1]
     return places
-
-
-def _make_ball(color: tuple[int, int, int]) -> Any:
-    ball: Any = trimesh.creation.icosphere(3, MARK_M)
-    ball.visual.vertex_colors = np.tile((*color, 255), (len(ball.vertices), 1))
-    return ball

@@ -1,12 +1,12 @@
 """Core of `mode=play`: commands of a person in, state of the simulated machines out.
 
-It knows neither browser nor window, and runs in one thread; viewers hand their commands over.
+It knows no browser and runs in one thread; the page hands its commands over.
 """
 
 from __future__ import annotations
 
 from collections import Counter, deque
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -32,6 +32,8 @@ RATE_S = 2.0
 DISTANCE_M, HEIGHT_M = (1.6, 4.6), (0.0, 1.6)
 """Where a target may be put: distance from the slew axis and height. Chosen by hand: a block that
 is nearer would stand in the undercarriage, and the arm of a Brokk 170 reaches 5.2 m."""
+SHOWN_STATE = {"scene": "start.scene", "target_m": "start.target_m", "estimate_m": "estimate_m"}
+"""State of the task, where it has it, that is drawn."""
 PUSH_S = 0.5
 """Time for which a push lasts, s. Chosen by hand."""
 
@@ -46,8 +48,6 @@ class PlayState:
         scene: Scenes, `(N, S)`; see `brokk_rl.sim.scene`; `None` where the task does not tell.
         target_m: True targets in the base frame, `(N, 3)`; `None` where the task has none.
         estimate_m: Targets as the policy sees them, likewise.
-        force_n: Peak contact force of the last step, `(N,)`.
-        load: Whether each world is being pushed, `(N,)` bool.
         driver: Who drives: a policy's name, or `PERSON`.
         note: About the policy, such as its checkpoint.
         selected: World that traces and commands are about.
@@ -64,8 +64,6 @@ class PlayState:
     scene: np.ndarray | None
     target_m: np.ndarray | None
     estimate_m: np.ndarray | None
-    force_n: np.ndarray
-    load: np.ndarray
     driver: str
     note: str
     selected: int
@@ -92,19 +90,6 @@ class PlayTraces:
     """
 
     t_s: np.ndarray
-    proposed: np.ndarray
-    given: np.ndarray
-    q: np.ndarray
-    lateral_m: np.ndarray
-    height_m: np.ndarray
-    force_n: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Sample:
-    """One control step of all worlds; fields as in `PlayTraces`, with an axis for the worlds."""
-
-    t_s: float
     proposed: np.ndarray
     given: np.ndarray
     q: np.ndarray
@@ -142,8 +127,9 @@ class PlaySession:
         self._pins: dict[int, torch.Tensor] = {}
         self._restarted = torch.zeros(loop.num_envs, dtype=torch.bool, device=loop.device)
         self._push_n: dict[int, tuple[torch.Tensor, int]] = {}
-        self._pulled: int | None = None
-        self._trace: deque[_Sample] = deque(maxlen=round(TRACE_S / loop.machine.period_s))
+        self._trace: deque[dict[str, np.ndarray]] = deque(
+            maxlen=round(TRACE_S / loop.machine.period_s)
+        )
         self._clock: deque[tuple[float, int]] = deque()
         self._endings: Counter[str] = Counter()
         self._successes = 0
@@ -208,8 +194,11 @@ class PlaySession:
 
     def nudge_lever(self, joint: int, change: float) -> None:
         """Move the person's lever of a joint by `change`, of full stroke."""
-        levers = self._person.levers
-        levers[joint] = (levers[joint] + change).clamp(-1.0, 1.0)
+        self.put_lever(joint, float(self._person.levers[joint]) + change)
+
+    def put_lever(self, joint: int, position: float) -> None:
+        """Put the person's lever of a joint to a position in [-1, 1]."""
+        self._person.levers[joint] = min(max(position, -1.0), 1.0)
 
     def set_levers(self, levers: torch.Tensor) -> None:
         """Put the person's levers to positions, `(J,)` in [-1, 1]."""
@@ -256,20 +245,6 @@ class PlaySession:
         force = torch.as_tensor(force_n, dtype=torch.float32, device=self.loop.device)
         self._push_n[self.selected] = force, round(PUSH_S / self.machine.period_s)
 
-    def pull_joints(self, load: np.ndarray | None) -> None:
-        """Load the joints of the selected machine until the next call.
-
-        Args:
-            load: Torque or force on each joint, `(J,)`, N m or N; `None` for none.
-        """
-        if load is None:
-            if self._pulled is not None:
-                self._read_load()[self._pulled] = 0.0
-            self._pulled = None
-            return
-        self._pulled = self.selected
-        self._read_load()[self._pulled] = torch.as_tensor(load)
-
     def _read_load(self) -> torch.Tensor:
         """Return the loads that the world knows, `(N, J)`."""
         world = self.loop.world
@@ -291,14 +266,10 @@ class PlaySession:
         """
         if not self.can_move_target:
             raise ConfigError(f"the target of {type(self.loop.task).__name__} cannot be moved")
-        position = np.asarray(position_m, float)
+        position = np.array(position_m, float)
         distance = max(float(np.hypot(*position[:2])), 1e-6)
-        position = np.array(
-            [
-                *position[:2] * np.clip(distance, *DISTANCE_M) / distance,
-                np.clip(position[2], *HEIGHT_M),
-            ]
-        )
+        position[:2] *= np.clip(distance, *DISTANCE_M) / distance
+        position[2] = np.clip(position[2], *HEIGHT_M)
         place = torch.as_tensor(position, dtype=torch.float32, device=self.loop.device)
         self._pins[self.selected] = place
         self._put_target(self.selected, place)
@@ -342,19 +313,14 @@ class PlaySession:
 
     def read(self) -> PlayState:
         """Return the state to draw."""
-        loop, state = self.loop, self.loop.task.state
-        target, estimate = state.get("start.target_m"), state.get("estimate_m")
-        scene = state.get("start.scene")
-        load = np.zeros(loop.num_envs, bool)
-        load[list(self._push_n)] = True
+        state = self.loop.task.state
+        drawn = {}
+        for field, name in SHOWN_STATE.items():
+            drawn[field] = _to_numpy(state[name]) if name in state else None
         return PlayState(
             t_s=self._steps * self.machine.period_s,
-            q=loop.world.q.cpu().numpy().copy(),
-            scene=None if scene is None else _to_numpy(scene),
-            target_m=None if target is None else _to_numpy(target),
-            estimate_m=None if estimate is None else _to_numpy(estimate),
-            force_n=_to_numpy(loop.end_force_n),
-            load=load,
+            q=_to_numpy(self.loop.world.q),
+            **drawn,
             driver=self.driver,
             note=self._notes[self._acting],
             selected=self.selected,
@@ -368,22 +334,11 @@ class PlaySession:
 
     def read_traces(self) -> PlayTraces:
         """Return the last seconds of the selected world."""
-        rows, world = list(self._trace), self.selected
-        empty = np.zeros((0, self.machine.num_joints))
-
-        def gather(name: str) -> np.ndarray:
-            values = [getattr(row, name)[world] for row in rows]
-            return np.array(values) if rows else empty
-
-        return PlayTraces(
-            t_s=np.array([row.t_s for row in rows]),
-            proposed=gather("proposed"),
-            given=gather("given"),
-            q=gather("q"),
-            lateral_m=gather("lateral_m"),
-            height_m=gather("height_m"),
-            force_n=gather("force_n"),
-        )
+        traces = {}
+        for field in fields(PlayTraces):
+            rows = [row[field.name][self.selected] for row in self._trace]
+            traces[field.name] = np.array(rows)
+        return PlayTraces(**traces)
 
     def read_observation(self) -> np.ndarray:
         """Return the vector that the policy sees in the selected world, `(O,)`."""
@@ -421,16 +376,17 @@ class PlaySession:
         error = torch.where(loop.done[:, None], torch.nan, error)
         proposed = self._person.proposed
         assert proposed is not None
+        seconds = np.full(loop.num_envs, self._steps * self.machine.period_s)
         self._trace.append(
-            _Sample(
-                t_s=self._steps * self.machine.period_s,
-                proposed=_to_numpy(proposed),
-                given=_to_numpy(loop.end_u),
-                q=_to_numpy(loop.end_q),
-                lateral_m=_to_numpy(error[:, :2].norm(dim=1)),
-                height_m=_to_numpy(error[:, 2]),
-                force_n=_to_numpy(loop.end_force_n),
-            )
+            {
+                "t_s": seconds,
+                "proposed": _to_numpy(proposed),
+                "given": _to_numpy(loop.end_u),
+                "q": _to_numpy(loop.end_q),
+                "lateral_m": _to_numpy(error[:, :2].norm(dim=1)),
+                "height_m": _to_numpy(error[:, 2]),
+                "force_n": _to_numpy(loop.end_force_n),
+            }
         )
 
     def _count_endings(self) -> None:

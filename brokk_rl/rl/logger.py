@@ -18,6 +18,7 @@ import numpy as np
 import yaml
 
 from brokk_rl.errors import ConfigError, SimulationError
+from brokk_rl.plot import draw_grid, make_figure, save_figure
 from brokk_rl.progress import SHARE, ItemProgress
 from brokk_rl.spec import spec
 
@@ -26,6 +27,8 @@ log = logging.getLogger(__name__)
 PROGRESS = "progress.csv"
 SUCCESS = "episode/success_strict"
 """Column of `progress.csv` with the share of successes among the episodes of an iteration."""
+LEVELS = (0.95, 0.99)
+"""Strict success whose time of training is reported."""
 WINDOW = 4096
 """Newest finished episodes over which success is averaged. Every iteration is asked: with 1,024 a
 training that succeeds in 0.98 of its episodes passed 0.99 by chance (benchmarks/h100/success)."""
@@ -379,8 +382,6 @@ def draw_curves(progress: Path, picture: Path) -> None:
 
     A curve whose column is missing is left out: a task may record fewer figures.
     """
-    from brokk_rl.plot import make_figure, save_figure
-
     with progress.open(newline="") as file:
         rows = []
         for row in csv.DictReader(file):
@@ -395,7 +396,7 @@ def draw_curves(progress: Path, picture: Path) -> None:
         for name, label in curves:
             axis.plot(steps, [row[name] for row in rows], label=label, linewidth=1.2)
         axis.set_title(title, loc="left", fontsize=10)
-        axis.grid(alpha=0.3)
+        draw_grid(axis)
         if limits:
             axis.set_ylim(*limits)
         if len(curves) > 1:

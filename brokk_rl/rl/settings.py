@@ -323,3 +323,23 @@ def _drop_nulls(value: Any) -> Any:
                 kept[key] = _drop_nulls(item)
         return kept
     return value
+
+
+@spec
+class BenchmarkSizes:
+    """Measurements: numbers of environments and durations.
+
+    Attributes:
+        num_envs: Numbers of environments, one row each; of each process where `torchrun` starts
+            several.
+        seconds: Least time of each measurement.
+        iterations: Training iterations timed, after one to warm up.
+    """
+
+    num_envs: tuple[Count, ...]
+    seconds: Positive
+    iterations: Count
+
+    def check(self) -> None:
+        if not self.num_envs:
+            raise ConfigError("num_envs: expected one or more numbers of environments, got none")

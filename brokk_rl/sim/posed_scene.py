@@ -35,6 +35,12 @@ class PosedScene:
 
     def set_pose(self, q: np.ndarray, scene: np.ndarray) -> None:
         """Put the machine at `q`, shape `(J,)`, beside the block of `scene`, shape `(S,)`."""
+        self.set_scene(scene)
+        self.data.qpos[:] = q
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def set_scene(self, scene: np.ndarray) -> None:
+        """Give the block the shape and the place of `scene`, shape `(S,)`."""
         row = torch.as_tensor(scene, dtype=torch.float64)[None]
         size, pos = self._placement.geoms(row)
         ids = self._placement.geom_ids.numpy()
@@ -44,5 +50,20 @@ class PosedScene:
         self.model.geom_size[ids], self.model.geom_pos[ids] = wall.size, wall.pos
         position, turn = self._placement.pose(row)
         self.data.mocap_pos[0], self.data.mocap_quat[0] = position[0].numpy(), turn[0].numpy()
-        self.data.qpos[:] = q
-        mujoco.mj_kinematics(self.model, self.data)
+
+    @property
+    def block_geoms(self) -> list[int]:
+        """Shown geoms of the block."""
+        is_block = self.model.geom_bodyid == self.model.body("block").id
+        is_shown = np.isin(self.model.geom_group, SHOWN_GROUPS)
+        return np.flatnonzero(is_block & is_shown).tolist()
+
+    def locate_bodies(self, q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return places `(N, bodies, 3)` and turns `(N, bodies, 3, 3)` at positions `(N, J)`."""
+        places, turns = [], []
+        for row in q:
+            self.data.qpos[:] = row
+            mujoco.mj_kinematics(self.model, self.data)
+            places.append(self.data.xpos.copy())
+            turns.append(self.data.xmat.reshape(-1, 3, 3).copy())
+        return np.array(places), np.array(turns)

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, remove_frame
+from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, make_figure, remove_frame
 from brokk_rl.statistics import compute_student_interval
 from deploy.study import tlx
 from deploy.study.analysis import Analysis, MeasuredTrial
@@ -31,7 +31,7 @@ def draw_paths(found: Analysis) -> Figure:
         if trial.counts and len(trial.tip_in_base_m):
             drawn.append(trial)
     holes = sorted({_name_hole(trial) for trial in drawn})
-    figure = Figure(figsize=(3.6 * max(1, len(holes)), 6.8), layout="constrained")
+    figure = make_figure(3.6 * max(1, len(holes)), 6.8)
     for column, name in enumerate(holes):
         here = []
         for trial in drawn:
@@ -53,7 +53,7 @@ def draw_paths(found: Analysis) -> Figure:
 
 def draw_radar(found: Analysis) -> Figure:
     """Draw the mean of each NASA-TLX scale, with and without guidance, with Student's intervals."""
-    figure = Figure(figsize=(6.2, 5.6), layout="constrained")
+    figure = make_figure(6.2, 5.6)
     axis = figure.add_subplot(projection="polar")
     angles = np.linspace(0, 2 * math.pi, len(tlx.SCALES), endpoint=False)
     # The two conditions are drawn slightly apart, so that their intervals do not hide each other.
@@ -86,7 +86,7 @@ def draw_radar(found: Analysis) -> Figure:
 def draw_pairs(found: Analysis, names: Sequence[str]) -> Figure:
     """Draw one line a participant from unguided to guided, a panel a measure; means with intervals beside."""
     rows = -(-len(names) // COLUMNS)
-    figure = Figure(figsize=(3.6 * COLUMNS, 2.9 * rows + 0.5), layout="constrained")
+    figure = make_figure(3.6 * COLUMNS, 2.9 * rows + 0.5)
     for number, name in enumerate(names):
         axis = figure.add_subplot(rows, COLUMNS, number + 1)
         values = (
@@ -123,7 +123,7 @@ def draw_pairs(found: Analysis, names: Sequence[str]) -> Figure:
 
 def draw_effects(found: Analysis, names: Sequence[str]) -> Figure:
     """Draw the effect of guidance on each measure in standard deviations of a person's difference, with 95 % intervals."""
-    figure = Figure(figsize=(8.0, 0.36 * len(names) + 1.4), layout="constrained")
+    figure = make_figure(8.0, 0.36 * len(names) + 1.4)
     axis = figure.add_subplot()
     axis.axvline(0.0, color=GREY, linewidth=1)
     for row, name in enumerate(names):

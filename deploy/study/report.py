@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from brokk_rl.errors import StorageError
+from brokk_rl.plot import save_figure
 from brokk_rl.report import Cell, Report
 from brokk_rl.session import write_json, write_text
 from deploy.study import plots, tlx
@@ -65,7 +66,7 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
                 figure.suptitle(
                     "SIMULATED OPERATORS", fontsize=9, color="#b3261e", x=0.02, ha="left"
                 )
-            figure.savefig(folder / f"{name}.png", dpi=150)
+            save_figure(figure, folder / f"{name}.png")
     except OSError as error:
         raise StorageError(
             f"cannot write the report into {folder}: {error.strerror or error}"

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import torch
 
+from brokk_rl.plot import make_figure, remove_frame, save_figure
 from brokk_rl.progress import ItemProgress
 from perception.segment.network import THRESHOLD
 from perception.segment.unet import CHANNELS, UNet
@@ -153,9 +154,7 @@ def draw_samples(
 
 def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
     """Draw loss and overlaps over the updates; writes a PNG."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(9, 3.6), layout="constrained")
+    figure = make_figure(9, 3.6)
     left, right = figure.subplots(1, 2)
     # The network that it began with was not fitted yet.
     fitted = [entry for entry in curve if entry["loss"] is not None]
@@ -173,5 +172,5 @@ def draw_curve(path: Path, curve: Sequence[dict[str, float | None]]) -> None:
     right.set(xlabel="update", ylabel="intersection over union, unseen frames", ylim=(0, 1))
     right.legend(frameon=False, loc="lower right")
     for axis in (left, right):
-        axis.spines[["top", "right"]].set_visible(False)
-    figure.savefig(path, dpi=100)
+        remove_frame(axis)
+    save_figure(figure, path)

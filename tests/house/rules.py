@@ -58,8 +58,8 @@ DOORS = {
     "tensordict": ("brokk_rl.rl",),
     "wandb": ("brokk_rl.rl",),
     "cv2": ("perception", "deploy.picture"),
+    "mjviser": ("brokk_rl.play",),
     "viser": ("brokk_rl.play",),
-    "trimesh": ("brokk_rl.play", "brokk_rl.sim"),
     "can": ("deploy", "actuators.recordings.can_log"),
     "cantools": ("deploy", "actuators.recordings.can_log"),
 }

@@ -179,19 +179,12 @@ def test_two_gpus_learn_together_what_rsl_rls_own_learn(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_bench_adds_up_what_two_processes_reach_and_compares_it_with_one(
-    tmp_path: Path,
-) -> None:
-    assert started(tmp_path, str(BIN / "brokk"), *BENCH, "session.out=one").returncode == 0
-    one = tmp_path / "one" / "benchmark.json"
-    assert together(tmp_path, *BENCH, "session.out=run", f"bench.against={one}").returncode == 0
+def test_the_bench_adds_up_what_two_processes_reach(tmp_path: Path) -> None:
+    assert together(tmp_path, *BENCH, "session.out=run").returncode == 0
     found = read(tmp_path / "run" / "benchmark.json")
     rates = [rank["train_env_steps_per_s"] for rank in found["per_rank"]]
     assert found["ranks"] == len(rates) == 2 and found["train_env_steps_per_s"] == pytest.approx(
         sum(rates)
-    )
-    assert found["weak_scaling"]["train_env_steps_per_s"] == pytest.approx(
-        sum(rates) / 2 / read(one)["train_env_steps_per_s"]
     )
 
 

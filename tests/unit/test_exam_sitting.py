@@ -186,16 +186,6 @@ def test_the_closed_share_is_that_worked_by_hand() -> None:
     assert examiner.MAX_DIFFERENCE == 0.2
 
 
-def test_progress_tells_the_time_left_by_the_items_of_this_run() -> None:
-    progress = ItemProgress("cases", 10)
-    progress.skip(4)
-    assert progress.describe(100.0) == "4 of 10"
-    progress.advance()
-    progress.advance()
-    # two in 240 s: 120 s each, four are left
-    assert progress.describe(240.0) == "6 of 10, about 8 min left"
-
-
 def test_an_interrupted_program_leaves_no_note_and_sits_again(
     machine: Machine, tmp_path: Path
 ) -> None:

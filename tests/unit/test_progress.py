@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from brokk_rl import progress
 from brokk_rl.progress import SHARE, ItemProgress, track_items
 
 
@@ -12,7 +11,7 @@ from brokk_rl.progress import SHARE, ItemProgress, track_items
 def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     """The time that the module reads, s."""
     now = [0.0]
-    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr("rich.console.monotonic", lambda: now[0])
     return now
 
 
@@ -39,7 +38,20 @@ def test_a_repeated_step_does_not_go_back_and_quiet_work_says_nothing(
     work.reach(7)
     clock[0] = 100.0
     work.reach(3, title="looking")
-    assert work.describe(10.0) == "7" and caplog.messages == []
+    assert work.describe() == "7" and caplog.messages == []
+
+
+def test_resumed_work_has_the_speed_of_this_run_and_ends_at_the_total(clock: list[float]) -> None:
+    work = ItemProgress("training", SHARE)
+    work.skip(0.5)
+    for second in (10.0, 20.0, 30.0):
+        clock[0] = second
+        work.reach(0.5 + second / 100)
+    # 0.01 a second: 0.2 are left
+    clock[0] = 30.0
+    assert work.describe() == "80%, about 0 min left"
+    work.reach(1.01, note="300 steps/s")
+    assert work.describe() == "100%, 300 steps/s"
 
 
 def test_items_are_counted_as_they_are_used() -> None:
