@@ -25,7 +25,7 @@ from actuators.effects.composition import ActuatorWithEffects, MeasuredActuatorM
 from actuators.open_loop import FreeRunWindows
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.errors import BrokkError, RecordingError
+from brokk_rl.errors import BrokkError, ConfigError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -241,7 +241,7 @@ def read_effects(path: Path, machine: Machine) -> dict[str, Any]:
             if fields.pop("_target_") != f"{target.__module__}.{target.__name__}":
                 raise ValueError(f"'{name}' has another target than the library's")
             found[name] = target(**fields)
-    except (OSError, KeyError, ValueError, TypeError, AttributeError, yaml.YAMLError) as error:
+    except (OSError, KeyError, ValueError, AttributeError, yaml.YAMLError, ConfigError) as error:
         raise RecordingError(f"{path}: no effects of the library ({error})") from error
     return found
 
