@@ -70,8 +70,8 @@ def build_quick_nodes(
                 continue
             try:
                 built[key] = build_node(value, key)
-            except _SlowImport:
-                late.append(key)
+            except (_SlowImport, _LackingPackageError):
+                late.append(key)  # the mode itself says first which package it needs
             except ConfigError as error:
                 refusals.append(error)
         machine = built.get("machine")
@@ -120,31 +120,31 @@ def load_class(target: object, place: str) -> Any:
     try:
         return getattr(importlib.import_module(module), name)
     except Exception as error:
+        if isinstance(error, ModuleNotFoundError):
+            text = extras.explain_missing_module(str(error.name), str(target))
+            if text:
+                raise _LackingPackageError(text) from error
         reason = _explain_import(module, name, error)
         if reason is None:
             raise
-        raise ConfigError(_complete("", f"{target}{reason}", place)) from error
+        raise ConfigError(_complete("", reason, place)) from error
 
 
 def _explain_import(module: str, name: str, error: Exception) -> str | None:
     """Return why a class cannot be imported, `None` for a defect of this package."""
-    missing = str(getattr(error, "name", None))
-    if isinstance(error, ModuleNotFoundError):
-        text = extras.explain_missing_module(missing, f"{module}.{name}")
-        if text:
-            return f": {text}"
+    target = f"{module}.{name}"
     found = _find_line(error)
     if found is None:
         if isinstance(error, ModuleNotFoundError) and "is not a package" not in str(error):
             return (
-                f": there is no module '{missing}' (seen from {Path.cwd()}); install its package, "
-                "or add its folder to PYTHONPATH"
+                f"{target}: there is no module '{error.name}' (seen from {Path.cwd()}); install its "
+                "package, or add its folder to PYTHONPATH"
             )
-        return f": the module '{module}' has no '{name}'"
+        return f"{target}: the module '{module}' has no '{name}'"
     file, line = found
     if Path(file).is_relative_to(Path(__file__).parents[1]) and "site-packages" not in file:
         return None
-    return f" cannot be imported: {file}, line {line}: {type(error).__name__}: {error}"
+    return f"{target} cannot be imported: {file}, line {line}: {type(error).__name__}: {error}"
 
 
 def _find_line(error: BaseException) -> tuple[str, int] | None:
@@ -185,6 +185,10 @@ def _complete(key: str, text: str, place: str) -> str:
     if typed == place or not typed.startswith(place):
         return f"{message} (in '{place}': change {place}.<field>=… or its file)"
     return f"{message} (change {typed}=… or its file)"
+
+
+class _LackingPackageError(ConfigError):
+    """A class needs a package that an extra brings and that is not installed."""
 
 
 class _SlowImport(BaseException):
