@@ -44,6 +44,8 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
         ConfigError: A class cannot be found, a key is unknown, or a value is refused.
     """
     built, late = build_quick_nodes(values, shared)
+    if RUN not in values:
+        raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
     kind = load_class(values[RUN], "")
     known = [field.name for field in fields(kind)]
     for key in late:

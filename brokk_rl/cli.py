@@ -89,6 +89,8 @@ def main() -> int:
         if _is_first_process():
             sys.stderr.write("interrupted\n")
         return 130
+    except SystemExit as left:  # Hydra has said why, as for `--cfg job --package` of no such part.
+        return 2 if left.code else 0
     except (FailedJob, Exception) as error:
         SweepFolder.drop_if_unused()
         cause = error.args[0] if isinstance(error, FailedJob) else error

@@ -16,6 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import distributed, extensions
 from brokk_rl.build import build_mode
+from brokk_rl.errors import ConfigError
 from brokk_rl.explain import read_mode_name
 from brokk_rl.policy_choice import insert_policy, is_going_on
 from brokk_rl.session import read_earlier_job, remove_empty_folders, require_new_folder
@@ -91,7 +92,11 @@ def _collect_facts(name: str, mode: Any) -> dict[str, Any]:
 
 
 def choose_run_folder(values: Mapping[str, Any]) -> Path:
-    """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`."""
+    """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`.
+
+    Raises:
+        ConfigError: `session.out` is a list or a table.
+    """
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
         fixed = settings.job.config.override_dirname.exclude_keys
@@ -99,8 +104,10 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
             int(settings.job.num), list(settings.overrides.task), list(fixed)
         )
     out = values["session"]["out"]
+    if isinstance(out, (list, dict)):
+        raise ConfigError(f"session.out: expected one folder, got {out}; change session.out=…")
     if out and out != "???":
-        return Path(out)
+        return Path(str(out))
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
     name = Path(name).stem if name else None  # An option may be a file: experiment=@<path>.
     stem = "_".join(

@@ -6,10 +6,11 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import pandas as pd
+from annotated_types import MinLen
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -70,7 +71,7 @@ class RunSelection:
         baseline: Values of the row to which others are compared; `None`: the first.
     """
 
-    runs: str | tuple[str, ...]
+    runs: str | Annotated[tuple[str, ...], MinLen(1)]
     baseline: dict[str, Any] | None
 
 

@@ -99,6 +99,12 @@ class Train:
     together: ClassVar[bool] = True
     """Several processes that `torchrun` starts train one policy."""
 
+    def check(self) -> None:
+        parts = (self.sim, *vars(self.sim).values())  # sim=auto holds two simulators
+        worlds = [part.num_worlds for part in parts if hasattr(part, "num_worlds")]
+        if worlds and self.rl.num_envs is None:
+            self.rl.check_batches(max(worlds))
+
     def run(self) -> float | None:
         """Train.
 

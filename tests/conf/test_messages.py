@@ -92,6 +92,8 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("session.out=it's",): ("'", r"""'session.out="it'"'"'s"'"""),
     ("session.out=a,b",): ("""one text: 'session.out="a,b"'""",),
     ("session.out=a(b)",): ("""'session.out="a(b)"'""",),
+    ("session.out=[a]",): ("expected one folder",),
+    ("mode=compare", "compare.runs=[]"): ("at least 1",),
     ("session.seed=",): ("session.seed=<value>",),
     ("rl.runner.actor.hidden_dims=(64,64)",): ("'rl.runner.actor.hidden_dims=[64,64]'",),
     ("rl.runner.algorithm.learning_rate=1,5",): ("learning_rate=1.5",),
@@ -115,13 +117,15 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=board", "board.rows=0"): ("expected a whole number of 2 or more, got 0",),
 }
 """A command, and parts of its message."""
-OWN_MODULES = {
+AFTER_TORCH = {
+    ("rl.runner.algorithm.num_mini_batches=100000",): ("num_mini_batches: expected at most 98304",),
     ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
     ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
     ("--config-dir", "own", "actuator=fails"): ("fails.py, line 2", "squareroot"),
     ("--config-dir", "own", "actuator=slip"): ("slip.py, line 2", "SyntaxError"),
 }
-"""The same for a class of one's own, whose module is imported after torch."""
+"""The same for what can be known only after the import of torch: a class of one's own, and values
+of several parts."""
 
 
 @pytest.fixture(scope="module")
@@ -131,12 +135,12 @@ def refusals(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], 
         (desk / name).parent.mkdir(parents=True, exist_ok=True)
         (desk / name).write_text(text)
     before = sorted(desk.iterdir())
-    found = refuse_all([*WRONG, *OWN_MODULES], desk)
+    found = refuse_all([*WRONG, *AFTER_TORCH], desk)
     assert sorted(desk.iterdir()) == before, "a refused command leaves nothing behind"
     return found
 
 
-@pytest.mark.parametrize("words", [*WRONG, *OWN_MODULES], ids=" ".join)
+@pytest.mark.parametrize("words", [*WRONG, *AFTER_TORCH], ids=" ".join)
 def test_the_message_says_what_to_write(
     words: tuple[str, ...], refusals: dict[tuple[str, ...], Refusal]
 ) -> None:
@@ -144,7 +148,7 @@ def test_the_message_says_what_to_write(
     assert refusal.code == 2
     assert sum(line.startswith("error: ") for line in refusal.told.splitlines()) == 1
     assert "Traceback" not in refusal.told
-    for part in (WRONG | OWN_MODULES)[words]:
+    for part in (WRONG | AFTER_TORCH)[words]:
         assert part in refusal.told
     if words in WRONG:
         assert not refusal.torch
