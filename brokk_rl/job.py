@@ -16,7 +16,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import distributed, extensions
 from brokk_rl.build import build_mode
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.explain import read_mode_name
 from brokk_rl.policy_choice import insert_policy, is_going_on
 from brokk_rl.session import read_earlier_job, remove_empty_folders, require_new_folder
@@ -95,7 +95,7 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
     """Return the run folder: that of a sweep's job, else `session.out`, else a new one in `runs`.
 
     Raises:
-        ConfigError: `session.out` is a list or a table.
+        ConfigError: `session` is no table, or `session.out` no single folder.
     """
     settings = HydraConfig.get()
     if settings.mode is RunMode.MULTIRUN:
@@ -103,7 +103,13 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
         return Path(settings.sweep.dir) / name_job(
             int(settings.job.num), list(settings.overrides.task), list(fixed)
         )
-    out = values["session"]["out"]
+    session = values["session"]
+    if not isinstance(session, Mapping):
+        raise ConfigError(
+            f"session={session}: it is a table, whose values are given as session.<name>=…; "
+            f"{list_choices(str(session), ('out', 'seed', 'device'))}"
+        )
+    out = session["out"]
     if isinstance(out, (list, dict)):
         raise ConfigError(f"session.out: expected one folder, got {out}; change session.out=…")
     if out and out != "???":
