@@ -148,7 +148,7 @@ def load_run(folder: Path) -> EvaluatedRun:
 
 def _find_training_run(folder: Path, values: Mapping[str, Any]) -> EvaluatedRun | None:
     """Return the run that trained the evaluated policy, also where both folders were moved."""
-    named = values.get("policy.folder")
+    named = values.get("policy.path")
     if not isinstance(named, str):
         return None
     for place in (Path(named), folder.parent / Path(named).name):

@@ -25,6 +25,7 @@ import numpy as np
 import yaml
 
 from brokk_rl import registry
+from brokk_rl.build import TARGET
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.observation import measure_ranges, restore_encoder
@@ -44,8 +45,6 @@ NUM_GOLDEN = 16
 """Answers in `golden.json`: whoever runs the file elsewhere compares with them first."""
 STAMP = "task"
 """Key in the metadata of the weights: fingerprint of the task of the contract beside them."""
-TARGET = "_target_"
-"""Key of a configuration node that names its class."""
 
 
 @dataclass(frozen=True)

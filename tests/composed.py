@@ -7,6 +7,9 @@ from typing import Any
 import pytest
 
 from brokk_rl import extensions, registry
+from brokk_rl.build import build_node
+from brokk_rl.policy_choice import apply_behaviour
+from brokk_rl.policy_folder import describe_spec, find_policy
 
 extensions.register_options([])  # the exam's options are those of an extension
 
@@ -14,6 +17,13 @@ extensions.register_options([])  # the exam's options are those of an extension
 def option(group: str, name: str, **fields: object) -> Any:
     """Returns the spec of one option with these fields, instantiated by itself."""
     return extensions.load_option(group, name, **fields)
+
+
+def own_task(task: Any, policy: object) -> Any:
+    """Returns a task's spec with the behaviour of the policy at a path."""
+    own = find_policy(str(policy)).task
+    assert own is not None
+    return build_node(apply_behaviour(describe_spec(task), own.behaviour), "task")
 
 
 def names(group: str) -> list[str]:

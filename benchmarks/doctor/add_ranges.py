@@ -17,8 +17,10 @@ import numpy as np
 import torch
 
 from brokk_rl import extensions
+from brokk_rl.build import build_node
 from brokk_rl.observation import measure_ranges, restore_encoder
-from brokk_rl.policy_choice import restore_task
+from brokk_rl.policy_choice import apply_behaviour
+from brokk_rl.policy_folder import describe_spec, find_policy
 from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
 
@@ -34,8 +36,9 @@ def measure(folder: Path) -> dict[str, object]:
     policy = TrainedPolicy(path=str(folder), task=None)
     follower = "person" if contract["task"]["behaviour"]["advice"] else "none"
     sim = replace(extensions.load_option("sim", "native"), num_worlds=NUM_ENVS, num_threads=2)
+    node = apply_behaviour(describe_spec(task), find_policy(str(folder)).task.behaviour)
     config = ControlLoopConfig(
-        machine=machine, sim=sim, task=restore_task(task, str(folder)), actuator=extensions.load_option("actuator", "mlp"),
+        machine=machine, sim=sim, task=build_node(node, "task"), actuator=extensions.load_option("actuator", "mlp"),
         effects={"library": extensions.load_option("effect", "library")}, follower=extensions.load_option("follower", follower),
     )  # fmt: skip
     torch.manual_seed(0)

@@ -31,7 +31,43 @@ log = logging.getLogger(__name__)
 
 
 @spec
-class Evaluate:
+class PlantMode:
+    """Parts of the control loop that the modes of a simulated plant share.
+
+    Attributes:
+        machine: The machine.
+        sim: Physics.
+        task: The task.
+        actuator: How commands become motion.
+        effect: Effects around the actuator model, by name.
+        event: Changes of the simulated machine, by name.
+        follower: Who stands between policy and machine.
+    """
+
+    machine: Machine
+    sim: Simulator
+    task: Task
+    actuator: Actuator
+    effect: dict[str, Effect]
+    event: dict[str, Event]
+    follower: Follower
+
+    def compose_loop(self, target: TargetSensorSpec | None = None) -> ControlLoopConfig:
+        """Return the parts of the control loop, and a sensor of the target where there is one."""
+        return ControlLoopConfig(
+            machine=self.machine,
+            sim=self.sim,
+            task=self.task,
+            actuator=self.actuator,
+            effects=self.effect,
+            events=self.event,
+            follower=self.follower,
+            target=target,
+        )
+
+
+@spec
+class Evaluate(PlantMode):
     """Evaluates a policy and its rivals on the same starts.
 
     Attributes:
@@ -50,13 +86,6 @@ class Evaluate:
     """
 
     session: Session
-    machine: Machine
-    sim: Simulator
-    task: Task
-    actuator: Actuator
-    effect: dict[str, Effect]
-    event: dict[str, Event]
-    follower: Follower
     target: TargetSensorSpec | None
     policy: PolicySpec
     rivals: dict[str, PolicySpec]
@@ -71,16 +100,7 @@ class Evaluate:
 
     def run(self) -> float:
         """Evaluate; return the strict success of the policy."""
-        config = ControlLoopConfig(
-            machine=self.machine,
-            sim=self.sim,
-            task=self.task,
-            actuator=self.actuator,
-            effects=self.effect,
-            events=self.event,
-            follower=self.follower,
-            target=self.target,
-        )
+        config = self.compose_loop(self.target)
         policies = {name_spec(self.policy): self.policy} | self.rivals
         results = evaluate_policies(config, self.evaluation, self.session, policies)
         return float(results["success_strict"]["mean"])

@@ -10,21 +10,18 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from brokk_rl.contracts.actuator import Actuator, Effect, Follower
-from brokk_rl.contracts.task import Policy, Task
-from brokk_rl.contracts.world import Simulator
+from brokk_rl.contracts.task import Policy
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
-from brokk_rl.machine import Machine
+from brokk_rl.modes.evaluate import PlantMode
 from brokk_rl.play.checkpoint_watch import CheckpointWatch
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.policy_folder import find_policy
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy
 from brokk_rl.session import Session
-from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec
 
 if TYPE_CHECKING:
@@ -43,7 +40,7 @@ RATE_S = 30.0
 
 
 @spec
-class Play:
+class Play(PlantMode):
     """Shows a policy at work, live, and lets a person touch it.
 
     Attributes:
@@ -58,13 +55,6 @@ class Play:
         play: Page, worlds and pace.
     """
 
-    machine: Machine
-    sim: Simulator
-    task: Task
-    actuator: Actuator
-    effect: dict[str, Effect]
-    event: dict[str, Event]
-    follower: Follower
     policy: PolicySpec
     play: PlaySettings
 
@@ -110,15 +100,7 @@ class Play:
         session = Session(out=".", seed=settings.seed, device=settings.device)
         device = session.torch_device()
         session.seed_all()
-        config = ControlLoopConfig(
-            machine=self.machine,
-            sim=self.sim,
-            task=self.task,
-            actuator=self.actuator,
-            effects=self.effect,
-            events=self.event,
-            follower=self.follower,
-        )
+        config = self.compose_loop()
         pool = max(NUM_STARTS, settings.worlds)
         loop = config.build(device, settings.worlds, pool, session.stream("starts"))
         watch = None

@@ -11,12 +11,8 @@ from typing import Any, ClassVar
 import torch
 
 from brokk_rl import distributed
-from brokk_rl.contracts.actuator import Actuator, Effect, Follower
-from brokk_rl.contracts.task import Task
-from brokk_rl.contracts.world import Simulator
 from brokk_rl.errors import SimulationError
-from brokk_rl.machine import Machine
-from brokk_rl.modes.evaluate import evaluate_policies
+from brokk_rl.modes.evaluate import PlantMode, evaluate_policies
 from brokk_rl.policy_folder import (
     CONTRACT,
     describe_policy,
@@ -47,7 +43,6 @@ from brokk_rl.rl.policy import (
 from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.session import Session, read_record, write_json
-from brokk_rl.sim.events import Event
 from brokk_rl.spec import name_spec, spec
 
 log = logging.getLogger(__name__)
@@ -62,7 +57,7 @@ TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 
 
 @spec
-class Train:
+class Train(PlantMode):
     """Trains a policy for a task through an actuator model, then evaluates and exports it.
 
     A training goes on from the newest checkpoint in its own folder, if there is one.
@@ -84,13 +79,6 @@ class Train:
     """
 
     session: Session
-    machine: Machine
-    sim: Simulator
-    task: Task
-    actuator: Actuator
-    effect: dict[str, Effect]
-    event: dict[str, Event]
-    follower: Follower
     rl: TrainingConfig
     tracking: Tracking
     evaluation: Evaluation
@@ -113,20 +101,11 @@ class Train:
         """
         device = self.session.torch_device()
         self.session.seed_all()
-        config = ControlLoopConfig(
-            machine=self.machine,
-            sim=self.sim,
-            task=self.task,
-            actuator=self.actuator,
-            effects=self.effect,
-            events=self.event,
-            follower=self.follower,
-        )
-        loop = config.build(
-            device, self.rl.num_envs, self.rl.num_starts, self.session.stream("starts")
-        )
+        config = self.compose_loop()
+        stream = self.session.stream("starts")
+        loop = config.build(device, self.rl.num_envs, self.rl.num_starts, stream)
         if self.rl.near_starts:
-            loop.bring_near(self.rl.near_starts, self.session.stream("starts"))
+            loop.bring_near(self.rl.near_starts, stream)
         loop.record_faults(self.rl.count_fault_steps(device.type))
         loop.capture(self.rl.fuse)
         group = TrainingGroup(device)
@@ -267,15 +246,11 @@ class Train:
         write_policy(folder, contract, actor.state_dict())
         answers = runner.record_answers()
         draw_curves(folder / PROGRESS, folder / "learning_curves.png")
-        policies: dict[str, PolicySpec] = {"trained": TrainedPolicy(path=str(folder), task=None)}
-        if "classical_action" in loop.task.offers:
-            policies["classical"] = ClassicalPolicy(task=None)
-        else:
-            log.info(
-                "the task (%s) has no classical controller to compare with",
-                type(self.task).__name__,
-            )
-        policies["untrained"] = UntrainedPolicy(training=self.rl)
+        policies: dict[str, PolicySpec] = {
+            "trained": TrainedPolicy(path=str(folder), task=None),
+            "classical": ClassicalPolicy(task=None),
+            "untrained": UntrainedPolicy(training=self.rl),
+        }
         results = evaluate_policies(config, self.evaluation, self.session, policies)
         task = config.task.build(self.machine, 1, torch.device("cpu"))
         if "deployable" in task.offers:

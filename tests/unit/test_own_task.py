@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import torch
 import training as runs
-import yaml
-from composed import option
+from composed import option, own_task
 from conftest import Done
 
 from brokk_rl.errors import CheckpointError, ConfigError
@@ -23,7 +22,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.export import Export
 from brokk_rl.observation import ObservationPart
-from brokk_rl.policy_choice import prepare_arguments, restore_task
+from brokk_rl.policy_choice import prepare_arguments
 from brokk_rl.policy_folder import (
     TaskDescription,
     describe_policy,
@@ -76,14 +75,12 @@ def newest(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_policy_restores_the_behaviour_and_leaves_the_conditions(newest: Path) -> None:
-    found = restore_task(insertion(episode_s=40.0), str(newest))
+    found = own_task(insertion(episode_s=40.0), str(newest))
     assert found == insertion(episode_s=40.0, memory=1)
-    with pytest.raises(CheckpointError, match="expected a policy of task=goal_pose"):
-        restore_task(option("task", "goal_pose"), str(newest))
 
 
 def test_advice_is_restored(machine: Machine) -> None:
-    advised = restore_task(insertion(), str(SHIPPED.with_name("behind_a_person")))
+    advised = own_task(insertion(), str(SHIPPED.with_name("behind_a_person")))
     assert advised.advice.delay_s == (0.2, 0.4) and advised.classical.straight is False
     assert advised.build(machine, 1, CPU).control.encoder.size == 198
 
@@ -127,7 +124,7 @@ def test_it_is_evaluated_by_its_own_task_beside_policies_of_other_tasks(
     short = 4.0
     default = insertion(episode_s=short)
     mine = TrainedPolicy(path=str(newest), task=replace(default, memory=1))
-    shipped = TrainedPolicy(path=str(SHIPPED), task=restore_task(default, str(SHIPPED)))
+    shipped = TrainedPolicy(path=str(SHIPPED), task=own_task(default, str(SHIPPED)))
     by_default = evaluate_policies(
         runs.plant(machine, default),
         how,
@@ -238,23 +235,27 @@ FEW = ("evaluation.num_recorded=1", "evaluation.video=false", "actuator=lag", "s
         (("task.action={kind: direct}",), "task.action.kind=direct was asked for"),
         (("task.memory=1",), "task.memory=1 was asked for, the policy has 13"),
         (("task=goal_pose",), "for task=borehole_insertion, but task=goal_pose was asked for"),
-        (("task=@mine.yaml",), "task.memory=1 was asked for, the policy has 13"),
-        (("experiment=@other.yaml",), "task.switch.rule=text was asked for, the policy has planar"),
     ],
     ids=lambda value: value[0] if isinstance(value, tuple) else None,
 )
 def test_the_command_refuses_what_its_policy_does_not_have(
     words: tuple[str, ...], told: str, brokk: Callable[..., Done], tmp_path: Path
 ) -> None:
-    source = Path(__file__).parents[2] / "conf" / "task"
-    task = yaml.safe_load((source / "borehole_insertion.yaml").read_text())
-    task |= {"noise": yaml.safe_load((source / "noise" / "assumed.yaml").read_text()), "memory": 1}
-    task.pop("defaults")
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(task))
-    (tmp_path / "other.yaml").write_text("# @package _global_\ntask: {switch: {rule: text}}\n")
     done = brokk(*EVALUATE, *FEW, *words)
     assert done.code == 2 and told in done.err, done.err
     assert not (tmp_path / "run").exists()
+
+
+def test_values_of_an_experiment_yield_to_the_policy(
+    brokk: Callable[..., Done], tmp_path: Path
+) -> None:
+    (tmp_path / "other.yaml").write_text(
+        "# @package _global_\ntask: {episode_s: 1.0, switch: {rule: text}}\n"
+    )
+    done = brokk(*EVALUATE, *FEW, "experiment=@other.yaml")
+    assert done.code == 0, done.err
+    found = json.loads((tmp_path / "run" / "evaluation.json").read_text())
+    assert found["task"] == json.loads((SHIPPED / "policy.json").read_text())["task"]
 
 
 def test_the_command_finds_the_task_of_its_policy(
@@ -299,7 +300,7 @@ def test_a_policy_brings_its_machine_and_the_actuator_of_its_training(
     [
         (("policy=policies/foreign", "machine=brokk170"), ("=foreign, but machine=brokk170", "name differ")),
         (("policy=runs/none",), ("policy=runs/none: expected a run folder", "no such path")),
-        (("policy=trainned",), ("there is no policy=trainned", "did you mean 'trained'")),
+        (("policy=trainned",), ("there is no policy=trainned; did you mean 'trained'",)),
         (("policy.folder=runs/x",), ("'policy.folder' is now 'policy'", "policy=runs/x")),
         (("mode=export", "checkpoint=runs/x"), ("brokk mode=export policy=runs/x",)),
         (("mode=train", "start_from=a/b", "session.out=c"), ("brokk mode=train session.out=c policy=a/b",)),

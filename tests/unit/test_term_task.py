@@ -13,9 +13,9 @@ import pytest
 import torch
 import training as runs
 from composed import option
-from hydra.utils import instantiate
 from kinematic import Kinematic, KinematicWorld
 
+from brokk_rl.build import build_node
 from brokk_rl.checks import check_task
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
@@ -234,7 +234,7 @@ def test_its_description_gives_the_same_terms_back() -> None:
         action=JointAction(scale=1.0, mask=False),
     )
     node = apply_behaviour(describe_spec(other), describe_task(task).behaviour)
-    assert instantiate(node, _convert_="all") == task
+    assert build_node(node, "task") == task
 
 
 def test_the_machine_s_loop_refuses_parts_that_it_does_not_give(

@@ -21,8 +21,10 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
+from brokk_rl.build import build_node
 from brokk_rl.contracts.task import Policy
-from brokk_rl.policy_choice import restore_task
+from brokk_rl.policy_choice import apply_behaviour
+from brokk_rl.policy_folder import describe_spec, find_policy
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.statistics import compute_wilson_interval
@@ -105,7 +107,13 @@ class PlantCases:
         trained = TrainedPolicy(path="tasks:policies/borehole_insertion", task=None)
         numbers = dataclasses.replace(task.classical, **before)
         self._cases: dict[str, Any] = {
-            "trained": (trained, restore_task(task, trained.path)),
+            "trained": (
+                trained,
+                build_node(
+                    apply_behaviour(describe_spec(task), find_policy(trained.path).task.behaviour),
+                    "task",
+                ),
+            ),
             "classical": (ClassicalPolicy(task=None), task),
             "classical before": (
                 ClassicalPolicy(task=None),

@@ -19,9 +19,11 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
+from brokk_rl.build import build_node
 from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.policy_choice import restore_task
+from brokk_rl.policy_choice import apply_behaviour
+from brokk_rl.policy_folder import describe_spec, find_policy
 from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
 from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
@@ -87,7 +89,10 @@ def draw_trajectories(words: list[str], bundle: Path, picture: Path) -> None:
     config = ControlLoopConfig(
         machine=spec.machine,
         sim=spec.sim,
-        task=restore_task(spec.task, trained.path),
+        task=build_node(
+            apply_behaviour(describe_spec(spec.task), find_policy(trained.path).task.behaviour),
+            "task",
+        ),
         actuator=spec.actuator,
         effects=spec.effect,
         follower=spec.follower,
