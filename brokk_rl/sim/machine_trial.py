@@ -35,8 +35,8 @@ def try_machine(
 
     Nothing diverged where the text is `None`.
 
-    Half of the worlds get new random commands in each period, as a policy at the start of a
-    training gives them, the other half full commands that stay.
+    The worlds get new random commands in each period, as a policy at the start of a training gives
+    them; where nothing can be touched, half of them get full commands that stay.
 
     Args:
         machine: The machine.
@@ -70,7 +70,8 @@ def try_machine(
     with torch.inference_mode():
         for step in range(math.ceil(TRIAL_S / machine.period_s)):
             u = torch.rand(q.shape, generator=generator) * 2.0 - 1.0
-            u[::2] = held[::2]
+            if drawn is None:  # a task would end such episodes before they hit the ground
+                u[::2] = held[::2]
             history.push_u(u)
             increment = u * stride
             if actuator is not None:
