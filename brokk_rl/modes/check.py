@@ -238,7 +238,7 @@ class Check:
         """Simulate a second of full commands from drawn starts, and say which joint diverges."""
         import torch
 
-        from brokk_rl.rl.speed_commands import accept_speeds
+        from brokk_rl.commands import accept_speeds
         from brokk_rl.sim.machine_trial import try_machine
 
         num, cpu = self.subject.num_starts, torch.device("cpu")

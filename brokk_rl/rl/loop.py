@@ -18,6 +18,7 @@ import torch
 from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
+from brokk_rl.commands import accept_speeds
 from brokk_rl.contracts.actuator import (
     Actuator,
     ActuatorModel,
@@ -34,7 +35,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import TaskDescription, describe_task
 from brokk_rl.rl.execution import capture_graph, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
-from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.faults import FaultRecorder
 from brokk_rl.sim.scene import find_site

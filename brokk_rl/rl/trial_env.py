@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from brokk_rl.commands import accept_speeds
 from brokk_rl.contracts.actuator import Actuator, Effect, FollowerModel
 from brokk_rl.contracts.operator import OperatorModel, OperatorView, TrialBatch
 from brokk_rl.contracts.task import Task
@@ -17,7 +18,6 @@ from brokk_rl.policy_folder import describe_task
 from brokk_rl.progress import track_items
 from brokk_rl.record import Recording
 from brokk_rl.rl.loop import ControlLoop
-from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 

@@ -14,11 +14,17 @@ from scipy.integrate import solve_ivp
 from actuators.excite.player import NominalLink
 from brokk_rl import record
 from brokk_rl.checks.actuator import check_actuator_model
-from brokk_rl.commands import SpeedProgram, find_rest, read_targets, scale_targets, view_speeds
+from brokk_rl.commands import (
+    SpeedProgram,
+    accept_speeds,
+    find_rest,
+    read_targets,
+    scale_targets,
+    view_speeds,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.rl.speed_commands import accept_speeds
 from brokk_rl.signals import Command
 from diagnosis.baseline import apply_changes
 from diagnosis.effect_library import load_effects
