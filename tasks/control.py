@@ -6,6 +6,7 @@ classical controller's guidance, the residual, and proposals for a person.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +15,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET, ObservationEncoder, list_pose_parts
 from tasks.advice import LeverAdviser
 from tasks.classical import ClassicalController, ControllerGuidance
-from tasks.settings import ToolPoseTask
+from tasks.settings import CommandBase, ToolPoseTask
 
 ERROR_SCALES_M = (0.1, 0.02)
 """Distances at which the saturated copies of position errors resolve: approach and insertion.
@@ -34,14 +35,14 @@ class ControlInput:
     Attributes:
         vector: The policy's observation vector, `(N, O)`.
         features: The `guide` group, `(N, G)`; see `compute_features`.
-        guidance: Commands and errors of the classical controller.
-        positioning: Whether only the exclusive joints move, `(N,)` bool.
+        base: Command of the classical controller, and bounds.
+        reach_m: Distance by which the switch decides, `(N,)`.
     """
 
     vector: torch.Tensor
     features: torch.Tensor
-    guidance: ControllerGuidance
-    positioning: torch.Tensor
+    base: CommandBase
+    reach_m: torch.Tensor
 
 
 class ToolPoseControl:
@@ -57,47 +58,50 @@ class ToolPoseControl:
         def to_constant(values: object) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        self.switch, self.action, self.memory = task.switch, task.action, task.memory
+        self.task = task
         self.controller = ClassicalController(task.classical, machine, device)
         self.adviser = LeverAdviser(task.advice, machine, device) if task.advice else None
         parts = list_pose_parts(machine, task.scaling, with_proposals=self.adviser is not None)
         self.encoder = ObservationEncoder(parts, to_constant, torch.cat)
         self.down = to_constant([0.0, 0.0, task.aim_below_m])
         self.exclusive = to_constant(machine.is_exclusive).bool()
+        self.num_forgotten = max(0, machine.num_history - task.memory)
 
-    def process(
-        self,
-        target_m: torch.Tensor,
-        q: torch.Tensor,
-        u: torch.Tensor,
-        pitch_rad: torch.Tensor,
-        proposed: torch.Tensor | None,
-    ) -> ControlInput:
+    def process(self, values: Mapping[str, torch.Tensor]) -> ControlInput:
         """Return the observation vector and all that the controller makes of it.
 
         Args:
-            target_m: Estimated target, `(N, 3)`.
-            q: Measured positions, oldest first, `(N, H, J)`.
-            u: Commands in force, oldest first, `(N, H, J)`.
-            pitch_rad: Wanted pitch, `(N,)`.
-            proposed: Proposals so far, oldest first, `(N, H, J)`; `None` without an adviser.
+            values: `target_in_base_m` `(N, 3)`, histories `q` and `u` `(N, H, J)`, `pitch_rad`
+                `(N,)`, and `proposals` `(N, H, J)` where there is an adviser.
         """
-        q, u = self._forget_positions(q), self._forget_commands(u)
+        target_m, pitch_rad = values[TARGET], values[PITCH]
+        seen = dict(values) | {"q": self._forget(values["q"]), "u": self._forget(values["u"], 0.0)}
         coming = None
-        if self.adviser is not None and proposed is not None:
-            proposed = self._forget_commands(proposed)
-            coming = self.adviser.coming(proposed, u[:, -1])
-        guidance = self.controller.guide(
-            q, u, target_m - self.down, pitch_rad, self.switch.reach_m, coming
-        )
-        positioning = self.switch.positioning(guidance)
-        values = {TARGET: target_m, "q": q, "u": u, PITCH: pitch_rad, PROPOSALS: proposed}
+        if self.adviser is not None:
+            seen[PROPOSALS] = self._forget(values[PROPOSALS], 0.0)
+            coming = self.adviser.coming(seen[PROPOSALS], seen["u"][:, -1])
+        guidance, base = self._guide(seen["q"], seen["u"], target_m, pitch_rad, coming)
         return ControlInput(
-            vector=self.encoder.encode(values),
-            features=compute_features(guidance, positioning, u[:, -1]),
-            guidance=guidance,
-            positioning=positioning,
+            vector=self.encoder.encode(seen),
+            features=compute_features(guidance, base.positioning, seen["u"][:, -1]),
+            base=base,
+            reach_m=self.task.switch.reach(guidance),
         )
+
+    def _guide(
+        self,
+        q: torch.Tensor,
+        u: torch.Tensor,
+        target_m: torch.Tensor,
+        pitch_rad: torch.Tensor,
+        coming: torch.Tensor | None = None,
+    ) -> tuple[ControllerGuidance, CommandBase]:
+        switch = self.task.switch
+        aim_m = target_m - self.down
+        guidance = self.controller.guide(q, u, aim_m, pitch_rad, switch.reach_m, coming)
+        positioning = switch.positioning(guidance)
+        bounds = (guidance.command, guidance.lowest, guidance.highest)
+        return guidance, CommandBase(*bounds, positioning)
 
     def plan(
         self,
@@ -123,60 +127,35 @@ class ToolPoseControl:
         planned = [q]
         for _ in range(num_times - 1):
             for _ in range(num_parts):
-                guidance = self.controller.guide(
-                    q[:, None], rest[:, None], target_m - self.down, pitch_rad, self.switch.reach_m
-                )
-                positioning = self.switch.positioning(guidance)
-                u = self.action.command(
-                    rest,
-                    guidance.command,
-                    guidance.lowest,
-                    guidance.highest,
-                    positioning,
-                    self.exclusive,
-                )
+                _, base = self._guide(q[:, None], rest[:, None], target_m, pitch_rad)
+                u = self.task.action.command(rest, base, self.exclusive)
                 q = q + self.controller.rate(u) * (step_s / num_parts)
             planned.append(q)
         return torch.stack(planned, 1)
 
     def command(
-        self,
-        output: torch.Tensor,
-        base: torch.Tensor,
-        lowest: torch.Tensor,
-        highest: torch.Tensor,
-        positioning: torch.Tensor,
-        proposed: torch.Tensor | None,
+        self, output: torch.Tensor, base: CommandBase, proposed: torch.Tensor | None
     ) -> torch.Tensor:
         """Return masked commands, or proposals where there is an adviser, `(N, J)`.
 
         Args:
             output: Output of the network, `(N, J)`.
-            base: See `ActionMapping.command`, like the next three.
-            lowest: See there.
-            highest: See there.
-            positioning: See there.
-            proposed: As in `process`.
+            base: See `ControlInput`.
+            proposed: Proposals so far, oldest first, `(N, H, J)`.
         """
-        u = self.action.command(output, base, lowest, highest, positioning, self.exclusive)
+        u = self.task.action.command(output, base, self.exclusive)
         if self.adviser is None or proposed is None:
             return u
-        return self.adviser.proposal(u, self._forget_commands(proposed))
+        return self.adviser.proposal(u, self._forget(proposed, 0.0))
 
-    def _forget_positions(self, q: torch.Tensor) -> torch.Tensor:
-        """Return positions `(N, H, J)` that rest before the last `memory` samples."""
-        forgotten = q.shape[1] - self.memory
-        if forgotten <= 0:
-            return q
-        still = q[:, forgotten : forgotten + 1].expand(-1, forgotten, -1)
-        return torch.cat((still, q[:, forgotten:]), 1)
-
-    def _forget_commands(self, u: torch.Tensor) -> torch.Tensor:
-        """Return commands `(N, H, J)` that are zero before the last `memory` samples."""
-        forgotten = u.shape[1] - self.memory
-        if forgotten <= 0:
-            return u
-        return torch.cat((torch.zeros_like(u[:, :forgotten]), u[:, forgotten:]), 1)
+    def _forget(self, history: torch.Tensor, rest: float | None = None) -> torch.Tensor:
+        """Return a history `(N, H, J)` with `rest` before the memory; `None`: at rest there."""
+        count = self.num_forgotten
+        if count == 0:
+            return history
+        first = history[:, count : count + 1].expand(-1, count, -1)
+        before = first if rest is None else torch.full_like(first, rest)
+        return torch.cat((before, history[:, count:]), 1)
 
 
 def compute_features(
@@ -241,20 +220,10 @@ class DeployedPolicy(torch.nn.Module):
         """Return valve commands, `(B, J)` in [-1, 1]."""
         control = self._control
         values = control.encoder.decode(observation)
-        target_m, q, u = values[TARGET], values["q"], values["u"]
-        pitch_rad = values.get(PITCH)
-        if pitch_rad is None:
-            pitch_rad = torch.full_like(target_m[:, 0], self._pitch_rad)
-        proposed = values.get(PROPOSALS)
-        seen = control.process(target_m, q, u, pitch_rad, proposed)
+        if PITCH not in values:
+            values[PITCH] = torch.full_like(observation[:, 0], self._pitch_rad)
+        seen = control.process(values)
         # encoding again is not exact to the last bit: only where history was forgotten
-        vector = seen.vector if control.memory < q.shape[1] else observation
-        guidance = seen.guidance
-        return control.command(
-            self.network({"policy": vector, "guide": seen.features}),
-            guidance.command,
-            guidance.lowest,
-            guidance.highest,
-            seen.positioning,
-            proposed,
-        )
+        vector = seen.vector if control.num_forgotten else observation
+        output = self.network({"policy": vector, "guide": seen.features})
+        return control.command(output, seen.base, values.get(PROPOSALS))

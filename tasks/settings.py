@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from annotated_types import Interval
 
@@ -20,6 +20,8 @@ from tasks.term_task import EpisodeTask
 if TYPE_CHECKING:
     import torch
 
+    from tasks.classical import ControllerGuidance
+
 Expected = NonNegative | NonNegativeRange
 """A number, or the range [low, high] in which it lies."""
 DeadZone = Annotated[float, Interval(ge=0, le=0.99)]
@@ -28,12 +30,21 @@ Uniform = Callable[[tuple[float, float]], "torch.Tensor"]
 """Draws `(M,)` numbers between two bounds."""
 
 
-class SwitchInput(Protocol):
-    """Distances by which `PhaseSwitch` decides, each `(N,)`; see `ControllerGuidance`."""
+@dataclass(frozen=True)
+class CommandBase:
+    """Command that a network corrects, and what bounds the sum.
 
-    reach_m: torch.Tensor
-    reach_3d_m: torch.Tensor
-    tip_z_m: torch.Tensor
+    Attributes:
+        command: Command of the classical controller, `(N, J)`.
+        lowest: Least commands that do not drive joints into their ends, `(N, J)`.
+        highest: Largest such commands, `(N, J)`.
+        positioning: Whether only the exclusive joints move, `(N,)` bool.
+    """
+
+    command: torch.Tensor
+    lowest: torch.Tensor
+    highest: torch.Tensor
+    positioning: torch.Tensor
 
 
 @dataclass
@@ -209,11 +220,11 @@ class PhaseSwitch:
     reach_m: NonNegativeRange
     height_m: Finite
 
-    def reach(self, guidance: SwitchInput) -> torch.Tensor:
+    def reach(self, guidance: ControllerGuidance) -> torch.Tensor:
         """Return the distance by which the rule decides, `(N,)`."""
         return guidance.reach_m if self.rule == "planar" else guidance.reach_3d_m
 
-    def positioning(self, guidance: SwitchInput) -> torch.Tensor:
+    def positioning(self, guidance: ControllerGuidance) -> torch.Tensor:
         """Return which environments are positioning, `(N,)` bool."""
         near, far = self.reach_m
         reach = self.reach(guidance)
@@ -242,30 +253,20 @@ class ActionMapping:
     limits: bool
 
     def command(
-        self,
-        output: torch.Tensor,
-        base: torch.Tensor,
-        lowest: torch.Tensor,
-        highest: torch.Tensor,
-        positioning: torch.Tensor,
-        exclusive: torch.Tensor,
+        self, output: torch.Tensor, base: CommandBase, exclusive: torch.Tensor
     ) -> torch.Tensor:
         """Return valve commands in [-1, 1], `(N, J)`.
 
         Args:
             output: Output of the network, `(N, J)`.
-            base: Command of the classical controller, `(N, J)`.
-            lowest: Least commands that do not drive joints into their ends, `(N, J)`
-                (`ControllerGuidance.lowest`).
-            highest: Largest such commands, `(N, J)`.
-            positioning: Whether only the exclusive joints move, `(N,)` bool.
+            base: Command of the classical controller, and bounds.
             exclusive: Which joints are exclusive, `(J,)` bool.
         """
-        u = self.scale * output + (base if self.kind == "residual" else 0.0)
+        u = self.scale * output + (base.command if self.kind == "residual" else 0.0)
         if self.limits:
-            u = u.minimum(highest).maximum(lowest)
+            u = u.minimum(base.highest).maximum(base.lowest)
         if self.mask:
-            u = u.where(mask_exclusive_joints(exclusive, positioning), 0.0)
+            u = u.where(mask_exclusive_joints(exclusive, base.positioning), 0.0)
         return u.clamp(-1.0, 1.0)
 
 

@@ -21,7 +21,7 @@ from brokk_rl.observation import PITCH, PROPOSALS, TARGET
 from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
 from tasks.process import START, EpisodeProcess
-from tasks.settings import ToolPoseTask
+from tasks.settings import CommandBase, ToolPoseTask
 from tasks.starts import DrawTally, draw_starts, move_starts_near
 from tasks.step_state import ToolState
 from tasks.terms import ObservedTerm
@@ -48,8 +48,8 @@ class ToolPoseProcess(EpisodeProcess):
         # errors of this episode's observation, and the sum of the samples of the target
         shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "q_scale": (), "u_scale": ()}
         # what the next command needs of an observation
-        shapes |= {"positioning": (), "rule_reach_m": ()}
-        shapes |= {"base": joints, "lowest": joints, "highest": joints}
+        shapes |= {"positioning": (), "reach_m": ()}
+        shapes |= {"command": joints, "lowest": joints, "highest": joints}
         if self.control.adviser:
             shapes["proposed"] = (self._machine.num_history, *joints)
         return shapes
@@ -111,14 +111,9 @@ class ToolPoseProcess(EpisodeProcess):
         """Return masked commands or proposals; see `TaskProcess.command`."""
         state = self.state
         proposed = state.get("proposed")
-        u = self.control.command(
-            action,
-            state["base"],
-            state["lowest"],
-            state["highest"],
-            state["positioning"].bool(),
-            proposed,
-        )
+        bounds = (state["command"], state["lowest"], state["highest"])
+        base = CommandBase(*bounds, state["positioning"].bool())
+        u = self.control.command(action, base, proposed)
         if proposed is not None:
             proposed.copy_(torch.cat((proposed[:, 1:], u[:, None]), 1))
         return self._remember_command(u)
@@ -131,7 +126,7 @@ class ToolPoseProcess(EpisodeProcess):
             "success": verdict.success,
             "target_m": start["target_m"] - self.control.down,
             "target_pitch_rad": start["target_pitch_rad"],
-            "reach_m": state["rule_reach_m"],
+            "reach_m": state["reach_m"],
             "reach_range_m": self.task.switch.reach_m,
             "positioning": state["positioning"].bool(),
             "paper_success": verdict.paper_success,
@@ -153,19 +148,18 @@ class ToolPoseProcess(EpisodeProcess):
         """
         state = self.state
         estimate_m = self._estimate_target(shift_m)
-        seen = self.control.process(
-            estimate_m,
-            self._scale_positions(history.q),
-            history.u * state["u_scale"][:, None, None],
-            state[f"{START}target_pitch_rad"],
-            state.get("proposed"),
-        )
-        guidance = seen.guidance
-        state["positioning"].copy_(seen.positioning)
-        state["rule_reach_m"].copy_(self.task.switch.reach(guidance))
-        state["base"].copy_(guidance.command)
-        state["lowest"].copy_(guidance.lowest)
-        state["highest"].copy_(guidance.highest)
+        values = {
+            TARGET: estimate_m,
+            "q": self._scale_positions(history.q),
+            "u": history.u * state["u_scale"][:, None, None],
+            PITCH: state[f"{START}target_pitch_rad"],
+        }
+        if "proposed" in state:
+            values[PROPOSALS] = state["proposed"]
+        seen = self.control.process(values)
+        for name in ("command", "lowest", "highest", "positioning"):
+            state[name].copy_(getattr(seen.base, name))
+        state["reach_m"].copy_(seen.reach_m)
         privileged = self._compute_privileged(estimate_m)
         if self._observed.encoders:
             terms = self._observed.observe(self._make_state(history, state["contact_force_n"]))

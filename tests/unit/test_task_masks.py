@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -12,7 +13,7 @@ from composed import option
 
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from tasks.classical import ClassicalController
-from tasks.settings import ActionMapping, PhaseSwitch
+from tasks.settings import ActionMapping, CommandBase, PhaseSwitch
 
 
 def switch(rule: str) -> PhaseSwitch:
@@ -84,14 +85,8 @@ def test_no_action_drives_a_joint_into_its_end() -> None:
         torch.tensor([[0.0, 1.0, 1.0, 0.4, 1.0]]),
     )
     for output in (torch.full((1, 5), 3.0), torch.full((1, 5), -3.0)):
-        u = action.command(
-            output,
-            torch.full((1, 5), 0.1),
-            lowest,
-            highest,
-            torch.tensor([False]),
-            torch.zeros(5, dtype=torch.bool),
-        )
+        base = CommandBase(torch.full((1, 5), 0.1), lowest, highest, torch.tensor([False]))
+        u = action.command(output, base, torch.zeros(5, dtype=torch.bool))
         assert torch.equal(u, highest if output[0, 0] > 0 else lowest)
 
 
@@ -101,9 +96,9 @@ def test_q2_never_moves_with_another_joint(kind: str, machine: Machine) -> None:
     action = ActionMapping(kind=kind, scale=0.5, mask=True, limits=False)  # type: ignore[arg-type]
     positioning = torch.arange(64) % 2 == 0
     exclusive = torch.as_tensor(machine.is_exclusive)
-    u = action.command(
-        5 * torch.randn(64, 5), torch.rand(64, 5) * 2 - 1, -FREE, FREE, positioning, exclusive
-    )
+    output = 5 * torch.randn(64, 5)
+    base = CommandBase(torch.rand(64, 5) * 2 - 1, -FREE, FREE, positioning)
+    u = action.command(output, base, exclusive)
     assert (u[positioning][:, [0, 2, 3, 4]] == 0).all() and (u[positioning][:, 1] != 0).any()
     assert (u[~positioning][:, 1] == 0).all() and (u[~positioning][:, [0, 2, 3, 4]] != 0).any()
     assert (u.abs() <= 1).all()
@@ -113,14 +108,8 @@ def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> 
     action = ActionMapping(kind="direct", scale=1.0, mask=True, limits=False)
     for positioning, paper in ((True, [0, 1, 0, 0, 0]), (False, [1, 0, 1, 1, 1])):
         flag = torch.tensor([positioning])
-        u = action.command(
-            torch.ones(1, 5),
-            torch.zeros(1, 5),
-            -FREE,
-            FREE,
-            flag,
-            torch.as_tensor(machine.is_exclusive),
-        )
+        base = CommandBase(torch.zeros(1, 5), -FREE, FREE, flag)
+        u = action.command(torch.ones(1, 5), base, torch.as_tensor(machine.is_exclusive))
         assert (
             u[0].tolist()
             == paper
@@ -129,20 +118,14 @@ def test_the_masks_are_the_papers_and_those_of_the_machine(machine: Machine) -> 
 
 
 def test_direct_and_residual_actions_on_numbers(machine: Machine) -> None:
-    output, base = (
-        torch.tensor([[0.4, 0.4, -0.4, 4.0, 0.0]]),
-        torch.tensor([[0.5, 0.5, 0.5, 0.5, -0.25]]),
-    )
-    rest = (-FREE, FREE, torch.tensor([False]), torch.as_tensor(machine.is_exclusive))
-    direct = ActionMapping(kind="direct", scale=0.5, mask=True, limits=False).command(
-        output, base, *rest
-    )
-    residual = ActionMapping(kind="residual", scale=0.5, mask=True, limits=False).command(
-        output, base, *rest
-    )
-    unmasked = ActionMapping(kind="residual", scale=0.5, mask=False, limits=False).command(
-        output, base, *rest
-    )
+    output = torch.tensor([[0.4, 0.4, -0.4, 4.0, 0.0]])
+    command = torch.tensor([[0.5, 0.5, 0.5, 0.5, -0.25]])
+    base = CommandBase(command, -FREE, FREE, torch.tensor([False]))
+    exclusive = torch.as_tensor(machine.is_exclusive)
+    residual = ActionMapping(kind="residual", scale=0.5, mask=True, limits=False)
+    direct = replace(residual, kind="direct").command(output, base, exclusive)
+    unmasked = replace(residual, mask=False).command(output, base, exclusive)
+    residual = residual.command(output, base, exclusive)
     np.testing.assert_allclose(direct[0], [0.2, 0.0, -0.2, 1.0, 0.0], atol=1e-6)
     np.testing.assert_allclose(residual[0], [0.7, 0.0, 0.3, 1.0, -0.25], atol=1e-6)
     np.testing.assert_allclose(unmasked[0], [0.7, 0.7, 0.3, 1.0, -0.25], atol=1e-6)
