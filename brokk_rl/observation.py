@@ -95,7 +95,11 @@ class ObservationEncoder:
         self.parts = {part.name: part for part in parts}
         self.size = sum(part.size for part in parts)
         self._concat = concat
-        self._scales = {part.name: (convert(part.mean), convert(part.std)) for part in parts}
+        # known before a control step is compiled
+        self._scales: dict[str, tuple[Any, Any]] = {}
+        for part in parts:
+            if np.ndim(part.mean) or (part.mean, part.std) != (0.0, 1.0):
+                self._scales[part.name] = convert(part.mean), convert(part.std)
 
     @property
     def has_target(self) -> bool:
@@ -106,9 +110,9 @@ class ObservationEncoder:
         """Return the vector, `(N, size)`, of values by name, each `(N, *shape)`."""
         scaled = []
         for name, part in self.parts.items():
-            mean, std = self._scales[name]
             value = values[name]
-            if not _is_unscaled(part):
+            if name in self._scales:
+                mean, std = self._scales[name]
                 value = (value - mean) / std
             # the width is fixed and the batch is not: a length read here would be a constant of
             # the exported graph
@@ -119,9 +123,11 @@ class ObservationEncoder:
         """Invert `encode`: return the values of vectors in their units, by name."""
         values, begin = {}, 0
         for name, part in self.parts.items():
-            mean, std = self._scales[name]
             value = vector[:, begin : begin + part.size].reshape(-1, *part.shape)
-            values[name] = value if _is_unscaled(part) else value * std + mean
+            if name in self._scales:
+                mean, std = self._scales[name]
+                value = value * std + mean
+            values[name] = value
             begin += part.size
         return values
 
@@ -136,10 +142,6 @@ class ObservationEncoder:
             sizes = {"name": name, "samples": samples, "width": width}
             parts.append(sizes | {"mean": part.mean, "std": part.std})
         return {"size": self.size, "order": order, "parts": parts}
-
-
-def _is_unscaled(part: ObservationPart) -> bool:
-    return np.ndim(part.mean) == 0 and (part.mean, part.std) == (0.0, 1.0)
 
 
 def list_pose_parts(
