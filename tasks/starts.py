@@ -16,9 +16,11 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.sim import scene
 from tasks.classical import REACH_DAMPING, ClassicalController
-from tasks.settings import ArmStarts, CandidateTargets, ToolPoseTask
+from tasks.settings import CandidateTargets, ToolPoseTask
 
 log = logging.getLogger(__name__)
+
+Starts = dict[str, torch.Tensor]
 
 BATCH_FACTOR, MIN_BATCH = 4, 256
 """Candidates per batch for each start asked for, and least batch. Chosen by hand."""
@@ -26,7 +28,7 @@ CHUNK = 4096
 """Candidates that are checked at once: what is found is known after each. Chosen by hand: less
 than a second on one core."""
 MIN_CANDIDATES, MIN_SHARE = 16384, 1 / 256
-"""Candidates after which `draw_starts` gives up, where no larger share of them can be done. Chosen
+"""Candidates after which a draw is given up, where no larger share of them can be done. Chosen
 by hand: the default tasks accept about one in four."""
 REPORT_S = 5.0
 """Seconds between two lines about the progress. Chosen by hand."""
@@ -116,58 +118,139 @@ class DrawTally:
         )
 
 
-def draw_starts(
-    task: ToolPoseTask, machine: Machine, count: int, seed: int, tally: DrawTally | None = None
-) -> dict[str, torch.Tensor]:
-    """Return `count` starts from which the target can be reached.
+class StartSearch:
+    """Search for starts from which a tool-pose task can be done, on the CPU.
 
     Args:
-        task: Gives targets, arms and controller.
+        task: Gives targets, arms, working range and controller.
         machine: The machine.
-        count: Number of starts.
-        seed: The same seed gives the same starts.
-        tally: Counts the candidates; `None` makes one.
-
-    Returns:
-        `q`, `scene`, `target_m`, `target_pitch_rad`.
-
-    Raises:
-        ConfigError: Nearly none of the drawn starts can be done.
     """
-    controller = ClassicalController(task.classical, machine, torch.device("cpu"))
-    generator = torch.Generator().manual_seed(seed)
-    batch = max(BATCH_FACTOR * count, MIN_BATCH)
-    down_m = torch.tensor([0.0, 0.0, task.aim_below_m])
 
-    def draw_uniform(bounds: tuple[float, float]) -> torch.Tensor:
-        return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
+    def __init__(self, task: ToolPoseTask, machine: Machine) -> None:
+        self._task, self._machine = task, machine
+        self._controller = ClassicalController(task.classical, machine, torch.device("cpu"))
+        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32)
+        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32)
 
-    drawn: list[dict[str, torch.Tensor]] = []
-    tally = tally or DrawTally(type(task).__name__, count)
-    while tally.done < count:
-        targets = task.draw_targets(draw_uniform)
-        q, free = draw_arms(task.arms, machine, controller, targets.object_z_m, generator)
-        rows = {"q": q} | _stack_targets(targets)
-        for first in range(0, batch, CHUNK):
-            inside = free[first : first + CHUNK]
-            part = {name: value[first : first + CHUNK][inside] for name, value in rows.items()}
-            _, in_range, reached = move_to_targets(
-                controller,
-                machine,
-                part["q"],
-                part["target_m"] - down_m,
-                part["target_pitch_rad"],
-                task.switch.reach_m,
-                task.arms.margin_rad,
-            )
-            drawn.append({name: value[in_range & reached] for name, value in part.items()})
-            tally.add(inside, in_range, reached)
-            if tally.done >= count:
-                break
-    return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
+    def draw(self, count: int, seed: int, tally: DrawTally | None = None) -> Starts:
+        """Return `count` starts from which the target can be reached.
+
+        Args:
+            count: Number of starts.
+            seed: The same seed gives the same starts.
+            tally: Counts the candidates; `None` makes one.
+
+        Returns:
+            `q`, `scene`, `target_m`, `target_pitch_rad`.
+
+        Raises:
+            ConfigError: Nearly none of the drawn starts can be done.
+        """
+        task, generator = self._task, torch.Generator().manual_seed(seed)
+        batch = max(BATCH_FACTOR * count, MIN_BATCH)
+        down_m = torch.tensor([0.0, 0.0, task.aim_below_m])
+
+        def draw_uniform(bounds: tuple[float, float]) -> torch.Tensor:
+            return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
+
+        drawn: list[Starts] = []
+        tally = tally or DrawTally(type(task).__name__, count)
+        while tally.done < count:
+            targets = task.draw_targets(draw_uniform)
+            q, free = self._draw_arms(targets.object_z_m, generator)
+            rows = {"q": q} | _stack_targets(targets)
+            for first in range(0, batch, CHUNK):
+                inside = free[first : first + CHUNK]
+                part = {name: value[first : first + CHUNK][inside] for name, value in rows.items()}
+                aim_m, pitch_rad = part["target_m"] - down_m, part["target_pitch_rad"]
+                _, in_range, reached = self.move(part["q"], aim_m, pitch_rad, task.arms.margin_rad)
+                drawn.append({name: value[in_range & reached] for name, value in part.items()})
+                tally.add(inside, in_range, reached)
+                if tally.done >= count:
+                    break
+        return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
+
+    def move_near(
+        self, start: Starts, share: float, height_m: tuple[float, float], seed: int
+    ) -> Starts:
+        """Return starts of which the first part begins upright above its target.
+
+        A beginner that never meets the target by chance learns from these what is to be gained
+        there (reverse curriculum, Florensa et al. 2017). Arms that do not get there stay as they
+        are.
+
+        Args:
+            start: Starts, as `draw` returns them.
+            share: Part of the starts that are brought near.
+            height_m: Heights of the tool point above `target_m`, (lowest, highest).
+            seed: The same seed gives the same heights.
+        """
+        count = round(share * len(start["q"]))
+        generator = torch.Generator().manual_seed(seed)
+        up = height_m[0] + (height_m[1] - height_m[0]) * torch.rand(count, 1, generator=generator)
+        above = start["target_m"][:count] + up * torch.tensor([0.0, 0.0, 1.0])
+        pitch_rad = start["target_pitch_rad"][:count]
+        q, good, reached = self.move(start["q"][:count], above, pitch_rad, NEAR_MARGIN_RAD)
+        moved = start["q"].clone()
+        moved[:count] = torch.where((good & reached)[:, None], q, moved[:count])
+        return start | {"q": moved}
+
+    def _draw_arms(
+        self, object_z_m: torch.Tensor, generator: torch.Generator
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw one arm per row of `object_z_m`.
+
+        Returns:
+            `q`, `(M, J)`, and whether it is in the open, `(M,)` bool.
+        """
+        arms = self._task.arms
+        lower, upper = self._lower + arms.margin_rad, self._upper - arms.margin_rad
+        shape = (len(object_z_m), self._machine.num_joints)
+        q = lower + (upper - lower) * torch.rand(shape, generator=generator)
+        pose = self._controller.kinematics.pose(q)
+        tip = pose.tip_in_base_m
+        free = (tip[:, 2] > object_z_m + arms.clearance_m) & (tip[:, 2] > arms.floor_m)
+        free &= tip[:, :2].norm(dim=1) > arms.nearest_m
+        free &= (pose.joints_in_base_m[:, 2:, 2] > arms.floor_m).all(1)
+        return q, free
+
+    def move(
+        self, q: torch.Tensor, target_m: torch.Tensor, pitch_rad: torch.Tensor, margin_rad: float
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Move to target poses from `q`, `(M, J)`, under the masks.
+
+        First the exclusive joints move until the reach lies well inside the good working range,
+        then the others by damped least squares.
+
+        Returns:
+            The joint positions at the end, `(M, J)`, whether the target came into the working
+            range, `(M,)` bool, and whether the tool ended at the wanted pose, `(M,)` bool.
+        """
+        controller, (near_m, far_m) = self._controller, self._task.switch.reach_m
+        exclusive = torch.as_tensor(self._machine.is_exclusive)
+        lower, upper = self._lower + margin_rad, self._upper - margin_rad
+        inner = 0.25 * (far_m - near_m)
+        q = q.clone()
+        for _ in range(REACH_STEPS):
+            reach, slope = controller.reach(q, target_m)
+            wanted = reach.clamp(near_m + inner, far_m - inner)
+            inside = (reach >= near_m) & (reach <= far_m)
+            step = (wanted - reach)[:, None] * slope / (slope.square() + REACH_DAMPING)
+            moved = (q + step.clamp(-REACH_MAX_STEP, REACH_MAX_STEP)).clamp(lower, upper)
+            q = torch.where(exclusive & ~inside[:, None], moved, q)
+        reach, _ = controller.reach(q, target_m)
+        good = (reach > near_m) & (reach < far_m)
+        for _ in range(POSE_STEPS):
+            pose, jacobian = controller.kinematics.pose_and_jacobian(q)
+            error, turn = target_m - pose.tip_in_base_m, pitch_rad - pose.pitch_rad
+            share = controller.approach(jacobian.tip, jacobian.pitch, error, error[:, 2], turn)
+            q = (q + POSE_STEP_S * share * controller.speed).clamp(lower, upper)
+        pose = controller.kinematics.pose(q)
+        near = (target_m - pose.tip_in_base_m).norm(dim=1) < POSE_TOLERANCE_M
+        return q, good, near & ((pitch_rad - pose.pitch_rad).abs() < POSE_TOLERANCE_RAD)
 
 
-def _stack_targets(targets: CandidateTargets) -> dict[str, torch.Tensor]:
+def _stack_targets(targets: CandidateTargets) -> Starts:
     """Return scene, target and pitch of candidates."""
     scenes = scene.make_nominal_scenes(len(targets.pitch_rad))
     for name, value in targets.scene.items():
@@ -177,109 +260,3 @@ def _stack_targets(targets: CandidateTargets) -> dict[str, torch.Tensor]:
         "target_m": torch.stack(targets.place_m, 1),
         "target_pitch_rad": targets.pitch_rad,
     }
-
-
-def move_starts_near(
-    task: ToolPoseTask,
-    machine: Machine,
-    start: dict[str, torch.Tensor],
-    share: float,
-    height_m: tuple[float, float],
-    seed: int,
-) -> dict[str, torch.Tensor]:
-    """Return starts of which the first part begins upright above its target.
-
-    A beginner that never meets the target by chance learns from these what is to be gained there
-    (reverse curriculum, Florensa et al. 2017). Arms that do not get there stay as they are.
-
-    Args:
-        task: Gives the controller.
-        machine: The machine.
-        start: Starts, as `draw_starts` returns them.
-        share: Part of the starts that are brought near.
-        height_m: Heights of the tool point above `target_m`, (lowest, highest).
-        seed: The same seed gives the same heights.
-    """
-    controller = ClassicalController(task.classical, machine, torch.device("cpu"))
-    count = round(share * len(start["q"]))
-    generator = torch.Generator().manual_seed(seed)
-    up = height_m[0] + (height_m[1] - height_m[0]) * torch.rand(count, 1, generator=generator)
-    above = start["target_m"][:count] + up * torch.tensor([0.0, 0.0, 1.0])
-    pitch_rad = start["target_pitch_rad"][:count]
-    reach_m = task.switch.reach_m
-    q, good, reached = move_to_targets(
-        controller, machine, start["q"][:count], above, pitch_rad, reach_m, NEAR_MARGIN_RAD
-    )
-    moved = start["q"].clone()
-    moved[:count] = torch.where((good & reached)[:, None], q, moved[:count])
-    return start | {"q": moved}
-
-
-def draw_arms(
-    arms: ArmStarts,
-    machine: Machine,
-    controller: ClassicalController,
-    object_z_m: torch.Tensor,
-    generator: torch.Generator,
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Draw one arm per row of `object_z_m`.
-
-    Returns:
-        `q`, `(M, J)`, and whether it is in the open, `(M,)` bool.
-    """
-    lower = torch.as_tensor(machine.lower, dtype=torch.float32) + arms.margin_rad
-    upper = torch.as_tensor(machine.upper, dtype=torch.float32) - arms.margin_rad
-    q = lower + (upper - lower) * torch.rand(
-        len(object_z_m), machine.num_joints, generator=generator
-    )
-    pose = controller.kinematics.pose(q)
-    tip = pose.tip_in_base_m
-    free = (tip[:, 2] > object_z_m + arms.clearance_m) & (tip[:, 2] > arms.floor_m)
-    free &= tip[:, :2].norm(dim=1) > arms.nearest_m
-    free &= (pose.joints_in_base_m[:, 2:, 2] > arms.floor_m).all(1)
-    return q, free
-
-
-def move_to_targets(
-    controller: ClassicalController,
-    machine: Machine,
-    q: torch.Tensor,
-    target_m: torch.Tensor,
-    pitch_rad: torch.Tensor,
-    reach_m: tuple[float, float],
-    margin_rad: float,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Move to target poses from `q`, `(M, J)`, under the masks.
-
-    First the exclusive joints move until the reach lies well inside the good working range, then
-    the others by damped least squares.
-
-    Returns:
-        The joint positions at the end, `(M, J)`, whether the target came into the working range,
-        `(M,)` bool, and whether the tool ended at the wanted pose, `(M,)` bool.
-    """
-    exclusive = torch.as_tensor(machine.is_exclusive)
-    lower = torch.as_tensor(machine.lower, dtype=torch.float32) + margin_rad
-    upper = torch.as_tensor(machine.upper, dtype=torch.float32) - margin_rad
-    inner = 0.25 * (reach_m[1] - reach_m[0])
-    q = q.clone()
-    for _ in range(REACH_STEPS):
-        reach, slope = controller.reach(q, target_m)
-        wanted = reach.clamp(reach_m[0] + inner, reach_m[1] - inner)
-        inside = (reach >= reach_m[0]) & (reach <= reach_m[1])
-        step = ((wanted - reach)[:, None] * slope / (slope.square() + REACH_DAMPING)).clamp(
-            -REACH_MAX_STEP, REACH_MAX_STEP
-        )
-        q = torch.where(exclusive & ~inside[:, None], (q + step).clamp(lower, upper), q)
-    reach, _ = controller.reach(q, target_m)
-    good = (reach > reach_m[0]) & (reach < reach_m[1])
-    for _ in range(POSE_STEPS):
-        pose, jacobian = controller.kinematics.pose_and_jacobian(q)
-        error = target_m - pose.tip_in_base_m
-        share = controller.approach(
-            jacobian.tip, jacobian.pitch, error, error[:, 2], pitch_rad - pose.pitch_rad
-        )
-        q = (q + POSE_STEP_S * share * controller.speed).clamp(lower, upper)
-    pose = controller.kinematics.pose(q)
-    near = (target_m - pose.tip_in_base_m).norm(dim=1) < POSE_TOLERANCE_M
-    return q, good, near & ((pitch_rad - pose.pitch_rad).abs() < POSE_TOLERANCE_RAD)

@@ -22,7 +22,7 @@ from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.control import DeployedPolicy, ToolPoseControl, list_feature_signs
 from tasks.process import START, EpisodeProcess
 from tasks.settings import CommandBase, ToolPoseTask
-from tasks.starts import DrawTally, draw_starts, move_starts_near
+from tasks.starts import DrawTally, StartSearch
 from tasks.step_state import ToolState
 from tasks.terms import ObservedTerm
 
@@ -62,13 +62,13 @@ class ToolPoseProcess(EpisodeProcess):
 
     def starts(self, count: int, seed: int) -> dict[str, torch.Tensor]:
         """Draw valid starts; see `TaskProcess.starts`."""
-        return self._judge_starts(draw_starts(self.task, self._machine, count, seed))
+        return self._judge_starts(StartSearch(self.task, self._machine).draw(count, seed))
 
     def count_starts(self, count: int, seed: int) -> dict[str, float]:
         """Return shares of drawn candidates; see `TaskProcess.count_starts`."""
         tally = DrawTally("", count)
         with contextlib.suppress(ConfigError):  # nearly none can be done, as the shares say
-            draw_starts(self.task, self._machine, count, seed, tally)
+            StartSearch(self.task, self._machine).draw(count, seed, tally)
         return tally.get_shares()
 
     def bring_near(
@@ -76,8 +76,8 @@ class ToolPoseProcess(EpisodeProcess):
     ) -> dict[str, torch.Tensor]:
         """Return starts with some above their target; see `TaskProcess.bring_near`."""
         start = {name: value.cpu() for name, value in start.items()}
-        moved = move_starts_near(self.task, self._machine, start, share, height_m, seed)
-        return self._judge_starts(moved)
+        search = StartSearch(self.task, self._machine)
+        return self._judge_starts(search.move_near(start, share, height_m, seed))
 
     def _judge_starts(self, start: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
         pose = Kinematics(self._machine, "cpu").pose(start["q"])

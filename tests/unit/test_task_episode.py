@@ -16,8 +16,6 @@ from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from tasks import starts
-from tasks.classical import ClassicalController
-from tasks.starts import move_to_targets
 from tasks.terms import ObservedTerm, RewardCurriculum, RewardTerm
 
 CPU = torch.device("cpu")
@@ -157,10 +155,8 @@ def test_a_draw_checked_in_parts_is_the_draw_checked_at_once(
 
 def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
     task = option("task", "goal_pose")
-    controller = ClassicalController(task.classical, machine, CPU)
-    found = move_to_targets(
-        controller, machine, torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), (1.7, 2.4), 0.1
-    )
+    search = starts.StartSearch(task, machine)
+    found = search.move(torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), 0.1)
     assert [part.shape for part in found] == [(0, 5), (0,), (0,)]
 
 
