@@ -226,7 +226,7 @@ def draw_seeds(methods: Sequence[Mapping[str, Any]]) -> Figure:
         seeds = list(method["difference"]["by_seed"].values()) if method["difference"] else []
         differences.plot(seeds, [row + 0.18] * len(seeds), ".", color=GREY)
     differences.axvline(0.0, color="black", linewidth=0.8)
-    means.set_xlabel("interquartile mean of strict success, 95 % of resamples")
+    means.set_xlabel("interquartile mean of success, 95 % of resamples")
     differences.set_xlabel("difference to the baseline: each seed, mean, 95 % interval")
     _name_rows(means, label_rows(methods))
     return figure
@@ -272,7 +272,7 @@ def _write_learning(runs: Sequence[EvaluatedRun], columns: Sequence[str], folder
         when = f"not in {curve['seconds'].iloc[-1]:.0f} s"
         if not reached_s.empty:
             when = f"after {reached_s.iloc[0]:.1f} s"
-        log.info("%s: strict success of %.2f while learning %s", run.folder.name, REACHED, when)
+        log.info("%s: success of %.2f while learning %s", run.folder.name, REACHED, when)
     if not curves:
         return
     thinned = pd.concat([curve.iloc[:: -(-len(curve) // MOST_ROWS)] for curve in curves])
@@ -314,7 +314,7 @@ def draw_learning(labels: Sequence[str], curves: Sequence[pd.DataFrame]) -> Figu
             label = ""  # one entry of the legend for all runs of a variation
         left.plot(curve["seconds"], curve[SUCCESS], label=label, **style)
         right.plot(1e-6 * curve["env_steps"], curve[SUCCESS], **style)
-    left.set(xlabel="wall clock of training, s", ylabel="strict success while learning")
+    left.set(xlabel="wall clock of training, s", ylabel="success while learning")
     right.set(xlabel="control steps, millions", ylim=(0.0, 1.0))
     for axis in (left, right):
         axis.axhline(REACHED, color=GREY, linewidth=0.8, linestyle="--")

@@ -317,7 +317,7 @@ def _log_success(logger: TrainingLogger, first_episodes: int) -> None:
     for level in LEVELS:
         passed = find_passing(logger.rows, level, first_episodes)
         text = "not reached" if passed is None else f"after {float(passed['seconds']):.1f} s"
-        log.info("strict success of %.2f while learning: %s", level, text)
+        log.info("success of %.2f while learning: %s", level, text)
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

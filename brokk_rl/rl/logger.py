@@ -33,7 +33,7 @@ WINDOW = 4096
 """Newest finished episodes over which success is averaged. Every iteration is asked: with 1,024 a
 training that succeeds in 0.98 of its episodes passed 0.99 by chance (benchmarks/h100/success)."""
 PANELS = (
-    ("Success", ((SUCCESS, "strict"), ("episode/success_paper", "paper's criterion")), (0.0, 1.0)),
+    ("Success", ((SUCCESS, "success"), ("episode/success_paper", "paper's criterion")), (0.0, 1.0)),
     ("Return", (("episode/return", "return per episode"),), None),
     ("Episode length (control steps)", (("episode/length", "length"),), None),
     ("Peak contact force (N)", (("episode/peak_force_n", "mean over episodes"),), None),
