@@ -12,51 +12,18 @@ follows Nakamura and Hanafusa (1986).
 
 """
 
-from dataclasses import dataclass
-
 import numpy as np
 import torch
 
 from brokk_rl.kinematics import Kinematics, ToolPose, multiply_small_matrices
 from brokk_rl.machine import Machine
-from tasks.settings import ClassicalConfig
+from tasks.settings import ClassicalConfig, ControllerGuidance
 
 REACH_DAMPING = 0.05
 """Damping of the exclusive joints' step towards the working range, m² per (rad or m)². Chosen by
 hand: bounds the step where a joint hardly changes the reach."""
 MIN_RADIUS_M = 1e-3
 """Floor of horizontal distances by which the controller divides."""
-
-
-@dataclass
-class ControllerGuidance:
-    """Commands and errors for a history and a target; `N` environments.
-
-    Attributes:
-        command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for
-            positioning, the others as for the approach.
-        error_m: Target minus predicted tool point, in the frame of the arm's plane (radial,
-            tangential, up), `(N, 3)`.
-        pitch_error_rad: Wanted minus predicted pitch, `(N,)`.
-        goal_error_m: Waypoint minus predicted tool point, up, `(N,)`: hover height while not
-            aligned, the final depth after.
-        reach_m: Measured distance from the first joint behind the exclusive ones to the target,
-            turned into the arm's plane, `(N,)`.
-        reach_3d_m: The same measured in space.
-        tip_z_m: Measured height of the tool point, `(N,)`.
-        lowest: Commands below these would drive joints into their ends, `(N, J)` in [-1, 0].
-        highest: Commands above these would, `(N, J)` in [0, 1].
-    """
-
-    command: torch.Tensor
-    error_m: torch.Tensor
-    pitch_error_rad: torch.Tensor
-    goal_error_m: torch.Tensor
-    reach_m: torch.Tensor
-    reach_3d_m: torch.Tensor
-    tip_z_m: torch.Tensor
-    lowest: torch.Tensor
-    highest: torch.Tensor
 
 
 class ClassicalController:

@@ -14,8 +14,8 @@ import torch
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET, ObservationEncoder, list_pose_parts
 from tasks.advice import LeverAdviser
-from tasks.classical import ClassicalController, ControllerGuidance
-from tasks.settings import CommandBase, ToolPoseTask
+from tasks.classical import ClassicalController
+from tasks.settings import CommandBase, ControllerGuidance, ToolPoseTask
 
 ERROR_SCALES_M = (0.1, 0.02)
 """Distances at which the saturated copies of position errors resolve: approach and insertion.

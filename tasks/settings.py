@@ -20,14 +20,43 @@ from tasks.term_task import EpisodeTask
 if TYPE_CHECKING:
     import torch
 
-    from tasks.classical import ControllerGuidance
-
 Expected = NonNegative | NonNegativeRange
 """A number, or the range [low, high] in which it lies."""
 DeadZone = Annotated[float, Interval(ge=0, le=0.99)]
 """A part of the full command that gives no motion."""
 Uniform = Callable[[tuple[float, float]], "torch.Tensor"]
 """Draws `(M,)` numbers between two bounds."""
+
+
+@dataclass
+class ControllerGuidance:
+    """Commands and errors for a history and a target; `N` environments.
+
+    Attributes:
+        command: Valve commands before the masks, `(N, J)` in [-1, 1]: exclusive joints as for
+            positioning, the others as for the approach.
+        error_m: Target minus predicted tool point, in the frame of the arm's plane (radial,
+            tangential, up), `(N, 3)`.
+        pitch_error_rad: Wanted minus predicted pitch, `(N,)`.
+        goal_error_m: Waypoint minus predicted tool point, up, `(N,)`: hover height while not
+            aligned, the final depth after.
+        reach_m: Measured distance from the first joint behind the exclusive ones to the target,
+            turned into the arm's plane, `(N,)`.
+        reach_3d_m: The same measured in space.
+        tip_z_m: Measured height of the tool point, `(N,)`.
+        lowest: Commands below these would drive joints into their ends, `(N, J)` in [-1, 0].
+        highest: Commands above these would, `(N, J)` in [0, 1].
+    """
+
+    command: torch.Tensor
+    error_m: torch.Tensor
+    pitch_error_rad: torch.Tensor
+    goal_error_m: torch.Tensor
+    reach_m: torch.Tensor
+    reach_3d_m: torch.Tensor
+    tip_z_m: torch.Tensor
+    lowest: torch.Tensor
+    highest: torch.Tensor
 
 
 @dataclass(frozen=True)

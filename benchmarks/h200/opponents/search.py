@@ -25,7 +25,8 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
-from tasks.classical import ClassicalController, ControllerGuidance
+from tasks.classical import ClassicalController
+from tasks.settings import ControllerGuidance
 from tasks.tool_pose import ToolPoseProcess
 
 SEED = 20261123
