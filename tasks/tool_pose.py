@@ -47,6 +47,7 @@ class ToolPoseProcess(EpisodeProcess):
         shapes = super()._list_shapes() | {"closeness": ()}
         # errors of this episode's observation, and the sum of the samples of the target
         shapes |= {"bias_m": (3,), "estimate_sum_m": (3,), "q_scale": (), "u_scale": ()}
+        shapes |= {"estimate_m": (3,)}  # the newest, for those who watch
         # what the next command needs of an observation
         shapes |= {"positioning": (), "reach_m": ()}
         shapes |= {"command": joints, "lowest": joints, "highest": joints}
@@ -106,6 +107,7 @@ class ToolPoseProcess(EpisodeProcess):
         state[f"{START}scene"][:, :3] += shift_m
         # one sample came with the reset, and one with each step since
         state["estimate_sum_m"] += (state["age"] + 1)[:, None] * shift_m
+        state["estimate_m"] += shift_m
 
     def command(self, action: torch.Tensor) -> torch.Tensor:
         """Return masked commands or proposals; see `TaskProcess.command`."""
@@ -148,6 +150,7 @@ class ToolPoseProcess(EpisodeProcess):
         """
         state = self.state
         estimate_m = self._estimate_target(shift_m)
+        state["estimate_m"].copy_(estimate_m)
         values = {
             TARGET: estimate_m,
             "q": self._scale_positions(history.q),
