@@ -16,11 +16,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import yaml
 from annotated_types import MinLen
-from rich.progress import Progress
 
 from brokk_rl.console_table import print_table
 from brokk_rl.contracts.vision import FinderSpec, FrameSourceSpec
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import spec
 from perception.benchmark.session_score import SessionScore, merge_scores, score_holes
@@ -111,10 +111,10 @@ class ScoreCamera:
         finder, tracker = self.perception.build(), self.board.build()
         scores: list[SessionScore] = []
         refused: dict[str, str] = {}
-        with self.source.build() as source, Progress(transient=True) as progress:
-            task, number = progress.add_task("frames", total=source.num_frames), 0
+        with self.source.build() as source, ItemProgress("frames", source.num_frames) as progress:
+            number = 0
             while True:
-                progress.update(task, completed=number)
+                progress.reach(number)
                 number += 1
                 try:
                     frame = source.read_latest()
