@@ -39,6 +39,9 @@ class ItemProgress:
     """
 
     def __init__(self, title: str, total: float | None, quiet: bool = False) -> None:
+        # Tables and figures go to stdout; whoever redirects them still sees the bar.
+        # A notebook without ipywidgets would get a warning for each bar.
+        console = Console(stderr=True, force_jupyter=False)
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -47,15 +50,13 @@ class ItemProgress:
             TimeElapsedColumn(),
             TextColumn("left"),
             TimeRemainingColumn(),
-            # Tables and figures go to stdout; whoever redirects them still sees the bar.
-            # A notebook without ipywidgets would get a warning for each bar.
-            console=Console(stderr=True, force_jupyter=False),
+            console=console,
             transient=True,
             speed_estimate_period=SPEED_WINDOW_S,
-            disable=quiet,
+            disable=quiet or not console.is_terminal,  # a bar leaves empty lines in a file
         )
         self._bar.add_task(title, total=total, note="")
-        self._is_logged = not quiet and not self._bar.console.is_terminal
+        self._is_logged = not quiet and not console.is_terminal
         self._told_s = self._bar.get_time()
 
     def skip(self, count: float = 1) -> None:

@@ -129,7 +129,7 @@ class Train(PlantMode):
             results = self._finish(config, runner, logger)
             files = [path for name in TRACKED for path in sorted(self.session.folder.glob(name))]
             tracker.report(flatten_figures(results["policies"], "evaluation"), files)
-        log.info("run folder: %s", self.session.folder)
+        log.info("policy, curves and evaluation are in %s", self.session.folder)
         return float(results["success_strict"]["mean"])
 
     def _begin(self, runner: TrainingRunner, logger: TrainingLogger) -> None:
