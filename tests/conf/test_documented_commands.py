@@ -38,6 +38,7 @@ NOT_COMPOSED = {
     "-sc install=": "completion of a shell composes nothing",
     "mode=<mode>": "any mode",
     "mode=X": "any mode",
+    " $R ": "words that stand once, above several commands",
     "group=option": "any group",
     "hydra/launcher=": "Hydra warns of the launcher's schema; brokk silences that",
     "mine.terms:": "a function that the reader writes",
@@ -153,13 +154,16 @@ def split_overrides(job: list[Override], groups: set[str]) -> tuple[frozenset[st
 
 def explain_fault(overrides: list[str], whole: bool) -> str | None:
     """Returns why a command does not compose, `None` if it does."""
+    # a policy's folder is there only after a run
+    chosen = [re.sub(r"^policy=(.*[/:.].*|run)$", "policy=trained", line) for line in overrides]
     try:
-        cfg = hydra.compose("config", overrides=overrides)
+        cfg = hydra.compose("config", overrides=chosen)
         if whole:
             cfg = OmegaConf.merge(cfg, {"session": {"out": "folder"}}) if "session" in cfg else cfg
             build_quick_nodes(*extensions.read_values(cfg))
     except Exception as error:
-        return cli.explain(error) or repr(error)
+        told = cli.explain(error) or repr(error)
+        return told if whole or "must be given" not in told else None
     return None
 
 

