@@ -32,6 +32,9 @@ from brokk_rl.sweep import SweepFolder
 
 log = logging.getLogger(__name__)
 
+FILE_WIDTH = 160
+"""Columns of a log that goes to a file or a pipe: most messages stay one line. Chosen by hand."""
+
 
 class FailedJob(BaseException):
     """A failed job on its way to `main`.
@@ -143,11 +146,11 @@ def _is_first_process() -> bool:
 
 def set_up_logging() -> None:
     """Send log records to stderr, unless logging is set up already."""
+    console = Console(stderr=True)
+    if not (console.is_terminal or os.environ.get("COLUMNS")):
+        console.width = FILE_WIDTH
     handler = RichHandler(
-        console=Console(stderr=True),
-        show_path=False,
-        log_time_format="%H:%M:%S",
-        omit_repeated_times=False,
+        console=console, show_path=False, log_time_format="%H:%M:%S", omit_repeated_times=False
     )
     logging.basicConfig(
         level=logging.INFO if _is_first_process() else logging.ERROR,
