@@ -108,7 +108,11 @@ def _measure_closeness(distance_m: torch.Tensor, turn_rad: torch.Tensor) -> torc
 
     Sum of distance at three scales, pitch at three, and both together.
     """
-    scales = (1.0, 0.3, 0.05)
-    near = sum(1 / (1 + distance_m / scale) for scale in scales) / 3
-    turned = sum(1 / (1 + turn_rad / scale) for scale in scales) / 3
+    near, turned = _average_nearness(distance_m), _average_nearness(turn_rad)
     return 0.5 * near + 0.2 * turned + 0.3 * near * turned
+
+
+def _average_nearness(error: torch.Tensor) -> torch.Tensor:
+    """Return the mean of 1 / (1 + error) at three scales."""
+    coarse, middle, fine = (1 / (1 + error / scale) for scale in (1.0, 0.3, 0.05))
+    return (coarse + middle + fine) / 3

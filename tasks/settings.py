@@ -5,7 +5,7 @@ This module needs no torch, so that a bad value is refused before torch is loade
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
@@ -89,7 +89,7 @@ class CandidateTargets:
 
     place_m: tuple[torch.Tensor, torch.Tensor, torch.Tensor]
     pitch_rad: torch.Tensor
-    scene: dict[str, torch.Tensor | float]
+    scene: Mapping[str, torch.Tensor | float]
     object_z_m: torch.Tensor
 
 
