@@ -60,6 +60,7 @@ DOORS = {
     "cv2": ("perception", "deploy.picture"),
     "mjviser": ("brokk_rl.play",),
     "viser": ("brokk_rl.play",),
+    "trimesh": ("brokk_rl.sim",),
     "can": ("deploy", "actuators.recordings.can_log"),
     "cantools": ("deploy", "actuators.recordings.can_log"),
 }
