@@ -271,10 +271,10 @@ def _resolve_range(
     else:
         table = value if isinstance(value, Mapping) else {OTHER: value}
         expand_per_joint(dict.fromkeys(table, 0.0), machine, where)  # refuses unknown names
-        low, high = np.empty(machine.num_joints), np.empty(machine.num_joints)
-        for j, name in enumerate(machine.joint_names):
-            ends = _resolve_ends(table[name if name in table else OTHER], number, machine)
-            low[j], high[j] = ends[0][j], ends[1][j]
+        ends = {key: _resolve_ends(entry, number, machine) for key, entry in table.items()}
+        rows = [ends[name if name in ends else OTHER] for name in machine.joint_names]
+        low = np.array([row[0][j] for j, row in enumerate(rows)], float)
+        high = np.array([row[1][j] for j, row in enumerate(rows)], float)
         if number.none is not None:
             low, high = (np.where(chosen, side, number.none) for side in (low, high))
     # Files from before sizes grew with the joints keep their meaning: the reference's bounds count too.

@@ -100,6 +100,7 @@ class Train(PlantMode):
             The strict success of the trained policy; `None` in all processes but the first.
         """
         device = self.session.torch_device()
+        log.info("training on %s: %s of %s", device, name_spec(self.task), self.machine.name)
         self.session.seed_all()
         config = self.compose_loop()
         stream = self.session.stream("starts")

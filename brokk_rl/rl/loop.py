@@ -11,6 +11,7 @@ import contextlib
 import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -80,20 +81,17 @@ class ControlLoopConfig:
 
         Args:
             device: Where to simulate.
-            num_envs: Number of environments; `None` for the number of the simulator's
-                configuration.
+            num_envs: Number of environments; `None` for that of the simulator's configuration.
             pool: Number of valid starts from which resets draw.
             seed: Seed of the starts.
             starts: Starts of another control loop, in the place of drawn ones.
         """
         site = find_site(getattr(self.task, "scene", None), self.sim)
         more: dict[str, Any] = {"site": site} if site else {}
+        build_world = self.sim.build
         if self.events:
-            world: World = build_varied_world(
-                self.sim, self.events, self.machine, device, num_envs, **more
-            )
-        else:
-            world = self.sim.build(self.machine, device, num_envs, **more)
+            build_world = partial(build_varied_world, self.sim, self.events)
+        world: World = build_world(self.machine, device, num_envs, **more)
         num = world.num_worlds
         model = self.actuator.build(self.machine, num, device)
         for effect in self.effects.values():
@@ -152,18 +150,13 @@ class ControlLoop(VecEnv):
         self.cfg: dict[str, Any] = {}
         self.starts = starts
         shape = (self.num_envs, machine.num_history, machine.num_joints)
-        self.history = History(
-            q=torch.zeros(shape, device=self.device), u=torch.zeros(shape, device=self.device)
-        )
+        q, u = torch.zeros(2, *shape, device=self.device)
+        self.history = History(q=q.clone(), u=u.clone())
         """History that the controller sees."""
         sides = getattr(actuator, "sides", frozenset())
         self._sensing = cast(SensingModel, actuator) if "measurement" in sides else None
         self._misplacing = cast(SensingModel, actuator) if "kinematics" in sides else None
-        self.truth = (
-            History(q=self.history.q.clone(), u=self.history.u.clone())
-            if self._sensing
-            else self.history
-        )
+        self.truth = History(q=q, u=u) if self._sensing else self.history
         """History of the machine itself; the same object where sensors are true."""
         self.reward = torch.zeros(self.num_envs, device=self.device)
         self.done = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)

@@ -178,7 +178,7 @@ def test_every_policy_meets_the_same_holes_and_the_same_errors(machine: Machine)
                 "bias_m",
                 "q_scale",
                 "u_scale",
-                "estimate_m",
+                "estimate_sum_m",
             )
             if loop.task.state["age"].eq(0).all():
                 met.append({name: loop.task.state[name].clone() for name in names})
