@@ -11,7 +11,7 @@ from brokk_rl.console_table import print_table, print_text
 from brokk_rl.contracts.actuator import Actuator, Effect
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.report import write_picture
+from brokk_rl.plot import save_figure
 from brokk_rl.session import Session
 from brokk_rl.spec import spec
 from diagnosis.deployment import doctor, page
@@ -72,7 +72,7 @@ class DoctorPolicy:
         found.write(folder)
         page.write_page(found, folder)
         if (picture := page.draw_evidence(found)) is not None:
-            write_picture(picture, folder / page.EVIDENCE_FILE)
+            save_figure(picture, folder / page.EVIDENCE_FILE)
         print_answer(found, folder)
 
     def examine(self) -> DoctorAnswer:

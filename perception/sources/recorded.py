@@ -49,7 +49,7 @@ class StereoVideo:
         size_px: Width and height of a device's picture, asked of it; `null` leaves it as it is.
     """
 
-    input: str
+    input: str | int
     layout: Literal["side_by_side", "above", "single"]
     rate_hz: float | None
     size_px: tuple[int, int] | None

@@ -50,6 +50,7 @@ WITHOUT_VALUES = {
     "mode=diagnose …": "the values before the dots stand in the block above it",
     "diagnosis.case=": "the folder is the reader's",
     "subject.model=arm.urdf": "the file is the reader's",
+    "surfaces.folder=": "the photographs are the reader's",
     '"$': "a variable of the shell holds a value that must be given",
 }
 """Parts of commands that leave out such values: groups and fields are checked alone."""
@@ -155,7 +156,9 @@ def split_overrides(job: list[Override], groups: set[str]) -> tuple[frozenset[st
 def explain_fault(overrides: list[str], whole: bool) -> str | None:
     """Returns why a command does not compose, `None` if it does."""
     # a policy's folder is there only after a run
-    chosen = [re.sub(r"^policy=(.*[/:.].*|run)$", "policy=trained", line) for line in overrides]
+    chosen = [
+        re.sub(r"^policy=(.*[/:.].*|(that_)?run)$", "policy=trained", line) for line in overrides
+    ]
     try:
         cfg = hydra.compose("config", overrides=chosen)
         if whole:
