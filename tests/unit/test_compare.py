@@ -174,7 +174,7 @@ def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path)
         elsewhere = tmp_path / f"{actuator}_{seed}_there"
         write_run(elsewhere, "hydraulic", 0, 0.5 if actuator == "ideal" else 0.7)
         # it was written on another machine; both folders were moved together
-        (elsewhere / "resolved.yaml").write_text(f"policy: {{folder: /gone/{trained.name}}}\n")
+        (elsewhere / "resolved.yaml").write_text(f"policy: {{path: /gone/{trained.name}}}\n")
     runs = [load_run(folder) for folder in find_runs([str(tmp_path / "*_there")])]
     columns = find_differences(runs)
     assert columns == ["actuator", "evaluated on"]
