@@ -50,6 +50,7 @@ WITHOUT_VALUES = {
     "mode=diagnose …": "the values before the dots stand in the block above it",
     "diagnosis.case=": "the folder is the reader's",
     "subject.model=arm.urdf": "the file is the reader's",
+    "effect@stand_in": "the file of the reader holds effects by name",
     "surfaces.folder=": "the photographs are the reader's",
     '"$': "a variable of the shell holds a value that must be given",
 }
@@ -157,7 +158,8 @@ def explain_fault(overrides: list[str], whole: bool) -> str | None:
     """Returns why a command does not compose, `None` if it does."""
     # a policy's folder is there only after a run
     chosen = [
-        re.sub(r"^policy=(.*[/:.].*|(that_)?run)$", "policy=trained", line) for line in overrides
+        re.sub(r"^policy=(?!(classical|shipped|trained|untrained)$).*", "policy=trained", line)
+        for line in overrides
     ]
     try:
         cfg = hydra.compose("config", overrides=chosen)
