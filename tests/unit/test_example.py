@@ -82,7 +82,7 @@ def test_its_tool_point_is_that_of_the_kinematics(example: Any, machine: Machine
 def test_it_ends_where_the_task_does(example: Any, machine: Machine) -> None:
     """Random holes near the tool: success where the task's own judgement says so."""
     policy = example.ExportedPolicy(ROOT / "tasks/policies/borehole_insertion")
-    process: Any = option("task", "borehole_insertion").build(machine, 1, torch.device("cpu"))
+    task: Any = option("task", "borehole_insertion")
     q = machine.home
     tip_m, _ = policy.locate_tip(q)
     generator = np.random.default_rng(1)
@@ -94,7 +94,7 @@ def test_it_ends_where_the_task_does(example: Any, machine: Machine) -> None:
             "target_pitch_rad": torch.zeros(1),
         }
         tip = torch.tensor(tip_m, dtype=torch.float32)[None]
-        expected = bool(process.goal.judge(tip, torch.zeros(1), start)["success"])
+        expected = bool(task.judge(tip, torch.zeros(1), start).success)
         assert (policy.find_end(target_m, q, 0.0) == "success") == expected
         outcomes.add(expected)
     assert outcomes == {True, False}
