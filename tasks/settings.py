@@ -356,7 +356,8 @@ class ToolPoseTask(EpisodeTask):
     """Fields that a policy has learned with; see `brokk_rl.policy_folder`."""
 
     def check_machine(self, machine: Machine) -> None:
-        """Refuse a memory that is longer than the machine's history."""
+        """Refuse a memory that is longer than the machine's history, and an episode of no step."""
+        super().check_machine(machine)
         if self.memory > machine.num_history:
             raise ConfigError(
                 f"task.memory: expected at most the {machine.num_history} samples of the history of "

@@ -68,6 +68,11 @@ class EpisodeTask:
 
     def check_machine(self, machine: Machine) -> None:
         """Refuse values that do not fit a machine; needs no torch."""
+        if self.episode_s < machine.period_s:
+            raise ConfigError(
+                f"task.episode_s: expected at least a control step of machine '{machine.name}', "
+                f"{machine.period_s:g} s, got {self.episode_s:g}"
+            )
 
     def build(self, machine: Machine, num_envs: int, device: torch.device) -> TaskProcess:
         """Return the task for `num_envs` environments on `device`."""

@@ -30,6 +30,8 @@ SETTLED_PART = 0.9
 CAPPED = "brokk_rl.rl.ppo:CappedGaussian"
 """The distribution whose cap `Exploration` moves."""
 PositiveShare = Annotated[float, Gt(0), Interval(le=1)]
+EnvCount = Annotated[int, Interval(ge=1, le=10**7)]
+"""The bound is for slips of the pen, chosen by hand; benchmarks go to 65,536."""
 Widths = Annotated[tuple[Count, ...], MinLen(1)]
 Activation = Literal[
     "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish",
@@ -201,7 +203,7 @@ class TrainingConfig:
             `num_steps_per_env`, …), handed on as it is.
     """
 
-    num_envs: Count | None
+    num_envs: EnvCount | None
     num_starts: Count
     budget: TrainingBudget
     save_interval: Count
