@@ -44,6 +44,8 @@ def read_arguments(words: Sequence[str]) -> list[str]:
         groups.setdefault(option.group, []).append(option.name)
     options, values = _split(words, groups)
     sweep = not SWEEP.isdisjoint(options)
+    if sweep and not values:
+        raise ConfigError("a sweep needs values: brokk -m mode=train session.seed=0,1,2")
     if not COMPLETION.isdisjoint(options) and len(values) != 1:
         raise ConfigError("completion of words: brokk -sc install=bash, or uninstall=bash")
     read = []
@@ -53,6 +55,8 @@ def read_arguments(words: Sequence[str]) -> list[str]:
             continue
         if "=" not in word or word == "=":
             raise ConfigError(_explain_word(word, values[place + 1 :], groups))
+        if word.startswith("mode=") and any(other.startswith("mode=") for other in values[:place]):
+            raise ConfigError(f"expected one mode, got {word} and another before it")
         read.append(_read_value(word, sweep, groups))
     return options + read
 

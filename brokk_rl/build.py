@@ -53,7 +53,10 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
             built[key] = build_node(values[key], key)
     for key in built:
         if key not in known:
-            raise ConfigError(f"the mode has no '{key}'; {list_choices(key, known)}")
+            raise ConfigError(
+                f"the mode has no '{key}'; {list_choices(key, known)}. A preset or experiment that "
+                "sets it is for other modes: leave it out"
+            )
     return _call(kind, {key: built[key] for key in values if key in built}, "")
 
 

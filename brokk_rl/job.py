@@ -109,7 +109,7 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
             f"session={session}: it is a table, whose values are given as session.<name>=…; "
             f"{list_choices(str(session), ('out', 'seed', 'device'))}"
         )
-    out = session["out"]
+    out = session.get("out")  # a preset may set others in a mode without a session
     if isinstance(out, (list, dict)):
         raise ConfigError(f"session.out: expected one folder, got {out}; change session.out=…")
     if out and out != "???":

@@ -42,6 +42,8 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     ("mode=train", "--seed=3"): ("seed=3",),
     ("mode=train", "--cfg"): ("--cfg needs a value",),
     ("mode=train", "--cfg", "jobs"): ("there is no --cfg jobs", "'job'"),
+    ("-m",): ("a sweep needs values", "session.seed=0,1,2"),
+    ("mode=train", "mode=evaluate"): ("expected one mode",),
     ("-sc",): ("-sc install=bash",),
     ("evaluat",): ("did you mean mode=evaluate?",),
     ("arm.urdf",): ("brokk mode=check subject.model=arm.urdf",),
@@ -118,6 +120,7 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
 }
 """A command, and parts of its message."""
 AFTER_TORCH = {
+    ("mode=play", "preset=gpu"): ("the mode has no", "leave it out"),
     ("rl.runner.algorithm.num_mini_batches=100000",): ("num_mini_batches: expected at most 98304",),
     ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
     ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
