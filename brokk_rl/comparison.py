@@ -290,7 +290,7 @@ def summarise_methods(
     table = pd.Series(scores).rename_axis(["method", "condition", "seed"])
     summaries = []
     for name, method in methods.items():
-        own = table[name]
+        own: Any = table[name]
         strata = own.groupby("condition", sort=False).agg(np.array)
         mean, interval = compute_interquartile_mean(strata.tolist(), generator)
         summaries.append(
@@ -301,7 +301,9 @@ def summarise_methods(
                 "interquartile_mean": mean,
                 "ci95": interval,
                 "is_baseline": name == baseline,
-                "difference": None if name == baseline else _compare(own, table[baseline]),
+                "difference": None
+                if name == baseline
+                else _compare(own, pd.Series(table[baseline])),
             }
         )
     return summaries
@@ -309,7 +311,7 @@ def summarise_methods(
 
 def _compare(own: pd.Series, baseline: pd.Series) -> dict[str, Any] | None:
     """Return by seed how much more often a method succeeds; `None` where no seed is shared."""
-    by_seed = (own - baseline).dropna().groupby("seed").mean()
+    by_seed: Any = (own - baseline).dropna().groupby("seed").mean()
     if by_seed.empty:
         return None
     interval = compute_student_interval(by_seed.tolist())

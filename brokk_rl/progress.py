@@ -79,7 +79,7 @@ class ItemProgress:
         """
         task = self._bar.tasks[0]
         done = max(task.completed, done if task.total is None else min(done, task.total))
-        fields = {} if note is None else {"note": note}
+        fields: dict[str, Any] = {} if note is None else {"note": note}
         self._bar.update(task.id, completed=done, description=title, **fields)
         if self._is_logged and self._bar.get_time() - self._told_s > LINE_EVERY_S:
             self._told_s = self._bar.get_time()

@@ -14,7 +14,7 @@ import operator
 import reprlib
 import types
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from pathlib import Path
@@ -121,18 +121,6 @@ def name_spec(value: object) -> str:
     return getattr(value, "label", type(value).__name__.lower())
 
 
-def restore_spec(kind: type[T], values: Mapping[str, Any]) -> T:
-    """Return the spec `kind` with plain values, as `dataclasses.asdict` gives them.
-
-    The classes come from the annotations of `kind`, never from the values: a file of somebody else
-    can choose numbers, but no code.
-
-    Raises:
-        SpecError: A field is unknown, missing, or of another type.
-    """
-    return kind(**values)
-
-
 def require_value(key: str, hint: Any, value: Any) -> Any:
     """Return a value as the annotation `hint` has it, as a field of a spec would.
 
@@ -199,7 +187,8 @@ def _constrain(hint: Any) -> Any:
     if origin in (Union, types.UnionType):
         return functools.reduce(operator.or_, map(_constrain, arguments))
     if origin in (tuple, dict, list):
-        return origin[tuple(item if item is ... else _constrain(item) for item in arguments)]
+        constrained: Any = tuple(item if item is ... else _constrain(item) for item in arguments)
+        return types.GenericAlias(origin, constrained)
     if hint is int:
         return Annotated[int, Strict(), BeforeValidator(_read_whole)]
     if hint is float:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -47,10 +47,10 @@ class Mirror:
         import torch
 
         if obs is not None:
-            seen = obs.clone()
-            for name, value in obs.items():
-                seen[name] = self.apply(name, value)
-            obs = torch.cat((obs, seen))
+            mirrored: Any = obs.clone()
+            for name, value in list(mirrored.items()):
+                mirrored[name] = self.apply(name, value)
+            obs = cast("TensorDict", torch.cat((obs, mirrored)))
         if actions is not None:
             actions = torch.cat((actions, actions * self.action))
         return obs, actions

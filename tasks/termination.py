@@ -35,17 +35,6 @@ def contact_force(state: StepState, largest_n: float) -> torch.Tensor:
     return state.contact_force_n > largest_n
 
 
-def tip_left(
-    state: StepState, x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, float]
-) -> torch.Tensor:
-    """The tool point leaves a box in the base frame, given by its lowest and highest values."""
-    outside = state.is_first & False
-    for axis, (low, high) in enumerate((x_m, y_m, z_m)):
-        along = state.tip_m[:, axis]
-        outside = outside | (along < low) | (along > high)
-    return outside
-
-
 def time_limit(state: StepState) -> torch.Tensor:
     """The time of the episode, `task.episode_s`, is over."""
     return state.steps >= state.max_steps

@@ -17,7 +17,7 @@ TOO_LONG_S = 60
 
 @dataclass(frozen=True)
 class Refusal:
-    """How a command ended: exit code, what it said, CPU time, whether torch was loaded."""
+    """End of a command: exit code, what it said, CPU time, whether torch was loaded."""
 
     code: int
     told: str

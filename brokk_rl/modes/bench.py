@@ -104,8 +104,8 @@ class Benchmark:
         still = torch.zeros(num, self.machine.num_joints, device=device)
         graphs = device.type == "cuda" and loop.world.supports_graphs
 
-        def physics() -> object:
-            return loop.world.step(still)
+        def physics() -> None:
+            loop.world.step(still)
 
         if graphs:
             physics = capture_graph(physics, device).replay

@@ -268,7 +268,7 @@ def _write_learning(runs: Sequence[EvaluatedRun], columns: Sequence[str], folder
             continue
         curves.append(curve)
         variations.append({column: run.get_setting(column) for column in columns})
-        reached_s = curve["seconds"][curve[SUCCESS] >= REACHED]
+        reached_s: Any = curve["seconds"][curve[SUCCESS] >= REACHED]
         when = f"not in {curve['seconds'].iloc[-1]:.0f} s"
         if not reached_s.empty:
             when = f"after {reached_s.iloc[0]:.1f} s"
@@ -287,7 +287,7 @@ def _read_progress(run: EvaluatedRun) -> pd.DataFrame | None:
     if not path.is_file():
         return None
     try:
-        curve = pd.read_csv(path, usecols=PROGRESS_COLUMNS, dtype=float)[PROGRESS_COLUMNS]
+        curve: Any = pd.read_csv(path, usecols=PROGRESS_COLUMNS, dtype=float)[PROGRESS_COLUMNS]
     except ValueError as error:
         raise ConfigError(
             f"{path} cannot be read ({error}); leave the run out of compare.runs"

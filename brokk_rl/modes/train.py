@@ -89,8 +89,8 @@ class Train(PlantMode):
 
     def check(self) -> None:
         parts = (self.sim, *vars(self.sim).values())  # sim=auto holds two simulators
-        worlds = [part.num_worlds for part in parts if hasattr(part, "num_worlds")]
-        if worlds and self.rl.num_envs is None:
+        worlds = [getattr(part, "num_worlds", 0) for part in parts]
+        if any(worlds) and self.rl.num_envs is None:
             self.rl.check_batches(max(worlds))
 
     def run(self) -> float | None:

@@ -16,7 +16,6 @@ from brokk_rl.machine import Machine
 from brokk_rl.sim.arm_model import TIP, ArmModel, ModelChoices, normalise_axis
 from brokk_rl.sim.drive import FASTEST_MODE, compute_inertia, find_fastest_mode
 from brokk_rl.sim.model_source import KINDS, JointLimits
-from brokk_rl.spec import restore_spec
 
 HYDRAULIC_NAMES = re.compile("boom|stick|bucket|dipper|cylinder", re.IGNORECASE)
 """Names of joints and links of machines that are moved by cylinders."""
@@ -93,7 +92,7 @@ class ImportedMachine:
 
     def build(self) -> Machine:
         """Return the machine."""
-        return restore_spec(Machine, self.values)
+        return Machine(**self.values)
 
     def format_yaml(self) -> str:
         """Return the text of the machine's file."""

@@ -61,7 +61,7 @@ class StereoVideo:
             FrameError: it cannot be opened, or cannot be cut into two pictures.
         """
         is_device = str(self.input).isdigit()
-        if not is_device and not Path(self.input).is_file():
+        if not is_device and not Path(str(self.input)).is_file():
             raise FrameError(
                 f"capture.input={self.input}: no such file; expected a video, or the number of a "
                 "camera such as 0"

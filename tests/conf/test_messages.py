@@ -26,7 +26,7 @@ FILES = {
     "fails.py": "import math\nfrom math import squareroot\n",
     "slip.py": "x = 1\ndef f(:\n",
 }
-"""What lies on the newcomer's desk."""
+"""Files in the folder from which the commands are started, by name."""
 WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     # words
     ("evaluate",): ("brokk mode=evaluate",),

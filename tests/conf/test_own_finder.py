@@ -22,45 +22,7 @@ from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import read_holes
 from perception import dataset
 
-FINDER = '''"""A finder of another package."""
-
-import numpy as np
-
-from brokk_rl.contracts.vision import FrameDetections, HolePose
-from brokk_rl.spec import spec
-
-
-@spec
-class DarkestSpot:
-    """Take the darkest place of a bright face for a hole."""
-
-    radius_m: float
-    std_m: float
-
-    def build(self):
-        return self
-
-    def find(self, frame):
-        known = np.isfinite(frame.depth_m)
-        if not known.any():
-            return FrameDetections(holes=[])
-        gray = frame.color.mean(axis=2)
-        rows, columns = np.nonzero(gray < 0.5 * np.median(gray))
-        if len(rows) == 0:
-            return FrameDetections(holes=[])
-        ray = np.linalg.solve(frame.camera_matrix, [columns.mean(), rows.mean(), 1.0])
-        hole = HolePose(
-            center_m=np.median(frame.depth_m[known]) * ray,
-            axis=np.array([0.0, 0.0, -1.0]),
-            radius_m=self.radius_m,
-            cov_m2=np.eye(3) * self.std_m**2,
-            axis_cov_rad2=np.zeros((3, 3)),
-            frame="camera",
-            score=0.5,
-            t_s=frame.t_s,
-        )
-        return FrameDetections(holes=[hole])
-'''
+FINDER = Path(__file__).parents[2] / "examples/my_package/my_package/darkest.py"
 OPTION = "_target_: spots.finder.DarkestSpot\nradius_m: 0.05   # m\nstd_m: 0.05      # m, a guess\n"
 
 
@@ -68,7 +30,7 @@ OPTION = "_target_: spots.finder.DarkestSpot\nradius_m: 0.05   # m\nstd_m: 0.05 
 def finder_spec(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Any:
     """The spec of a finder in an installed package `spots`."""
     folder = tmp_path_factory.mktemp("site")
-    files = {"finder.py": FINDER, "conf/perception/darkest.yaml": OPTION}
+    files = {"finder.py": FINDER.read_text(), "conf/perception/darkest.yaml": OPTION}
     install_package(folder, "spots", files, monkeypatch)
     return importlib.import_module("spots.finder").DarkestSpot(radius_m=0.05, std_m=0.05)
 

@@ -44,10 +44,6 @@ SUCCESS, START, TIME = (
     [
         (ends("joint_limit", margin=0.1), {"q": [[0.0, 0.0], [0.0, -0.91], [0.89, 0.0]]}),
         (ends("contact_force", largest_n=100.0), {"contact_force_n": [0.0, 101.0, 100.0]}),
-        (
-            ends("tip_left", x_m=[-1, 1], y_m=[-1, 1], z_m=[0, 2]),
-            {"tip_m": [[1.0, -1.0, 0.0], [0.0, 1.1, 0.5], [-1.0, 0.5, 2.0]]},
-        ),
         (TIME, {"steps": [0.0, 10.0, 9.0]}),
         (SUCCESS, {"success": [False, True, False]}),
         (START, {"age": [1.0, 1.0, 2.0], "contact_force_n": [0.0, 1.0, 1.0]}),
