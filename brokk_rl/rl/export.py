@@ -66,7 +66,7 @@ def export_onnx(
     metadata = {}
     for key, value in contract.items():
         if key != "network":
-            metadata[f"brokk.{key}"] = _format_metadata(value)
+            metadata[f"brokk.{key}"] = value if isinstance(value, str) else json.dumps(value)
     model = onnx.load(part)
     onnx.helper.set_model_props(model, metadata)
     onnx.save(model, part)
@@ -132,7 +132,3 @@ def _write_onnx(module: torch.nn.Module, example: torch.Tensor, path: Path) -> N
             dynamo=False,
         )
         torch_log.setLevel(level)
-
-
-def _format_metadata(value: Any) -> str:
-    return value if isinstance(value, str) else json.dumps(value)
