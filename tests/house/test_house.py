@@ -46,8 +46,8 @@ def test_the_sources_keep(rule: Callable[[Mapping[str, str]], list[str]]) -> Non
 
 NOUNS = ("spec",)
 """Functions that are no verbs: the decorator of specs."""
-QUANTITIES = ("tasks.reward", "tasks.observations", "tasks.termination", "tasks.figures")
-"""Modules of terms, which are named by their quantity: users type these names."""
+QUANTITIES = ("tasks.terms",)
+"""Terms, which are named by their quantity: users type these names."""
 
 
 def test_functions_begin_with_a_verb() -> None:
@@ -78,12 +78,12 @@ def test_numbers_of_the_configuration_are_explained() -> None:
             "brokk_rl.rl.runner",
             "def f():\n    from brokk_rl.modes.train import Train",
         ),
-        (rules.floors, "brokk_rl.modes.train", "from tasks.reward import Term"),
-        (rules.floors, "tasks.reward", "import actuators.models.lag"),
+        (rules.floors, "brokk_rl.modes.train", "from tasks.terms import Term"),
+        (rules.floors, "tasks.terms", "import actuators.models.lag"),
         (rules.floors, "actuators.models.lag", "import diagnosis.answer"),
         (rules.doors, "diagnosis.answer", "import mujoco"),
         (rules.floors, "brokk_rl.modes.list", "from brokk_rl import extensions"),
-        (rules.doors, "tasks.reward", "import mujoco"),
+        (rules.doors, "tasks.terms", "import mujoco"),
         (rules.doors, "brokk_rl.modes.list", "from omegaconf import OmegaConf"),
         (rules.doors, "brokk_rl.rl.runner", "import warp as wp"),
         (rules.doors, "deploy.runtime", "from brokk_rl.sim import scene"),
@@ -109,7 +109,7 @@ def test_a_planted_violation_is_found(
 @pytest.mark.parametrize(
     ("rule", "module", "text"),
     [
-        (rules.floors, "tasks.reward", "from brokk_rl.sim import scene"),
+        (rules.floors, "tasks.terms", "from brokk_rl.sim import scene"),
         (rules.floors, "diagnosis.answer", "from actuators.models.lag import Lag"),
         (
             rules.floors,

@@ -12,7 +12,7 @@ from kinematic import KinematicWorld
 
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from tasks.classical import ClassicalController, _solve_4
+from tasks.control import ClassicalController, _solve_4
 
 CPU = torch.device("cpu")
 RANGE_M = (1.7, 2.4)

@@ -19,8 +19,8 @@ from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.faults import Fault, FaultRecorder
 from brokk_rl.sim.scene import make_nominal_scenes
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
-from tasks.step_state import StepState
-from tasks.terms import RewardTerm
+from tasks.term_task import RewardTerm
+from tasks.terms import StepState
 
 NATIVE = NativeSimulator(num_worlds=4, substeps=5, num_threads=1)
 FUSED = WarpSimulator(

@@ -10,9 +10,9 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from tasks import reward
-from tasks.step_state import ToolState
-from tasks.terms import RewardCurriculum, RewardTerm
+from tasks import terms
+from tasks.term_task import RewardCurriculum, RewardTerm
+from tasks.terms import ToolState
 
 YES, NO = torch.tensor([True]), torch.tensor([False])
 
@@ -58,7 +58,7 @@ def test_working_distance_falls_off_outside_the_good_range(
     state: ToolState, reach_m: float, expected: float
 ) -> None:
     positioning = replace(state, positioning=YES, reach_m=torch.tensor([reach_m]))
-    assert reward.working_distance(positioning, edge=0.25).item() == pytest.approx(
+    assert terms.working_distance(positioning, edge=0.25).item() == pytest.approx(
         expected, rel=1e-5
     )
 
@@ -67,28 +67,28 @@ def test_while_positioning_only_the_working_distance_counts(state: ToolState) ->
     positioning = replace(
         state, positioning=YES, contact_force_n=torch.tensor([900.0]), paper_success=YES
     )
-    for term in (reward.distance, reward.pitch, reward.insertion, reward.approach_command_change):
+    for term in (terms.distance, terms.pitch, terms.insertion, terms.approach_command_change):
         assert term(positioning).item() == 0.0, term.__name__
-    assert reward.far_contact(positioning, largest=0.7).item() == 0.0
-    assert reward.working_distance(state, edge=0.25).item() == 0.0, (
+    assert terms.far_contact(positioning, largest=0.7).item() == 0.0
+    assert terms.working_distance(state, edge=0.25).item() == 0.0, (
         "and once it is done, all the others"
     )
 
 
 def test_distance_is_one_over_one_plus_metres(state: ToolState) -> None:
-    assert reward.distance(state).item() == pytest.approx(1 / 1.25)
+    assert terms.distance(state).item() == pytest.approx(1 / 1.25)
 
 
 def test_pitch_is_one_over_one_plus_radians_both_ways(state: ToolState) -> None:
-    assert reward.pitch(state).item() == pytest.approx(1 / 1.25)
-    assert reward.pitch(replace(state, pitch_rad=torch.tensor([1.75]))).item() == pytest.approx(
+    assert terms.pitch(state).item() == pytest.approx(1 / 1.25)
+    assert terms.pitch(replace(state, pitch_rad=torch.tensor([1.75]))).item() == pytest.approx(
         1 / 1.25
     )
 
 
 def test_insertion_pays_both_alignments_while_the_papers_criterion_holds(state: ToolState) -> None:
-    assert reward.insertion(state).item() == 0.0
-    assert reward.insertion(replace(state, paper_success=YES)).item() == pytest.approx(0.8 + 0.8)
+    assert terms.insertion(state).item() == 0.0
+    assert terms.insertion(replace(state, paper_success=YES)).item() == pytest.approx(0.8 + 0.8)
 
 
 @pytest.mark.parametrize(
@@ -102,12 +102,12 @@ def test_contact_costs_its_force_only_far_from_the_hole(
         contact_force_n=torch.tensor([120.0]),
         target_m=state.tip_m + torch.tensor([[0.0, 0.0, distance_m]]),
     )
-    assert reward.far_contact(touching, largest=0.7).item() == pytest.approx(expected)
+    assert terms.far_contact(touching, largest=0.7).item() == pytest.approx(expected)
 
 
 def test_command_change_sums_over_joints(state: ToolState) -> None:
-    assert reward.approach_command_change(state).item() == pytest.approx(0.25 + 0.5)
-    assert reward.command_change(replace(state, positioning=YES)).item() == pytest.approx(0.75), (
+    assert terms.approach_command_change(state).item() == pytest.approx(0.25 + 0.5)
+    assert terms.command_change(replace(state, positioning=YES)).item() == pytest.approx(0.75), (
         "this one counts everywhere"
     )
 
@@ -126,31 +126,31 @@ def test_the_papers_total_on_one_state(state: ToolState) -> None:
     params = {"far_contact": {"largest": 0.7}, "working_distance": {"edge": 0.25}}
     total = 0.0
     for name, weight in weights.items():
-        term = RewardTerm(function=f"tasks.reward:{name}", params=params.get(name, {}), weight=1.0)
+        term = RewardTerm(function=f"tasks.terms:{name}", params=params.get(name, {}), weight=1.0)
         total = total + weight * term.resolve()(done)
     assert float(total) == pytest.approx(1.6 + 8.0 - 0.0075, rel=1e-5)
 
 
 def test_progress_is_the_gain_of_closeness(state: ToolState) -> None:
-    assert reward.progress(state).item() == 0.125
+    assert terms.progress(state).item() == 0.125
 
 
 def test_success_and_duration_are_one(state: ToolState) -> None:
     assert (
-        reward.success(state).item() == 0.0
-        and reward.success(replace(state, success=YES)).item() == 1.0
+        terms.success(state).item() == 0.0
+        and terms.success(replace(state, success=YES)).item() == 1.0
     )
-    assert reward.duration(state).item() == 1.0
+    assert terms.duration(state).item() == 1.0
 
 
 def test_failing_costs_one_and_what_was_gained(state: ToolState) -> None:
-    assert reward.failure(state).item() == 0.0
-    assert reward.failure(replace(state, failed=YES)).item() == 1.5
+    assert terms.failure(state).item() == 0.0
+    assert terms.failure(replace(state, failed=YES)).item() == 1.5
 
 
 def test_contact_counts_kilonewtons_up_to_ten(state: ToolState) -> None:
     forces = torch.tensor([0.0, 2500.0, 80000.0])
-    assert reward.contact(replace(state, contact_force_n=forces), most_n=1e4).tolist() == [
+    assert terms.contact(replace(state, contact_force_n=forces), most_n=1e4).tolist() == [
         0.0,
         2.5,
         10.0,
@@ -168,10 +168,10 @@ def test_contact_counts_kilonewtons_up_to_ten(state: ToolState) -> None:
 )
 def test_params_that_the_function_does_not_take_are_refused(params: dict, words: str) -> None:
     with pytest.raises(ConfigError, match=words):
-        RewardTerm(function="tasks.reward:contact", params=params, weight=1.0)
+        RewardTerm(function="tasks.terms:contact", params=params, weight=1.0)
 
 
-@pytest.mark.parametrize("function", ["tasks.reward:nonsense", "no.such.module:f", "tasks.reward"])
+@pytest.mark.parametrize("function", ["tasks.terms:nonsense", "no.such.module:f", "tasks.terms"])
 def test_a_term_that_is_no_function_is_refused(function: str) -> None:
     with pytest.raises(ConfigError, match=r"expected package\.module:function"):
         RewardTerm(function=function, weight=1.0)
@@ -189,7 +189,7 @@ def test_an_episode_pays_for_its_hardest_blow_once(
         peak_force_n=torch.tensor([float(before_n)]),
         contact_force_n=torch.tensor([float(now_n)]),
     )
-    assert reward.peak_contact(blow, above_n=0.0, most_n=1e4).item() == pytest.approx(expected)
+    assert terms.peak_contact(blow, above_n=0.0, most_n=1e4).item() == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ def test_a_heavy_blow_pays_for_what_the_peak_grows_beyond_ten_kilonewtons(
     blow = replace(
         state, peak_force_n=torch.tensor([before_n]), contact_force_n=torch.tensor([now_n])
     )
-    assert reward.peak_contact(blow, above_n=1e4, most_n=1e5).item() == pytest.approx(expected)
+    assert terms.peak_contact(blow, above_n=1e4, most_n=1e5).item() == pytest.approx(expected)
 
 
 def curriculum(**changes: object) -> RewardCurriculum:
@@ -239,6 +239,6 @@ def test_a_curriculum_that_makes_no_sense_is_refused(changes: dict, words: str) 
 @pytest.mark.parametrize("name", ["borehole_insertion", "goal_pose"])
 def test_a_curriculum_of_a_term_that_the_task_lacks_is_refused(name: str) -> None:
     task = option("task", name)
-    with pytest.raises(ConfigError, match=r"there is no reward term speed; expected some of .*"):
+    with pytest.raises(ConfigError, match=r"there is no reward term speed; choices: "):
         replace(task, curriculum=curriculum(begin={"speed": 0.5}))
     replace(task, curriculum=curriculum(begin={"failure": 0.5}))

@@ -15,8 +15,8 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
-from tasks import starts
-from tasks.terms import ObservedTerm, RewardCurriculum, RewardTerm
+from tasks import tool_pose
+from tasks.term_task import ObservedTerm, RewardCurriculum, RewardTerm
 
 CPU = torch.device("cpu")
 TASKS = ("borehole_insertion", "goal_pose")
@@ -104,7 +104,7 @@ def test_poses_have_many_pitches_and_no_block_near(machine: Machine) -> None:
 def test_a_draw_of_which_nothing_can_be_done_ends_with_the_reason(
     distance_m: tuple[float, float], reason: str, machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(starts, "MIN_CANDIDATES", 1024)
+    monkeypatch.setattr(tool_pose, "MIN_CANDIDATES", 1024)
     task = option("task", "borehole_insertion")
     task = replace(task, hole=replace(task.hole, distance_m=distance_m))
     process = task.build(machine, 1, CPU)
@@ -117,9 +117,9 @@ def test_a_draw_of_which_little_can_be_done_goes_on(
     machine: Machine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Tried on a chunk in which one candidate in 200 can be done, then one in 300."""
-    monkeypatch.setattr(starts, "MIN_CANDIDATES", 1000)
+    monkeypatch.setattr(tool_pose, "MIN_CANDIDATES", 1000)
     free = torch.ones(6000, dtype=torch.bool)
-    tally = starts.DrawTally("a task", 10_000)
+    tally = tool_pose.DrawTally("a task", 10_000)
     done = torch.arange(6000) % 200 == 0
     tally.add(free, done, done)
     done = torch.arange(6000) % 10_000 == 0
@@ -131,8 +131,8 @@ def test_a_long_draw_tells_how_far_it_is(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     clock = iter([0.0, 4.0, 6.0, 7.0, 12.0])
-    monkeypatch.setattr(starts.time, "monotonic", lambda: next(clock))
-    tally = starts.DrawTally("a task", 1000)
+    monkeypatch.setattr(tool_pose.time, "monotonic", lambda: next(clock))
+    tally = tool_pose.DrawTally("a task", 1000)
     some = torch.arange(200) % 2 == 0
     with caplog.at_level(logging.INFO):
         for _ in range(4):
@@ -148,14 +148,14 @@ def test_a_draw_checked_in_parts_is_the_draw_checked_at_once(
 ) -> None:
     process = option("task", "borehole_insertion").build(machine, 1, CPU)
     whole = process.starts(100, 2)
-    monkeypatch.setattr(starts, "CHUNK", 64)
+    monkeypatch.setattr(tool_pose, "CHUNK", 64)
     parts = process.starts(100, 2)
     assert all(torch.equal(parts[name], value) for name, value in whole.items())
 
 
 def test_a_draw_with_no_arm_in_the_open_is_just_empty(machine: Machine) -> None:
     task = option("task", "goal_pose")
-    search = starts.StartSearch(task, machine)
+    search = tool_pose.StartSearch(task, machine)
     found = search.move(torch.zeros(0, 5), torch.zeros(0, 3), torch.zeros(0), 0.1)
     assert [part.shape for part in found] == [(0, 5), (0,), (0,)]
 
@@ -484,7 +484,7 @@ def test_penalties_grow_with_the_share_of_worlds_whose_last_episode_succeeded(
     machine: Machine,
 ) -> None:
     """Four worlds. `duration` pays 1 in each step: a quarter of it at first, all of it once all have succeeded."""
-    terms = {"time": RewardTerm(function="tasks.reward:duration", weight=1.0)}
+    terms = {"time": RewardTerm(function="tasks.terms:duration", weight=1.0)}
     rule = RewardCurriculum(begin={"time": 0.25}, success=(0.0, 1.0))
     stage = Stage(machine, num_envs=4, reward=terms, curriculum=rule)
     assert stage.step().reward.tolist() == [0.25] * 4
@@ -524,7 +524,7 @@ def test_a_hole_that_is_narrower_than_the_chisel_is_refused() -> None:
 
 def test_terms_of_ones_own_extend_what_the_critic_sees(machine: Machine) -> None:
     term = ObservedTerm(
-        function="tasks.observations:tool_pitch", samples=2, mean=1.0, std=0.5, noise=0.0, bias=0.0
+        function="tasks.terms:tool_pitch", samples=2, mean=1.0, std=0.5, noise=0.0, bias=0.0
     )
     stage = Stage(machine, privileged={"pitch": term})
     plain = Stage(machine).process.observe(stage.history)["privileged"]

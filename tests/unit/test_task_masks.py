@@ -12,7 +12,7 @@ import torch
 from composed import option
 
 from brokk_rl.machine import Machine, mask_exclusive_joints
-from tasks.classical import ClassicalController
+from tasks.control import ClassicalController
 from tasks.settings import ActionMapping, CommandBase, PhaseSwitch
 
 

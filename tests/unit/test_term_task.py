@@ -31,10 +31,18 @@ from brokk_rl.session import Session
 from brokk_rl.sim.scene import find_site, make_nominal_scenes
 from brokk_rl.spec import spec
 from deploy.policy.bundle import PolicyBundle
-from tasks.process import compute_command
-from tasks.step_state import StepState
-from tasks.term_task import JointAction, StartsNearHome, TermTask, UniformCommand
-from tasks.terms import FigureTerm, HeldCriterion, ObservedTerm, RewardTerm, TerminationTerm
+from tasks.term_task import (
+    FigureTerm,
+    HeldCriterion,
+    JointAction,
+    ObservedTerm,
+    RewardTerm,
+    StartsNearHome,
+    TerminationTerm,
+    TermTask,
+    UniformCommand,
+)
+from tasks.terms import StepState
 
 CPU = torch.device("cpu")
 SHIPPED = Path(__file__).parents[2] / "tasks" / "policies" / "borehole_insertion"
@@ -68,8 +76,8 @@ def figure(function: str, title: str) -> FigureTerm:
     )
 
 
-TIME = TerminationTerm(function="tasks.termination:time_limit", outcome="time")
-SUCCESS = TerminationTerm(function="tasks.termination:succeeded", outcome="success")
+TIME = TerminationTerm(function="tasks.terms:time_limit", outcome="time")
+SUCCESS = TerminationTerm(function="tasks.terms:success", outcome="success")
 
 
 def make(**changes: Any) -> Turn:
@@ -79,11 +87,11 @@ def make(**changes: Any) -> Turn:
         "start": StartsNearHome(spread=0.2, margin=0.05),
         "command": {"speed": UniformCommand(lowest=(0.1,), highest=(0.2,))},
         "observation": {
-            "joints": term("tasks.observations:joint_positions", samples=3, std=0.5),
+            "joints": term("tasks.terms:joint_positions", samples=3, std=0.5),
             "error": term(f"{__name__}:error", mean=1.0, std=2.0),
             "off": None,
         },
-        "privileged": {"force": term("tasks.observations:contact_force", std=1000.0)},
+        "privileged": {"force": term("tasks.terms:contact_force", std=1000.0)},
         "action": JointAction(scale=0.5, mask=True),
         "reward": {"penalty": RewardTerm(function=f"{__name__}:penalty", weight=2.0)},
         "curriculum": None,
@@ -91,8 +99,8 @@ def make(**changes: Any) -> Turn:
             function=f"{__name__}:is_turning", params={"tolerance": 0.01}, share=0.5, after_s=0.1
         ),
         "figures": {
-            "success_strict": figure("tasks.figures:success", "turned"),
-            "held_share": figure("tasks.figures:held_share", "turning"),
+            "success_strict": figure("tasks.terms:success", "turned"),
+            "held_share": figure("tasks.terms:held_share", "turning"),
         },
         "termination": {"time_limit": TIME},
     }
@@ -126,7 +134,7 @@ def asked(machine: Machine) -> float:
 
 def test_it_keeps_the_contract_of_tasks(machine: Machine) -> None:
     check_task(make(), machine)
-    noisy = term("tasks.observations:tip_position", noise=0.01, bias=0.02, samples=2)
+    noisy = term("tasks.terms:tip_position", noise=0.01, bias=0.02, samples=2)
     check_task(make(observation={"tip": noisy}, privileged={}), machine)
 
 
@@ -154,7 +162,7 @@ def test_the_vector_holds_the_terms_in_order_oldest_sample_first(
 
 def test_a_bias_stays_for_an_episode_and_noise_does_not(machine: Machine) -> None:
     torch.manual_seed(0)
-    tip = term("tasks.observations:tip_position", bias=0.02)
+    tip = term("tasks.terms:tip_position", bias=0.02)
     process: Any = make(observation={"tip": tip}).build(machine, 256, CPU)
     start, everywhere = process.starts(256, 1), torch.ones(256, dtype=torch.bool)
     history = History(
@@ -206,12 +214,12 @@ def test_the_reward_is_the_weighted_sum(machine: Machine, asked: float) -> None:
 def test_exclusive_joints_move_alone_where_their_command_is_the_largest(machine: Machine) -> None:
     exclusive = torch.tensor(machine.is_exclusive)
     output = torch.tensor([[0.2, 0.4, 0.0, 0.0, 0.3], [0.2, 0.4, 0.0, 0.0, -3.0]])
-    found = compute_command(JointAction(scale=0.5, mask=True), output, exclusive)
+    found = JointAction(scale=0.5, mask=True).command(output, exclusive)
     assert found.tolist() == [
         pytest.approx([0.0, 0.2, 0.0, 0.0, 0.0]),
         pytest.approx([0.1, 0.0, 0.0, 0.0, -1.0]),
     ]
-    free = compute_command(JointAction(scale=0.5, mask=False), output, exclusive)
+    free = JointAction(scale=0.5, mask=False).command(output, exclusive)
     assert free[1].tolist() == pytest.approx([0.1, 0.2, 0.0, 0.0, -1.0])
 
 
@@ -230,7 +238,7 @@ def test_the_contract_names_each_part_and_gives_the_vector_back(machine: Machine
 def test_its_description_gives_the_same_terms_back() -> None:
     task = make()
     other = make(
-        observation={"error": term("tasks.observations:commands")},
+        observation={"error": term("tasks.terms:commands")},
         action=JointAction(scale=1.0, mask=False),
     )
     node = apply_behaviour(describe_spec(other), describe_task(task).behaviour)
@@ -313,8 +321,8 @@ def test_a_scene_that_cannot_be_built_is_refused(machine: Machine, tmp_path: Pat
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (lambda: term("tasks.observations:nothing"), "observation term .* cannot be found"),
-        (lambda: term("tasks.observations:commands", std=0.0), "std: expected"),
+        (lambda: term("tasks.terms:nothing"), "observation term .* cannot be found"),
+        (lambda: term("tasks.terms:commands", std=0.0), "std: expected"),
         (
             lambda: UniformCommand(lowest=(0.0, 1.0), highest=(1.0,)),
             "expected as many values as lowest",

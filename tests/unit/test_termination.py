@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import pytest
 import torch
+from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from tasks.managers import TerminationManager
-from tasks.step_state import StepState
-from tasks.terms import TerminationTerm, check_terminations
+from tasks.process import TerminationManager
+from tasks.term_task import TerminationTerm
+from tasks.terms import StepState
 
 NOWHERE = torch.zeros(3, dtype=torch.bool)
 
@@ -29,11 +31,11 @@ def state(q: torch.Tensor | None = None, **changes: Any) -> StepState:
 
 
 def ends(name: str, outcome: Any = "failure", **params: Any) -> TerminationTerm:
-    return TerminationTerm(function=f"tasks.termination:{name}", params=params, outcome=outcome)
+    return TerminationTerm(function=f"tasks.terms:{name}", params=params, outcome=outcome)
 
 
 SUCCESS, START, TIME = (
-    ends("succeeded", "success"),
+    ends("success", "success"),
     ends("start_in_contact", "void"),
     ends("time_limit", "time"),
 )
@@ -43,7 +45,7 @@ SUCCESS, START, TIME = (
     ("term", "changes"),
     [
         (ends("joint_limit", margin=0.1), {"q": [[0.0, 0.0], [0.0, -0.91], [0.89, 0.0]]}),
-        (ends("contact_force", largest_n=100.0), {"contact_force_n": [0.0, 101.0, 100.0]}),
+        (ends("force_limit", largest_n=100.0), {"contact_force_n": [0.0, 101.0, 100.0]}),
         (TIME, {"steps": [0.0, 10.0, 9.0]}),
         (SUCCESS, {"success": [False, True, False]}),
         (START, {"age": [1.0, 1.0, 2.0], "contact_force_n": [0.0, 1.0, 1.0]}),
@@ -59,7 +61,7 @@ def test_the_first_term_counts_and_time_counts_last() -> None:
     terms = TerminationManager(
         {
             "time_limit": TIME,
-            "blow": ends("contact_force", largest_n=100.0),
+            "blow": ends("force_limit", largest_n=100.0),
             "off": None,
             "limit": ends("joint_limit", margin=0.0),
         }
@@ -100,8 +102,9 @@ def test_a_void_start_is_no_success_and_no_failure() -> None:
     ],
 )
 def test_a_list_that_cannot_end_an_episode_is_refused(terms: dict[str, Any], told: str) -> None:
+    task = option("task", "goal_pose")
     with pytest.raises(ConfigError, match=told):
-        check_terminations(terms)
+        dataclasses.replace(task, termination=terms)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +112,7 @@ def test_a_list_that_cannot_end_an_episode_is_refused(terms: dict[str, Any], tol
     [
         (lambda: ends("nothing"), "termination term .* cannot be found"),
         (lambda: ends("TYPE_CHECKING"), "is no function"),
-        (lambda: ends("succeeded", "end"), "outcome: expected"),
+        (lambda: ends("success", "end"), "outcome: expected"),
         (lambda: ends("joint_limit"), "missing a required argument: 'margin'"),
     ],
 )

@@ -25,7 +25,7 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
-from tasks.classical import ClassicalController
+from tasks.control import ClassicalController
 from tasks.settings import ControllerGuidance
 from tasks.tool_pose import ToolPoseProcess
 
