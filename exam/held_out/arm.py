@@ -2,64 +2,60 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from collections.abc import Sequence
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.signals import Command, JointState
+from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.case_distribution import PlantRun
 from exam.held_out.causes import CAUSES, OutsideCauses
 from exam.held_out.hydraulics import OPEN, STEP_S, Linkage, PilotedSpools, SensingHydraulics
 from exam.held_out.parameters import CHANGES, ArmParameters, change_machine, draw_machine
-from exam.held_out.readings import TRACKER_SPREAD, RunChance, SteppedEncoders
+from exam.held_out.readings import RunChance, SteppedEncoders
 from exam.plants.electronics import CommandBus
+from exam.plants.family import DrawnPlants, PlantLink
 from exam.plants.linkage import Arm
 
+MAKE = "sensing"
 SPOOL_STEP = 1e-5
 """Movement of a spool in a step, of full stroke, that counts as one."""
 VISCOSITY_RATIO = 6.0
 """Viscosity of cold over that of warm oil: ISO VG 46 at 10 and 50 degrees Celsius, ISO 3448."""
 
 
-class SensingArm:
+class SensingArm(PlantLink):
     """A `Link` to simulated machines of the held-out make.
 
     Args:
         machine: Geometry, masses, limits.
-        parameters: Of each run's machine.
-        kinds: Cause outside the library of each run, or `None`.
-        seeds: Chance of each run.
-        elapsed_s: How long each machine has run before.
-        tracked: Whether the tool of each run is measured.
+        make: The only one.
+        parameters: Of each run's machine; `severity` is that of its outside cause.
+        runs: The runs.
         steps: Control periods of the longest run.
     """
 
     def __init__(
         self,
         machine: Machine,
+        make: str,
         parameters: Sequence[ArmParameters],
-        kinds: Sequence[str | None],
-        seeds: Sequence[int],
-        elapsed_s: np.ndarray,
-        tracked: Sequence[bool],
+        runs: Sequence[PlantRun],
         steps: int,
     ) -> None:
-        self._machine = machine
-        n = self._n = {name: np.stack([one[name] for one in parameters]) for name in parameters[0]}
-        self._chance = [
-            RunChance(seed, one, steps) for seed, one in zip(seeds, parameters, strict=True)
-        ]
-        self._lost = np.stack([one.lost for one in self._chance], 1)
-        self._queue = np.stack([one.queue for one in self._chance], 1)
-        self._noise = np.stack([one.noise for one in self._chance], 1)
-        self._settling = np.stack([one.settling for one in self._chance], 1)
-        luck = np.stack([one.luck for one in self._chance], 1)
-        phase = np.array([one.phase for one in self._chance])
-        self._causes = OutsideCauses(machine, list(kinds), n["severity"], phase, luck)
+        chance = []
+        for run, one in zip(runs, parameters, strict=True):
+            chance.append(RunChance(run.chance, one, steps))
+        super().__init__(machine, parameters, runs, chance)
+        n = self._n
+        self._lost, self._queue = self._stack_chance("lost"), self._stack_chance("queue")
+        self._noise, self._settling = self._stack_chance("noise"), self._stack_chance("settling")
+        phase = np.array([one.phase for one in chance])
+        self._causes = OutsideCauses(
+            machine, self._kinds, n["severity"], phase, self._stack_chance("luck")
+        )
         bus = {
             "transport_s": n["transport_s"] + n["wait_s"],
             "jitter_s": 0.5 * n["queue_s"],  # mean delay of the effect, whose delays are uniform
@@ -72,12 +68,10 @@ class SensingArm:
         )
         self._linkage = Linkage(n, machine, self._causes.mounting_rad)
         self._weight, self._encoders = Arm(machine, n), SteppedEncoders(n)
-        self._q = np.tile(machine.home, (len(parameters), 1))
+        self._q = np.tile(machine.home, (len(runs), 1))
         self._link, self._trace = self._q.copy(), [self._q.copy()]
         self._is_open = np.zeros(self._q.shape, dtype=bool)
         self._motions = np.zeros(self._q.shape, dtype=int)
-        self._k, self._tracked = 0, np.array(tracked)
-        self._elapsed_s = np.asarray(elapsed_s, dtype=float)
         self._half_play = 0.5 * (n["play_rad"] + n["added_play_rad"])
         self._num_kept = (
             1 + round(machine.period_s / STEP_S) * 12
@@ -89,20 +83,12 @@ class SensingArm:
         """True positions of the links, `(N, J)`."""
         return self._link
 
-    def read(self) -> JointState:
-        """Return the present readings of the encoders."""
+    def _measure(self) -> np.ndarray:
         shown = self._encoders.read(self._stamped(), self._noise[self._k])
-        return JointState(self._k * self._machine.period_s, self._causes.show(self._k, shown))
+        return self._causes.show(self._k, shown)
 
-    def extra(self) -> Mapping[str, np.ndarray]:
-        """Return the measured tool, NaN in runs without a tracker; empty where none has one."""
-        if not self._tracked.any():
-            return {}
-        tip_m, pitch_rad = self._weight.tool(self._link)
-        seen = np.concatenate([tip_m, pitch_rad[:, None]], 1)
-        noise = np.stack([chance.tool[self._k] for chance in self._chance])
-        seen = np.where(self._tracked[:, None], seen + noise * TRACKER_SPREAD, np.nan)
-        return dict(zip(("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad"), seen.T, strict=True))
+    def _find_arm(self) -> Arm:
+        return self._weight
 
     def send(self, command: Command) -> Command:
         """Move on by one control period with these commands, `(N, J)`."""
@@ -164,12 +150,6 @@ class SensingArm:
         place = len(trace) - 1 - np.round(steps).astype(int)
         return np.take_along_axis(trace, place[None], 0)[0]
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: Any) -> None:
-        pass
-
 
 def _compute_warming(times: np.ndarray) -> np.ndarray:
     """Return how much of the change of viscosity is over after so many time constants, 0 to 1."""
@@ -178,7 +158,7 @@ def _compute_warming(times: np.ndarray) -> np.ndarray:
 
 
 @spec
-class HeldOutPlants:
+class HeldOutPlants(DrawnPlants):
     """Arms with a load-sensing pump, for sealed exams only.
 
     Attributes:
@@ -192,58 +172,26 @@ class HeldOutPlants:
     outside_not_on: dict[str, tuple[str, ...]]
 
     is_held_out = True
-
-    def check(self) -> None:
-        for name in self.outside_not_on:
-            if name not in CAUSES:
-                raise ConfigError(
-                    f"exam.plants.outside_not_on: no cause '{name}'; {list_choices(name, CAUSES)}"
-                )
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of the effects that its plants can have."""
-        return tuple(CHANGES)
-
-    @property
-    def outside_faults(self) -> tuple[str, ...]:
-        """Names of the causes outside the library that its plants can have."""
-        return CAUSES
+    table = CHANGES
+    causes = CAUSES
+    severity = "severity"
 
     def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
         """Return the make of each run: all are of one."""
-        return ["sensing"] * len(runs)
+        return [MAKE] * len(runs)
 
-    def build(self, machine: Machine, runs: Sequence[PlantRun], run_s: float) -> SensingArm:
-        """Return runs side by side.
+    def draw(self, machine: Machine, run: PlantRun, roughness: float) -> tuple[str, ArmParameters]:
+        """Return make and parameters of a run's machine, with its effects.
 
         Raises:
-            ConfigError: the exam is not sealed, or an effect, cause or roughness is unknown.
+            ConfigError: the exam is not sealed, or an effect is unknown.
         """
         if not self.sealed:
             raise ConfigError(
                 "exam_plants=held_out: this make is held out from development and calibration; only a "
                 "sealed exam draws from it (exam_protocol=sealed), development has exam_plants=valves"
             )
-        parameters, kinds = [], []
-        for run in runs:
-            if run.roughness not in self.roughness:
-                raise ConfigError(
-                    f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
-                    f"{list_choices(run.roughness, self.roughness)}"
-                )
-            numbers = draw_machine(machine, run.seed, self.roughness[run.roughness])
-            numbers = change_machine(numbers, run.faults)
-            if run.outside_fault is not None:
-                numbers["severity"] = run.outside_fault.severity
-            parameters.append(numbers)
-            kinds.append(run.outside_fault.kind if run.outside_fault else None)
-        return SensingArm(
-            machine,
-            parameters,
-            kinds,
-            [run.chance for run in runs],
-            np.array([run.elapsed_s for run in runs]),
-            [run.tracked for run in runs],
-            round(run_s / machine.period_s),
-        )
+        numbers = draw_machine(machine, run.seed, roughness)
+        return MAKE, change_machine(numbers, run.faults)
+
+    link = staticmethod(SensingArm)

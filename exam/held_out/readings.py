@@ -10,8 +10,6 @@ BURST_FRAMES = 1.8
 """Mean length of a burst of lost frames; chosen by hand, as of a fading radio link."""
 NUM_MOTIONS = 4096
 """Motions of a run for which the rest of a compensator is drawn; then they repeat."""
-TRACKER_SPREAD = (0.0015, 0.0015, 0.0015, 0.001)
-"""Standard deviation of the measured tool point, m, and of its pitch, rad; chosen by hand."""
 QUANTISER_BAND = 0.6
 """Steps that a position must leave its reading by before that changes: 0.5 without hysteresis."""
 

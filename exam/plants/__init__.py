@@ -5,6 +5,8 @@ electronics              command frames on the bus; encoders and tracker
 valve                    pilot, spool, metering land
 power_stages             from opening to speed, three makes
 linkage                  elastic boom, play, weight, tool
+changes                  table of effects as changes of numbers
+family                   bases of a link to runs, and of a family of plants
 faults                   effects of the library as changes of the parameters
 out_of_library_faults    faults that the library has no name for
 plant                    all parts at work in N runs side by side

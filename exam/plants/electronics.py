@@ -53,12 +53,6 @@ class CommandBus:
         return np.take_along_axis(self._u, (self._seen % NUM_FRAMES)[None], 0)[0]
 
 
-TRACKER_M = 0.0015
-"""Standard deviation of the measured tool point, m; chosen by hand."""
-TRACKER_RAD = 0.001
-"""Standard deviation of its measured pitch, rad; chosen by hand."""
-
-
 class Encoders:
     """Positions as they are logged.
 

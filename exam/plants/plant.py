@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, Self
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.signal import lfilter
 
-from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
-from brokk_rl.signals import Command, JointState
+from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from exam.case_distribution import PlantRun
 from exam.plants import out_of_library_faults, plant_parameters
-from exam.plants.electronics import TRACKER_M, TRACKER_RAD, CommandBus, Encoders
+from exam.plants.electronics import CommandBus, Encoders
+from exam.plants.family import DrawnPlants, PlantLink
 from exam.plants.faults import FAULTS, apply_faults
 from exam.plants.linkage import Arm, Boom
 from exam.plants.out_of_library_faults import OutOfLibraryFaults
@@ -35,18 +34,14 @@ WARM_S = 900.0
 """Time constant of the tank's temperature, s; chosen by hand: a quarter of an hour."""
 
 
-class ExamPlant:
+class ExamPlant(PlantLink):
     """A `Link` to simulated machines of one make.
 
     Args:
         machine: Geometry, masses, limits.
         make: See `plant_parameters.MAKES`.
-        parameters: Of each run's machine.
-        outside_faults: Fault outside the library of each run, or `None`; its severity is the
-            parameter `outside_severity`.
-        seeds: Chance of each run.
-        elapsed_s: How long each machine has run before.
-        tracked: Whether the tool of each run is measured.
+        parameters: Of each run's machine; `outside_severity` is that of its outside fault.
+        runs: The runs.
         steps: Control periods of the longest run.
     """
 
@@ -55,32 +50,26 @@ class ExamPlant:
         machine: Machine,
         make: str,
         parameters: Sequence[PlantParameters],
-        outside_faults: Sequence[str | None],
-        seeds: Sequence[int],
-        elapsed_s: np.ndarray,
-        tracked: Sequence[bool],
+        runs: Sequence[PlantRun],
         steps: int,
     ) -> None:
-        self._machine, self._n = machine, _stack_runs(parameters)
-        n, count, joints = self._n, len(parameters), machine.num_joints
-        self._chance: list[_RunNoise] = []
-        for seed, one in zip(seeds, parameters, strict=True):
-            self._chance.append(_RunNoise(seed, one, steps, machine))
-        self._wander = np.stack([chance.wander for chance in self._chance], 1)
-        self._noise = np.stack([chance.noise for chance in self._chance], 1)
-        self._luck = np.stack([chance.luck for chance in self._chance], 1)
+        chance = []
+        for run, one in zip(runs, parameters, strict=True):
+            chance.append(_RunNoise(run.chance, one, steps, machine))
+        super().__init__(machine, parameters, runs, chance)
+        n, count, joints = self._n, len(runs), machine.num_joints
+        self._wander, self._noise = self._stack_chance("wander"), self._stack_chance("noise")
+        self._luck = self._stack_chance("luck")
         self._line, self._valve = CommandBus(n, machine.period_s), SpoolValve(n)
         self._power = POWER_STAGES[make](n, machine)
         self._outside_faults = OutOfLibraryFaults(
-            machine, list(outside_faults), n["outside_severity"], self._luck[:, :, 2]
+            machine, self._kinds, n["outside_severity"], self._luck[:, :, 2]
         )
         self._arm, self._encoders = Arm(machine, n), Encoders(n, machine.period_s)
         self._q = np.tile(machine.home, (count, 1))
         self._boom = Boom(n, self._q, np.full((count, 1), make != "chambers"))
         self._true, self._earlier = self._q.copy(), self._q.copy()
         self._flow, self._droop = np.zeros((count, joints)), np.zeros((count, 1))
-        self._k, self._tracked = 0, np.array(tracked)
-        self._elapsed_s = np.asarray(elapsed_s, dtype=float)
         self._starving = make == "compensated"
         self._power.begin(self._arm.load(self._true))
 
@@ -89,26 +78,12 @@ class ExamPlant:
         """True positions of the links, `(N, J)`."""
         return self._true
 
-    def read(self) -> JointState:
-        """Return the present readings of the encoders."""
+    def _measure(self) -> np.ndarray:
         shown = self._outside_faults.shown(self._true), self._outside_faults.shown(self._earlier)
-        return JointState(
-            self._k * self._machine.period_s, self._encoders.read(*shown, self._noise[self._k])
-        )
+        return self._encoders.read(*shown, self._noise[self._k])
 
-    def extra(self) -> Mapping[str, np.ndarray]:
-        """Return the measured tool, NaN in runs without a tracker; empty where none has one."""
-        if not self._tracked.any():
-            return {}
-        tip_m, pitch_rad = self._arm.tool(self._true)
-        seen = np.concatenate([tip_m, pitch_rad[:, None]], 1)
-        noise = np.stack([chance.tool[self._k] for chance in self._chance])
-        seen = np.where(
-            self._tracked[:, None],
-            seen + noise * [TRACKER_M, TRACKER_M, TRACKER_M, TRACKER_RAD],
-            np.nan,
-        )
-        return dict(zip(("ee_x_m", "ee_y_m", "ee_z_m", "ee_pitch_rad"), seen.T, strict=True))
+    def _find_arm(self) -> Arm:
+        return self._arm
 
     def send(self, command: Command) -> Command:
         """Move on by one control period with these commands, `(N, J)`."""
@@ -167,20 +142,6 @@ class ExamPlant:
         )
         return opening * given / np.maximum(asked, 1e-9)
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: Any) -> None:
-        pass
-
-
-def _stack_runs(parameters: Sequence[PlantParameters]) -> PlantParameters:
-    """Return each parameter of all runs, `(N, J)`."""
-    stacked = {}
-    for name in parameters[0]:
-        stacked[name] = np.stack([one[name] for one in parameters])
-    return stacked
-
 
 class _RunNoise:
     """Random numbers of one run, drawn beforehand: a run does not depend on its neighbours."""
@@ -205,67 +166,26 @@ class _RunNoise:
 
 
 @spec
-class HydraulicPlants:
+class HydraulicPlants(DrawnPlants):
     """Hydraulic arms of three makes (chambers, compensated, throttled), each machine unique.
 
     Attributes:
         roughness: By name, how much hysteresis, waviness, wandering, droop and warm-up a machine
             has; calibrated numbers.
+        outside_not_on: Joints on which nothing of an outside fault would be seen.
     """
 
     roughness: dict[str, float]
+    outside_not_on: dict[str, tuple[str, ...]]
 
-    is_held_out = False
+    table = FAULTS
+    causes = out_of_library_faults.KINDS
 
-    @property
-    def outside_not_on(self) -> Mapping[str, tuple[str, ...]]:
-        """Return nothing: every joint shows every outside fault."""
-        return {}
+    def draw(
+        self, machine: Machine, run: PlantRun, roughness: float
+    ) -> tuple[str, PlantParameters]:
+        """Return make and parameters of a run's machine, with its faults."""
+        make, numbers = plant_parameters.draw_plant(machine, run.seed, roughness)
+        return make, apply_faults(numbers, run.faults)
 
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of the effects that its plants can have."""
-        return tuple(FAULTS)
-
-    @property
-    def outside_faults(self) -> tuple[str, ...]:
-        """Names of the faults outside the library that its plants can have."""
-        return out_of_library_faults.KINDS
-
-    def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
-        """Return the make of each run."""
-        return [plant_parameters.draw_plant(machine, run.seed, 1.0)[0] for run in runs]
-
-    def build(self, machine: Machine, runs: Sequence[PlantRun], run_s: float) -> ExamPlant:
-        """Return runs of one make, side by side.
-
-        Raises:
-            ConfigError: an effect, an outside_fault or a roughness is unknown.
-        """
-        makes, parameters, outside_faults = set(), [], []
-        for run in runs:
-            if run.roughness not in self.roughness:
-                raise ConfigError(
-                    f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
-                    f"{list_choices(run.roughness, self.roughness)}"
-                )
-            make, numbers = plant_parameters.draw_plant(
-                machine, run.seed, self.roughness[run.roughness]
-            )
-            numbers = apply_faults(numbers, run.faults)
-            if run.outside_fault is not None:
-                numbers["outside_severity"] = run.outside_fault.severity
-            makes.add(make)
-            parameters.append(numbers)
-            outside_faults.append(run.outside_fault.kind if run.outside_fault else None)
-        (make,) = makes
-        return ExamPlant(
-            machine,
-            make,
-            parameters,
-            outside_faults,
-            [run.chance for run in runs],
-            np.array([run.elapsed_s for run in runs]),
-            [run.tracked for run in runs],
-            round(run_s / machine.period_s),
-        )
+    link = staticmethod(ExamPlant)

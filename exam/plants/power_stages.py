@@ -27,6 +27,44 @@ def compute_friction(speed: np.ndarray, dry: np.ndarray, viscous: np.ndarray) ->
     return dry / np.sqrt(speed * speed + SMOOTHING_SPEED * SMOOTHING_SPEED) + viscous
 
 
+class PowerStage:
+    """Base of the three makes: inertia of the joints, leak and stops.
+
+    Args:
+        numbers: The machine's, `(N, J)`.
+        machine: Full speeds, yield forces, stiffness.
+        force_ratio: Force at supply pressure over the machine's yield force.
+    """
+
+    dt_s: float
+
+    def __init__(
+        self, numbers: PlantParameters, machine: Machine, force_ratio: float = 1.0
+    ) -> None:
+        self._n, self._leak = numbers, numbers["leak"] / machine.max_speed
+        self.speed = np.zeros(numbers["notch"].shape)
+        force = force_ratio * np.array([body.yield_force.value for body in machine.bodies])
+        stiffness = np.array([body.stiffness.value for body in machine.bodies])
+        inertia = stiffness / RAD_PER_CYCLE**2 / 36.0  # first mode at 6 Hz
+        self._push = force / (inertia * machine.max_speed)  # 1/s
+
+    def begin(self, load: np.ndarray) -> None:
+        """Let the cylinders of resting joints bear their load, `(N, J)`."""
+
+    def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
+        """Return the speeds after a time step, of `max_speed`.
+
+        Args:
+            opening: Signed flow asked for, of that at full speed, `(N, J)`.
+            load: Weight in the positive direction over yield force, `(N, J)`.
+        """
+        raise NotImplementedError
+
+    def stopped(self, where: np.ndarray) -> None:
+        """Take the speed from joints at their stops, `(N, J)` bool."""
+        self.speed = np.where(where, 0.0, self.speed)
+
+
 CHAMBER_FORCE_RATIO = 1.4
 """Force at supply pressure over the machine's yield force."""
 ROD_AREA = 0.75
@@ -40,16 +78,14 @@ DROP_OUT, DROP_IN = 1.0 - ROD_AREA * BACK_PRESSURE, 1.0 - BACK_PRESSURE
 """Pressure over the inlet at full speed without load, extending and retracting."""
 
 
-class TwoChamberCylinders:
+class TwoChamberCylinders(PowerStage):
     """Chamber pressures and speeds; semi-implicit Euler."""
 
     dt_s = 0.0025
 
     def __init__(self, numbers: PlantParameters, machine: Machine) -> None:
-        self._n = numbers
-        shape = numbers["notch"].shape
-        self.speed = np.zeros(shape)
-        self._bore, self._rod = np.zeros(shape), np.zeros(shape)
+        super().__init__(numbers, machine, CHAMBER_FORCE_RATIO)
+        self._bore, self._rod = np.zeros_like(self.speed), np.zeros_like(self.speed)
         self._loose_out, self._loose_in = (
             np.clip(wanted * drop / (1.0 - wanted * (1.0 - drop)), 0.0, 1.0)
             for wanted, drop in (
@@ -61,11 +97,6 @@ class TwoChamberCylinders:
         own_s = 1.0 / numbers["mode_hz"]
         mode_hz = 1.0 / np.hypot(own_s, numbers["soft_s"])
         hose = (numbers["soft_s"] * mode_hz) ** 2  # share of the compliance
-        force = CHAMBER_FORCE_RATIO * np.array([body.yield_force.value for body in machine.bodies])
-        inertia = (
-            np.array([body.stiffness.value for body in machine.bodies]) / RAD_PER_CYCLE**2 / 36.0
-        )  # first mode at 6 Hz
-        self._push = force / (inertia * machine.max_speed)  # 1/s
         self._stiff = (RAD_PER_CYCLE * mode_hz) ** 2 / self._push / (1.0 + ROD_AREA)  # 1/s
         # a soft hose rings with its own damping, and lower friction allows it
         ringing = 2.0 * numbers["soft_damping"] * RAD_PER_CYCLE * mode_hz / self._push
@@ -73,7 +104,6 @@ class TwoChamberCylinders:
         self._viscous = numbers["viscous"] + hose * (
             np.minimum(ringing, numbers["viscous"]) - numbers["viscous"]
         )
-        self._leak = numbers["leak"] / machine.max_speed
 
     def begin(self, load: np.ndarray) -> None:
         """Let the cylinders of resting joints bear their load, `(N, J)`."""
@@ -85,12 +115,7 @@ class TwoChamberCylinders:
         self._bore = ROD_AREA * self._rod - load / CHAMBER_FORCE_RATIO
 
     def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Return the speeds after a time step, of `max_speed`.
-
-        Args:
-            opening: Signed flow asked for, of that at full speed, `(N, J)`.
-            load: Weight in the positive direction over yield force, `(N, J)`.
-        """
+        """See `PowerStage.step`."""
         dt_s, area, out = self.dt_s, np.abs(opening), opening > 0
         bore, rod = self._bore, self._rod
         # the compensator keeps the drop over the inlet, as far as it is not loose
@@ -114,40 +139,27 @@ class TwoChamberCylinders:
         self._bore, self._rod, self.speed = bore, rod, speed
         return speed
 
-    def stopped(self, where: np.ndarray) -> None:
-        """Take the speed from joints at their stops, `(N, J)` bool."""
-        self.speed = np.where(where, 0.0, self.speed)
-
 
 COMPENSATED_FORCE_RATIO = 1.6
 """Force at supply pressure over the machine's yield force."""
 
 
-class CompensatedValves:
+class CompensatedValves(PowerStage):
     """Force of the oil column and speed of each joint; Heun's method."""
 
     dt_s = 0.005
 
     def __init__(self, numbers: PlantParameters, machine: Machine) -> None:
-        self._n = numbers
-        shape = numbers["notch"].shape
-        self.speed, self._force = np.zeros(shape), np.zeros(shape)
-        force = COMPENSATED_FORCE_RATIO * np.array(
-            [body.yield_force.value for body in machine.bodies]
-        )
-        inertia = (
-            np.array([body.stiffness.value for body in machine.bodies]) / RAD_PER_CYCLE**2 / 36.0
-        )
-        self._push = force / (inertia * machine.max_speed)
+        super().__init__(numbers, machine, COMPENSATED_FORCE_RATIO)
+        self._force = np.zeros_like(self.speed)
         self._stiff = (RAD_PER_CYCLE * numbers["mode_hz"]) ** 2 / self._push
-        self._leak = numbers["leak"] / machine.max_speed
 
     def begin(self, load: np.ndarray) -> None:
         """Let the cylinders of resting joints bear their load, `(N, J)`."""
         self._force = -load / COMPENSATED_FORCE_RATIO
 
     def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Return the speeds after a time step, of `max_speed`; see `chambers` for the arguments."""
+        """See `PowerStage.step`."""
         n, dt_s = self._n, self.dt_s
         # the compensator's spring gives: flow falls in proportion to the load it works against
         flow = opening * np.clip(1.0 + 0.5 * n["sensitivity"] * np.sign(opening) * load, 0.2, 1.8)
@@ -166,34 +178,21 @@ class CompensatedValves:
         self.speed = self.speed + 0.5 * dt_s * (speed_1 + speed_2)
         return self.speed
 
-    def stopped(self, where: np.ndarray) -> None:
-        """Take the speed from joints at their stops, `(N, J)` bool."""
-        self.speed = np.where(where, 0.0, self.speed)
 
-
-class ThrottleValves:
+class ThrottleValves(PowerStage):
     """Speed of each joint; exponential steps."""
 
     dt_s = 0.01
 
     def __init__(self, numbers: PlantParameters, machine: Machine) -> None:
-        self._n = numbers
-        self.speed = np.zeros(numbers["notch"].shape)
-        self._sink = numbers["leak"] / machine.max_speed
+        super().__init__(numbers, machine)
         self._keep = np.exp(-self.dt_s / numbers["answer_s"])
 
-    def begin(self, load: np.ndarray) -> None:
-        """Do nothing: there is no pressure to build up."""
-
     def step(self, opening: np.ndarray, load: np.ndarray) -> np.ndarray:
-        """Return the speeds after a time step, of `max_speed`; see `chambers` for the arguments."""
+        """See `PowerStage.step`."""
         grip = 0.5 * self._n["sensitivity"] / (0.4 + 0.6 * np.minimum(np.abs(opening), 1.0))
         settled = (
-            opening * np.clip(1.0 + grip * np.sign(opening) * load, 0.2, 1.8) + self._sink * load
+            opening * np.clip(1.0 + grip * np.sign(opening) * load, 0.2, 1.8) + self._leak * load
         )
         self.speed = settled + (self.speed - settled) * self._keep
         return self.speed
-
-    def stopped(self, where: np.ndarray) -> None:
-        """Take the speed from joints at their stops, `(N, J)` bool."""
-        self.speed = np.where(where, 0.0, self.speed)

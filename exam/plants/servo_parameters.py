@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
-from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
+from exam.plants.changes import Change, FaultSizes, apply_changes
 from exam.plants.faults import FAULTS as VALVE_FAULTS
-from exam.plants.faults import FaultSizes
 from exam.plants.plant_parameters import PlantParameters
 
 MAKES = ("bristle", "dry")
@@ -83,24 +82,12 @@ def _add_sag(n: PlantParameters, size: FaultSizes) -> None:
     n["pull_n_m"] = n["pull_n_m"] - n["stiffness"] * size["sag_rad"]
 
 
-def _add_quantisation(n: PlantParameters, size: FaultSizes) -> None:
-    n["step_rad"] = np.maximum(n["step_rad"], size["step_rad"])
-
-
 def _add_joint_friction(n: PlantParameters, size: FaultSizes) -> None:
     n["added_friction_n_m"] = n["added_friction_n_m"] + size["part"] * n["full_n_m"]
 
 
 def _add_joint_damping(n: PlantParameters, size: FaultSizes) -> None:
     n["added_viscous"] = n["added_viscous"] + size["part"] * n["full_n_m"] / n["full_rad_s"]
-
-
-def _add_joint_armature(n: PlantParameters, size: FaultSizes) -> None:
-    n["added_armature"] = n["added_armature"] + size["part"]
-
-
-def _add_drive_gain(n: PlantParameters, size: FaultSizes) -> None:
-    n["stiffness"] = n["stiffness"] * size["gain"]
 
 
 def _add_torque_limit(n: PlantParameters, size: FaultSizes) -> None:
@@ -110,38 +97,29 @@ def _add_torque_limit(n: PlantParameters, size: FaultSizes) -> None:
 
 
 LIKE_VALVES = ("dead_time", "delay_jitter", "frame_loss", "rate_limit", "sensor_noise")
-"""Effects that change the same parameters as on a valve."""
-FAULTS: dict[str, Callable[[PlantParameters, FaultSizes], None]] = {
-    # of the bus, of the slope of targets, of readings: as on valves
+"""Effects that change the same parameters as on a valve: of the bus, of the slope of targets, of
+readings."""
+FAULTS: dict[str, Change] = {
     **{name: VALVE_FAULTS[name] for name in LIKE_VALVES},
     "lag": _add_lag,
     "backlash": _add_backlash,
     "sag": _add_sag,
-    "quantisation": _add_quantisation,
+    "quantisation": (("step_rad", np.maximum, "step_rad"),),
     "torque_limit": _add_torque_limit,
     "joint_friction": _add_joint_friction,
     "joint_damping": _add_joint_damping,
-    "joint_armature": _add_joint_armature,
-    "drive_gain": _add_drive_gain,
+    "joint_armature": (("added_armature", np.add, "part"),),
+    "drive_gain": (("stiffness", np.multiply, "gain"),),
 }
-"""Change of the parameters by effect, in place. The last four are effects on numbers of an MJCF
-file: only a candidate that diagnoses such a simulator can name them."""
+"""Change of the parameters by effect. The last four are effects on numbers of an MJCF file: only a
+candidate that diagnoses such a simulator can name them."""
 
 
 def change_servos(
     numbers: PlantParameters, faults: Mapping[str, FaultSizes], machine: Machine
 ) -> PlantParameters:
-    """Return the parameters of an arm with faults.
-
-    Raises:
-        ConfigError: a fault is unknown.
-    """
-    found = {name: value.copy() for name, value in numbers.items()}
+    """Return the parameters of an arm with faults; raises as `apply_changes`."""
     # as `diagnosis.mjcf.plant` counts: an error of 5 % of the travel, and full speed
-    found["full_n_m"] = 0.05 * found["stiffness"] * (machine.upper - machine.lower)
-    found["full_rad_s"] = machine.max_speed.copy()
-    for name, size in faults.items():
-        if name not in FAULTS:
-            raise ConfigError(f"exam: no servo has '{name}'; {list_choices(name, FAULTS)}")
-        FAULTS[name](found, size)
-    return found
+    full_n_m = 0.05 * numbers["stiffness"] * (machine.upper - machine.lower)
+    known = numbers | {"full_n_m": full_n_m, "full_rad_s": machine.max_speed}
+    return apply_changes(known, faults, FAULTS, "an arm of exam_plants=servos")

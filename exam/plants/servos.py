@@ -7,22 +7,22 @@ quantised reading drives motors with back EMF against friction, and weight comes
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Self
 
 import numpy as np
 from scipy.signal import lfilter
 
 from brokk_rl.commands import find_rest
-from brokk_rl.errors import ConfigError, list_choices
+from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Dimension, Machine
-from brokk_rl.signals import Command, JointState
+from brokk_rl.signals import Command
 from brokk_rl.spec import spec
 from diagnosis.mjcf.plant import MjcfPlant
 from exam.case_distribution import PlantRun
 from exam.plants import servo_parameters
 from exam.plants.electronics import CommandBus
+from exam.plants.family import DrawnPlants, PlantLink
 from exam.plants.plant_parameters import PlantParameters
 from exam.plants.servo_causes import CAUSES, ServoCauses
 from exam.plants.servo_drive import FRICTIONS, STEP_S, Friction, PositionLoop, TargetFilter
@@ -48,7 +48,7 @@ def restrict_to_torques(machine: Machine) -> Machine:
     )
 
 
-class ServoArm:
+class ServoArm(PlantLink):
     """A `Link` to simulated arms of one make.
 
     Args:
@@ -67,16 +67,13 @@ class ServoArm:
         runs: Sequence[PlantRun],
         steps: int,
     ) -> None:
-        self._machine = machine
-        n = self._n = {name: np.stack([one[name] for one in parameters]) for name in parameters[0]}
-        self._plant = MjcfPlant(ARM, restrict_to_torques(machine))
         chance = [_RunChance(run.chance, machine, steps) for run in runs]
-        self._noise = np.stack([one.noise for one in chance], 1)
-        self._wander = np.stack([one.wander for one in chance], 1)
-        self._luck = np.stack([one.luck for one in chance], 1)
-        self._elapsed_s = np.array([run.elapsed_s for run in runs])
-        kinds = [run.outside_fault.kind if run.outside_fault else None for run in runs]
-        self._causes = ServoCauses(machine, kinds, n["outside_severity"])
+        super().__init__(machine, parameters, runs, chance)
+        n = self._n
+        self._plant = MjcfPlant(ARM, restrict_to_torques(machine))
+        self._noise, self._wander = self._stack_chance("noise"), self._stack_chance("wander")
+        self._luck = self._stack_chance("luck")
+        self._causes = ServoCauses(machine, self._kinds, n["outside_severity"])
         q = np.tile(machine.home, (len(runs), 1))
         self._state = self._plant.start(q, np.zeros_like(q))
         self._bus = CommandBus(n, machine.period_s)
@@ -94,20 +91,11 @@ class ServoArm:
         self._sigma = np.hypot(n["noise_rad"], n["extra_noise_rad"])
         self._middle = (machine.upper + machine.lower) / 2
         self._duty, self._through = np.zeros_like(q), np.zeros_like(q)
-        self._k = 0
 
     @property
     def q(self) -> np.ndarray:
         """True positions of the joints, `(N, J)`."""
         return self._plant.read(self._state)[0]
-
-    def read(self) -> JointState:
-        """Return the present readings of the encoders."""
-        return JointState(self._k * self._machine.period_s, self._measure(self.q))
-
-    def extra(self) -> Mapping[str, np.ndarray]:
-        """Return nothing: no tool is tracked."""
-        return {}
 
     def send(self, command: Command) -> Command:
         """Move on by one control period with these commands, `(N, J)`."""
@@ -125,7 +113,7 @@ class ServoArm:
     def _step(self, t_s: float) -> None:
         n, causes, loop = self._n, self._causes, self._loop
         q, speed = self._plant.read(self._state)
-        reading = self._measure(q)
+        reading = self._measure_at(q)
         target = causes.target(self._targets.step(self._bus.at(t_s)), reading)
         cap = np.minimum(n["duty_cap"], causes.cap(self._duty))
         self._duty = loop.step(target, reading, speed, cap)
@@ -142,15 +130,12 @@ class ServoArm:
         torque = motor - lost + cogging + pull
         self._state = self._plant.run(self._state, torque[:, None], self._changes or None)[:, 0]
 
-    def _measure(self, q: np.ndarray) -> np.ndarray:
+    def _measure(self) -> np.ndarray:
+        return self._measure_at(self.q)
+
+    def _measure_at(self, q: np.ndarray) -> np.ndarray:
         step = self._n["step_rad"]
         return np.round((q + self._sigma * self._noise[self._k]) / step) * step
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: Any) -> None:
-        pass
 
 
 class _RunChance:
@@ -168,7 +153,7 @@ class _RunChance:
 
 
 @spec
-class ServoPlants:
+class ServoPlants(DrawnPlants):
     """Tabletop arms of position servos in two makes of friction, each arm unique.
 
     Attributes:
@@ -179,54 +164,23 @@ class ServoPlants:
     roughness: dict[str, float]
     outside_not_on: dict[str, tuple[str, ...]]
 
-    is_held_out = False
+    table = servo_parameters.FAULTS
+    causes = CAUSES
 
-    def check(self) -> None:
-        for name in self.outside_not_on:
-            if name not in CAUSES:
-                raise ConfigError(
-                    f"exam.plants.outside_not_on: no cause '{name}'; {list_choices(name, CAUSES)}"
-                )
-
-    @property
-    def effects(self) -> tuple[str, ...]:
-        """Names of the effects that its plants can have."""
-        return tuple(servo_parameters.FAULTS)
-
-    @property
-    def outside_faults(self) -> tuple[str, ...]:
-        """Names of the causes outside the library that its plants can have."""
-        return CAUSES
-
-    def makes(self, machine: Machine, runs: Sequence[PlantRun]) -> list[str]:
-        """Return the make of each run."""
-        return [servo_parameters.draw_servos(machine, run.seed, 1.0)[0] for run in runs]
-
-    def build(self, machine: Machine, runs: Sequence[PlantRun], run_s: float) -> ServoArm:
-        """Return runs of one make, side by side.
+    def draw(
+        self, machine: Machine, run: PlantRun, roughness: float
+    ) -> tuple[str, PlantParameters]:
+        """Return make and parameters of a run's arm, with its faults.
 
         Raises:
-            ConfigError: the machine is not commanded by position, or an effect or a roughness is
-                unknown.
+            ConfigError: the machine is not commanded by position, or an effect is unknown.
         """
         if machine.interface != "position":
             raise ConfigError(
                 f"exam_plants=servos: machine '{machine.name}' is commanded by {machine.interface}; expected a machine of "
                 "position servos, e.g. machine=so101"
             )
-        makes, parameters = set(), []
-        for run in runs:
-            if run.roughness not in self.roughness:
-                raise ConfigError(
-                    f"exam: no roughness '{run.roughness}' in exam.plants.roughness; "
-                    f"{list_choices(run.roughness, self.roughness)}"
-                )
-            size = self.roughness[run.roughness]
-            make, numbers = servo_parameters.draw_servos(machine, run.seed, size)
-            numbers = servo_parameters.change_servos(numbers, run.faults, machine)
-            if run.outside_fault is not None:
-                numbers["outside_severity"] = run.outside_fault.severity
-            makes.add(make)
-            parameters.append(numbers)
-        (make,) = makes
-        return ServoArm(machine, make, parameters, runs, round(run_s / machine.period_s))
+        make, numbers = servo_parameters.draw_servos(machine, run.seed, roughness)
+        return make, servo_parameters.change_servos(numbers, run.faults, machine)
+
+    link = staticmethod(ServoArm)

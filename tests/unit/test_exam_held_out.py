@@ -17,7 +17,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
 from exam import dataset
 from exam.calibration import load_weighed_cases
-from exam.case_distribution import PlantRun
+from exam.case_distribution import PlantRun, UnknownFault
 from exam.held_out import causes, parameters
 from exam.held_out.arm import HeldOutPlants, SensingArm
 from exam.held_out.hydraulics import Linkage, compute_orifice
@@ -48,16 +48,11 @@ def played(
     elapsed_s: float = 900.0,
 ) -> np.ndarray:
     """Positions of machines side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
-    count, steps = len(runs), len(runs[0][1])
-    plant = SensingArm(
-        machine,
-        [numbers for numbers, _ in runs],
-        kinds or [None] * count,
-        [0] * count,
-        np.full(count, elapsed_s),
-        [False] * count,
-        steps,
-    )
+    steps, made = len(runs[0][1]), []
+    for kind in kinds or [None] * len(runs):
+        cause = None if kind is None else UnknownFault(kind, np.ones(machine.num_joints))
+        made.append(PlantRun(0, "mild", 0, elapsed_s, outside_fault=cause))
+    plant = SensingArm(machine, "sensing", [numbers for numbers, _ in runs], made, steps)
     path = [plant.read().q]
     for k in range(steps):
         plant.send(Command(np.stack([u[k] for _, u in runs])))

@@ -12,6 +12,7 @@ from composed import option
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine, mask_exclusive_joints
 from brokk_rl.signals import Command
+from exam.case_distribution import PlantRun, UnknownFault
 from exam.plants import out_of_library_faults
 from exam.plants.electronics import CommandBus
 from exam.plants.faults import FAULTS, apply_faults
@@ -60,16 +61,11 @@ def played(
     """Returns the positions of several machines of one make side by side, `(T + 1, N, J)`, each under commands `(T, J)`."""
     numbers, commands = [numbers for numbers, _ in runs], np.stack([u for _, u in runs], 1)
     count = len(runs)
-    plant = ExamPlant(
-        machine,
-        make,
-        numbers,
-        outside_faults or [None] * count,
-        [0] * count,
-        np.full(count, 900.0),
-        [False] * count,
-        len(commands),
-    )
+    made = []
+    for kind in outside_faults or [None] * count:
+        fault = None if kind is None else UnknownFault(kind, np.ones(machine.num_joints))
+        made.append(PlantRun(0, "mild", 0, 900.0, outside_fault=fault))
+    plant = ExamPlant(machine, make, numbers, made, len(commands))
     path = [plant.read().q]
     for u in commands:
         plant.send(Command(u))
@@ -343,16 +339,8 @@ def test_a_run_is_the_same_whatever_runs_beside_it_and_machines_differ(machine: 
     u = step(machine, 0.7, 40)
 
     def paths(numbers: list[PlantParameters], seeds: list[int]) -> np.ndarray:
-        plant = ExamPlant(
-            machine,
-            "throttled",
-            numbers,
-            [None] * len(numbers),
-            seeds,
-            np.zeros(len(numbers)),
-            [False] * len(numbers),
-            40,
-        )
+        runs = [PlantRun(0, "mild", seed, 0.0) for seed in seeds]
+        plant = ExamPlant(machine, "throttled", numbers, runs, 40)
         for command in u:
             plant.send(Command(np.repeat(command[None], len(numbers), 0)))
         return plant.read().q
@@ -377,17 +365,8 @@ def test_chance_alone_leaves_most_of_the_stated_floor(
         if make == "throttled"
     ]
     count, steps = len(numbers), 1200
-    none, zeros = [None] * 2 * count, np.zeros(2 * count)
-    twice = ExamPlant(
-        machine,
-        "throttled",
-        numbers * 2,
-        none,
-        list(range(2 * count)),
-        zeros,
-        [False] * 2 * count,
-        steps,
-    )
+    runs = [PlantRun(0, roughness, chance, 0.0) for chance in range(2 * count)]
+    twice = ExamPlant(machine, "throttled", numbers * 2, runs, steps)
     generator, shape = np.random.default_rng(0), (steps // 30, count, machine.num_joints)
     levels = generator.uniform(-1.0, 1.0, shape) * (
         generator.random(shape) > 0.3
