@@ -152,19 +152,21 @@ def encode_mask(label: FrameLabel) -> np.ndarray:
 def write_camera(
     folder: Path,
     matrix: np.ndarray,
+    size_px: Sequence[int],
     base_from_camera: np.ndarray | None,
     baseline_m: float | None,
     dist: Sequence[float] = (),
     disparity_std_px: float | None = None,
     gamma: float | None = None,
 ) -> None:
-    """Write `camera.yaml`; see `brokk_rl.signals.Frame`.
+    """Write `camera.yaml`; see `brokk_rl.signals.Frame`. `size_px`: columns and rows of the pictures.
 
     Raises:
         StorageError: it could not be written.
     """
     told: dict[str, Any] = {
         "K": np.asarray(matrix).tolist(),
+        "size_px": [int(one) for one in size_px],
         "dist": [float(value) for value in dist],
     }
     if baseline_m is not None:

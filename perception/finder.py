@@ -15,7 +15,7 @@ import numpy as np
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
-from perception import rectification, search
+from perception import pair_check, search
 from perception.contracts import (
     EllipseDetectorSpec,
     HoleProposerSpec,
@@ -23,9 +23,9 @@ from perception.contracts import (
     SegmenterSpec,
 )
 from perception.face_depth import FaceDepth, FaceMatcher
+from perception.pair_check import PairCheck
 from perception.pose.plane_conic import convert_to_gray
 from perception.pose.wall_light import IN_DUST
-from perception.rectification import RectificationCheck
 
 SAME_ELLIPSE = 0.15
 """Distance and difference in size, as parts of an ellipse's size, below which two ellipses are the
@@ -43,10 +43,7 @@ SHAPE_REASONS = ("part of a circle on the face with a rim", "radius, m", "axis r
 """Reasons that refuse an ellipse and not its region: it may have followed the wrong edges."""
 
 EXPLANATIONS = {
-    rectification.REASON: (
-        "the rows of left and right picture do not correspond, so its depth is wrong",
-        "Calibrate the camera pair.",
-    ),
+    **pair_check.EXPLANATIONS,
     "part of the picture that is block": (
         "too little of the picture is block",
         "Is the block in sight, the segmenter the right one?",
@@ -143,7 +140,7 @@ class StagedPerception:
         roi: Search region: the `mask` of the block, or its bounding `box`.
         apart: Holes nearer to each other than this many radii are one; the outer rim wins.
         faces: Matches candidates again where depth is coarse (`stereo.shrink`); `null` for never.
-        rectification: Check of the pair before anything else; `null` for none.
+        pair: Check of the camera pair before anything else; `null` for none.
     """
 
     segmenter: SegmenterSpec
@@ -159,7 +156,7 @@ class StagedPerception:
     roi: Literal["mask", "box"]
     apart: float
     faces: FaceDepth | None
-    rectification: RectificationCheck | None
+    pair: PairCheck | None
 
     def build(self) -> StagedFinder:
         """Return a finder."""
@@ -189,6 +186,7 @@ class StagedFinder:
         self._segmenter, self._detector = settings.segmenter.build(), settings.ellipse.build()
         self._proposer = settings.proposer.build() if settings.proposer else None
         self._pose = settings.pose.build()
+        self._pair = settings.pair.build() if settings.pair else None
 
     def find(self, frame: Frame) -> FrameDetections:
         """Return all detections of one frame, in the base frame where the camera's pose is known.
@@ -200,9 +198,9 @@ class StagedFinder:
         ms: dict[str, float] = {}
         with _time_stage(ms, "frame"):
             frame = rectify(frame)
-        if s.rectification is not None:
+        if self._pair is not None:
             with _time_stage(ms, "pair"):
-                fault = s.rectification.find_fault(frame)
+                fault = self._pair.find_fault(frame)
             if fault is not None:
                 return FrameDetections([], [fault], [], None, ms)
         with _time_stage(ms, "segment"):

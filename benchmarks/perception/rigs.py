@@ -71,7 +71,7 @@ def main() -> None:
     drifted: FrameRenderer = compose("studio", *plain_pictures, "rig/error=drifted")
     session: Session = compose("session", "mode=render", "session.seed=1", "session.out=.")
     after: StagedFinder = compose("perception", "mode=perceive").build()
-    before = replace(after.settings, rectification=None).build()
+    before = replace(after.settings, pair=None).build()
     scores: dict[tuple[str, float, str], FinderScore] = defaultdict(FinderScore)
     noticed: dict[tuple[str, float], int] = defaultdict(int)
     for number in range(max(given.count, given.drawn)):

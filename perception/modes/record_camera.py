@@ -55,6 +55,7 @@ class RecordCamera:
                 dataset.write_camera(
                     folder,
                     model.matrix,
+                    frame.color.shape[1::-1],
                     model.base_from_camera,
                     model.baseline_m,
                     distortion,
@@ -72,6 +73,7 @@ class RecordCamera:
     def _check_frame(self, frame: RawFrame, model: CameraModel) -> None:
         """Refuse pictures that do not fit the camera's numbers."""
         height, width = frame.color.shape[:2]
+        validation.check_size(model.size_px, height, width, self.lens, frame.name)
         validation.check_matrix_fits(model.matrix, height, width, self.lens)
         if frame.right is not None:
             validation.check_same_size(frame.color, frame.right, frame.name, "the right picture")

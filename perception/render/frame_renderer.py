@@ -93,6 +93,7 @@ class FrameRenderer:
         dataset.write_camera(
             folder,
             rig.left.matrix,
+            (rig.width, rig.height),
             scenes.base_from_camera,
             rig.baseline_m,
             disparity_std_px=rig.disparity_std_px,

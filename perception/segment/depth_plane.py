@@ -159,8 +159,8 @@ class PlaneSegmenter:
         if known.mean() < self._settings.min_known:
             raise FrameError(
                 f"{frame.name or 'frame'}: depth is known in {known.mean():.1%} of the pixels, "
-                f"depth_plane needs {self._settings.min_known:.0%}; check the depth camera, or segment "
-                "by colour (perception/segmenter=onnx)"
+                f"depth_plane needs {self._settings.min_known:.0%}; check the depth camera, its light "
+                "and its range"
             )
         self._tolerance = self._settings.num_sigma * scale_noise(self._settings.noise_per_m, frame)
         grid = SightGrid.of(frame.camera_matrix, inverse.shape, step)

@@ -17,6 +17,7 @@ from brokk_rl.spec import Positive, Share, spec
 from perception import dataset
 from perception.calibrate.disparity_error import correct_depth
 from perception.calibrate.extrinsics import CameraPlacement, load_extrinsics
+from perception.pair_check import EXPLANATIONS, PairCheck
 from perception.sources import validation
 from perception.stereo import Stereo
 
@@ -36,6 +37,7 @@ class FrameFolder:
         base_from_camera: Pose of the camera in the base frame: `calibration.yaml` of
             `mode=calibrate`, or `(4, 4)`; `null` takes `T_base_cam` of `camera.yaml`.
         stereo: Computes the depth of a frame that has a right picture and no depth.
+        pair: Says why a pair gives no depth.
     """
 
     folder: str
@@ -44,6 +46,7 @@ class FrameFolder:
     needs: Literal["depth", "camera", "nothing"]
     base_from_camera: CameraPlacement
     stereo: Stereo
+    pair: PairCheck
 
     def build(self) -> FolderSource:
         """Return the source, not yet opened."""
@@ -62,6 +65,7 @@ class CameraModel:
     disparity_std_px: float | None = None
     disparity_error_px: tuple[float, float, float] = (0.0, 0.0, 0.0)
     gamma: float = validation.USUAL_GAMMA
+    size_px: tuple[int, int] | None = None
 
 
 def read_camera(path: Path) -> CameraModel:
@@ -98,6 +102,7 @@ def read_camera(path: Path) -> CameraModel:
         if "disparity_std_px" in optional
         else None,
         gamma=validation.check_gamma(optional.get("gamma", validation.USUAL_GAMMA), where),
+        size_px=validation.parse_size(told.get("size_px"), where),
     )
 
 
@@ -179,9 +184,9 @@ class FolderSource:
         color = validation.convert_color(picture, str(paths[dataset.COLOR]))
         height, width = color.shape[:2]
         camera = self._camera or CameraModel(_guess_camera_matrix(height, width), None, None, None)
-        validation.check_matrix_fits(
-            camera.matrix, height, width, str(self._place / dataset.CAMERA)
-        )
+        where = str(self._place / dataset.CAMERA)
+        validation.check_size(camera.size_px, height, width, where, str(paths[dataset.COLOR]))
+        validation.check_matrix_fits(camera.matrix, height, width, where)
         right = None
         if paths[dataset.RIGHT].exists():
             right = validation.convert_color(
@@ -231,7 +236,15 @@ class FolderSource:
         matched = self._settings.stereo.depth_m(
             color, right, float(camera.matrix[0, 0]), camera.baseline_m
         )
-        checked = validation.check_depth(matched, f"{stem}: matching left and right", least)
+        try:
+            checked = validation.check_depth(matched, f"{stem}: matching left and right", least)
+        except FrameError as error:
+            pair = Frame(color, matched, camera.matrix, None, 0.0, right=right)
+            fault = self._settings.pair.find_fault(pair)
+            if fault is None:
+                raise
+            explanation, remedy = EXPLANATIONS[fault.reason]
+            raise FrameError(f"{stem}: {explanation}. {remedy}") from error
         return checked, self._settings.stereo.shrink
 
 

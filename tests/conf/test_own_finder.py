@@ -41,7 +41,7 @@ def test_it_passes_the_checker(finder_spec: Any) -> None:
 
 def test_mode_perceive_takes_it_by_name(finder_spec: Any, brokk: Callable, tmp_path: Path) -> None:
     frame, _, _ = drawn()
-    dataset.write_camera(tmp_path / "frames", K, np.eye(4), None)
+    dataset.write_camera(tmp_path / "frames", K, (640, 480), np.eye(4), None)
     for number in range(3):
         dataset.write_frame(tmp_path / "frames" / f"{number:05d}", frame.color, frame.depth_m)
     done = brokk("mode=perceive", "perceive.input=frames", "perception=darkest", "session.out=out")

@@ -265,7 +265,7 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> Path:
     other, right = np.random.default_rng(1), np.eye(4)
     right[0, 3] = -BASELINE_M
     poses = board.posed(option("machine", "brokk170"), 20, 0, 0.002, 0.001, 0.0005)
-    dataset.write_camera(folder, board.MATRIX, None, BASELINE_M)
+    dataset.write_camera(folder, board.MATRIX, (1280, 720), None, BASELINE_M)
     for number, there in enumerate(poses.camera_from_board):
         dataset.write_picture(folder / f"{number:03d}.color.png", board.picture(there, chance))
         partner = board.picture(right @ there, other, -DISPARITY_ERROR_PX)
@@ -296,7 +296,7 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     assert "corners of the board" in lost["left_out"]
     folder = FrameFolder(
         folder=str(footage), rate_hz=1.0, least_known=0.0, needs="camera", base_from_camera="run/calibration.yaml",
-        stereo=option("stereo", "sgbm"),
+        stereo=option("stereo", "sgbm"), pair=option("perception/pair", "matched_features"),
     )  # fmt: skip
     with folder.build() as source:
         frame = source.read_latest()
@@ -360,7 +360,7 @@ def test_a_board_filmed_while_the_arm_moves_is_enough(
     )
     record.write_recording(recording, tmp_path / "run.parquet")
     frame_s, late_s, chance = np.arange(0.5, 11.5, 0.3), 0.12, np.random.default_rng(0)
-    dataset.write_camera(tmp_path, board.MATRIX, None, None)
+    dataset.write_camera(tmp_path, board.MATRIX, (1280, 720), None, None)
     there = np.stack([np.interp(frame_s + late_s, t_s, column) for column in q.T], 1)
     links = arm.compute_link_poses(machine, there).base_from_link
     for number, link in enumerate(links):
@@ -385,7 +385,7 @@ def test_the_command_takes_touched_points(
     height, width = 360, 640
     matrix = board.MATRIX / 2
     matrix[2, 2] = 1.0
-    dataset.write_camera(tmp_path, matrix, None, None)
+    dataset.write_camera(tmp_path, matrix, (640, 360), None, None)
     for number in range(8):
         while True:
             q = board.MIDDLE + chance.uniform(-1, 1, 5) * [0.4, 0.2, 0.4, 0.4, 0.4]
@@ -431,7 +431,7 @@ def test_a_given_point_is_as_exact_as_a_click_of_the_camera_that_is_known(
 ) -> None:
     # beside the axis a point is known by its click alone: 2 px at 2 m are 2 * 2 / 400 m
     matrix = np.array([[400.0, 0.0, 160.0], [0.0, 400.0, 120.0], [0.0, 0.0, 1.0]])
-    dataset.write_camera(tmp_path, matrix, None, None)
+    dataset.write_camera(tmp_path, matrix, (320, 240), None, None)
     depth = np.full((240, 320), 2.0, np.float32)
     dataset.write_frame(tmp_path / "00", np.zeros((240, 320, 3), np.uint8), depth)
     measured = {"camera_m": [0.0, 0.0, 2.0], "base_m": [2.0, 0.0, 0.0]}
@@ -446,6 +446,7 @@ def test_a_given_point_is_as_exact_as_a_click_of_the_camera_that_is_known(
             source=FrameFolder(
                 folder=str(tmp_path),
                 stereo=option("stereo", "sgbm"),
+                pair=option("perception/pair", "matched_features"),
                 rate_hz=10.0,
                 least_known=0.01,
                 needs="depth",

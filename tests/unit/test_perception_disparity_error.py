@@ -147,7 +147,7 @@ def test_cameras_take_the_error_from_the_calibration(tmp_path: Path) -> None:
     color = np.full((90, 160, 3), 128, np.uint8)
     dataset.write_frame(tmp_path / "0", color, np.full((90, 160), 2.0, np.float32))
     matrix = np.array([[88.0, 0, 79.5], [0, 88.0, 44.5], [0, 0, 1]])
-    dataset.write_camera(tmp_path, matrix, None, BASELINE_M)
+    dataset.write_camera(tmp_path, matrix, (160, 90), None, BASELINE_M)
     folder = option("perception/source", "folder", folder=str(tmp_path), base_from_camera=str(path))
     with folder.build() as source:
         frame = source.read_latest()

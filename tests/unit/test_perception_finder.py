@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from composed import option
-from drawn import AXIS, CENTER, drawn
+from drawn import AXIS, CENTER, K, drawn
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks
 from perception import dataset, search
@@ -69,9 +69,24 @@ def test_a_flat_disc_is_refused_in_words() -> None:
 
 def test_lens_distortion_is_taken_out() -> None:
     frame, _, _ = drawn()
-    bent = replace(frame, distortion=np.array([0.05, 0.0, 0.0, 0.0]))
-    straight = rectify(bent)
+    coefficients = np.array([-0.25, 0.05, 0.0, 0.0])
+    # a spot far from the middle, which such a lens shows 20 px too far inside
+    spot = np.array([90.0, 400.0])
+    columns, rows = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    light = 255.0 * np.exp(-((columns - spot[0]) ** 2 + (rows - spot[1]) ** 2) / 50.0)
+    color = np.repeat(light.astype(np.uint8)[..., None], 3, 2)
+    straight = rectify(replace(frame, color=color, distortion=coefficients))
     assert straight.distortion is None
+    weight = straight.color[..., 0].astype(float)
+    seen = np.array([(columns * weight).sum(), (rows * weight).sum()]) / weight.sum()
+    ray = (spot - K[:2, 2]) / K[[0, 1], [0, 1]]
+    true = ray.copy()
+    for _ in range(50):  # the lens' polynomial, inverted by hand
+        square = float(true @ true)
+        true = ray / (1.0 - 0.25 * square + 0.05 * square**2)
+    expected = true * K[[0, 1], [0, 1]] + K[:2, 2]
+    assert np.linalg.norm(expected - spot) > 5.0
+    assert seen == pytest.approx(expected, abs=0.5)
     known = straight.depth_m[np.isfinite(straight.depth_m)]
     assert np.isin(known, frame.depth_m).all()
     assert rectify(replace(frame, distortion=np.zeros(5))).color is frame.color

@@ -48,7 +48,9 @@ def footage(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[cuboid
         )
         poses[f"{number:02d}"] = view.world_from_camera.tolist()
         views.append(view)
-    dataset.write_camera(folder / "frames", views[0].frame.camera_matrix, None, None)
+    first = views[0].frame
+    size_px = first.color.shape[1::-1]
+    dataset.write_camera(folder / "frames", first.camera_matrix, size_px, None, None)
     (folder / "poses.yaml").write_text(yaml.safe_dump(poses))
     return folder, views
 

@@ -18,7 +18,7 @@ from perception import dataset
 def folder(tmp_path: Path) -> Path:
     place = tmp_path / "frames"
     place.mkdir()
-    dataset.write_camera(place, K, np.eye(4), None)
+    dataset.write_camera(place, K, (640, 480), np.eye(4), None)
     frame, masks, _ = drawn()
     label = dataset.FrameLabel(
         masks.block > 0.5, np.zeros(masks.block.shape, bool), np.zeros(masks.block.shape, bool)

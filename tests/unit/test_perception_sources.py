@@ -35,7 +35,7 @@ POSE = np.array(
 def frames(tmp_path: Path) -> Path:
     """A folder of two sound frames, 00000 and 00001."""
     chance = np.random.default_rng(0)
-    dataset.write_camera(tmp_path, MATRIX, POSE, 0.12)
+    dataset.write_camera(tmp_path, MATRIX, (WIDTH, HEIGHT), POSE, 0.12)
     for number in range(2):
         color = chance.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
         depth = np.full((HEIGHT, WIDTH), 2.0 + number, np.float32)
@@ -54,6 +54,7 @@ def folder(path: Path, **changes: Any) -> FrameFolder:
                 "needs": "depth",
                 "base_from_camera": None,
                 "stereo": option("stereo", "sgbm"),
+                "pair": option("perception/pair", "matched_features"),
             }
             | changes
         ),
@@ -142,7 +143,7 @@ BREACHES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "depth of three axes": (lambda f: save(f / "00000.depth.npy", np.ones((*SIZE, 1))), r"expected \(height, width\)"),
     "misaligned depth": (lambda f: save(f / "00000.depth.npy", np.ones((HEIGHT // 2, WIDTH // 2))), r"depth has 80 x 45 pixels"),
     "misaligned right": (lambda f: save(f / "00000.right.png", np.zeros((9, 9, 3), np.uint8)), r"right picture has 9 x 9 pixels"),
-    "another resolution": (lambda f: camera(f, K=(MATRIX * [[4], [4], [1]]).tolist()), r"cx is 318 px in a picture of 160 x 90"),
+    "another resolution": (lambda f: camera(f, K=(MATRIX * [[4], [4], [1]]).tolist()), r"cx 318 px, expected about 79.5"),
     "long lens": (lambda f: camera(f, K=(MATRIX + np.diag([9e3, 9e3, 0])).tolist()), r"9088 px is absurd"),
 }  # fmt: skip
 
@@ -223,12 +224,31 @@ def test_photographs_alone_will_do_for_ellipses(tmp_path: Path) -> None:
     )
 
 
+def test_a_camera_matrix_of_another_resolution_is_refused_by_its_name(tmp_path: Path) -> None:
+    color = np.full((720, 1280, 3), 128, np.uint8)
+    dataset.write_frame(tmp_path / "00000", color, np.full((720, 1280), 2.0, np.float32))
+
+    def refuse(size: tuple[int, int], told: tuple[int, int] | None, match: str) -> None:
+        focal_px = 0.55 * size[0]
+        middle = [(size[0] - 1) / 2, (size[1] - 1) / 2]
+        matrix = [[focal_px, 0, middle[0]], [0, focal_px, middle[1]], [0, 0, 1]]
+        content = {"K": matrix, "dist": []} | ({} if told is None else {"size_px": list(told)})
+        (tmp_path / "camera.yaml").write_text(yaml.safe_dump(content))
+        with folder(tmp_path).build() as source, pytest.raises(FrameError, match=match):
+            source.read_latest()
+
+    for size in ((1920, 1080), (640, 360), (2560, 1440), (1472, 828), (720, 1280)):
+        refuse(size, None, "K has")
+    refuse((1280, 720), (1920, 1080), "K of .* is that of pictures of 1920 x 1080 px")
+    refuse((720, 1280), (720, 1280), "the pictures are turned")
+
+
 def test_a_pair_without_depth_is_matched(tmp_path: Path) -> None:
     chance = np.random.default_rng(1)
     grain = cv2.GaussianBlur(chance.standard_normal((120, 400)).astype(np.float32), (0, 0), 1.0)
     wide = np.repeat(np.clip(128 + 120 * grain, 0, 255).astype(np.uint8)[..., None], 3, 2)
     matrix = np.array([[200.0, 0.0, 119.5], [0.0, 200.0, 59.5], [0.0, 0.0, 1.0]])
-    dataset.write_camera(tmp_path, matrix, None, 0.12)
+    dataset.write_camera(tmp_path, matrix, (240, 120), None, 0.12)
     # All of it 12 px: 200 * 0.12 / 12 = 2 m.
     dataset.write_frame(tmp_path / "00000", wide[:, 100:340], None, wide[:, 112:352])
     found = read(tmp_path)[0]

@@ -1,0 +1,292 @@
+"""Check of a camera pair by matched features: order, turn, rectification, and the scale of depth.
+
+The rows of a rectified pair correspond, and what it shows lies farther right in its left picture.
+Features are matched without any depth, because the depth of a bad pair is the first to fail. A
+shift across alone shows nothing here: a board at known distances measures it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from brokk_rl.contracts.vision import Rejection
+from brokk_rl.signals import Frame
+from brokk_rl.spec import Count, NonNegative, Positive, Share, spec
+from perception.robust_fit import estimate_spread, fit_linear
+
+FEW = "matched features of the pair"
+ORDER = "part of the features that lie farther right in the left picture"
+TURN = "vertical over horizontal distance of matched features"
+ROWS = "vertical disparity of the pair, px"
+UNSURE = "standard deviation of the vertical disparity, px"
+CANNOT_TELL = (FEW, UNSURE)
+"""Reasons that say nothing of the pair."""
+SCALE = "depth by disparity over the depth told"
+EXPLANATIONS = {
+    ROWS: (
+        "the rows of left and right picture do not correspond, so its depth is wrong",
+        "Rectify the pictures, or calibrate the camera pair.",
+    ),
+    ORDER: (
+        "left and right picture are swapped: what they show lies farther left in the left one",
+        "Swap them: .color.png is the left one, .right.png the right one.",
+    ),
+    TURN: (
+        "the pictures are turned: their features are apart from top to bottom",
+        "Turn them so that the cameras stand side by side, and K and dist with them.",
+    ),
+    FEW: (
+        "left and right picture share too few features to tell whether they are rectified",
+        "Is it the same moment, is there light, is a lens covered?",
+    ),
+    UNSURE: (
+        "the shared features are too uncertain to tell whether the pair is rectified",
+        "Is there light, are the pictures sharp?",
+    ),
+    SCALE: (
+        "depth and pair disagree by this factor",
+        "A factor of 1000, 100 or 10 is the unit of depth; else K, baseline_m, or both belong to "
+        "another resolution or camera.",
+    ),
+}
+"""Explanation and remedy for each reason."""
+
+
+@dataclass(frozen=True)
+class PairMatches:
+    """Places of the same features in both pictures of a pair, px.
+
+    Attributes:
+        left: `(n, 2)`.
+        right: `(n, 2)`.
+    """
+
+    left: np.ndarray
+    right: np.ndarray
+
+    def select_common_shift(self, reach_px: float) -> PairMatches:
+        """Return the matches whose vertical shift is near the commonest one."""
+        shift_px = (self.right - self.left)[:, 1]
+        near = np.abs(shift_px[:, None] - shift_px[None, :]) < reach_px
+        chosen = near[np.argmax(np.count_nonzero(near, axis=1))]
+        return PairMatches(self.left[chosen], self.right[chosen])
+
+
+@dataclass(frozen=True)
+class PairAlignment:
+    """Vertical disparity of a pair: `pitch_px (1 + y²) + roll_px x + focal_px y`.
+
+    `x` and `y` are coordinates at depth 1. All are what the right picture shows lower, px.
+
+    Attributes:
+        pitch_px: By a turn about the x axis, or a shift of the picture; focal length times angle.
+        roll_px: By a turn about the optical axis, likewise.
+        focal_px: By another focal length.
+        rms_px: Root mean square over the whole picture, less what noise alone gives.
+        std_px: Standard deviation of `rms_px`.
+    """
+
+    pitch_px: float
+    roll_px: float
+    focal_px: float
+    rms_px: float
+    std_px: float
+
+
+@spec
+class PairCheck:
+    """Refuse frames whose pair is swapped, turned, not rectified, or at odds with its depth.
+
+    Attributes:
+        width_px: Width of the pictures in which features are searched.
+        num_features: Most features of a picture.
+        window_px: Side of the window that registers a feature (Lucas and Kanade 1981).
+        contrast: Largest gain of contrast before the search (CLAHE).
+        corner: Least step of brightness of a corner, grey levels.
+        cell_px: Side of the squares of the small picture of which one feature counts.
+        return_px: Largest error of a match on the way there and back, in the small picture.
+        common_px: Departure from the commonest vertical shift within which matches are no gross
+            errors: a repeated pattern has as many wrong partners as right ones.
+        least_matches: Matches below which nothing can be told; such a frame is refused unless the
+            pair was found good before.
+        least_ahead: Least part of the features that lie farther right in the left picture.
+        most_turn: Largest quotient of vertical and horizontal distance of matched features.
+        limit_px: Largest root mean square of the vertical disparity over the picture.
+        num_sigma: Standard deviations by which it must exceed the limit.
+        most_std_px: Standard deviation of that, from which nothing can be told.
+        scale: Largest departure from 1 of depth by disparity over a depth that was measured.
+        every: Frames of the same pair of which one is checked.
+    """
+
+    width_px: Count
+    num_features: Count
+    window_px: Count
+    contrast: Positive
+    corner: Count
+    cell_px: Positive
+    return_px: Positive
+    common_px: Positive
+    least_matches: Count
+    least_ahead: Share
+    most_turn: Positive
+    limit_px: Positive
+    num_sigma: NonNegative
+    most_std_px: Positive
+    scale: Share
+    every: Count
+
+    def build(self) -> PairWatch:
+        """Return a watch that has seen no frame yet."""
+        return PairWatch(self)
+
+    def find_fault(self, frame: Frame) -> Rejection | None:
+        """Return why the pair of a frame is refused; `None` for a good pair, or a single picture."""
+        if frame.right is None or frame.right.shape != frame.color.shape:
+            return None
+        matches = self.match_features(frame.color, frame.right)
+        if len(matches.left) < self.least_matches:
+            return Rejection("frame", FEW, float(len(matches.left)), float(self.least_matches))
+        ahead_px = matches.left - matches.right
+        across_px, down_px = np.abs(np.median(ahead_px, axis=0))
+        turn = float(down_px / max(across_px, 1.0))
+        if turn > self.most_turn:
+            return Rejection("frame", TURN, turn, self.most_turn)
+        share = float(np.mean(ahead_px[:, 0] > 0))
+        if share < self.least_ahead:
+            return Rejection("frame", ORDER, share, self.least_ahead)
+        matches = matches.select_common_shift(self.common_px)
+        found = fit_alignment(matches, frame)
+        if len(matches.left) < self.least_matches:
+            return Rejection("frame", FEW, float(len(matches.left)), float(self.least_matches))
+        if found.rms_px - self.num_sigma * found.std_px > self.limit_px:
+            return Rejection("frame", ROWS, found.rms_px, self.limit_px)
+        if found.std_px > self.most_std_px:
+            return Rejection("frame", UNSURE, found.std_px, self.most_std_px)
+        scale = measure_depth_scale(matches, frame, self.least_matches)
+        if scale is not None and abs(np.log(scale)) > np.log1p(self.scale):
+            return Rejection("frame", SCALE, scale, 1.0)
+        return None
+
+    def match_features(self, left: np.ndarray, right: np.ndarray) -> PairMatches:
+        """Return the features that both pictures, RGB `(h, w, 3)`, show.
+
+        ORB finds partners anywhere; Lucas and Kanade's registration places them. Both work in
+        smaller pictures of equalised contrast, in which dust and dark hide least.
+        """
+        shrink = max(1, round(left.shape[1] / self.width_px))
+        equalizer = cv2.createCLAHE(self.contrast, (8, 8))
+        pictures = []
+        for picture in (left, right):
+            gray = cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY)
+            size = gray.shape[1] // shrink, gray.shape[0] // shrink
+            small = cv2.resize(gray, size, interpolation=cv2.INTER_AREA)
+            pictures.append(np.asarray(equalizer.apply(small)))
+        detector = cv2.ORB.create(self.num_features, fastThreshold=self.corner)
+        mine, my_words = detector.detectAndCompute(pictures[0], None)
+        theirs, their_words = detector.detectAndCompute(pictures[1], None)
+        nothing = PairMatches(np.zeros((0, 2)), np.zeros((0, 2)))
+        if not mine or not theirs:
+            return nothing
+        pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(my_words, their_words)
+        if not pairs:
+            return nothing
+        start = np.array([mine[one.queryIdx].pt for one in pairs], np.float32)
+        end = np.array([theirs[one.trainIdx].pt for one in pairs], np.float32)
+        # Features of several scales at one place share their error: one of each cell counts.
+        cell = np.floor(start / self.cell_px)
+        first = np.unique(cell[:, 0] * 10_000 + cell[:, 1], return_index=True)[1]
+        start, end = start[first], end[first]
+        there = self._register(pictures[0], pictures[1], start, end)
+        back = self._register(pictures[1], pictures[0], there, start)
+        good = np.linalg.norm(back - start, axis=1) < self.return_px
+        # Pixel centres: a shrunk pixel's centre lies between those it covers.
+        left_px = (start[good].astype(float) + 0.5) * shrink - 0.5
+        right_px = (there[good].astype(float) + 0.5) * shrink - 0.5
+        return PairMatches(left_px, right_px)
+
+    def _register(
+        self, one: np.ndarray, other: np.ndarray, start: np.ndarray, guess: np.ndarray
+    ) -> np.ndarray:
+        """Return the places in another picture of features at `start`, near `guess`, `(n, 2)`."""
+        window = (self.window_px, self.window_px)
+        return cv2.calcOpticalFlowPyrLK(
+            one, other, start, guess.copy(), winSize=window, maxLevel=1,
+            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+        )[0]  # fmt: skip
+
+
+class PairWatch:
+    """Check of the frames of one camera: a good pair is checked once in `every` frames."""
+
+    def __init__(self, settings: PairCheck) -> None:
+        self._settings = settings
+        self._rig: tuple[object, ...] = ()
+        self._is_good = False
+        self._num_unchecked = 0
+
+    def find_fault(self, frame: Frame) -> Rejection | None:
+        """Return why the pair of a frame is refused; see `PairCheck.find_fault`.
+
+        A frame that shows too few features is judged as the last one of the same camera that showed
+        enough; without one it is refused.
+        """
+        rig = (frame.camera_matrix.tobytes(), frame.baseline_m, frame.color.shape)
+        if rig != self._rig:
+            self._rig, self._is_good = rig, False
+        self._num_unchecked += 1
+        if self._is_good and self._num_unchecked < self._settings.every:
+            return None
+        fault = self._settings.find_fault(frame)
+        if fault is not None and fault.reason in CANNOT_TELL and self._is_good:
+            return None
+        self._num_unchecked, self._is_good = 0, fault is None
+        return fault
+
+
+def fit_alignment(matches: PairMatches, frame: Frame) -> PairAlignment:
+    """Return the vertical disparity over the picture: three numbers, fitted robustly."""
+    shift_px = (matches.right - matches.left)[:, 1]
+    design = _build_design(frame, matches.right[:, 0], matches.right[:, 1])
+    # A hundredth of a pixel: pictures drawn without noise would leave no scale.
+    solution, cov = fit_linear(design, shift_px, 0.01)
+    height, width = frame.color.shape[:2]
+    across, down = np.meshgrid(np.linspace(0, width - 1, 15), np.linspace(0, height - 1, 9))
+    everywhere = _build_design(frame, across.ravel(), down.ravel())
+    gram = everywhere.T @ everywhere / len(everywhere)
+    noise = float(np.trace(gram @ cov))
+    rms_px = float(np.sqrt(max(float(solution @ gram @ solution) - noise, 0.0)))
+    pitch, roll, focal = (float(value) for value in solution)
+    return PairAlignment(pitch, roll, focal, rms_px, float(np.sqrt(noise)))
+
+
+def measure_depth_scale(matches: PairMatches, frame: Frame, least: int) -> float | None:
+    """Return depth by disparity over the depth of the frame, the median of the matches.
+
+    Returns:
+        `None` where fewer than `least` matches have depth, or do not agree.
+    """
+    if frame.baseline_m is None:
+        return None
+    column, row = np.rint(matches.left).astype(int).T
+    told_m = frame.depth_m[row, column]
+    disparity_px = (matches.left - matches.right)[:, 0]
+    known = np.isfinite(told_m) & (disparity_px > 0)
+    if np.count_nonzero(known) < least:
+        return None
+    pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
+    logarithm = np.log(pull_px / disparity_px[known] / told_m[known])
+    middle = float(np.median(logarithm))
+    # Half of the matches lie within a tenth, or depth and pair show different things.
+    if estimate_spread(logarithm - middle) > 0.1:
+        return None
+    return float(np.exp(middle))
+
+
+def _build_design(frame: Frame, columns: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    matrix = frame.camera_matrix
+    x = (columns - matrix[0, 2]) / matrix[0, 0]
+    y = (rows - matrix[1, 2]) / matrix[1, 1]
+    return np.stack([1.0 + y**2, x, y], axis=1)
