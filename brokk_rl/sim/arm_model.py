@@ -21,7 +21,7 @@ import trimesh
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.sim.kinematic_tree import KinematicTree
-from brokk_rl.sim.model_reader import read_source
+from brokk_rl.sim.model_source import NUM_SIZES, read_source
 
 TIP = "tip"
 TIP_NAMES = re.compile("tip|tcp|tool|grasp|grip_site|^grip|:grip|ee_|eef|end_?eff|attach", re.I)
@@ -29,14 +29,6 @@ TIP_NAMES = re.compile("tip|tcp|tool|grasp|grip_site|^grip|:grip|ee_|eef|end_?ef
 NEAREST_TIP_M, GUESSED_TIP_M = 1e-3, np.array([0.0, 0.0, 0.1])
 """Distance of a tool point from the last joint at least, so that the tool has a direction, and a
 tool point where the model has none."""
-_SIZES = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 3,
-    int(mujoco.mjtGeom.mjGEOM_CYLINDER): 2,
-    int(mujoco.mjtGeom.mjGEOM_BOX): 3,
-}
-"""Number of sizes of each primitive."""
 
 
 @dataclass(frozen=True)
@@ -132,26 +124,28 @@ class ArmModel:
 
     def _move_to_base(self) -> None:
         """Put the foot of the robot above the origin, its x axis forward; heights stay."""
-        data, root = self.data, self._arm.root
-        foot_m = np.array([*data.xpos[root, :2], 0.0])
+        model, data, root = self.model, self.data, self._arm.root
+        x_m, y_m, _ = data.xpos[root]
         forward = data.xmat[root].reshape(3, 3)[:, 0]
         yaw = math.atan2(forward[1], forward[0]) if np.hypot(*forward[:2]) > 0.5 else 0.0
-        if np.allclose((*foot_m, yaw), 0.0, atol=1e-6):
+        if np.allclose((x_m, y_m, yaw), 0.0, atol=1e-6):
             return
-        turn = np.array(
-            [[math.cos(yaw), math.sin(yaw), 0], [-math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
-        )
         self.remarks.append(
-            f"The robot stands at x {foot_m[0]:.3g}, y {foot_m[1]:.3g} m, turned by {yaw:.3g} rad; its foot is the "
+            f"The robot stands at x {x_m:.3g}, y {y_m:.3g} m, turned by {yaw:.3g} rad; its foot is the "
             "origin here, and it looks along x."
         )
-        for name in ("xanchor", "xipos", "geom_xpos", "site_xpos", "xpos"):
-            points = getattr(data, name)
-            points[:] = (points - foot_m) @ turn.T
-        data.xaxis[:] = data.xaxis @ turn.T
-        for name in ("ximat", "geom_xmat"):
-            frames = getattr(data, name)
-            frames[:] = (turn @ frames.reshape(-1, 3, 3)).reshape(-1, 9)
+        turn, moved_m, turned = np.zeros(4), np.zeros(3), np.zeros(4)
+        mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), -yaw)
+        free = int(model.body_jntadr[root])
+        if free >= 0 and model.jnt_type[free] == mujoco.mjtJoint.mjJNT_FREE:
+            place = data.qpos[model.jnt_qposadr[free] :][:7]
+            pos_m, quat = place[:3], place[3:]
+        else:
+            pos_m, quat = model.body_pos[root], model.body_quat[root]
+        mujoco.mju_rotVecQuat(moved_m, pos_m - (x_m, y_m, 0.0), turn)
+        mujoco.mju_mulQuat(turned, turn, quat)
+        pos_m[:], quat[:] = moved_m, turned
+        mujoco.mj_forward(model, data)
 
     def sum_masses(self, row: int) -> tuple[float, np.ndarray, np.ndarray]:
         """Return mass (kg), centre (m, from the joint) and inertia about it of a link.
@@ -203,7 +197,8 @@ class ArmModel:
             return choices[tip] - last
         if TIP in sites:
             return sites[TIP] - last
-        palm = [body for body in bodies if not self._is_behind(body, fingers)]
+        gripper = set(self._arm.gripper)
+        palm = [body for body in bodies if gripper.isdisjoint(self.tree.list_above(body, False))]
         choices: dict[str, np.ndarray] = {}
         for places in reversed(self._list_frames(palm)):
             choices |= {
@@ -243,13 +238,6 @@ class ArmModel:
             if model.site_bodyid[site] in bodies
         }
         return sites, {model.body(body).name: data.xpos[body] for body in bodies}
-
-    def _is_behind(self, body: int, others: set[int]) -> bool:
-        while body:
-            if body in others:
-                return True
-            body = int(self.model.body_parentid[body])
-        return False
 
     def write(self, name: str, tool_m: np.ndarray) -> tuple[mujoco.MjModel, str, dict[str, bytes]]:
         """Return model, text and meshes of an MJCF whose link frames lie in the joints, parallel to the base at zero."""
@@ -305,7 +293,7 @@ class ArmModel:
             turn = self.data.geom_xmat[geom].reshape(3, 3)
             centre = self.data.geom_xpos[geom]
             place = {"pos": centre - at_m, "quat": _to_quaternion(turn)}
-            if kind in _SIZES:
+            if kind in NUM_SIZES:
                 place |= {"type": model.geom_type[geom], "size": model.geom_size[geom]}
             elif kind != mujoco.mjtGeom.mjGEOM_MESH:
                 continue

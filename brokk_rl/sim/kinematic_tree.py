@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import mujoco
 
@@ -62,6 +61,7 @@ class KinematicTree:
             elif self._is_locked(joint):
                 self._passive[joint] = "cannot move: it has no limits and a damping like a lock"
         self._cut_loops()
+        self._chains = self._list_chains()
 
     def choose(self, chain: Sequence[str], tip: str | None, with_gripper: bool) -> ArmChain:
         """Return the arm: the one that is named, else the longest chain.
@@ -78,18 +78,20 @@ class KinematicTree:
         if chain:
             joints = self._choose_named(chain)
         else:
-            joints, gripper = self._find_longest()
+            joints, gripper = self._choose_longest()
             beyond = self.list_above(self.find_frame(tip)[1]) if tip else []
             if tip and not set(beyond) <= {*joints, *gripper}:
                 joints, gripper = beyond, []
         if with_gripper and gripper:
             joints = [*joints, gripper[0]]
             gripper = gripper[1:]
-        used = {*joints, *gripper}
-        roots = self.model.body_rootid[self.model.jnt_bodyid]
-        root = int(roots[joints[0]])
-        others = [one for one in self._driven if one not in used and roots[one] == root]
-        return ArmChain(joints, root, gripper, others)
+        root = self._find_root(joints[0])
+        others = []
+        for joint in range(self.model.njnt):
+            is_used = joint in self._passive or joint in joints or joint in gripper
+            if not is_used and self._find_root(joint) == root:
+                others.append(joint)
+        return ArmChain(list(joints), root, gripper, others)
 
     def name(self, joint: int) -> str:
         """Return the name of a joint; one without is called by its body."""
@@ -155,29 +157,13 @@ class KinematicTree:
             )
         return said
 
-    @cached_property
-    def _driven(self) -> list[int]:
-        return [joint for joint in range(self.model.njnt) if joint not in self._passive]
-
-    @cached_property
-    def _children(self) -> dict[int, list[int]]:
-        """Driven joints behind each; -1 is the base."""
-        children: dict[int, list[int]] = {-1: []} | {joint: [] for joint in self._driven}
-        for joint in self._driven:
-            above = self.list_above(int(self.model.jnt_bodyid[joint]))
-            place = above.index(joint)
-            children[above[place - 1] if place else -1].append(joint)
-        return children
-
-    def _count_depth(self, joint: int) -> int:
-        """Return the number of joints of the longest chain that begins with a joint."""
-        return 1 + max((self._count_depth(child) for child in self._children[joint]), default=0)
-
-    def _list_behind(self, joint: int) -> list[int]:
-        found = [joint]
-        for child in self._children[joint]:
-            found += self._list_behind(child)
-        return found
+    def _list_chains(self) -> list[tuple[int, ...]]:
+        """Driven joints from the base to each end of the model, the shortest first."""
+        paths = {tuple(self.list_above(body)) for body in range(1, self.model.nbody)}
+        inner = {path[:place] for path in paths for place in range(len(path))}
+        return sorted(
+            paths - inner - {()}, key=lambda path: (len(path), [-joint for joint in path])
+        )
 
     def _is_free(self, joint: int) -> bool:
         return int(self.model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_FREE
@@ -214,138 +200,128 @@ class KinematicTree:
 
     def _rank_side(self, end: int, side: list[int]) -> tuple[bool, bool, float]:
         """Return how much a side of a loop is the arm: joints go on behind it, no slide, mass."""
-        model = self.model
+        path = tuple(self.list_above(end))
         goes_on = any(
-            body > end and end in self._list_parents(body) and model.body_jntnum[body]
-            for body in range(model.nbody)
+            len(chain) > len(path) and chain[: len(path)] == path for chain in self._list_chains()
         )
         has_slide = any(self._is_slide(joint) for joint in side)
-        return goes_on, not has_slide, float(model.body_subtreemass[end])
-
-    def _list_parents(self, body: int) -> list[int]:
-        found = []
-        while body:
-            body = int(self.model.body_parentid[body])
-            found.append(body)
-        return found
+        return goes_on, not has_slide, float(self.model.body_subtreemass[end])
 
     def _is_slide(self, joint: int) -> bool:
         return int(self.model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_SLIDE
 
-    def _find_longest(self) -> tuple[list[int], list[int]]:
-        """Return the joints of the longest chain, and those of the gripper at its end."""
-        chain: list[int] = []
-        children = self._choose_tree()
-        while children:
-            ranked = sorted(children, key=self._count_depth, reverse=True)
-            if self._is_gripper(chain, ranked):
-                behind = [joint for child in ranked for joint in self._list_behind(child)]
-                return chain, behind
-            chain.append(self._choose_branch(chain, ranked))
-            children = self._children[chain[-1]]
-        return chain, []
-
-    def _choose_tree(self) -> list[int]:
-        """Return the first joints of the robot with the longest chain.
+    def _choose_longest(self) -> tuple[tuple[int, ...], list[int]]:
+        """Return the joints of the longest chain, and those of the gripper at its end.
 
         Raises:
-            ConfigError: Nothing moves, or several robots are alike.
+            ConfigError: Nothing moves, or several robots, legs or arms are alike.
         """
-        trees: dict[int, list[int]] = {}
-        for joint in self._children[-1]:
-            root = int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
-            trees.setdefault(root, []).append(joint)
-        if not trees:
-            raise self._refuse(
-                "it has no joint that moves"
-                + self._describe_passive()
-                + "; a fragment that a scene "
-                "includes has none either: give the scene"
+        chains = self._list_standing()
+        arm: tuple[int, ...] = ()
+        while True:
+            roots = {self._find_root(chain[0]) for chain in chains}
+            branches: dict[int, tuple[int, ...]] = {}
+            for chain in chains:
+                if len(chain) > len(arm):
+                    root = self._find_root(chain[0])
+                    branches[chain[len(arm)] if len(roots) == 1 else root] = chain
+            ranked = sorted(branches.values(), key=lambda chain: (-len(chain), chain))
+            if not ranked:
+                return arm, []
+            if self._is_gripper(arm, ranked):
+                behind = sorted({joint for chain in chains for joint in chain[len(arm) :]})
+                return arm, behind
+            chosen = self._choose_branch(arm, ranked)
+            if len(roots) > 1:
+                root = self._find_root(chosen[0])
+                chains = [chain for chain in chains if self._find_root(chain[0]) == root]
+            else:
+                arm = chosen[: len(arm) + 1]
+                chains = [chain for chain in chains if chain[: len(arm)] == arm]
+
+    def _list_standing(self) -> list[tuple[int, ...]]:
+        """Return the chains of robots that stand, or of all where none has a chain of two joints."""
+        if not self._chains:
+            passive = [f"{self.name(joint)} {why}" for joint, why in self._passive.items()]
+            why = f" ({'; '.join(passive)})" if passive else ""
+            raise self._source.refuse(
+                f"it has no joint that moves{why}; a fragment that a scene includes has none either: "
+                "give the scene"
             )
-        depth = {
-            root: max(self._count_depth(joint) for joint in joints)
-            for root, joints in trees.items()
-        }
-        fixed = [root for root in trees if not self._is_floating(root)]
-        candidates = fixed if fixed and max(depth[root] for root in fixed) > 1 else list(trees)
-        most = max(depth[root] for root in candidates)
-        alike = [root for root in candidates if depth[root] == most]
-        if len(alike) > 1 and most > 1:
-            alike = [root for root in alike if self._has_drive(trees[root])] or alike
-        if len(alike) > 1 and most > 1:
-            names = ", ".join(self.model.body(root).name for root in alike)
-            ends = [self._name_end(max(trees[root], key=self._count_depth)) for root in alike]
-            raise self._refuse(
-                f"{len(alike)} robots ({names}) have {most} joints each; name the last joint of one: "
-                f"subject.chain={' or subject.chain='.join(ends)}"
-            )
-        return trees[alike[0]]
+        standing = []
+        for chain in self._chains:
+            first = int(self.model.body_jntadr[self._find_root(chain[0])])
+            if first < 0 or not self._is_free(first):
+                standing.append(chain)
+        return standing if max(map(len, standing), default=0) > 1 else self._chains
 
-    def _describe_passive(self) -> str:
-        said = [f"{self.name(joint)} {why}" for joint, why in self._passive.items()]
-        return f" ({'; '.join(said)})" if said else ""
+    def _find_root(self, joint: int) -> int:
+        return int(self.model.body_rootid[self.model.jnt_bodyid[joint]])
 
-    def _is_floating(self, root: int) -> bool:
-        joints = self.model.body_jntnum[root]
-        return bool(joints) and self._is_free(int(self.model.body_jntadr[root]))
-
-    def _is_gripper(self, chain: list[int], ranked: list[int]) -> bool:
-        """Return whether the branches behind a chain are fingers: named so, or short and alike."""
-        if not chain:
+    def _is_gripper(self, arm: tuple[int, ...], ranked: list[tuple[int, ...]]) -> bool:
+        """Return whether the branches behind an arm are fingers: named so, or short and alike."""
+        depths = [len(chain) - len(arm) for chain in ranked]
+        if not arm or depths[0] >= max(len(arm), 2):
             return False
-        body = self.model.body(int(self.model.jnt_bodyid[ranked[0]])).name
-        depths = [self._count_depth(joint) for joint in ranked]
-        is_short = depths[0] < max(len(chain), 2)
-        if GRIPPER.search(f"{self.name(ranked[0])} {body}") and is_short:
-            return len(chain) > 1 or len(ranked) > 1
-        is_alike = len(ranked) > 1 and depths[0] == depths[1]
-        return is_alike and is_short and len(chain) > 1
+        first = ranked[0][len(arm)]
+        body = self.model.body(int(self.model.jnt_bodyid[first])).name
+        if GRIPPER.search(f"{self.name(first)} {body}"):
+            return len(arm) > 1 or len(ranked) > 1
+        return len(arm) > 1 and depths.count(depths[0]) > 1
 
-    def _choose_branch(self, chain: list[int], ranked: list[int]) -> int:
-        """Return the joint with which the chain goes on.
+    def _choose_branch(
+        self, arm: tuple[int, ...], ranked: list[tuple[int, ...]]
+    ) -> tuple[int, ...]:
+        """Return the chain with which an arm goes on.
 
         Raises:
-            ConfigError: Several branches are alike: legs, fingers or two arms.
+            ConfigError: Several are alike: robots, legs, fingers or two arms.
         """
-        depths = [self._count_depth(joint) for joint in ranked]
-        alike = [
-            joint
-            for joint, depth in zip(ranked, depths, strict=True)
-            if depth >= depths[0] - 1 and (depth > 1 or depths[0] == 1)
-        ]
-        if len(alike) > 1 and depths[0] > 1:
-            alike = [joint for joint in alike if self._has_drive([joint])] or alike
+        depths = [len(chain) - len(arm) for chain in ranked]
+        most = depths[0]
+        alike = []
+        for chain, depth in zip(ranked, depths, strict=True):
+            if depth == most or (depth == most - 1 and depth > 1):
+                alike.append(chain)
+        if most > 1:
+            alike = [chain for chain in alike if self._has_drive(arm, chain)] or alike
         if len(alike) == 1:
             return alike[0]
-        base = int(self.model.body_parentid[self.model.jnt_bodyid[alike[0]]])
+        ends = [self.name(chain[-1]) for chain in alike]
+        roots = {self._find_root(chain[0]) for chain in alike}
+        if len(roots) > 1:
+            names = ", ".join(self.model.body(root).name for root in sorted(roots))
+            raise self._source.refuse(
+                f"{len(alike)} robots ({names}) have {most} joints each; name the last joint of "
+                f"one: subject.chain={' or subject.chain='.join(ends)}"
+            )
+        base = int(self.model.body_parentid[self.model.jnt_bodyid[alike[0][len(arm)]]])
         where = self.model.body(base).name
-        ends = [self._name_end(joint) for joint in alike]
-        if depths[0] == 1 and not chain:
-            raise self._refuse(
+        if most == 1 and not arm:
+            raise self._source.refuse(
                 f"{len(alike)} single joints hang on '{where}' side by side ({', '.join(ends)}), such as wheels; "
                 "expected a chain of joints, an arm. Name one: subject.chain=" + ends[0]
             )
         kind = "two arms or legs" if len(alike) == 2 else "legs or fingers"
-        raise self._refuse(
-            f"{len(alike)} chains of {depths[0]} joints leave '{where}' ({', '.join(ends)}): {kind}. A machine is one "
+        raise self._source.refuse(
+            f"{len(alike)} chains of {most} joints leave '{where}' ({', '.join(ends)}): {kind}. A machine is one "
             f"arm on a base that stands still, so a robot that walks cannot be trained here (mjlab and Isaac Lab "
             f"can). One of them as an arm: subject.chain={ends[0]}"
         )
 
-    def _has_drive(self, joints: list[int]) -> bool:
-        """Return whether an actuator moves a joint of these or behind them."""
+    def _has_drive(self, arm: tuple[int, ...], chain: tuple[int, ...]) -> bool:
+        """Return whether an actuator moves a joint of a branch behind an arm."""
         model = self.model
-        moved = set()
-        for actuator in range(model.nu):
-            if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT:
-                moved.add(int(model.actuator_trnid[actuator, 0]))
-        return any(behind in moved for joint in joints for behind in self._list_behind(joint))
-
-    def _name_end(self, joint: int) -> str:
-        """Return the name of the last joint of the longest chain behind one."""
-        while self._children[joint]:
-            joint = max(self._children[joint], key=self._count_depth)
-        return self.name(joint)
+        is_joint = model.actuator_trntype == mujoco.mjtTrn.mjTRN_JOINT
+        moved = set(model.actuator_trnid[is_joint, 0].tolist())
+        branch = chain[: len(arm) + 1]
+        behind = {
+            joint
+            for one in self._chains
+            if one[: len(branch)] == branch
+            for joint in one[len(arm) :]
+        }
+        return not moved.isdisjoint(behind)
 
     def _choose_named(self, names: Sequence[str]) -> list[int]:
         """Return the joints of a chain that is named by its end, its ends, or its joints."""
@@ -356,13 +332,13 @@ class KinematicTree:
             if name in by_name:
                 joint = by_name[name]
                 if joint in self._passive:
-                    raise self._refuse(f"subject.chain: {name} {self._passive[joint]}")
+                    raise self._source.refuse(f"subject.chain: {name} {self._passive[joint]}")
                 found.append((joint, int(model.jnt_bodyid[joint])))
                 continue
             bodies = [i for i in range(1, model.nbody) if model.body(i).name == name]
             if not bodies:
                 listed = [*by_name, *(model.body(i).name for i in range(1, model.nbody))]
-                raise self._refuse(
+                raise self._source.refuse(
                     f"subject.chain: there is no joint or link '{name}'; {list_choices(name, listed)}"
                 )
             found.append((None, bodies[0]))
@@ -373,7 +349,7 @@ class KinematicTree:
         chosen = [one for one, _ in found]
         if len(found) > 1 and None not in chosen:
             if beside := [self.name(one) for one in chosen if one is not None and one not in path]:
-                raise self._refuse(
+                raise self._source.refuse(
                     f"subject.chain: {', '.join(beside)} do not lie on the way to {names[-1]}"
                 )
             return [one for one in path if one in chosen]
@@ -381,8 +357,5 @@ class KinematicTree:
             before = self.list_above(found[0][1])
             path = [one for one in path if one not in before]
         if not path:
-            raise self._refuse(f"subject.chain={','.join(names)}: no joint moves it")
+            raise self._source.refuse(f"subject.chain={','.join(names)}: no joint moves it")
         return path
-
-    def _refuse(self, text: str) -> ConfigError:
-        return ConfigError(f"subject.model={self._source.path}: {text}")

@@ -15,7 +15,7 @@ import yaml
 from brokk_rl.machine import Machine
 from brokk_rl.sim.arm_model import TIP, ArmModel, ModelChoices, normalise_axis
 from brokk_rl.sim.drive import FASTEST_MODE, compute_inertia, find_fastest_mode
-from brokk_rl.sim.model_source import KINDS, JointLimits
+from brokk_rl.sim.model_source import KINDS, UNITS, JointLimits
 
 HYDRAULIC_NAMES = re.compile("boom|stick|bucket|dipper|cylinder", re.IGNORECASE)
 """Names of joints and links of machines that are moved by cylinders."""
@@ -27,14 +27,6 @@ GUESSED_TRAVEL = {"hinge": (-math.pi, math.pi), "slide": (-1.0, 1.0)}
 """Ends of travel where the file has none, rad and m: one turn, and the length of an arm."""
 CLEARANCE_M = 0.02
 """Height of all that touches above the ground at home."""
-UNITS = {"hinge": "rad", "slide": "m"}
-
-
-CLASSES = {
-    frozenset({"value", "source", "confidence"}): "Dimension",
-    frozenset({"axis", "origin_m", "mass_kg", "com_m", "yield_force", "stiffness"}): "Body",
-}
-"""Class of a table of a machine's file by its keys; the others are the machine and its joints."""
 
 
 @dataclass(frozen=True)
@@ -96,9 +88,8 @@ class ImportedMachine:
 
     def format_yaml(self) -> str:
         """Return the text of the machine's file."""
-        text = yaml.safe_dump(
-            _add_targets(self.values), sort_keys=False, width=160, default_flow_style=None
-        )
+        values = {"_target_": "brokk_rl.machine.Machine"} | self.values
+        text = yaml.safe_dump(values, sort_keys=False, width=160, default_flow_style=None)
         return f"# {self.values['title']}.\n{text}"
 
 
@@ -315,14 +306,3 @@ class _MachineDescription:
 
 def _make_dimension(value: float, source: str, confidence: str) -> dict[str, Any]:
     return {"value": float(f"{float(value):.6g}"), "source": source, "confidence": confidence}
-
-
-def _add_targets(values: Any) -> Any:
-    """Return a machine's plain data with the class of each table, as its YAML has them."""
-    if isinstance(values, list):
-        return [_add_targets(value) for value in values]
-    if not isinstance(values, dict):
-        return values
-    name = CLASSES.get(frozenset(values), "Machine" if "joints" in values else "Joint")
-    target = {"_target_": f"brokk_rl.machine.{name}"}
-    return target | {key: _add_targets(value) for key, value in values.items()}

@@ -1,31 +1,64 @@
-"""A model file with what MuJoCo does not read of it; reading of an MJCF."""
+"""A URDF or MJCF as people have them: what MuJoCo would misread is mended with a remark, or refused.
+
+MuJoCo reads both kinds of file into the same spec. Inertias, ranges and meshes are mended there. Of a
+URDF the numbers are cleaned before, and the speed limits read, which MuJoCo does not know.
+"""
 
 from __future__ import annotations
 
+import io
 import math
+import os
+import re
 import warnings
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import mujoco
 import numpy as np
+import trimesh
+
+from brokk_rl.errors import ConfigError, list_choices
 
 KINDS: dict[int, Literal["hinge", "slide"]] = {
     int(mujoco.mjtJoint.mjJNT_HINGE): "hinge",
     int(mujoco.mjtJoint.mjJNT_SLIDE): "slide",
 }
 """Joints of which a machine is made."""
-DOUBTED = {
-    "hinge": (4.0 * math.pi + 0.1, "rad", "degrees", math.pi / 180.0),
-    "slide": (30.0, "m", "mm", 1e-3),
+NUM_SIZES = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 3,
+    int(mujoco.mjtGeom.mjGEOM_CYLINDER): 2,
+    int(mujoco.mjtGeom.mjGEOM_BOX): 3,
 }
-"""Limit beyond which the unit is doubted, the unit, the one that is likely, and its factor: joints of
-arms end at two turns, and axes of portals at some 20 m."""
+"""Number of sizes of each primitive."""
+UNITS = {"hinge": "rad", "slide": "m"}
+DOUBTED = {"hinge": (4.0 * math.pi + 0.1, "degrees", math.pi / 180.0), "slide": (30.0, "mm", 1e-3)}
+"""Limit beyond which the unit is doubted, the one that is likely, and its factor: joints of arms end
+at two turns, and axes of portals at some 20 m."""
 NARROW_RAD = 0.12
 """Travel of a hinge below which radians may have been read as degrees: π becomes 0.055."""
+FASTEST = {"hinge": 30.0, "slide": 10.0}
+"""Speed beyond which a limit is a placeholder, rad/s and m/s: no joint of an arm is as fast."""
 SMALLEST_KG, SMALLEST_KG_M2 = 1e-6, 1e-9
 """Mass and inertia of frames, which MuJoCo wants to be positive."""
+DENSITY_KG_M3 = 2700.0
+"""Density of aluminium, for the inertia of a link that has none."""
+LARGEST_M = 5.0
+"""Radius of gyration of a link beyond which its inertia has another unit; a crane's boom has 3 m."""
+MOST_FACES = 200_000
+"""Faces that MuJoCo reads of an STL."""
+INERTIA = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
+LIMITS = frozenset({"lower", "upper", "velocity", "effort"})
+"""Attributes of a URDF that may be empty."""
+NUMBERS = {*INERTIA, *LIMITS, "xyz", "rpy", "value", "radius", "length", "size", "scale"}
+NUMBERS |= {"multiplier", "offset"}
+"""Attributes of a URDF that hold numbers."""
+MESH_PREFIX = re.compile(r"^(package|model|file)://")
 
 
 @dataclass
@@ -52,13 +85,13 @@ class ModelSource:
     Attributes:
         path: The file.
         model: The compiled model; fixed frames keep their names.
-        limits: Of each hinge and slide, by name.
+        limits: Of each joint, by name.
         followers: Joint that a joint follows (`<mimic>`, or `<equality>` of joints), by name.
         notes: Names of joints and links by what was mended at them.
     """
 
     path: Path
-    model: mujoco.MjModel
+    model: Any = None
     limits: dict[str, JointLimits] = field(default_factory=dict)
     followers: dict[str, str] = field(default_factory=dict)
     notes: dict[str, list[str]] = field(default_factory=dict)
@@ -72,21 +105,365 @@ class ModelSource:
         """Note that something was mended at a joint, link or file."""
         self.notes.setdefault(text, []).append(name)
 
+    def refuse(self, text: str) -> ConfigError:
+        """Return an error about the file."""
+        return ConfigError(f"subject.model={self.path}: {text}")
 
-def set_travel(
-    found: JointLimits, travel: tuple[float, float], kind: str, name: str, source: ModelSource
-) -> None:
-    """Write the ends of a joint's travel: in order, in rad, and only where there are some."""
-    lower, upper = travel
-    if lower > upper:
-        source.note(name, f"the lower limit {lower:g} lies above the upper {upper:g}; swapped.")
-        lower, upper = upper, lower
-    if lower == upper or not np.isfinite(travel).all():
-        source.note(name, f"limits of {travel[0]:g} and {travel[1]:g} are none.")
+
+def read_source(path: Path, packages: Sequence[str] = ()) -> ModelSource:
+    """Return a URDF or MJCF.
+
+    Args:
+        path: The file.
+        packages: Folders in which `package://` and missing meshes are searched first.
+
+    Raises:
+        ConfigError: The file is missing, is neither, or holds something that cannot be mended.
+    """
+    source = ModelSource(path)
+    if not path.is_file():
+        raise source.refuse(f"there is no such file (seen from {Path.cwd()})")
+    root = _parse_xml(source)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what MuJoCo will no longer read in a later version
+            if root.tag == "robot":
+                _clean_urdf(root, source)
+                spec = mujoco.MjSpec.from_string(ElementTree.tostring(root, encoding="unicode"))
+                _mend_links(spec)
+            else:
+                spec = mujoco.MjSpec.from_file(str(path))
+            _embed_meshes(spec, source, packages)
+            _mend_inertias(spec, source)
+            _mend_ranges(spec, source)
+            source.model = spec.compile()
+    except ValueError as error:
+        raise source.refuse(f"MuJoCo cannot read it as URDF or MJCF: {error}") from error
+    _read_limits(source)
+    return source
+
+
+def _parse_xml(source: ModelSource) -> ElementTree.Element:
+    try:
+        root = ElementTree.parse(source.path).getroot()
+    except (ElementTree.ParseError, UnicodeDecodeError) as error:
+        is_xacro = "xacro" in source.path.name or "prefix" in str(error)
+        hint = "; run xacro first" if is_xacro else ""
+        raise source.refuse(
+            f"it is no XML, cannot read it as URDF or MJCF ({error}){hint}"
+        ) from error
+    if root.tag not in ("robot", "mujoco"):
+        raise source.refuse(
+            f"expected a URDF (<robot>) or an MJCF (<mujoco>), got <{root.tag}>; export it as one of these"
+        )
+    return root
+
+
+# the text of a URDF
+
+
+def _clean_urdf(root: ElementTree.Element, source: ModelSource) -> None:
+    """Make a URDF readable for MuJoCo, and read the speed limits; refuse what has no meaning."""
+    for part in (*root.findall("link"), *root.findall("joint")):
+        where = f"{part.tag} '{part.get('name')}'"
+        for element in part.iter():
+            for key, text in [("", f"<{element.tag}>"), *element.attrib.items()]:
+                if "${" in text or "$(" in text or text.startswith("<xacro"):
+                    raise source.refuse(
+                        f'{where} has {key}="{text}": this is xacro, not yet a URDF; run '
+                        f"`xacro {source.path.name} > robot.urdf` and give robot.urdf"
+                    )
+                if key in NUMBERS and (key != "value" or element.tag == "mass"):
+                    _clean_number(element, key, where, source)
+    _check_names(root, source)
+    for link in root.findall("link"):
+        _complete_inertial(link)
+    for joint in root.findall("joint"):
+        _clean_joint(joint, source)
+    own = root.find("mujoco")
+    if own is None:
+        own = ElementTree.SubElement(root, "mujoco")
+    for compiler in own.findall("compiler"):
+        own.remove(compiler)
+    ElementTree.SubElement(own, "compiler", discardvisual="false", strippath="false")
+
+
+def _clean_number(element: ElementTree.Element, key: str, where: str, source: ModelSource) -> None:
+    text = element.attrib[key].strip()
+    if not text and key in LIMITS:
+        source.note(where, f'{key}="" is empty and counts as not given.')
+        del element.attrib[key]
         return
-    bound, unit, wrong, factor = DOUBTED[kind]
-    if max(-lower, upper) > bound:
-        found.is_doubted = True
+    if re.fullmatch(r"[-+]?\d+,\d+", text):
+        element.attrib[key] = text.replace(",", ".")
+        source.note(
+            where, f'{key}="{text}" has a decimal comma and is read as {element.attrib[key]}.'
+        )
+    said = f'{where}: {key}="{text}" of <{element.tag}>'
+    try:
+        values = [float(word) for word in element.attrib[key].split()]
+    except ValueError:
+        values = []
+    if not values:
+        raise source.refuse(
+            f"{said} is no number; expected numbers with a point, separated by spaces"
+        )
+    if not np.isfinite(values).all() and key not in LIMITS:
+        raise source.refuse(f"{said} is not finite; change it")
+    if key == "rpy" and max(map(abs, values)) > 2.0 * math.pi:
+        source.note(where, f'rpy="{text}" is doubted: expected rad; degrees?')
+
+
+def _check_names(root: ElementTree.Element, source: ModelSource) -> None:
+    """Raise an error where a name repeats, or a joint hangs on a link that there is not."""
+    links = [link.get("name", "") for link in root.findall("link")]
+    joints = root.findall("joint")
+    for names in (links, [joint.get("name", "") for joint in joints]):
+        for name in names:
+            if names.count(name) > 1:
+                raise source.refuse(f"the name '{name}' repeats; rename one")
+    for joint in joints:
+        for end in ("parent", "child"):
+            element = joint.find(end)
+            name = "" if element is None else element.get("link", "")
+            if name not in links:
+                raise source.refuse(
+                    f"joint '{joint.get('name')}': there is no {end} link '{name}'; "
+                    f"{list_choices(name, links)}"
+                )
+
+
+def _complete_inertial(link: ElementTree.Element) -> None:
+    """Give the inertia of a link all of its entries; one without a mass goes."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return
+    if inertial.find("mass") is None:
+        link.remove(inertial)
+        return
+    inertia = inertial.find("inertia")
+    if inertia is None:
+        inertia = ElementTree.SubElement(inertial, "inertia")
+    for key in INERTIA:
+        inertia.attrib.setdefault(key, "0")
+
+
+def _clean_joint(joint: ElementTree.Element, source: ModelSource) -> None:
+    """Leave the limits of a joint that are some; keep its speed limit."""
+    name, limit = joint.get("name", ""), joint.find("limit")
+    if (kind := joint.get("type")) in ("floating", "planar"):
+        joint.set("type", "fixed")
+        source.note(name, f"{kind}, and counts as fixed: the base of a machine stands still.")
+    if limit is None:
+        return
+    for key in ("velocity", "effort"):
+        value = float(limit.get(key, "0"))
+        if not (value > 0.0 and math.isfinite(value)):
+            if value != 0.0:
+                source.note(name, f'{key}="{value:g}" is no limit and counts as not given.')
+            limit.attrib.pop(key, None)
+    lower, upper = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+    if lower == upper or not math.isfinite(upper - lower):
+        if {"lower", "upper"} & limit.attrib.keys():
+            source.note(name, f"limits of {lower:g} and {upper:g} are none.")
+        limit.attrib.pop("lower", None)
+        limit.attrib.pop("upper", None)
+    if "velocity" in limit.attrib:
+        source.limits[name] = JointLimits(speed=float(limit.attrib["velocity"]))
+
+
+# the spec of both kinds
+
+
+def _mend_links(spec: mujoco.MjSpec) -> None:
+    """Take away what MuJoCo guesses of the shapes of a URDF: masses, and shapes without a size."""
+    for body in spec.bodies[1:]:
+        body.explicitinertial = True
+    for mesh in spec.meshes:  # open surfaces have no volume
+        mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
+    for geom in list(spec.geoms):
+        sizes = geom.size[: NUM_SIZES.get(int(geom.type), 0)]
+        if min(sizes, default=1.0) <= 0.0:
+            spec.delete(geom)
+
+
+def _embed_meshes(spec: mujoco.MjSpec, source: ModelSource, packages: Sequence[str]) -> None:
+    """Give each mesh its file as an asset; delete those that cannot be read, and all textures."""
+    here = source.path.resolve().parent
+    folders = [Path(), *(Path(folder).expanduser() for folder in packages)]
+    folders += [here / spec.meshdir, here, *here.parents[:3]]
+    searched = os.environ.get("ROS_PACKAGE_PATH", "")
+    folders += [Path(folder) for folder in searched.split(os.pathsep) if folder]
+    assets, missing = {}, []
+    for number, mesh in enumerate(list(spec.meshes)):
+        if not mesh.file:
+            continue
+        file = _find_mesh(mesh.file, folders)
+        if file and file.suffix == ".msh":  # MuJoCo's own format
+            mesh.file = str(file.resolve())
+            continue
+        data = _load_mesh(file) if file else None
+        if data is None:
+            missing.append(mesh.file)
+            for geom in [one for one in spec.geoms if one.meshname == mesh.name]:
+                spec.delete(geom)
+            spec.delete(mesh)
+            continue
+        mesh.file = f"{number}_{file.stem}.stl"
+        assets[mesh.file] = data
+    spec.meshdir, spec.assets = "", assets
+    if missing:
+        source.note(
+            f"{len(missing)} meshes (first: {missing[0]})",
+            "not found or not read, and left out. subject.packages=[<folder>] says where to look.",
+        )
+    for material in spec.materials:
+        material.textures = [""] * len(material.textures)
+    for picture in (*spec.textures, *spec.skins):
+        spec.delete(picture)
+
+
+def _find_mesh(name: str, folders: Sequence[Path]) -> Path | None:
+    """Return a mesh of a name such as `package://arm/meshes/base.stl`."""
+    bare = Path(MESH_PREFIX.sub("", name))
+    names = [bare]
+    if MESH_PREFIX.match(name) and len(bare.parts) > 1:
+        # beside a file that stands in the package itself, without its name
+        names.append(Path(*bare.parts[1:]))
+    for folder in folders:
+        for choice in names:
+            if (folder / choice).is_file():
+                return folder / choice
+    return None
+
+
+def _load_mesh(file: Path) -> bytes | None:
+    """Return a mesh file as a binary STL; `None` where it cannot be read or is too large."""
+    try:
+        mesh = trimesh.load(file, force="mesh", process=False)
+    except Exception:  # each format of trimesh has errors of its own
+        return None
+    if not isinstance(mesh, trimesh.Trimesh) or not 4 <= len(mesh.faces) <= MOST_FACES:
+        return None
+    if np.ptp(mesh.vertices, axis=0).min() <= 0.0:  # flat: MuJoCo wants a volume
+        return None
+    stream = io.BytesIO()
+    mesh.export(stream, file_type="stl")
+    return stream.getvalue()
+
+
+def _mend_inertias(spec: mujoco.MjSpec, source: ModelSource) -> None:
+    """Give each body an inertia that a body can have, or raise an error that names it."""
+    spec.compiler.fusestatic = False
+    spec.compiler.discardvisual = False
+    spec.compiler.boundmass = SMALLEST_KG
+    spec.compiler.boundinertia = SMALLEST_KG_M2
+    for body in spec.bodies[1:]:
+        if not body.explicitinertial:
+            continue
+        where, mass_kg = f"link '{body.name}'", float(body.mass)
+        if mass_kg < 0.0:
+            raise source.refuse(f"{where} has a mass of {mass_kg:g} kg; write one above 0")
+        if mass_kg < SMALLEST_KG:  # a frame
+            _set_inertia(body, np.zeros(3), np.eye(3))
+            continue
+        principal, axes = np.linalg.eigh(_read_tensor(body))
+        if not principal.any():
+            radius_m = (3.0 * mass_kg / (4.0 * math.pi * DENSITY_KG_M3)) ** (1 / 3)
+            principal = np.full(3, 0.4 * mass_kg * radius_m**2)
+            source.note(
+                where,
+                "no inertia; that of an aluminium ball of its mass is taken. Write <inertia>.",
+            )
+        if principal[0] <= 0.0:
+            raise source.refuse(
+                f"{where} has a principal inertia of {principal[0]:.3g} kg m²; expected values above 0, "
+                "check ixx to izz and their signs"
+            )
+        if principal[2] > (1.0 + 1e-6) * (principal[0] + principal[1]):
+            source.note(
+                where,
+                f"an inertia that no body has ({principal[2]:.3g} exceeds {principal[0]:.3g} + "
+                f"{principal[1]:.3g} kg m²); the largest is cut to their sum. Check its <inertia>.",
+            )
+            principal[2] = 0.999 * (principal[0] + principal[1])
+        if math.sqrt(principal[2] / mass_kg) > LARGEST_M:
+            source.note(where, f"{principal[2]:.3g} kg m² at {mass_kg:g} kg are doubted: units?")
+        _set_inertia(body, principal, axes)
+
+
+def _read_tensor(body: mujoco.MjsBody) -> np.ndarray:
+    """Return the inertia of a body in its inertial frame, `(3, 3)`."""
+    if math.isnan(body.fullinertia[0]):
+        return np.diag(body.inertia)
+    xx, yy, zz, xy, xz, yz = body.fullinertia
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _set_inertia(body: mujoco.MjsBody, principal: np.ndarray, axes: np.ndarray) -> None:
+    """Give a body principal inertias about axes, the columns, in its inertial frame."""
+    axes = axes * np.array([1.0, 1.0, np.linalg.det(axes)])  # right-handed
+    turn, whole = np.zeros(4), np.zeros(4)
+    mujoco.mju_mat2Quat(turn, axes.ravel())
+    mujoco.mju_mulQuat(whole, body.iquat, turn)
+    body.iquat, body.inertia = whole, principal
+    body.fullinertia[0] = math.nan
+
+
+def _mend_ranges(spec: mujoco.MjSpec, source: ModelSource) -> None:
+    for joint in spec.joints:
+        lower, upper = joint.range
+        if lower > upper:
+            source.note(
+                joint.name, f"the lower limit {lower:g} lies above the upper {upper:g}; swapped."
+            )
+            joint.range = joint.range[::-1]
+            joint.limited = mujoco.mjtLimited.mjLIMITED_TRUE
+
+
+# what the compiled model says
+
+
+def _read_limits(source: ModelSource) -> None:
+    """Read ends of travel, efforts and followers of the joints."""
+    model = source.model
+    for joint in range(model.njnt):
+        name, kind = model.joint(joint).name, KINDS.get(int(model.jnt_type[joint]))
+        found = source.limits.setdefault(name, JointLimits())
+        if kind is None:
+            continue
+        if model.jnt_limited[joint]:
+            _read_travel(found, *map(float, model.jnt_range[joint]), kind, name, source)
+        if model.jnt_actfrclimited[joint]:
+            found.effort = float(model.jnt_actfrcrange[joint, 1])
+        if found.speed and found.is_doubted:
+            found.speed *= DOUBTED[kind][2]
+        elif found.speed and found.speed > FASTEST[kind]:
+            source.note(
+                name,
+                f"the speed limit of {found.speed:g} {UNITS[kind]}/s is doubted and counts as not given.",
+            )
+            found.speed = None
+    for actuator in range(model.nu):
+        if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
+            continue
+        found = source.limits[model.joint(int(model.actuator_trnid[actuator, 0])).name]
+        if model.actuator_forcelimited[actuator] and not found.effort:
+            found.effort = float(model.actuator_forcerange[actuator, 1])
+    for number in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+        follower, leader = int(model.eq_obj1id[number]), int(model.eq_obj2id[number])
+        name = model.joint(leader).name if leader >= 0 else "a constant"
+        source.followers[model.joint(follower).name] = name
+
+
+def _read_travel(
+    found: JointLimits, lower: float, upper: float, kind: str, name: str, source: ModelSource
+) -> None:
+    """Write the ends of a joint's travel in rad or m, whatever unit they seem to have."""
+    bound, wrong, factor = DOUBTED[kind]
+    found.is_doubted = max(-lower, upper) > bound
+    if found.is_doubted:
+        unit = UNITS[kind]
         source.note(
             name,
             f"limits of {lower:g} to {upper:g} {unit} are doubted and read as {wrong}: "
@@ -96,107 +473,3 @@ def set_travel(
     elif kind == "hinge" and upper - lower < NARROW_RAD:
         source.note(name, f"limits of {lower:.3g} to {upper:.3g} rad are narrow: degrees or rad?")
     found.travel = (lower, upper)
-
-
-def balance_inertia(principal: np.ndarray) -> np.ndarray:
-    """Return principal inertias, smallest first, that a body can have: the largest is cut."""
-    return np.array([*principal[:2], 0.999 * principal[:2].sum()])
-
-
-def describe_balance(principal: np.ndarray, keys: str) -> str:
-    """Return a remark about principal inertias that no body has; `keys` are those to check."""
-    return (
-        f"an inertia that no body has ({principal[2]:.3g} exceeds {principal[0]:.3g} + "
-        f"{principal[1]:.3g} kg m²); the largest is cut to their sum. Check {keys}."
-    )
-
-
-def read_mjcf(path: Path) -> ModelSource:
-    """Return an MJCF: a machine, or a scene with machines and objects."""
-    source = ModelSource(path, model=Any)  # pyright: ignore[reportArgumentType]
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what MuJoCo will no longer read in a later version
-        spec = mujoco.MjSpec.from_file(str(path))
-        source.model = model = _compile_mended(spec, source)
-    _read_mjcf_limits(source)
-    for number in range(model.neq):
-        pair = model.eq_obj1id[number], model.eq_obj2id[number]
-        if model.eq_type[number] == mujoco.mjtEq.mjEQ_JOINT:
-            leader = model.joint(int(pair[1])).name if pair[1] >= 0 else "a constant"
-            source.followers[model.joint(int(pair[0])).name] = leader
-    return source
-
-
-def _compile_mended(spec: mujoco.MjSpec, source: ModelSource) -> mujoco.MjModel:
-    """Return the compiled model, with what MuJoCo would end at mended."""
-    spec.compiler.fusestatic = False
-    spec.compiler.discardvisual = False
-    spec.compiler.boundmass = SMALLEST_KG
-    spec.compiler.boundinertia = SMALLEST_KG_M2
-    _remove_missing_files(spec, source)
-    _balance_inertias(spec, source)
-    for joint in spec.joints:
-        if joint.range[0] > joint.range[1]:
-            lower, upper = joint.range
-            source.note(
-                joint.name, f"the lower limit {lower:g} lies above the upper {upper:g}; swapped."
-            )
-            joint.range = joint.range[::-1]
-    return spec.compile()
-
-
-def _read_mjcf_limits(source: ModelSource) -> None:
-    """Read limits and efforts of the joints of an MJCF."""
-    model = source.model
-    for joint in range(model.njnt):
-        name, kind = model.joint(joint).name, int(model.jnt_type[joint])
-        found = source.limits[name] = JointLimits()
-        shape = KINDS.get(kind)
-        if model.jnt_limited[joint] and shape:
-            lower, upper = model.jnt_range[joint]
-            set_travel(found, (float(lower), float(upper)), shape, name, source)
-        if model.jnt_actfrclimited[joint]:
-            found.effort = float(model.jnt_actfrcrange[joint, 1])
-    for actuator in range(model.nu):
-        if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-            continue
-        found = source.limits[model.joint(int(model.actuator_trnid[actuator, 0])).name]
-        if model.actuator_forcelimited[actuator] and not found.effort:
-            found.effort = float(model.actuator_forcerange[actuator, 1])
-
-
-def _remove_missing_files(spec: mujoco.MjSpec, source: ModelSource) -> None:
-    """Delete meshes and textures whose files are missing, and the geoms that are drawn of them."""
-    path, missing = source.path, []
-    for mesh in list(spec.meshes):
-        if mesh.file and not (path.parent / spec.meshdir / mesh.file).is_file():
-            missing.append(mesh.file)
-            for geom in [one for one in spec.geoms if one.meshname == mesh.name]:
-                spec.delete(geom)
-            spec.delete(mesh)
-    if missing:
-        source.note(
-            f"{len(missing)} meshes (first: {missing[0]})",
-            "not found and left out. Put them beside the file.",
-        )
-    for skin in list(spec.skins):
-        spec.delete(skin)
-    gone = set()
-    for texture in list(spec.textures):
-        if texture.file and not (path.parent / spec.texturedir / texture.file).is_file():
-            gone.add(texture.name)
-            spec.delete(texture)
-    for material in spec.materials:
-        material.textures = ["" if name in gone else name for name in material.textures]
-
-
-def _balance_inertias(spec: mujoco.MjSpec, source: ModelSource) -> None:
-    """Balance inertias that no body has."""
-    for body in spec.bodies:
-        order = np.argsort(body.inertia)
-        principal = np.array(body.inertia)[order]
-        if body.explicitinertial and principal[2] > (1.0 + 1e-6) * (principal[0] + principal[1]):
-            source.note(f"body '{body.name}'", describe_balance(principal, "diaginertia"))
-            balanced = np.zeros(3)
-            balanced[order] = balance_inertia(principal)
-            body.inertia = balanced
