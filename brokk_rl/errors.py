@@ -36,6 +36,10 @@ class SimulationError(BrokkError):
     """The simulation lost too many worlds to divergence or overflow."""
 
 
+class TrainingError(BrokkError):
+    """A loss, a gradient or a weight of a training is not finite; its checkpoints are whole."""
+
+
 class DistributedError(BrokkError):
     """Processes of one training lost contact, or their policies differ."""
 

@@ -13,7 +13,6 @@ from composed import option
 from kinematic import Kinematic
 
 from brokk_rl.machine import Machine
-from brokk_rl.rl.logger import NoTracking, TrainingLogger
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
@@ -62,33 +61,24 @@ def make(
     training: TrainingConfig,
     loop: ControlLoop | None = None,
     device: torch.device = CPU,
-) -> tuple[TrainingRunner, TrainingLogger]:
+) -> TrainingRunner:
     """Returns a runner on a control loop of its own; every run of a test starts from the same seed."""
     folder.mkdir(exist_ok=True)
     torch.manual_seed(0)
     loop = loop or plant(machine).build(device, training.num_envs, training.num_starts, 0)
-    book = TrainingLogger(
-        folder,
-        NoTracking().open(folder, {}),
-        loop.statistics,
-        STEPS * loop.num_envs,
-        training.max_fault_rate,
-        training.budget.share_spent,
-    )
-    return TrainingRunner(loop, training, folder, device, book), book
+    return TrainingRunner(loop, training, folder)
 
 
 def train(
     machine: Machine, folder: Path, training: TrainingConfig, resume: Path | None = None
 ) -> TrainingRunner:
     """Trains until the budget is spent, from the beginning or from a checkpoint."""
-    runner, book = make(machine, folder, training)
-    with book:
-        if resume:
-            # Whatever happened in this process before, the checkpoint knows better.
-            torch.manual_seed(999)
-            runner.load(str(resume))
-        runner.run()
+    runner = make(machine, folder, training)
+    if resume:
+        # Whatever happened in this process before, the checkpoint knows better.
+        torch.manual_seed(999)
+        runner.load(str(resume))
+    runner.run()
     return runner
 
 

@@ -22,8 +22,7 @@ import torch
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "h200"))
 from train_jobs import build, compose  # pyright: ignore[reportMissingImports]
 
-from brokk_rl.rl.logger import NoTracking, TrainingLogger
-from brokk_rl.rl.runner import TrainingGroup, TrainingRunner, allow_tensor_cores
+from brokk_rl.rl.runner import TrainingRunner, allow_tensor_cores
 
 VARIANTS = {
     "eager": (False, True, False),
@@ -59,11 +58,7 @@ def main() -> None:
         runner_config = copy.deepcopy(spec.rl.runner)
         runner_config["algorithm"]["use_mixed_precision"] = mixed
         training = replace(spec.rl, runner=runner_config, fuse=fuse, tf32=tf32)
-        logger = TrainingLogger(
-            folder, NoTracking().open(folder, {}), loop.statistics, num_envs * NUM_STEPS, 1.0,
-            lambda *_: 0.0, quiet=True,
-        )  # fmt: skip
-        runner = TrainingRunner(loop, training, folder, device, logger, TrainingGroup(device))
+        runner = TrainingRunner(loop, training, folder)
         learner = cast(Any, runner.alg)
         rows, first_s = [], 0.0
         with allow_tensor_cores(tf32):

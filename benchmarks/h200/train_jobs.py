@@ -38,10 +38,11 @@ from brokk_rl.extensions import load_mode
 from brokk_rl.modes.train import Train
 from brokk_rl.policy_folder import describe_policy, write_policy
 from brokk_rl.rl.evaluation import evaluate_policy
-from brokk_rl.rl.logger import PROGRESS, NoTracking, TrainingLogger
+from brokk_rl.rl.group import TrainingGroup
+from brokk_rl.rl.logger import PROGRESS
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, NetworkPolicy
-from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
+from brokk_rl.rl.runner import TrainingRunner
 
 log = logging.getLogger("train_jobs")
 COLUMNS = {
@@ -151,19 +152,11 @@ def train(spec: Train, folder: Path, options: argparse.Namespace) -> tuple[Any, 
     (options.folder / "taken" / "first_loop").touch()
     spec.session.seed_all()
     group = TrainingGroup(device)
-    num_steps = loop.num_envs * int(spec.rl.runner["num_steps_per_env"])
-    logger = TrainingLogger(
-        folder,
-        NoTracking().open(folder, {}),
-        lambda: group.pool_statistics(loop.statistics()),
-        num_steps,
-        spec.rl.max_fault_rate,
-        spec.rl.budget.share_spent,
-    )
-    with group, logger:
+    with group:
         training = replace(spec.rl, save_interval=10**6, keep_checkpoints=1)
-        runner = TrainingRunner(loop, training, folder, device, logger, group)
+        runner = TrainingRunner(loop, training, folder, group)
         runner.run()
+    logger = runner.logger
     actor = runner.alg.get_policy()
     facts = {
         "env_steps": logger.env_steps,

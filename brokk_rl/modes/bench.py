@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from statistics import median
 from typing import Any, ClassVar
 
@@ -16,9 +17,9 @@ from brokk_rl.contracts.task import Task
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.machine import Machine
 from brokk_rl.rl.execution import capture_graph
-from brokk_rl.rl.logger import NoTracking, TrainingLogger
+from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
-from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
+from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import BenchmarkSizes, TrainingConfig
 from brokk_rl.session import Session, read_versions, write_json
 from brokk_rl.spec import spec
@@ -127,15 +128,8 @@ class Benchmark:
     ) -> float:
         """Return the seconds of a control step of all environments in training."""
         num_steps = int(self.rl.runner["num_steps_per_env"])
-        logger = TrainingLogger(
-            self.session.folder,
-            NoTracking().open(self.session.folder, {}),
-            loop.statistics,
-            loop.num_envs * num_steps,
-            1.0,
-            lambda *_: 0.0,
-        )
-        runner = TrainingRunner(loop, self.rl, self.session.folder, device, logger, group)
+        training = replace(self.rl, max_fault_rate=1.0)
+        runner = TrainingRunner(loop, training, self.session.folder, group)
         runner.learn(1)
         _wait(device)
         group.wait()

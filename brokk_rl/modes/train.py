@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import torch
 
 from brokk_rl import distributed
-from brokk_rl.errors import SimulationError
+from brokk_rl.contracts.task import SUCCESS
 from brokk_rl.modes.evaluate import PlantMode, evaluate_policies
 from brokk_rl.policy_folder import (
     CONTRACT,
@@ -22,16 +22,8 @@ from brokk_rl.policy_folder import (
     write_policy,
 )
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
-from brokk_rl.rl.logger import (
-    LEVELS,
-    PROGRESS,
-    NoTracking,
-    Tracker,
-    Tracking,
-    TrainingLogger,
-    draw_curves,
-    find_passing,
-)
+from brokk_rl.rl.group import TrainingGroup
+from brokk_rl.rl.logger import LEVELS, PROGRESS, Tracking, TrainingLogger, draw_curves, find_passing
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
 from brokk_rl.rl.policy import (
     ClassicalPolicy,
@@ -40,7 +32,7 @@ from brokk_rl.rl.policy import (
     UntrainedPolicy,
     load_initial_weights,
 )
-from brokk_rl.rl.runner import TrainingGroup, TrainingRunner
+from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.spec import name_spec, spec
@@ -49,9 +41,6 @@ log = logging.getLogger(__name__)
 
 FAULTS = "faults"
 """Folder of recorded faults in a run folder."""
-MAX_FAULT_FILES = 8
-"""Faults that one process writes, 100 kB each. Chosen by hand: later ones tell little more."""
-
 TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 """Files of the run folder that a tracker gets at the end."""
 
@@ -107,43 +96,41 @@ class Train(PlantMode):
         loop = config.build(device, self.rl.num_envs, self.rl.num_starts, stream)
         if self.rl.near_starts:
             loop.bring_near(self.rl.near_starts, stream)
-        loop.record_faults(self.rl.count_fault_steps(device.type))
+        folder = self.session.folder
+        loop.record_faults(self.rl.count_fault_steps(device.type), folder / FAULTS)
         loop.capture(self.rl.fuse)
         group = TrainingGroup(device)
+        is_first = group.rank.first
         _log_setup(loop, group)
         self.session.seed_all()  # capturing has drawn random numbers
-
-        tracking = self.tracking if group.rank.first else NoTracking()
-        with contextlib.closing(
-            tracking.open(self.session.folder, self._describe_run())
-        ) as tracker:
-            logger = self._open_logger(loop, group, tracker)
-            with self._explain_interruption(), group, logger:
-                runner = TrainingRunner(loop, self.rl, self.session.folder, device, logger, group)
-                self._begin(runner, logger)
-                if group.rank.first:
-                    write_json(self.session.folder / CONTRACT, self._describe_policy(loop))
+        with contextlib.ExitStack() as stack:
+            with self._explain_interruption(), group:
+                runner = TrainingRunner(loop, self.rl, folder, group)
+                self._begin(runner)
+                if is_first:
+                    write_json(folder / CONTRACT, self._describe_policy(loop))
+                    step = runner.current_learning_iteration
+                    tracker = self.tracking.open(folder, self._describe_run(), step)
+                    runner.logger.writer = stack.enter_context(contextlib.closing(tracker))
                 runner.run()
-            if not group.rank.first:
+            if not is_first:
                 return None
+            logger = runner.logger
             _log_success(logger, group.rank.count * loop.num_envs * loop.task.max_episode_steps)
-            results = self._finish(config, runner, logger)
-            files = [path for name in TRACKED for path in sorted(self.session.folder.glob(name))]
-            tracker.report(flatten_figures(results["policies"], "evaluation"), files)
-        log.info("policy, curves and evaluation are in %s", self.session.folder)
+            results = self._finish(config, runner)
+            files = [path for name in TRACKED for path in sorted(folder.glob(name))]
+            logger.writer.report(flatten_figures(results["policies"], "evaluation"), files)
+        log.info("policy, curves and evaluation are in %s", folder)
         return float(results["success_strict"]["mean"])
 
-    def _begin(self, runner: TrainingRunner, logger: TrainingLogger) -> None:
+    def _begin(self, runner: TrainingRunner) -> None:
         """Load the checkpoint from which training goes on, or the network with which it begins."""
         checkpoint = self._find_checkpoint()
         if checkpoint is not None:
             runner.load(str(checkpoint))
-            log.info(
-                "going on from %s: %d control steps, %.0f s",
-                checkpoint,
-                logger.env_steps,
-                logger.seconds,
-            )
+            book = runner.logger
+            text = "going on from %s: %d control steps, %.0f s"
+            log.info(text, checkpoint, book.env_steps, book.seconds)
             return
         if distributed.read_rank().first:  # a run that was stopped before its first checkpoint
             (self.session.folder / PROGRESS).unlink(missing_ok=True)
@@ -222,37 +209,23 @@ class Train(PlantMode):
         }
         return contract
 
-    def _open_logger(
-        self, loop: ControlLoop, group: TrainingGroup, tracker: Tracker
-    ) -> TrainingLogger:
-        """Return the logger of this process; only the first of several writes."""
-        faults = FaultLog(loop, self.session.folder / FAULTS, f"rank{group.rank.index}_")
-        return TrainingLogger(
-            self.session.folder,
-            tracker,
-            lambda: group.pool_statistics(faults.read_statistics()),
-            loop.num_envs * int(self.rl.runner["num_steps_per_env"]) * group.rank.count,
-            self.rl.max_fault_rate,
-            self.rl.budget.share_spent,
-            quiet=not group.rank.first,
-        )
-
-    def _finish(
-        self, config: ControlLoopConfig, runner: TrainingRunner, logger: TrainingLogger
-    ) -> dict[str, Any]:
+    def _finish(self, config: ControlLoopConfig, runner: TrainingRunner) -> dict[str, Any]:
         """Write policy and curves, evaluate, export; return the content of `evaluation.json`."""
         folder, loop, actor = self.session.folder, runner.env, runner.alg.get_policy()
         contract = self._describe_policy(loop)
-        contract["trained"] |= {"env_steps": logger.env_steps, "seconds": logger.seconds}
+        book = runner.logger
+        contract["trained"] |= {"env_steps": book.env_steps, "seconds": book.seconds}
         write_policy(folder, contract, actor.state_dict())
         answers = runner.record_answers()
-        draw_curves(folder / PROGRESS, folder / "learning_curves.png")
         policies: dict[str, PolicySpec] = {
             "trained": TrainedPolicy(path=str(folder), task=None),
             "classical": ClassicalPolicy(task=None),
             "untrained": UntrainedPolicy(training=self.rl),
         }
         results = evaluate_policies(config, self.evaluation, self.session, policies)
+        controller = results["policies"].get("classical")
+        line = controller and controller[SUCCESS]["mean"]
+        draw_curves(folder / PROGRESS, folder / "learning_curves.png", loop.task.figures, line)
         task = config.task.build(self.machine, 1, torch.device("cpu"))
         if "deployable" in task.offers:
             export_onnx(folder, actor, task, self.machine, contract, answers)
@@ -270,42 +243,6 @@ def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
         elif isinstance(value, (int, float)):
             found[f"{name}/{key}"] = float(value)
     return found
-
-
-class FaultLog:
-    """Writes the last states of the worlds that diverge in a training.
-
-    Args:
-        loop: The control loop.
-        folder: For the files; made where there is a fault.
-        prefix: Beginning of the file names; several processes write into one folder.
-    """
-
-    def __init__(self, loop: ControlLoop, folder: Path, prefix: str) -> None:
-        self._loop, self._folder, self._prefix = loop, folder, prefix
-        self._num_written = len(list(folder.glob(f"{prefix}*.npz")))
-
-    def read_statistics(self) -> dict[str, float]:
-        """Return `ControlLoop.statistics`; write the faults since the last call.
-
-        Raises:
-            SimulationError: A reward was not finite: the next update would spoil the policy.
-        """
-        statistics = self._loop.statistics()
-        if self._loop.recorder is None or not self._loop.num_held:
-            return statistics
-        for fault in self._loop.recorder.fetch(MAX_FAULT_FILES - self._num_written):
-            self._folder.mkdir(exist_ok=True)
-            path = self._folder / f"{self._prefix}{self._num_written}.npz"
-            fault.save(path)
-            self._num_written += 1
-            log.warning("a world diverged: %s; its last states: %s", fault.cause, path)
-            if fault.is_reward:
-                raise SimulationError(
-                    f"{fault.cause}: expected finite rewards; change task.reward. The last states "
-                    f"stand in {path}; the newest checkpoint is from before."
-                )
-        return statistics
 
 
 def _log_success(logger: TrainingLogger, first_episodes: int) -> None:

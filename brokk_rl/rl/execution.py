@@ -1,4 +1,4 @@
-"""Capture of steps in CUDA graphs, and errors of `torch.compile`."""
+"""Capture of steps in CUDA graphs, errors of `torch.compile`, and threads of small tensors."""
 
 from __future__ import annotations
 
@@ -56,3 +56,22 @@ def report_compile_errors() -> Iterator[None]:
             "C++ compiler (g++), or give "
             "rl.fuse=false"
         ) from error
+
+
+@contextlib.contextmanager
+def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
+    """Limit torch to one thread inside of this context; nothing changes where `device` is a GPU.
+
+    The tensors of a control step are too small to be shared by threads. Torch's other threads would
+    wait for the next tensor in a busy loop, on the cores on which the physics runs. On a computer
+    with other work, every step would then wait for the slowest thread.
+    """
+    before = torch.get_num_threads()
+    if torch.device(device).type != "cpu" or before == 1:
+        yield
+        return
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

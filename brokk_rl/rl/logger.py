@@ -8,19 +8,28 @@ from __future__ import annotations
 
 import csv
 import logging
+import math
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
+import pandas as pd
 import yaml
 
-from brokk_rl.errors import ConfigError, SimulationError
-from brokk_rl.plot import draw_grid, make_figure, save_figure
+from brokk_rl.contracts.task import Figure
+from brokk_rl.errors import ConfigError, SimulationError, TrainingError
+from brokk_rl.plot import GREY, draw_grid, make_figure, save_figure
+from brokk_rl.policy_folder import list_checkpoints
 from brokk_rl.progress import SHARE, ItemProgress
+from brokk_rl.rl.group import TrainingGroup
+from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.spec import spec
+
+if TYPE_CHECKING:
+    from brokk_rl.rl.loop import ControlLoop
 
 log = logging.getLogger(__name__)
 
@@ -32,15 +41,10 @@ LEVELS = (0.95, 0.99)
 WINDOW = 4096
 """Newest finished episodes over which success is averaged. Every iteration is asked: with 1,024 a
 training that succeeds in 0.98 of its episodes passed 0.99 by chance (benchmarks/h100/success)."""
-PANELS = (
-    ("Success", ((SUCCESS, "success"), ("episode/success_paper", "paper's criterion")), (0.0, 1.0)),
-    ("Return", (("episode/return", "return per episode"),), None),
-    ("Episode length (control steps)", (("episode/length", "length"),), None),
-    ("Peak contact force (N)", (("episode/peak_force_n", "mean over episodes"),), None),
-    ("Exploration", (("policy/action_std", "standard deviation of the action"),), None),
-    ("Rate (control steps per second)", (("rate/env_steps_per_s", "training"),), None),
-)
-"""Title, (column of `progress.csv`, label) of each curve, and limits of the vertical axis."""
+EPISODE = "episode/"
+"""Begins the columns of `progress.csv` with means over the episodes of an iteration."""
+NUM_COLUMNS = 3
+"""Panels beside one another in the picture of the curves. Chosen by hand."""
 
 
 class Tracker:
@@ -59,8 +63,12 @@ class Tracker:
 class Tracking(Protocol):
     """A spec in `conf/tracking`: opens a tracking run."""
 
-    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Return an open tracking run for the run in `folder`, described by `config`."""
+    def open(self, folder: Path, config: dict[str, Any], step: int) -> Tracker:
+        """Return an open tracking run for the run in `folder`, described by `config`.
+
+        The run goes on at the iteration `step`: what an earlier process stored from there on is
+        replaced.
+        """
         ...
 
 
@@ -68,7 +76,7 @@ class Tracking(Protocol):
 class NoTracking:
     """No tracker: `progress.csv` and the pictures of the run folder only."""
 
-    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
+    def open(self, folder: Path, config: dict[str, Any], step: int) -> Tracker:
         """Return a tracker that does nothing."""
         return Tracker()
 
@@ -77,9 +85,9 @@ class NoTracking:
 class TensorBoardTracking:
     """TensorBoard event files in the run folder."""
 
-    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
+    def open(self, folder: Path, config: dict[str, Any], step: int) -> Tracker:
         """Return a tracker that writes `folder/tensorboard`."""
-        return _TensorBoardTracker(folder, config)
+        return _TensorBoardTracker(folder, config, step)
 
 
 @spec
@@ -100,16 +108,17 @@ class WandbTracking:
     tags: tuple[str, ...]
     mode: Literal["offline", "online", "disabled"]
 
-    def open(self, folder: Path, config: dict[str, Any]) -> Tracker:
-        """Return a tracker with a run of its own, named after the run folder."""
+    def open(self, folder: Path, config: dict[str, Any], step: int) -> Tracker:
+        """Return a tracker with the one run of the run folder, named after it."""
         return _WandbTracker(self, folder, config)
 
 
 class _TensorBoardTracker(Tracker):
-    def __init__(self, folder: Path, config: dict[str, Any]) -> None:
+    def __init__(self, folder: Path, config: dict[str, Any], step: int) -> None:
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer, self._step = SummaryWriter(str(folder / "tensorboard")), 0
+        self._step = step
+        self._writer = SummaryWriter(str(folder / "tensorboard"), purge_step=step)
         for name, value in config.items():
             text = value if isinstance(value, str) else yaml.safe_dump(value, sort_keys=False)
             self._writer.add_text(name, f"```\n{text.strip()}\n```")
@@ -148,6 +157,8 @@ class _WandbTracker(Tracker):
                 group=config.group or _find_sweep(folder),
                 tags=list(config.tags),
                 name=folder.name,
+                id=_find_wandb_run(folder),
+                resume="allow",
                 dir=str(folder),
                 config=run_config,
                 mode=config.mode,
@@ -183,6 +194,12 @@ class _WandbTracker(Tracker):
         self._run.finish()
 
 
+def _find_wandb_run(folder: Path) -> str | None:
+    """Return the id of the run that an earlier process began in a run folder, if any."""
+    runs = sorted((folder / "wandb").glob("*run-*-*"))  # offline-run-<date>_<time>-<id>
+    return runs[-1].name.rpartition("-")[2] if runs else None
+
+
 def _find_sweep(folder: Path) -> str | None:
     """Return the name of the sweep whose job runs in `folder`, `None` for a single run."""
     return folder.parent.name if (folder.parent / "multirun.yaml").is_file() else None
@@ -191,48 +208,42 @@ def _find_sweep(folder: Path) -> str | None:
 class TrainingLogger:
     """Logger of one training run; has the methods that `OnPolicyRunner` of rsl-rl calls.
 
+    Of several processes the first shows and writes for all; the others count.
+
     Args:
         folder: Run folder.
-        tracker: Where figures go beside `progress.csv`; its owner closes it.
-        statistics: Returns the figures of the episodes finished since its last call; see
-            `ControlLoop.statistics`.
-        steps_per_iteration: Control steps of all environments (and ranks) in one iteration.
-        max_fault_rate: Share of control steps that may end in a diverged or overflowing world.
-        measure_share: Returns the spent share of the run's budget, 1 or more at its end, from
-            control steps and seconds.
-        quiet: Count only, show and write nothing: of several processes the first writes for all.
+        loop: The control loop, asked for the figures of finished episodes.
+        training: Configuration.
+        group: The processes that train together.
     """
 
     def __init__(
-        self,
-        folder: Path,
-        tracker: Tracker,
-        statistics: Callable[[], dict[str, float]],
-        steps_per_iteration: int,
-        max_fault_rate: float,
-        measure_share: Callable[[int, float], float],
-        quiet: bool = False,
+        self, folder: Path, loop: ControlLoop, training: TrainingConfig, group: TrainingGroup
     ) -> None:
         self.log_dir = str(folder)
-        self.writer: Tracker | None = tracker
+        self.writer = Tracker()
+        """Where figures go beside `progress.csv`; its owner closes it."""
         self.env_steps, self.seconds = 0, 0.0
-        self.steps_per_iteration = steps_per_iteration
-        self._statistics, self._measure_share = statistics, measure_share
-        self._max_fault_rate = max_fault_rate
-        self._quiet = quiet
-        self._path = folder / PROGRESS
+        num_steps = int(training.runner["num_steps_per_env"])
+        self.steps_per_iteration = loop.num_envs * num_steps * group.rank.count
+        self._loop, self._training, self._group = loop, training, group
+        self._folder, self._path = folder, folder / PROGRESS
         self.rows: list[dict[str, Any]] = []
         """Figures of every iteration, as `progress.csv` holds them."""
         self._num_unwritten = 0
         self._told_first = False
         self._last_episode: dict[str, float] = {}
         self._clock = time.perf_counter()
-        self._progress = ItemProgress("training", SHARE, quiet)
+        self._progress = ItemProgress("training", SHARE, self._quiet)
+
+    @property
+    def _quiet(self) -> bool:
+        return not self._group.rank.first
 
     @property
     def share_done(self) -> float:
         """Spent share of the run's budget, 1 or more at its end."""
-        return self._measure_share(self.env_steps, self.seconds)
+        return self._training.budget.share_spent(self.env_steps, self.seconds)
 
     def __enter__(self) -> TrainingLogger:
         self._progress.__enter__()
@@ -269,20 +280,14 @@ class TrainingLogger:
 
         Raises:
             SimulationError: More worlds diverged or overflowed than `max_fault_rate` allows.
+            TrainingError: A loss, a gradient or a weight is not finite.
         """
         now = time.perf_counter()
         self.seconds += now - self._clock
         self._clock = now
         self.env_steps += self.steps_per_iteration
-        statistics = self._statistics()
-        if statistics["fault_rate"] > self._max_fault_rate:
-            raise SimulationError(
-                f"{statistics['fault_rate']:.2%} of the control steps of iteration {it} ended in a "
-                "world that diverged, became NaN or overflowed its contact buffers (limit "
-                f"{self._max_fault_rate:.2%}). Look at the drive's stiffness, the time step "
-                "(sim.substeps) and the sizes of the buffers (sim). The first ones are recorded in "
-                "the folder faults of the run."
-            )
+        statistics = self._group.pool_statistics(self._loop.statistics())
+        self._require_sound(it, statistics["fault_rate"], loss_dict)
         figures = {
             "env_steps": float(self.env_steps),
             "seconds": self.seconds,
@@ -295,15 +300,14 @@ class TrainingLogger:
             "policy/action_std": float(rest["action_std"].detach().mean()),
         }
         figures |= {f"loss/{name}": float(value) for name, value in loss_dict.items()}
-        episode = {f"episode/{name}": value for name, value in statistics.items()}
+        episode = {f"{EPISODE}{name}": value for name, value in statistics.items()}
         # an iteration without a finished episode repeats the last known figures of episodes
         if figures["episodes"] or not self._last_episode:
             self._last_episode = episode
         figures |= self._last_episode
         self.rows.append({"iteration": it, **figures})
         self._num_unwritten += 1
-        if self.writer is not None:
-            self.writer.log(figures, it)
+        self.writer.log(figures, it)
         rate, success = figures["rate/env_steps_per_s"], figures.get(SUCCESS, 0.0)
         # the last iteration may go beyond the budget
         note = f"{rate:,.0f} steps/s, success {success:.2f}"
@@ -311,6 +315,29 @@ class TrainingLogger:
         if not self._told_first and not self._quiet:
             self._told_first = True
             log.info("first iteration after %.1f s: %s", self.seconds, note)
+
+    def _require_sound(self, it: int, fault_rate: float, losses: Mapping[str, float]) -> None:
+        """Refuse to go on after an iteration that lost worlds or spoiled the policy."""
+        most = self._training.max_fault_rate
+        if fault_rate > most:
+            raise SimulationError(
+                f"{fault_rate:.2%} of the control steps of iteration {it} ended in a world that "
+                "diverged, became NaN or overflowed its contact buffers (limit "
+                f"{most:.2%}). Look at the drive's stiffness, the time step (sim.substeps) and the "
+                "sizes of the buffers (sim). The first ones are recorded in the folder faults of "
+                "the run."
+            )
+        spoiled = [name for name, value in losses.items() if not math.isfinite(value)]
+        if spoiled:
+            kept = list_checkpoints(self._folder)
+            remains = (
+                f"{kept[-1]} is the last whole checkpoint" if kept else "there is no checkpoint"
+            )
+            raise TrainingError(
+                f"iteration {it}: expected finite numbers, got {losses[spoiled[0]]} for "
+                f"{', '.join(spoiled)}; {remains}. Change rl.runner.algorithm.learning_rate, or the "
+                "weights of task.reward"
+            )
 
     def flush(self) -> None:
         """Append new rows to `progress.csv`; called with every checkpoint so that both agree."""
@@ -377,33 +404,59 @@ def find_passing(
     return None
 
 
-def draw_curves(progress: Path, picture: Path) -> None:
+def draw_curves(
+    progress: Path, picture: Path, words: Mapping[str, Figure], controller: float | None = None
+) -> None:
     """Draw `progress.csv` over control steps into a PNG; an empty file gives no picture.
 
-    A curve whose column is missing is left out: a task may record fewer figures.
+    Args:
+        progress: The file.
+        picture: The PNG.
+        words: Figures that the task names, by the name in `TaskProcess.episode`.
+        controller: Success of the classical controller, drawn as a line; `None` for none.
     """
-    with progress.open(newline="") as file:
-        rows = []
-        for row in csv.DictReader(file):
-            rows.append({name: float(value) for name, value in row.items()})
-    if not rows:
+    rows = pd.read_csv(progress, dtype=float)
+    if rows.empty:
         return
-    figure = make_figure(13, 6.5)
-    axes = figure.subplots(2, 3)
-    steps = [row["env_steps"] / 1e6 for row in rows]
-    for axis, (title, series, limits) in zip(axes.flat, PANELS, strict=True):
-        curves = [(name, label) for name, label in series if name in rows[0]]
-        for name, label in curves:
-            axis.plot(steps, [row[name] for row in rows], label=label, linewidth=1.2)
+    panels = _list_panels(words)
+    num_rows = -(-len(panels) // NUM_COLUMNS)
+    figure = make_figure(13, 3.25 * num_rows)
+    axes = figure.subplots(num_rows, NUM_COLUMNS, squeeze=False).flat
+    for axis, (title, curves) in zip(axes, panels.items(), strict=False):
+        for label, column, factor in curves:
+            if column in rows:
+                axis.plot(
+                    rows["env_steps"] / 1e6, factor * rows[column], label=label, linewidth=1.2
+                )
         axis.set_title(title, loc="left", fontsize=10)
-        draw_grid(axis)
-        if limits:
-            axis.set_ylim(*limits)
-        if len(curves) > 1:
-            axis.legend(frameon=False, fontsize=8)
-    for axis in axes[1]:
         axis.set_xlabel("control steps, millions")
-    minutes = rows[-1]["seconds"] / 60
-    title = f"{progress.parent.name}: {minutes:.1f} minutes of training"
+        draw_grid(axis)
+        if title == "Success":
+            axis.set_ylim(0.0, 1.0)
+            if controller is not None:
+                axis.axhline(controller, label="controller", color=GREY, linestyle="--")
+        if len(axis.lines) > 1:
+            axis.legend(frameon=False, fontsize=8)
+    for axis in axes[len(panels) :]:
+        axis.remove()
+    title = f"{progress.parent.name}: {rows['seconds'].iloc[-1] / 60:.1f} minutes of training"
     figure.suptitle(title, x=0.01, ha="left")
     save_figure(figure, picture)
+
+
+def _list_panels(words: Mapping[str, Figure]) -> dict[str, list[tuple[str, str, float]]]:
+    """Return the curves of each panel, (label, column of `progress.csv`, factor), by its title."""
+    panels = {
+        "Success": [],
+        "Return": [("", f"{EPISODE}return", 1.0)],
+        "Episode length (control steps)": [("", f"{EPISODE}length", 1.0)],
+    }
+    for name, figure in words.items():
+        curve = (figure.title, EPISODE + name, figure.factor)
+        if figure.unit == "share":
+            panels["Success"].append(curve)
+        elif not figure.of_success:  # the mean over all episodes would count failures as zero
+            panels[f"{figure.title.capitalize()} ({figure.unit})"] = [curve]
+    panels["Exploration (standard deviation)"] = [("", "policy/action_std", 1.0)]
+    panels["Rate (control steps per second)"] = [("", "rate/env_steps_per_s", 1.0)]
+    return panels

@@ -12,6 +12,7 @@ import logging
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -31,10 +32,12 @@ from brokk_rl.contracts.actuator import (
 from brokk_rl.contracts.target import TargetSensor, TargetSensorSpec
 from brokk_rl.contracts.task import FAULT, REWARD, STEPS, Task, TaskProcess
 from brokk_rl.contracts.world import Simulator, TracedWorld, World
+from brokk_rl.distributed import read_rank
+from brokk_rl.errors import SimulationError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import TaskDescription, describe_task
-from brokk_rl.rl.execution import capture_graph, report_compile_errors
+from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.settings import NearStarts
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.faults import FaultRecorder
@@ -43,6 +46,9 @@ from brokk_rl.sim.scene import find_site
 Starts = dict[str, torch.Tensor]
 
 log = logging.getLogger(__name__)
+
+MAX_FAULT_FILES = 8
+"""Faults that one process writes, 100 kB each. Chosen by hand: later ones tell little more."""
 
 
 @dataclass(frozen=True)
@@ -177,8 +183,6 @@ class ControlLoop(VecEnv):
         self._totals = torch.zeros(len(self._total_names), device=self.device)
         self._steps = 0
         self._is_known = torch.ones(self.num_envs, dtype=torch.bool, device=self.device)
-        self.num_held = 0
-        """Worlds whose fault could be fetched from the recorder when `statistics` was last asked."""
         self._action = torch.zeros(self.num_envs, self.num_actions, device=self.device)
         # addresses that stay: a captured graph writes to them
         self._groups = {
@@ -218,11 +222,12 @@ class ControlLoop(VecEnv):
             self._perceive(start)
             self.done.fill_(False)
 
-    def record_faults(self, num_steps: int) -> None:
+    def record_faults(self, num_steps: int, folder: Path) -> None:
         """Keep the last steps of worlds that diverge, before `capture`; see `FaultRecorder`.
 
         Args:
             num_steps: Control steps kept of each world; 0 keeps none.
+            folder: Where `statistics` writes them; made where there is a fault.
         """
         if num_steps == 0:
             return
@@ -234,6 +239,7 @@ class ControlLoop(VecEnv):
             if name.startswith(REWARD):
                 terms[name.removeprefix(REWARD)] = value
         self.recorder = FaultRecorder(self.world, self.machine, num_steps, terms)
+        self._fault_folder = folder
         self.begin()
 
     def bring_near(self, near: NearStarts, seed: int) -> None:
@@ -317,11 +323,15 @@ class ControlLoop(VecEnv):
     def statistics(self) -> dict[str, float]:
         """Return figures of the episodes that finished since the last call: means, endings, number.
 
-        Reads back from the device once.
+        Reads back from the device once, and writes the faults recorded since.
+
+        Raises:
+            SimulationError: A reward was not finite: the next update would spoil the policy.
         """
         num_held = self.recorder.is_held.sum() if self.recorder else self._totals.new_zeros(())
         *totals, held = torch.cat((self._totals, num_held[None].float())).tolist()  # one read-back
-        self.num_held = int(held)
+        if self.recorder and held:
+            self._write_faults(self.recorder)
         values = dict(zip(self._total_names, totals, strict=True))
         episodes = sum(totals[len(self.task.episode) :])
         fault_rate = values[f"end/{FAULT}"] / max(1, self._steps * self.num_envs)
@@ -329,6 +339,21 @@ class ControlLoop(VecEnv):
         self._steps = 0
         means = {name: value / max(1.0, episodes) for name, value in values.items()}
         return means | {"episodes": episodes, "fault_rate": fault_rate}
+
+    def _write_faults(self, recorder: FaultRecorder) -> None:
+        """Write the faults that are held, and release their worlds."""
+        prefix = f"rank{read_rank().index}_"  # several processes write into one folder
+        num = len(list(self._fault_folder.glob(f"{prefix}*.npz")))
+        for number, fault in enumerate(recorder.fetch(MAX_FAULT_FILES - num), num):
+            self._fault_folder.mkdir(exist_ok=True)
+            path = self._fault_folder / f"{prefix}{number}.npz"
+            fault.save(path)
+            log.warning("a world diverged: %s; its last states: %s", fault.cause, path)
+            if fault.is_reward:
+                raise SimulationError(
+                    f"{fault.cause}: expected finite rewards; change task.reward. The last states "
+                    f"stand in {path}; the newest checkpoint is from before."
+                )
 
     def state_dict(self) -> dict[str, Any]:
         """Return copies of all that is needed to go on exactly, but for random generators."""
@@ -459,22 +484,3 @@ class ControlLoop(VecEnv):
     def _draw(self) -> Starts:
         rows = torch.randint(len(self.starts["q"]), (self.num_envs,), device=self.device)
         return {key: value[rows] for key, value in self.starts.items()}
-
-
-@contextlib.contextmanager
-def limit_to_one_thread(device: torch.device | str) -> Iterator[None]:
-    """Limit torch to one thread inside of this context; nothing changes where `device` is a GPU.
-
-    The tensors of a control step are too small to be shared by threads. Torch's other threads would
-    wait for the next tensor in a busy loop, on the cores on which the physics runs. On a computer
-    with other work, every step would then wait for the slowest thread.
-    """
-    before = torch.get_num_threads()
-    if torch.device(device).type != "cpu" or before == 1:
-        yield
-        return
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)

@@ -28,14 +28,16 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Normal
+from torch.nn.utils import get_total_norm
 
-from brokk_rl.rl.execution import capture_graph, report_compile_errors
-from brokk_rl.rl.loop import limit_to_one_thread
+from brokk_rl.rl.execution import capture_graph, limit_to_one_thread, report_compile_errors
 from brokk_rl.rl.rollout import CapturedRollout, pad_columns, run_network
 
 LOWEST_RATE, HIGHEST_RATE, RATE_FACTOR = 1e-5, 1e-2, 1.5
 """Bounds and step of the adaptive learning rate, as in rsl-rl."""
 FIGURES = ("value", "surrogate", "entropy")
+SIZES = ("returns", "gradients", "weights of the actor", "weights of the critic")
+"""Largest sizes that an update is checked by, in words."""
 PARAMETER = "parameter_"
 """Beginning of the names under which samples hold the parameters of the old distribution."""
 CLIP_MARGIN = 1e-6
@@ -111,8 +113,20 @@ class DevicePPO(PPO):
             self._rollout.compute_returns(obs)
 
     def update(self) -> dict[str, float]:
-        """Learn from the stored steps; return mean losses (`rsl_rl.algorithms.PPO.update`)."""
-        return self.update_on_device() if self._on_device else super().update()
+        """Learn from the stored steps; return mean losses (`rsl_rl.algorithms.PPO.update`).
+
+        Where a gradient or a weight is not finite, it stands among the losses by its name in
+        `SIZES`.
+        """
+        if self._on_device:
+            return self.update_on_device()
+        try:
+            losses = super().update()
+        except RuntimeError:  # torch draws nothing with a spread that is NaN
+            losses = _name_spoiled(self._measure_sizes().tolist())
+            if not losses:
+                raise
+        return _name_spoiled(self._measure_sizes().tolist()) | losses
 
     def update_on_device(self) -> dict[str, float]:
         """Learn as `update` does, with one read-back; the same numbers up to rounding."""
@@ -131,9 +145,26 @@ class DevicePPO(PPO):
         for model in (self.actor, self.critic):
             self._normalise(model)
         self.storage.clear()
-        *sums, self.learning_rate = torch.cat((self._sums, self._rate[None])).tolist()
+        found = torch.cat((self._sums, self._rate[None], self._measure_sizes())).tolist()
+        self.learning_rate = found[len(FIGURES)]
         updates = self.num_learning_epochs * self.num_mini_batches
-        return {name: value / updates for name, value in zip(FIGURES, sums, strict=True)}
+        losses = {name: value / updates for name, value in zip(FIGURES, found, strict=False)}
+        return _name_spoiled(found[-len(SIZES) :]) | losses
+
+    @torch.no_grad()
+    def _measure_sizes(self) -> torch.Tensor:
+        """Return the norms of `SIZES` after an update, `(4,)`; the host does not wait for them.
+
+        A gradient that is not finite in an earlier mini-batch has spoiled the weights.
+        """
+        parameters = chain(self.actor.parameters(), self.critic.parameters())
+        groups = [[self.storage.returns]]
+        groups += [[one.grad for one in parameters if one.grad is not None]]
+        for model in (self.actor, self.critic):
+            groups.append(
+                [value for value in model.state_dict().values() if value.is_floating_point()]
+            )
+        return torch.stack([get_total_norm(group) for group in groups])
 
     def save(self) -> dict[str, Any]:
         """Return the state without device-specific entries, so that any device can load it."""
@@ -369,6 +400,12 @@ class DevicePPO(PPO):
         too_near = (divergence < self._wanted / 2.0) & (divergence > 0.0)
         rate = torch.where(too_near, higher, self._rate)
         self._rate.copy_(torch.where(divergence > self._wanted * 2.0, lower, rate))
+
+
+def _name_spoiled(sizes: Sequence[float]) -> dict[str, float]:
+    """Return the sizes that are not finite by their names."""
+    named = zip(SIZES, sizes, strict=True)
+    return {name: value for name, value in named if not math.isfinite(value)}
 
 
 class CappedGaussian(GaussianDistribution):

@@ -1,28 +1,21 @@
-"""rsl-rl's on-policy runner with exact resume, atomic checkpoints and a budget.
-
-Several processes, one for each GPU, may train one policy. rsl-rl averages gradients and normalisers
-over them. `TrainingGroup` adds the process group itself, decisions that the first process makes for
-all, statistics over all environments, and a check that all still hold the same policy.
-"""
+"""rsl-rl's on-policy runner with exact resume, atomic checkpoints and a budget."""
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
 import logging
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-import torch.distributed as dist
 from rsl_rl.runners import OnPolicyRunner
 
-from brokk_rl import distributed
-from brokk_rl.errors import CheckpointError, ConfigError, DistributedError, StorageError
+from brokk_rl.errors import CheckpointError, ConfigError, StorageError
 from brokk_rl.policy_folder import TaskDescription, find_policy, list_checkpoints, read_checkpoint
+from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import TrainingLogger
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import load_policy, scale_output
@@ -36,8 +29,6 @@ ITERATIONS_PER_ROUND = 10
 NUM_ANSWERS = 256
 """Observations at most, of as many environments, that a checkpoint holds with the network's own
 commands. Chosen by hand: many phases of an episode, and 150 kB."""
-LOST_CONNECTION = ("gloo", "NCCL", "Connection closed by peer", "Connection reset by peer")
-"""Words of a RuntimeError that is a lost connection: gloo has no class of its own for it."""
 
 
 class TrainingRunner(OnPolicyRunner):
@@ -52,8 +43,6 @@ class TrainingRunner(OnPolicyRunner):
         env: The control loop; a checkpoint of another machine than its own is refused.
         training: Configuration.
         folder: Checkpoints go here.
-        device: Where the networks live.
-        logger: Takes the place of rsl-rl's logger.
         group: The processes that train together, entered; `None` for a single process.
     """
 
@@ -65,12 +54,10 @@ class TrainingRunner(OnPolicyRunner):
         env: ControlLoop,
         training: TrainingConfig,
         folder: Path,
-        device: torch.device,
-        logger: TrainingLogger,
         group: TrainingGroup | None = None,
     ) -> None:
         self.training, self.folder = training, folder
-        self.group = group or TrainingGroup(device)
+        self.group = group or TrainingGroup(env.device)
         offered = list(map(str, env.get_observations().keys()))
         _require_groups(training.runner["obs_groups"], offered)
         config = training.runner_config()
@@ -78,9 +65,9 @@ class TrainingRunner(OnPolicyRunner):
             config["algorithm"]["symmetry_cfg"] = _mirror_steps(env)
         printed = io.StringIO()
         with contextlib.redirect_stdout(printed):  # rsl-rl prints its networks
-            super().__init__(env, config, log_dir=None, device=str(device))
+            super().__init__(env, config, log_dir=None, device=str(env.device))
         log.debug(printed.getvalue())
-        self.logger = logger
+        self.logger = TrainingLogger(folder, env, training, self.group)
         if training.output_gain != 1.0:
             scale_output(self.alg.actor, training.output_gain)
         if isinstance(self.alg, DevicePPO):
@@ -88,30 +75,27 @@ class TrainingRunner(OnPolicyRunner):
             if training.teacher:
                 self.alg.follow(load_policy(find_policy(training.teacher.folder), env).actor)
 
-    def run(self, until: Callable[[], bool] = lambda: False) -> None:
+    def run(self) -> None:
         """Train until the budget is spent; save a checkpoint every `save_interval`.
 
-        Args:
-            until: Asked after each round; training ends early where it returns true.
+        Raises:
+            SimulationError: Too many worlds diverged.
+            TrainingError: A loss, a gradient or a weight is not finite.
         """
-        first = self.current_learning_iteration == 0
-        while num := self.group.broadcast_first(self._count_iterations()):
-            if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
-                self._follow_schedules(self.group.broadcast_first(self.logger.share_done))
-            with contextlib.redirect_stdout(io.StringIO()):
-                self.learn(
-                    num, init_at_random_ep_len=first and self.training.random_episode_lengths
-                )
-            first = False
-            # `learn` leaves the index of the last iteration; the next one is another
-            self.current_learning_iteration += 1
-            enough = self.group.broadcast_first(until())
-            over = enough or self.group.broadcast_first(self._count_iterations()) == 0
-            if over or self.current_learning_iteration % self.training.save_interval == 0:
-                self.group.check_same(self._policy_state())
-                self.checkpoint()
-            if enough:
-                break
+        spread = self.current_learning_iteration == 0 and self.training.random_episode_lengths
+        with self.logger:
+            while num := self.group.broadcast_first(self._count_iterations()):
+                if self.current_learning_iteration % ITERATIONS_PER_ROUND == 0:
+                    self._follow_schedules(self.group.broadcast_first(self.logger.share_done))
+                with contextlib.redirect_stdout(io.StringIO()):
+                    self.learn(num, init_at_random_ep_len=spread)
+                spread = False
+                # `learn` leaves the index of the last iteration; the next one is another
+                self.current_learning_iteration += 1
+                is_over = self.group.broadcast_first(self._count_iterations()) == 0
+                if is_over or self.current_learning_iteration % self.training.save_interval == 0:
+                    self.group.check_same(self._policy_state())
+                    self.checkpoint()
 
     def _follow_schedules(self, share_spent: float) -> None:
         """Set the divergence to aim at, the cap of the noise and the teacher's weight."""
@@ -190,6 +174,7 @@ class TrainingRunner(OnPolicyRunner):
             "fingerprint": self.env.machine.fingerprint(),
             "task": self.env.description.to_json(),
             "network": self.training.describe_network(),
+            "beginning": self.training.describe_beginning(),
             "answers": self.record_answers(),
         }
         path = self.folder / f"model_{self.current_learning_iteration}.pt"
@@ -231,6 +216,7 @@ class TrainingRunner(OnPolicyRunner):
         Raises:
             CheckpointError: The file is missing, corrupt, holds NaN or belongs to another machine
                 or configuration.
+            ConfigError: A value was changed that counts only when a training begins.
         """
         content = read_checkpoint(Path(path), self.device)
         self.env.machine.check_fingerprint(content.get("fingerprint", {}), path)
@@ -241,6 +227,7 @@ class TrainingRunner(OnPolicyRunner):
             "resolved policy=<run> session.out=<run>",
         )
         try:
+            self._refuse_late_values(content["beginning"], path)
             self.alg.load(content, None, strict=True)
             own = [content, *content.get("others", [])][self.group.rank.index :][:1]
             # Empty where more processes continue than were stopped: the new ones start afresh.
@@ -258,136 +245,14 @@ class TrainingRunner(OnPolicyRunner):
             ) from error
         return {}
 
-
-class TrainingGroup:
-    """Process group of a training, a context manager; without effect for a single process.
-
-    Args:
-        device: Where this process computes: NCCL between GPUs, gloo between CPUs and for data
-            on the host.
-    """
-
-    def __init__(self, device: torch.device) -> None:
-        self.device, self.rank = device, distributed.read_rank()
-
-    @property
-    def together(self) -> bool:
-        """True when there is more than one process."""
-        return self.rank.count > 1
-
-    def __enter__(self) -> TrainingGroup:
-        if self.device.type == "cuda":
-            torch.cuda.set_device(self.device)
-        if self.together:
-            backend = "cpu:gloo,cuda:nccl" if self.device.type == "cuda" else "gloo"
-            dist.init_process_group(backend, rank=self.rank.index, world_size=self.rank.count)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: object
-    ) -> None:
-        if not self.together:
-            return
-        if error is None:
-            dist.barrier()
-            dist.destroy_process_group()
-            return
-        # gloo's threads must end before the interpreter does, or it aborts. Between GPUs nothing is
-        # destroyed after an error: NCCL would wait for processes that have ended.
-        if self.device.type == "cpu":
-            dist.destroy_process_group()
-        if isinstance(error, dist.DistError) or (
-            isinstance(error, RuntimeError) and any(word in str(error) for word in LOST_CONNECTION)
-        ):
-            raise DistributedError(
-                f"rank {self.rank.index}: another process of this training has ended; its own "
-                f"message says why ({str(error).splitlines()[0]})"
-            ) from error
-
-    def wait(self) -> None:
-        """Wait until all processes have called this."""
-        if self.together:
-            dist.barrier()
-
-    def broadcast_first(self, value: Any) -> Any:
-        """Return the `value` of the first process, so that all act by the same clock."""
-        if not self.together:
-            return value
-        box = [value]
-        dist.broadcast_object_list(box, src=0)
-        return box[0]
-
-    def gather(self, value: Any) -> list[Any]:
-        """Return the `value` (plain numbers and text) of all processes, in the order of ranks."""
-        if not self.together:
-            return [value]
-        found: list[Any] = [None] * self.rank.count
-        dist.all_gather_object(found, value)
-        return found
-
-    def gather_on_first(self, state: Any) -> list[Any]:
-        """Return the `state` of all processes to the first one, an empty list to the others.
-
-        A state is a mapping of tensors; they are copied to the host.
-        """
-        if not self.together:
-            return [state]
-        found: list[Any] = [None] * self.rank.count
-        dist.gather_object(_copy_to_host(state), found if self.rank.first else None, dst=0)
-        return found if self.rank.first else []
-
-    def pool_statistics(self, figures: Mapping[str, float]) -> dict[str, float]:
-        """Return the figures of all environments of all processes; see `ControlLoop.statistics`.
-
-        Means over episodes weigh by the number of episodes; the fault rate by control steps, which
-        are as many everywhere.
-        """
-        parts = self.gather(dict(figures))
-        episodes = sum(part["episodes"] for part in parts)
-        pooled = {}
-        for name in figures:
-            pooled[name] = sum(part[name] * part["episodes"] for part in parts) / max(1.0, episodes)
-        return pooled | {
-            "episodes": episodes,
-            "fault_rate": sum(part["fault_rate"] for part in parts) / len(parts),
-        }
-
-    def check_same(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Compare the numbers of all processes, bit for bit.
-
-        Raises:
-            DistributedError: They differ; the message names the ranks that differ from the first.
-        """
-        if not self.together:
-            return
-        first, *others = self.gather(hash_tensors(state))
-        differing = [str(rank) for rank, value in enumerate(others, 1) if value != first]
-        if differing:
-            raise DistributedError(
-                f"the policy of rank {', '.join(differing)} is no longer that of rank 0: "
-                "parameters or normalisers differ. "
-                "Look for randomness or data-dependent code that runs on some ranks only, and "
-                "for GPUs of different kinds."
-            )
-
-
-def hash_tensors(state: Mapping[str, torch.Tensor]) -> str:
-    """Return the SHA-256 of names and bytes of tensors."""
-    digest = hashlib.sha256()
-    for name, value in state.items():
-        digest.update(name.encode())
-        digest.update(
-            value.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
-        )
-    return digest.hexdigest()
-
-
-def _copy_to_host(state: Any) -> Any:
-    if isinstance(state, torch.Tensor):
-        return state.detach().cpu()
-    if isinstance(state, Mapping):
-        return {name: _copy_to_host(value) for name, value in state.items()}
-    return state
+    def _refuse_late_values(self, began_with: Mapping[str, Any], path: str) -> None:
+        for key, value in self.training.describe_beginning().items():
+            if value != began_with[key]:
+                raise ConfigError(
+                    f"{key}={value} was asked for, but {path} began with {began_with[key]}, and a "
+                    "training that goes on keeps what it has made of it. Leave it out, or begin "
+                    "anew with this network: policy=<run folder> session.out=<another folder>"
+                )
 
 
 @contextlib.contextmanager

@@ -62,6 +62,14 @@ RUNNER_VALUES: dict[str, Any] = {
 """Allowed values of rsl-rl's own configuration. It does not check numbers itself: outside of these
 it divides by zero, climbs instead of descends, or trains nothing; unknown words end it late."""
 
+BEGINNING = (
+    "output_gain",
+    "random_episode_lengths",
+    "runner.algorithm.learning_rate",
+    "runner.algorithm.optimizer",
+    "runner.actor.distribution_cfg.init_std",
+)
+"""Values that count only when a training begins: a checkpoint holds what has become of them."""
 REFUSED_CLASSES = {
     "RNNModel": "recurrent networks are neither exported nor deployed; task.memory gives a history",
     "CNNModel": "observations are vectors, not pictures",
@@ -273,6 +281,14 @@ class TrainingConfig:
         for part in path.split("."):
             value = value.get(part) if isinstance(value, dict) else None
         return value
+
+    def describe_beginning(self) -> dict[str, Any]:
+        """Return the values of `BEGINNING` by the keys under which they are typed."""
+        found = {}
+        for path in BEGINNING:
+            name, _, inside = path.partition(".")
+            found[f"rl.{path}"] = self._read_runner(inside) if inside else getattr(self, name)
+        return found
 
     def divergence(self, share_spent: float) -> float | None:
         """Return the `desired_kl` of updates when this share of the budget is spent."""

@@ -16,7 +16,6 @@ from composed import option
 from brokk_rl.contracts.task import REWARD
 from brokk_rl.contracts.world import TracedWorld
 from brokk_rl.machine import Machine
-from brokk_rl.modes.train import FaultLog
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.ppo import DevicePPO
 from brokk_rl.sim.simulator import NativeSimulator, WarpSimulator
@@ -57,13 +56,12 @@ def test_a_captured_recorder_keeps_the_last_steps_of_a_world_that_diverges(
     machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     loop = make_loop(machine)
-    loop.record_faults(10)
+    loop.record_faults(10, tmp_path / "faults")
     loop.capture()
     assert loop.graph_active and loop.recorder is not None
-    faults = FaultLog(loop, tmp_path / "faults", "rank0_")
     assert isinstance(loop.world, TracedWorld)
     push(loop, 3)
-    assert faults.read_statistics()["fault_rate"] == 0.0
+    assert loop.statistics()["fault_rate"] == 0.0
     seen = []
     for step in range(15):
         seen.append(loop.world.trace["q"][WILD].clone().cpu())
@@ -72,19 +70,19 @@ def test_a_captured_recorder_keeps_the_last_steps_of_a_world_that_diverges(
         push(loop, 1, seed=step)
     assert loop.recorder.is_held.nonzero().flatten().tolist() == [WILD]
     push(loop, 25)  # the host comes later: the ring has gone round, the world has begun anew
-    assert faults.read_statistics()["fault_rate"] > 0.0
+    assert loop.statistics()["fault_rate"] > 0.0
     with np.load(tmp_path / "faults/rank0_0.npz", allow_pickle=False) as dump:
         assert dump["q"].shape == (10, machine.num_joints)
         np.testing.assert_allclose(dump["q"][:-1], torch.stack(seen[-9:]).numpy(), rtol=1e-6)
     assert "a world diverged" in caplog.text
-    assert faults.read_statistics()["fault_rate"] == 0.0  # released
+    assert loop.statistics()["fault_rate"] == 0.0  # released
 
 
-def test_a_recorder_changes_no_episode(machine: Machine) -> None:
+def test_a_recorder_changes_no_episode(machine: Machine, tmp_path: Path) -> None:
     ends = []
     for steps in (0, 20):
         loop = make_loop(machine)
-        loop.record_faults(steps)
+        loop.record_faults(steps, tmp_path)
         loop.capture(fuse=True)
         torch.manual_seed(1)
         loop.begin({name: value[:NUM].clone() for name, value in loop.starts.items()})
@@ -162,12 +160,11 @@ def test_a_training_with_the_mirror_and_a_recorder_stays_captured(
 ) -> None:
     training = replace(runs.small(max_env_steps=NUM * runs.STEPS * 6, symmetry=True), num_envs=NUM)
     loop = make_loop(machine)
-    loop.record_faults(20)
+    loop.record_faults(20, tmp_path)
     loop.capture()
     folder = tmp_path / "run"
-    runner, book = runs.make(machine, folder, training, loop, CUDA)
-    with book:
-        runner.run()
+    runner = runs.make(machine, folder, training, loop, CUDA)
+    runner.run()
     assert isinstance(runner.alg, DevicePPO) and len(runner.alg._epoch or ()) == 1
     assert all(torch.isfinite(value).all() for value in runs.weights(runner).values())
     assert len(runs.progress(folder)) == 6

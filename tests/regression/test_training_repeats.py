@@ -130,10 +130,9 @@ def test_with_physics_and_the_learned_actuator_too(machine: Machine, tmp_path: P
             torch.manual_seed(0)
             plant = replace(runs.plant(machine, sim=native), actuator=option("actuator", "mlp"))
             loop = plant.build(torch.device("cpu"), 16, 64, 0)
-            runner, book = runs.make(machine, tmp_path / name, training, loop)
-            with book:
-                if iterations == 6 and len(budgets) == 2:
-                    runner.load(str(tmp_path / name / "model_3.pt"))
-                runner.run()
+            runner = runs.make(machine, tmp_path / name, training, loop)
+            if iterations == 6 and len(budgets) == 2:
+                runner.load(str(tmp_path / name / "model_3.pt"))
+            runner.run()
             ends[name] = runs.weights(runner)
     assert same(ends["whole"], ends["parts"])

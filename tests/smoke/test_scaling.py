@@ -106,7 +106,7 @@ def test_two_processes_that_were_stopped_go_on_exactly(run: Path) -> None:
 DIFFER = """
 import sys, torch
 from brokk_rl.errors import DistributedError
-from brokk_rl.rl.runner import TrainingGroup
+from brokk_rl.rl.group import TrainingGroup
 try:
     with TrainingGroup(torch.device("cpu")) as group:
         group.check_same({"weight": torch.ones(3)})
@@ -129,7 +129,7 @@ LEARN = """
 import copy, sys, torch
 from test_rl_ppo import _algorithm, _learn, _roll_out
 from brokk_rl import distributed
-from brokk_rl.rl.runner import TrainingGroup
+from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.ppo import DevicePPO
 from rsl_rl.algorithms import PPO
 name = sys.argv[1] if sys.argv[1] == "cpu" else f"cuda:{distributed.read_rank().local}"

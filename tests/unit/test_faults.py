@@ -14,7 +14,6 @@ from composed import option
 
 from brokk_rl.errors import SimulationError
 from brokk_rl.machine import Machine
-from brokk_rl.modes.train import FaultLog
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.sim.faults import Fault, FaultRecorder
 from brokk_rl.sim.scene import make_nominal_scenes
@@ -83,31 +82,30 @@ def test_a_full_buffer_is_named(machine: Machine) -> None:
     assert "sim.num_constraints" in record_step(world, machine, torch.zeros_like(low)).cause
 
 
-def make_loop(machine: Machine, task: Any = None) -> ControlLoop:
+def make_loop(machine: Machine, folder: Path, task: Any = None) -> ControlLoop:
     torch.manual_seed(0)
     loop = runs.plant(machine, task, NATIVE).build(runs.CPU, 4, 64, 5)
-    loop.record_faults(20)
+    loop.record_faults(20, folder)
     return loop
 
 
 def test_a_training_writes_the_states(
     machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    loop = make_loop(machine)
-    faults = FaultLog(loop, tmp_path / "faults", "rank0_")
+    loop = make_loop(machine, tmp_path / "faults")
     for _ in range(6):
         loop.step(torch.zeros(4, 5))
-    assert faults.read_statistics()["fault_rate"] == 0.0 and not (tmp_path / "faults").exists()
+    assert loop.statistics()["fault_rate"] == 0.0 and not (tmp_path / "faults").exists()
     scene = loop.task.state["start.scene"][WILD].clone()
     loop.world.trace["reference"][WILD, 0] = float("nan")
     loop.step(torch.zeros(4, 5))
-    assert faults.read_statistics()["fault_rate"] == 0.25
+    assert loop.statistics()["fault_rate"] == 0.25
     path = tmp_path / "faults/rank0_0.npz"
     assert f"the drive's reference of q1 was not finite; its last states: {path}" in caplog.text
     with np.load(path, allow_pickle=False) as dump:
         assert dump["q"].shape == dump["increment"].shape == (7, 5)
         assert np.allclose(dump["scene"], scene)
-    assert faults.read_statistics()["fault_rate"] == 0.0  # released
+    assert loop.statistics()["fault_rate"] == 0.0  # released
 
 
 def divide_by_zero(state: StepState) -> torch.Tensor:
@@ -119,18 +117,20 @@ def test_a_reward_term_that_is_not_finite_stops_the_run_by_name(
 ) -> None:
     task = option("task", "borehole_insertion")
     broken = RewardTerm(function=f"{__name__}:divide_by_zero", weight=-0.01)
-    loop = make_loop(machine, replace(task, reward=task.reward | {"command_change": broken}))
+    loop = make_loop(
+        machine, tmp_path, replace(task, reward=task.reward | {"command_change": broken})
+    )
     loop.step(torch.zeros(4, 5))  # 0 / 0
     with pytest.raises(SimulationError, match="reward term command_change was not finite"):
-        FaultLog(loop, tmp_path / "faults", "rank0_").read_statistics()
+        loop.statistics()
 
 
 def test_a_simulator_that_shows_no_states_is_not_recorded(
-    machine: Machine, caplog: pytest.LogCaptureFixture
+    machine: Machine, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     loop = runs.plant(machine).build(runs.CPU, 4, 64, 0)
     with caplog.at_level("INFO"):
-        loop.record_faults(5)
+        loop.record_faults(5, tmp_path)
     assert loop.recorder is None and "faults are not recorded" in caplog.text
 
 

@@ -57,9 +57,8 @@ def newest(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     torch.manual_seed(0)
     training = runs.small(max_env_steps=2 * ITERATION)
     loop = runs.plant(machine, insertion(memory=1)).build(CPU, 16, 64, 0)
-    runner, book = runs.make(machine, folder, training, loop)
-    with book:
-        runner.run()
+    runner = runs.make(machine, folder, training, loop)
+    runner.run()
     actor, process = runner.alg.get_policy(), loop.task
     contract = describe_policy(
         training.describe_network(),
@@ -195,8 +194,8 @@ def test_recorded_answers_are_those_of_the_network_in_the_loop(machine: Machine)
 
 def test_resuming_in_another_task_is_refused_by_name(newest: Path, machine: Machine) -> None:
     training = runs.small(max_env_steps=4 * ITERATION)
-    runner, book = runs.make(machine, newest, training)
-    with book, pytest.raises(CheckpointError, match=r"task\.memory is 1 there, 13 here.*resolved"):
+    runner = runs.make(machine, newest, training)
+    with pytest.raises(CheckpointError, match=r"task\.memory is 1 there, 13 here.*resolved"):
         runner.load(str(newest / "model_2.pt"))
 
 

@@ -9,7 +9,7 @@ import torch
 
 from brokk_rl import distributed
 from brokk_rl.errors import ConfigError, DeviceError
-from brokk_rl.rl.runner import TrainingGroup, hash_tensors
+from brokk_rl.rl.group import TrainingGroup, hash_tensors
 from brokk_rl.session import Session
 
 

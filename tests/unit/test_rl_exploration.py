@@ -69,10 +69,9 @@ def test_training_moves_the_cap_and_a_checkpoint_keeps_it(machine: Machine, tmp_
     cap = runner.alg.actor.distribution.log_cap
     # moved at the start of every tenth iteration, the last time when 30 of 40 were done
     assert cap.item() == pytest.approx(math.log(0.125))
-    again, book = make(machine, tmp_path / "again", training)
+    again = make(machine, tmp_path / "again", training)
     assert again.alg.actor.distribution.log_cap.item() == pytest.approx(math.log(0.5))
-    with book:
-        again.load(str(tmp_path / "model_40.pt"))
+    again.load(str(tmp_path / "model_40.pt"))
     assert again.alg.actor.distribution.log_cap.item() == pytest.approx(math.log(0.125))
 
 

@@ -12,7 +12,13 @@ import pytest
 import torch
 import training as runs
 
-from brokk_rl.errors import CheckpointError, ConfigError, SimulationError, StorageError
+from brokk_rl.errors import (
+    CheckpointError,
+    ConfigError,
+    SimulationError,
+    StorageError,
+    TrainingError,
+)
 from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import find_checkpoint, list_checkpoints, read_checkpoint
 from brokk_rl.rl.settings import TrainingBudget
@@ -38,10 +44,9 @@ def test_a_budget_that_is_no_multiple_of_an_iteration_is_filled_up(
 
 
 def test_the_budget_of_seconds_ends_training(machine: Machine, tmp_path: Path) -> None:
-    runner, book = runs.make(machine, tmp_path, runs.small(max_seconds=0.4, save_interval=1000))
-    with book:
-        runner.run()
-    assert 0.4 <= book.seconds < 2.0
+    runner = runs.make(machine, tmp_path, runs.small(max_seconds=0.4, save_interval=1000))
+    runner.run()
+    assert 0.4 <= runner.logger.seconds < 2.0
 
 
 def test_the_first_budget_that_is_spent_counts() -> None:
@@ -111,9 +116,9 @@ def test_a_full_disk_leaves_the_older_checkpoint_and_nothing_half_written(
 def test_a_folder_that_cannot_be_written_is_a_storage_error(
     machine: Machine, tmp_path: Path
 ) -> None:
-    runner, book = runs.make(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
+    runner = runs.make(machine, tmp_path / "run", runs.small(max_env_steps=ITERATION))
     (tmp_path / "run").rmdir()
-    with book, pytest.raises(StorageError, match=r"cannot write the checkpoint .*model_0\.pt"):
+    with pytest.raises(StorageError, match=r"cannot write the checkpoint .*model_0\.pt"):
         runner.checkpoint()
 
 
@@ -131,11 +136,8 @@ def changed(checkpoint: Path, change: Callable[[dict[str, Any]], Any]) -> Path:
 
 
 def loading(machine: Machine, checkpoint: Path, **changes: Any) -> None:
-    runner, book = runs.make(
-        machine, checkpoint.parent, runs.small(max_env_steps=ITERATION, **changes)
-    )
-    with book:
-        runner.load(str(checkpoint))
+    runner = runs.make(machine, checkpoint.parent, runs.small(max_env_steps=ITERATION, **changes))
+    runner.load(str(checkpoint))
 
 
 def test_a_truncated_checkpoint_is_named_corrupt(checkpoint: Path, machine: Machine) -> None:
@@ -228,7 +230,7 @@ def test_resuming_where_there_is_no_checkpoint_says_so(tmp_path: Path, machine: 
 
 
 def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: Path) -> None:
-    runner, book = runs.make(
+    runner = runs.make(
         machine, tmp_path, runs.small(max_env_steps=100 * ITERATION, max_fault_rate=0.001)
     )
     step = runner.env.world.step
@@ -241,19 +243,72 @@ def test_too_many_faults_stop_the_run_with_an_error(machine: Machine, tmp_path: 
 
     runner.env.world.step = diverges  # type: ignore[method-assign]
     # one of 16 environments in each step: 6.25 %
-    with (
-        book,
-        pytest.raises(
-            SimulationError, match=r"6\.25% of the control steps of iteration 0 .*limit 0\.10%"
-        ),
+    with pytest.raises(SimulationError, match=r"6\.25% .* of iteration 0 .*limit 0\.10%"):
+        runner.run()
+
+
+@pytest.mark.parametrize(
+    ("number", "term"), [(float("inf"), "returns"), (float("nan"), "returns"), (1e30, ".*value")]
+)
+def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(
+    number: float, term: str, machine: Machine, tmp_path: Path
+) -> None:
+    runner = runs.make(machine, tmp_path, runs.small(max_env_steps=3 * ITERATION))
+    step, calls = runner.env.step, [0]
+
+    def spoils(actions: torch.Tensor) -> Any:
+        calls[0] += 1
+        groups, reward, *rest = step(actions)
+        is_spoiled = calls[0] == 2 * runs.STEPS + 1
+        return groups, reward + number if is_spoiled else reward, *rest
+
+    runner.env.step = spoils  # type: ignore[method-assign]
+    with pytest.raises(
+        TrainingError, match=rf"iteration 2: .* for {term}.*model_2\.pt is the last"
     ):
         runner.run()
+    assert [path.name for path in list_checkpoints(tmp_path)] == ["model_1.pt", "model_2.pt"]
+    assert len(runs.progress(tmp_path)) == 2
+
+
+@pytest.mark.parametrize("part", ["actor", "critic"])
+def test_a_weight_that_the_last_update_spoils_is_named_and_not_written(
+    part: str, machine: Machine, tmp_path: Path
+) -> None:
+    runner = runs.make(machine, tmp_path, runs.small(max_env_steps=ITERATION))
+    finish = runner.alg.critic.update_normalization
+
+    def spoils(observations: Any) -> None:
+        finish(observations)
+        next(getattr(runner.alg, part).parameters()).data.view(-1)[0] = torch.inf
+
+    runner.alg.critic.update_normalization = spoils  # type: ignore[method-assign]
+    with pytest.raises(TrainingError, match=rf"weights of the {part}; there is no checkpoint"):
+        runner.run()
+    assert not list_checkpoints(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "key"),
+    [
+        ({"learning_rate": 1e-3}, "rl.runner.algorithm.learning_rate=0.001"),
+        ({}, "rl.output_gain=2.0"),
+    ],
+)
+def test_a_value_that_cannot_take_effect_any_more_is_refused(
+    changes: dict[str, float], key: str, checkpoint: Path, machine: Machine
+) -> None:
+    runner = runs.small(max_env_steps=1).runner
+    runner["algorithm"] |= changes
+    gain = 1.0 if changes else 2.0
+    with pytest.raises(ConfigError, match=rf"{key} was asked for, .*model_1\.pt began with"):
+        loading(machine, checkpoint, runner=runner, output_gain=gain)
 
 
 def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(
     machine: Machine, tmp_path: Path
 ) -> None:
-    runner, book = runs.make(
+    runner = runs.make(
         machine, tmp_path, runs.small(max_env_steps=3 * ITERATION, max_fault_rate=0.1)
     )
     step, calls = runner.env.world.step, [0]
@@ -267,8 +322,7 @@ def test_few_faults_are_counted_and_training_goes_on_with_finite_numbers(
             runner.env.world.faults[3] = True
 
     runner.env.world.step = diverges_once  # type: ignore[method-assign]
-    with book:
-        runner.run()
+    runner.run()
     rows = runs.progress(tmp_path)
     assert [float(row["fault_rate"]) for row in rows] == [1 / ITERATION, 0.0, 0.0]
     assert float(rows[0]["episode/end/fault"]) == 1.0 and all(

@@ -18,14 +18,14 @@ from brokk_rl.rl.logger import NoTracking, TensorBoardTracking, WandbTracking, _
 
 
 def test_without_a_tracker_nothing_is_written(tmp_path: Path) -> None:
-    tracker = NoTracking().open(tmp_path, {})
+    tracker = NoTracking().open(tmp_path, {}, 0)
     tracker.log({"a": 1.0}, 0)
     tracker.close()
     assert not list(tmp_path.iterdir())
 
 
 def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
-    tracker = TensorBoardTracking().open(tmp_path, {})
+    tracker = TensorBoardTracking().open(tmp_path, {}, 0)
     for step in range(3):
         tracker.log({"episode/success_strict": 0.1 * step, "loss/value": 2.0}, step)
     tracker.close()
@@ -37,6 +37,18 @@ def test_tensorboard_gets_every_figure_at_its_step(tmp_path: Path) -> None:
         (2, 0.2),
     ]
     assert len(events.Scalars("loss/value")) == 3
+
+
+def test_a_run_that_goes_on_has_each_step_once(tmp_path: Path) -> None:
+    for process, (first, last) in enumerate([(0, 8), (5, 10)]):
+        tracker = TensorBoardTracking().open(tmp_path, {}, first)
+        for step in range(first, last):
+            tracker.log({"loss/value": float(process)}, step)
+        tracker.close()
+    events = EventAccumulator(str(tmp_path / "tensorboard")).Reload().Scalars("loss/value")
+    assert [(one.step, one.value) for one in events] == [
+        (step, float(step >= 5)) for step in range(10)
+    ]
 
 
 def test_wandb_is_offline_unless_asked() -> None:
@@ -55,7 +67,7 @@ def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
     folders = [tmp_path / name for name in ("job_0", "job_1")]
     for folder in folders:
         folder.mkdir()
-        tracker = tracking.open(folder, {"seed": 0})
+        tracker = tracking.open(folder, {"seed": 0}, 0)
         tracker.log({"loss/value": 1.0}, 0)
         tracker.close()
     found = [list((folder / "wandb").glob("offline-run-*")) for folder in folders]
@@ -63,6 +75,9 @@ def test_every_job_of_a_process_gets_a_wandb_run_of_its_own(
     assert found[0][0].name != found[1][0].name and all(
         list(runs[0].glob("run-*.wandb")) for runs in found
     )
+    tracking.open(folders[0], {"seed": 0}, 1).close()
+    again = {path.name.rpartition("-")[2] for path in (folders[0] / "wandb").glob("offline-run-*")}
+    assert again == {found[0][0].name.rpartition("-")[2]}, "a job that goes on keeps its id"
 
 
 @pytest.mark.parametrize("mode", ["", "sideways"])
@@ -76,9 +91,9 @@ def test_an_environment_that_wandb_refuses_is_explained(
     tracking = WandbTracking(project="tests", group=None, tags=(), mode="disabled")
     if mode:
         with pytest.raises(ConfigError, match="WANDB_MODE"):
-            tracking.open(tmp_path, {})
+            tracking.open(tmp_path, {}, 0)
     else:
-        tracking.open(tmp_path, {}).close()
+        tracking.open(tmp_path, {}, 0).close()
 
 
 SMALL = (
