@@ -2,32 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from textwrap import fill
 from typing import Annotated, Any
 
-import numpy as np
 import pandas as pd
 from annotated_types import MinLen
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import Figure as Picture
 
 from brokk_rl.comparison import (
-    RATE,
+    HIGH,
+    LOW,
     EvaluatedRun,
-    Result,
+    average_seeds,
     describe_differences,
     find_differences,
     find_runs,
-    group_results,
-    label_rows,
     list_figures,
+    list_rates,
     load_run,
     summarise_methods,
+    tabulate_runs,
 )
 from brokk_rl.console_table import print_table
+from brokk_rl.contracts.task import Figure
 from brokk_rl.errors import ConfigError
 from brokk_rl.plot import (
     BLUE,
@@ -56,10 +58,7 @@ MOST_COLUMNS = 4
 Chosen by hand."""
 LABEL_WIDTH = 42
 """Characters of a row label in a picture before it wraps."""
-UNITS = {"s": ("s", 1.0), "m": ("mm", 1e3), "n": ("kN", 1e-3), "rad": ("rad", 1.0)}
-"""Shown unit, and its factor, of a figure whose name ends with a unit."""
 COLORS = (BLUE, ORANGE, *OTHERS)
-LATEX = str.maketrans({sign: f"\\{sign}" for sign in "&%$#_{}"} | {"\\": r"\textbackslash{}"})
 
 
 @spec
@@ -87,167 +86,154 @@ class Compare:
         patterns = (self.compare.runs,) if isinstance(self.compare.runs, str) else self.compare.runs
         runs = [load_run(folder) for folder in find_runs(patterns)]
         columns = find_differences(runs)
-        results = []
-        for run in runs:
-            results.extend(run.list_results(columns))
-        groups = group_results(results)
+        table = tabulate_runs(runs, columns)
+        groups = average_seeds(table, columns)
         generator = self.session.generator("compare")
-        methods = summarise_methods(results, self.compare.baseline, generator)
+        methods = summarise_methods(table, columns, self.compare.baseline, generator)
         folder = self.session.folder
-        content = {"columns": columns, "groups": groups, "runs": results, "methods": methods}
-        write_json(folder / "comparison.json", {"schema": 1, **content})
-        write_text(folder / "comparison.csv", format_csv(results))
-        figures = list_figures(results)
-        save_figure(draw_comparison(groups, figures), folder / "comparison.png")
+        content = {"schema": 2, "columns": columns}
+        for name, rows in (("groups", groups), ("runs", table), ("methods", methods)):
+            content[name] = json.loads(rows.to_json(orient="records", double_precision=15))
+        write_json(folder / "comparison.json", content)
+        write_text(folder / "comparison.csv", table.to_csv(index=False, lineterminator="\n"))
+        words = collect_words(runs, list_figures(table))
+        picture = draw_comparison(groups, columns, words, list_rates(table))
+        save_figure(picture, folder / "comparison.png")
         _write_learning(runs, columns, folder)
-        _print_groups(groups, columns, figures)
-        if any(method["ci95"] for method in methods):
-            table = build_seed_table(methods)
-            print_table(list(table.columns), table.to_numpy().tolist())
-            write_text(folder / "comparison.tex", format_latex(table))
-            save_figure(draw_seeds(methods), folder / "seeds.png")
+        _print_groups(groups, columns, words, list_rates(table))
+        if not methods.empty and methods["mean" + LOW].notna().any():
+            seeds = build_seed_table(methods, columns)
+            print_table(list(seeds.columns), seeds.to_numpy().tolist())
+            write_text(folder / "comparison.tex", format_latex(seeds))
+            save_figure(draw_seeds(methods, seeds["method"]), folder / "seeds.png")
         log.info("%d runs compared in %s", len(runs), folder)
 
 
-def format_csv(results: Sequence[Result]) -> str:
-    """Return CSV text with one line for each run and policy."""
-    lines = []
-    figures = list_figures(results)
-    rates = [name for name in figures if name.startswith(RATE)]
-    for result in results:
-        line = {name: result[name] for name in ("folder", "policy", "seed")}
-        line |= result["variation"]
-        line["episodes"] = result["episodes"]
-        for name in figures:
-            line[name] = result.get(name, {}).get("mean")
-        for name in rates:
-            interval = result.get(name, {}).get("ci95")
-            line[f"{name}_low"], line[f"{name}_high"] = interval or (None, None)
-        lines.append(line)
-    return pd.DataFrame(lines).to_csv(index=False, lineterminator="\n")
+def collect_words(runs: Sequence[EvaluatedRun], names: Sequence[str]) -> dict[str, Figure]:
+    """Return the words of figures: those of the runs' tasks, else their names."""
+    told: dict[str, Mapping[str, Any]] = {}
+    for run in runs:
+        told |= run.evaluation.get("figures", {})
+    words = {}
+    for name in names:
+        plain = Figure(name.replace("_", " "), "", 1.0, 3, of_success=False)
+        words[name] = Figure(**told[name]) if name in told else plain
+    return words
 
 
-def _name_figure(name: str) -> tuple[str, float]:
-    """Return heading and factor of a figure: `lateral_error_m` is shown in mm."""
-    if name.startswith(RATE):
-        return f"{name.removeprefix(RATE)} success", 1.0
-    words, _, unit = name.rpartition("_")
-    if unit not in UNITS:
-        return name.replace("_", " "), 1.0
-    shown, factor = UNITS[unit]
-    return f"{words.replace('_', ' ')}, {shown}", factor
+def _name_figure(figure: Figure) -> str:
+    unit = "" if figure.unit in ("share", "") else f", {figure.unit}"
+    return figure.title + unit
 
 
 def _print_groups(
-    groups: Sequence[Mapping[str, Any]], columns: Sequence[str], figures: Sequence[str]
+    groups: pd.DataFrame, columns: Sequence[str], words: Mapping[str, Figure], rates: Sequence[str]
 ) -> None:
-    settings = [[str(group["variation"][column]) for column in columns] for group in groups]
+    settings = groups[list(columns)]
     if len(columns) > MOST_COLUMNS:
-        columns = ["unlike most"]
-        variations = [group["variation"] for group in groups]
-        settings = [[text] for text in describe_differences(variations)]
-    rows = []
-    for group, setting in zip(groups, settings, strict=True):
-        cells = [_format_figure(group[name], name) for name in figures]
-        rows.append([group["policy"], *setting, str(group["runs"]), *cells])
-    headings = [_name_figure(name)[0] for name in figures]
-    print_table(["policy", *columns, "seeds", *headings], rows)
+        settings = pd.DataFrame({"unlike most": describe_differences(settings)})
+    cells = {}
+    for name, figure in words.items():
+        shown = groups[name].map(lambda value, by=figure.factor: f"{by * value:.3g}")
+        if name in rates:
+            half = (groups[name + HIGH] - groups[name + LOW]) / 2
+            shown += half.map(lambda value: "" if pd.isna(value) else f" ±{value:.3f}")
+        cells[_name_figure(figure)] = shown.where(groups[name].notna(), None)
+    table = pd.concat([groups["policy"], settings, groups["runs"], pd.DataFrame(cells)], axis=1)
+    headings = ["policy", *settings.columns, "seeds", *cells]
+    print_table(headings, table.astype(object).where(table.notna(), None).to_numpy().tolist())
 
 
-def _format_figure(figure: Mapping[str, Any], name: str) -> str | None:
-    if figure["mean"] is None:
-        return None
-    text = f"{figure['mean'] * _name_figure(name)[1]:.3g}"
-    if figure["ci95"] and name.startswith(RATE):
-        low, high = figure["ci95"]
-        text += f" ±{(high - low) / 2:.3f}"
-    return text
+def label_rows(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+    """Return a short name of each row: its policy, and the values that most others lack."""
+    texts = describe_differences(rows[list(columns)])
+    return [", ".join(filter(None, pair)) for pair in zip(rows["policy"], texts, strict=True)]
 
 
-def build_seed_table(methods: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
+def build_seed_table(methods: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
     """Return the table of interquartile means and differences, as text."""
-    rows = []
-    for label, method in zip(label_rows(methods), methods, strict=True):
-        shown, spread = "baseline" if method["is_baseline"] else "–", ""
-        if difference := method["difference"]:
-            shown = f"{difference['mean']:+.3f}"
-            spread = _format_interval(difference["ci95"], "+.3f")
-        mean = f"{method['interquartile_mean']:.3f}"
-        interval = _format_interval(method["ci95"], ".3f")
-        rows.append([label, str(method["runs"]), mean, interval, shown, spread])
-    headings = ["method", "runs", "interquartile mean", "95 %", "difference by seed", "95 %"]
-    return pd.DataFrame(rows, columns=headings)
+    settings = [column for column in columns if column in methods]
+    shown = _format_column(methods, "difference", "{:+.3f}")
+    return pd.DataFrame(
+        {
+            "method": label_rows(methods, settings),
+            "runs": methods["runs"].map(str),
+            "interquartile mean": _format_column(methods, "mean", "{:.3f}"),
+            "95 %": _format_interval(methods, "mean", "{:.3f}"),
+            "difference by seed": shown.mask(methods["is_baseline"], "baseline"),
+            "95 % of it": _format_interval(methods, "difference", "{:+.3f}"),
+        }
+    )
 
 
-def _format_interval(interval: Sequence[float] | None, form: str) -> str:
-    return f"{interval[0]:{form}} to {interval[1]:{form}}" if interval else ""
+def _format_column(table: pd.DataFrame, name: str, form: str) -> pd.Series:
+    return (
+        table[name].astype(float).map(lambda value: "–" if pd.isna(value) else form.format(value))
+    )
+
+
+def _format_interval(table: pd.DataFrame, name: str, form: str) -> pd.Series:
+    low, high = _format_column(table, name + LOW, form), _format_column(table, name + HIGH, form)
+    return (low + " to " + high).mask(table[name + LOW].isna(), "")
 
 
 def format_latex(table: pd.DataFrame) -> str:
     """Return the table of `build_seed_table` for a paper, in LaTeX with the package booktabs."""
-    escaped = table.map(lambda text: text.translate(LATEX))
-    signed = escaped.replace(r"([-+][\d.]+)", r"$\1$", regex=True)  # the minus of mathematics
-    signed.iloc[:, 0] = escaped.iloc[:, 0]
-    header = ["Method", "Runs", "IQM", r"95\,\%", "Difference", r"95\,\%"]
-    return signed.to_latex(index=False, header=header, column_format="lrrlrl")
+    return table.to_latex(index=False, escape=True, column_format="lrrlrl")
 
 
-def draw_comparison(groups: Sequence[Mapping[str, Any]], figures: Sequence[str]) -> Figure:
-    """Draw rates with intervals, and each other figure, a row for each policy and variation."""
-    rates = [name for name in figures if name.startswith(RATE)]
-    others = [name for name in figures if not name.startswith(RATE)]
-    figure = make_figure(6.0 + 2.0 * len(others), 1.4 + 0.42 * len(groups))
+def draw_comparison(
+    groups: pd.DataFrame, columns: Sequence[str], words: Mapping[str, Figure], rates: Sequence[str]
+) -> Picture:
+    """Draw rates with intervals, and each other figure, a row for each policy and setting."""
+    others = {name: figure for name, figure in words.items() if name not in rates}
+    picture = make_figure(6.0 + 2.0 * len(others), 1.4 + 0.42 * len(groups))
     widths = [2, *[1] * len(others)]
-    axes = figure.subplots(1, len(widths), sharey=True, width_ratios=widths, squeeze=False)[0]
-    success = axes[0]
+    success, *axes = picture.subplots(
+        1, len(widths), sharey=True, width_ratios=widths, squeeze=False
+    )[0]
     for index, name in enumerate(rates):
-        heading = _name_figure(name)[0]
-        _draw_rows(success, [group[name] for group in groups], COLORS[index], heading, 0.2 * index)
+        _draw_rows(success, groups, name, COLORS[index], words[name].title, shift=0.2 * index)
     success.set_xlabel("success rate, 95 % interval")
     success.set_xlim(right=1.005)
-    add_legend(figure, success)
-    for axis, name in zip(axes[1:], others, strict=True):
-        heading, factor = _name_figure(name)
-        _draw_rows(axis, [group[name] for group in groups], GREY, None, factor=factor)
-        axis.set_xlabel(heading)
+    add_legend(picture, success)
+    for axis, (name, figure) in zip(axes, others.items(), strict=True):
+        _draw_rows(axis, groups, name, GREY, factor=figure.factor)
+        axis.set_xlabel(_name_figure(figure))
         axis.set_xlim(left=0.0)
-    _name_rows(success, label_rows(groups))
-    return figure
+    _name_rows(success, label_rows(groups, columns))
+    return picture
 
 
-def draw_seeds(methods: Sequence[Mapping[str, Any]]) -> Figure:
+def draw_seeds(methods: pd.DataFrame, labels: Sequence[str]) -> Picture:
     """Draw interquartile means with intervals, and the difference to the baseline of each seed."""
-    figure = make_figure(11.0, 1.6 + 0.45 * len(methods))
-    means, differences = figure.subplots(1, 2, sharey=True)
-    overall = [{"mean": method["interquartile_mean"], "ci95": method["ci95"]} for method in methods]
-    _draw_rows(means, overall, BLUE)
-    _draw_rows(differences, [method["difference"] for method in methods], ORANGE)
-    for row, method in enumerate(methods):
-        seeds = list(method["difference"]["by_seed"].values()) if method["difference"] else []
-        differences.plot(seeds, [row + 0.18] * len(seeds), ".", color=GREY)
+    picture = make_figure(11.0, 1.6 + 0.45 * len(methods))
+    means, differences = picture.subplots(1, 2, sharey=True)
+    _draw_rows(means, methods, "mean", BLUE)
+    _draw_rows(differences, methods, "difference", ORANGE)
+    for row, by_seed in enumerate(methods["by_seed"]):
+        differences.plot(list(by_seed.values()), [row + 0.18] * len(by_seed), ".", color=GREY)
     differences.axvline(0.0, color="black", linewidth=0.8)
     means.set_xlabel("interquartile mean of success, 95 % of resamples")
     differences.set_xlabel("difference to the baseline: each seed, mean, 95 % interval")
-    _name_rows(means, label_rows(methods))
-    return figure
+    _name_rows(means, labels)
+    return picture
 
 
 def _draw_rows(
     axis: Axes,
-    figures: Sequence[Mapping[str, Any] | None],
+    table: pd.DataFrame,
+    name: str,
     color: str,
     label: str | None = None,
     shift: float = 0.0,
     factor: float = 1.0,
 ) -> None:
-    """Draw means as marks and intervals as lines; figures without a mean are left out."""
-    for row, figure in enumerate(figures):
-        if figure is None or figure["mean"] is None:
-            continue
-        axis.plot(factor * figure["mean"], row + shift, "o", color=color, label=label)
-        label = None  # one entry of the legend for all rows
-        if figure["ci95"]:
-            axis.plot(factor * np.array(figure["ci95"]), [row + shift] * 2, color=color)
+    """Draw a figure as marks and its intervals as lines; what is missing is left out."""
+    places = [row + shift for row in range(len(table))]
+    values = factor * table[[name, name + LOW, name + HIGH]].astype(float)
+    axis.plot(values[name], places, "o", color=color, label=label)
+    axis.hlines(places, values[name + LOW], values[name + HIGH], color=color)
     draw_grid(axis, "x")
     axis.tick_params(axis="y", length=0)
 
@@ -261,13 +247,13 @@ def _name_rows(axis: Axes, labels: Sequence[str]) -> None:
 def _write_learning(runs: Sequence[EvaluatedRun], columns: Sequence[str], folder: Path) -> None:
     """Write and draw the learning curves of those runs that trained; say when they succeeded."""
     curves: list[pd.DataFrame] = []
-    variations = []
+    settings = []
     for run in runs:
         curve = _read_progress(run)
         if curve is None:
             continue
         curves.append(curve)
-        variations.append({column: run.get_setting(column) for column in columns})
+        settings.append({column: run.describe_setting(column) for column in columns})
         reached_s: Any = curve["seconds"][curve[SUCCESS] >= REACHED]
         when = f"not in {curve['seconds'].iloc[-1]:.0f} s"
         if not reached_s.empty:
@@ -277,8 +263,8 @@ def _write_learning(runs: Sequence[EvaluatedRun], columns: Sequence[str], folder
         return
     thinned = pd.concat([curve.iloc[:: -(-len(curve) // MOST_ROWS)] for curve in curves])
     write_text(folder / "learning.csv", thinned.to_csv(index=False, lineterminator="\n"))
-    figure = draw_learning(describe_differences(variations), curves)
-    save_figure(figure, folder / "learning.png")
+    labels = describe_differences(pd.DataFrame(settings, index=range(len(curves))))
+    save_figure(draw_learning(labels, curves), folder / "learning.png")
 
 
 def _read_progress(run: EvaluatedRun) -> pd.DataFrame | None:
@@ -298,20 +284,20 @@ def _read_progress(run: EvaluatedRun) -> pd.DataFrame | None:
     return None if curve.empty else curve
 
 
-def draw_learning(labels: Sequence[str], curves: Sequence[pd.DataFrame]) -> Figure:
+def draw_learning(labels: Sequence[str], curves: Sequence[pd.DataFrame]) -> Picture:
     """Draw strict success of training episodes over time and over control steps.
 
     Args:
-        labels: Variation of each run; runs of one variation share a colour.
+        labels: Settings of each run; runs of the same settings share a colour.
         curves: Seconds, control steps and success of each run.
     """
-    figure = make_figure(11.0, 4.2)
-    left, right = figure.subplots(1, 2, sharey=True)
+    picture = make_figure(11.0, 4.2)
+    left, right = picture.subplots(1, 2, sharey=True)
     names = list(dict.fromkeys(labels))
     for index, (label, curve) in enumerate(zip(labels, curves, strict=True)):
         style = {"color": f"C{names.index(label) % 10}", "linewidth": 1.0}
         if label in labels[:index]:
-            label = ""  # one entry of the legend for all runs of a variation
+            label = ""  # one entry of the legend for all runs of the same settings
         left.plot(curve["seconds"], curve[SUCCESS], label=label, **style)
         right.plot(1e-6 * curve["env_steps"], curve[SUCCESS], **style)
     left.set(xlabel="wall clock of training, s", ylabel="success while learning")
@@ -322,4 +308,4 @@ def draw_learning(labels: Sequence[str], curves: Sequence[pd.DataFrame]) -> Figu
         draw_grid(axis)
     if len(names) > 1:
         left.legend(loc="lower right", frameon=False, fontsize=8)
-    return figure
+    return picture

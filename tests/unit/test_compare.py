@@ -9,16 +9,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy import stats
 
 from brokk_rl.comparison import (
+    average_seeds,
     describe_differences,
     find_differences,
     find_runs,
-    group_results,
+    list_figures,
     load_run,
     summarise_methods,
+    tabulate_runs,
 )
 from brokk_rl.errors import ConfigError
 from brokk_rl.modes.compare import build_seed_table, format_latex
@@ -51,6 +54,11 @@ def write_run(folder: Path, actuator: str, seed: int, strict: float, **more: Any
     }
     (folder / "evaluation.json").write_text(json.dumps(figures | more))
     (folder / "session.json").write_text(json.dumps(record))
+
+
+def average(*folders: Path, columns: list[str] | None = None) -> list[dict[str, Any]]:
+    table = tabulate_runs([load_run(folder) for folder in folders], columns or [])
+    return average_seeds(table, columns or []).to_dict("records")
 
 
 @pytest.fixture
@@ -86,8 +94,7 @@ def test_a_task_without_the_figures_of_an_insertion_has_its_own(tmp_path: Path) 
     write_run(folder, "ideal", 0, 0.5)
     hover = {"episodes": 10, "success_strict": {"mean": 0.5}, "height_m": 0.2, "actuator": "ideal"}
     (folder / "evaluation.json").write_text(json.dumps(hover))
-    (group,) = group_results(load_run(folder).list_results([]))
-    assert list(group)[4:] == ["success_strict", "height_m"]
+    assert list_figures(tabulate_runs([load_run(folder)], [])) == ["success_strict", "height_m"]
 
 
 def test_runs_are_found_in_their_order_below_a_sweep(sweep: Path) -> None:
@@ -111,22 +118,24 @@ def test_only_what_differs_is_a_column_and_seeds_are_not(sweep: Path) -> None:
 
 
 def test_seeds_become_one_row_with_the_interval_over_them(sweep: Path) -> None:
-    results = [
-        result
-        for folder in find_runs([str(sweep)])
-        for result in load_run(folder).list_results(["actuator"])
-    ]
-    ideal, mlp = group_results(results)
-    assert ideal["variation"] == {"actuator": "ideal"}
-    assert ideal["seeds"] == [0, 1]
-    assert ideal["success_strict"]["mean"] == pytest.approx(0.3)
-    assert ideal["success_strict"]["ci95"] == (0.0, 1.0)  # a rate: cut off at 0 and 1
-    assert mlp["success_strict"]["ci95"] == pytest.approx((0.9, 0.9))
+    ideal, mlp = average(*find_runs([str(sweep)]), columns=["actuator"])
+    assert (ideal["actuator"], ideal["seeds"]) == ("ideal", [0, 1])
+    assert ideal["success_strict"] == pytest.approx(0.3)
+    # a rate: cut off at 0 and 1
+    assert (ideal["success_strict_low"], ideal["success_strict_high"]) == (0.0, 1.0)
+    assert (mlp["success_strict_low"], mlp["success_strict_high"]) == pytest.approx((0.9, 0.9))
+    # two values 1500: mean 1500, no spread
+    assert (ideal["peak_force_n"], ideal["peak_force_n_high"]) == (1500.0, 1500.0)
 
 
 def test_a_single_run_has_the_interval_of_its_episodes(sweep: Path) -> None:
-    (single,) = group_results(load_run(sweep / "2_mlp").list_results([]))
-    assert single["success_strict"]["ci95"] == compute_wilson_interval(90, 100)
+    path = sweep / "2_mlp" / "evaluation.json"
+    content = json.loads(path.read_text())
+    content["success_strict"]["ci95"] = [0.83, 0.94]
+    path.write_text(json.dumps(content))
+    (single,) = average(sweep / "2_mlp")
+    assert (single["success_strict_low"], single["success_strict_high"]) == (0.83, 0.94)
+    assert np.isnan(single["peak_force_n_low"])
 
 
 def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
@@ -137,15 +146,15 @@ def test_every_policy_of_an_evaluation_gets_its_row(tmp_path: Path) -> None:
         "time_to_insert_s": {"median": None},
     }
     write_run(tmp_path / "run", "mlp", 0, 0.9, policies={"trained": figures, "classical": figures})
-    rows = group_results(load_run(tmp_path / "run").list_results([]))
+    rows = average(tmp_path / "run")
     assert [row["policy"] for row in rows] == ["trained", "classical"]
-    assert rows[0]["success_paper"] == {"mean": None, "ci95": None}
+    assert np.isnan(rows[0]["success_paper"])
 
 
 def test_a_broken_evaluation_is_named(sweep: Path) -> None:
     (sweep / "0_ideal" / "evaluation.json").write_text("{}")
     with pytest.raises(ConfigError, match=r"0_ideal.*episodes"):
-        load_run(sweep / "0_ideal").list_results([])
+        tabulate_runs([load_run(sweep / "0_ideal")], [])
     (sweep / "0_ideal" / "evaluation.json").write_text("{")
     with pytest.raises(ConfigError, match="cannot be read"):
         load_run(sweep / "0_ideal")
@@ -178,12 +187,10 @@ def test_an_evaluation_elsewhere_belongs_to_the_run_that_trained(tmp_path: Path)
     runs = [load_run(folder) for folder in find_runs([str(tmp_path / "*_there")])]
     columns = find_differences(runs)
     assert columns == ["actuator", "evaluated on"]
-    ideal, mlp = group_results([result for run in runs for result in run.list_results(columns)])
-    assert (ideal["variation"], ideal["seeds"]) == (
-        {"actuator": "ideal", "evaluated on": "hydraulic"},
-        [0, 1],
-    )
-    assert (ideal["success_strict"]["mean"], mlp["success_strict"]["mean"]) == (0.5, 0.7)
+    ideal, mlp = average_seeds(tabulate_runs(runs, columns), columns).to_dict("records")
+    assert (ideal["actuator"], ideal["evaluated on"]) == ("ideal", "hydraulic")
+    assert ideal["seeds"] == [0, 1]
+    assert (ideal["success_strict"], mlp["success_strict"]) == (0.5, 0.7)
 
 
 def test_a_sweep_over_a_whole_node_is_told_apart_by_its_values(tmp_path: Path) -> None:
@@ -220,11 +227,8 @@ def test_a_row_says_only_what_most_others_do_not_share() -> None:
         {"task.noise.a": 1, "rl.a": 3},
         {"task.noise.a": 4, "rl.a": 2},
     ]
-    assert describe_differences(rows) == ["", "rl.a 3", "task.noise.a 4"]
-    assert describe_differences([{"task.memory": 13}, {"task.memory": 1}]) == [
-        "memory 13",
-        "memory 1",
-    ]
+    assert describe_differences(pd.DataFrame(rows)) == ["", "rl.a 3", "task.noise.a 4"]
+    assert describe_differences(pd.DataFrame({"task.memory": [13, 1]})) == ["memory 13", "memory 1"]
 
 
 def test_the_interquartile_mean_drops_the_outer_quarters() -> None:
@@ -259,42 +263,47 @@ def test_interquartile_means_are_those_of_rliable(
     assert bounds == pytest.approx(interval, abs=0.006)
 
 
-def results_of(actuator: str, scores: dict[str, dict[int, float]]) -> list[dict[str, Any]]:
-    results = []
+def results_of(actuator: str, scores: dict[str, dict[int, float]]) -> pd.DataFrame:
+    rows = []
     for condition, rates in scores.items():
         for seed, rate in rates.items():
-            variation = {"actuator": actuator, "evaluated on": condition}
-            success = {"mean": rate, "ci95": None}
-            about = {"policy": "trained", "seed": seed, "variation": variation}
-            results.append(about | {"success_strict": success})
-    return results
+            rows.append(["trained", seed, actuator, condition, rate])
+    names = ["policy", "seed", *COLUMNS, "success_strict"]
+    return pd.DataFrame(rows, columns=names)
+
+
+COLUMNS = ["actuator", "evaluated on"]
 
 
 def test_differences_are_those_of_the_same_seed_and_condition() -> None:
-    results = [
-        *results_of("lag", {"ideal": {0: 0.5, 1: 0.9}, "mlp": {0: 0.3}}),
-        *results_of("mlp", {"ideal": {1: 1.0, 0: 0.7, 2: 0.0}, "mlp": {0: 0.7}}),
-    ]
-    base, other = summarise_methods(results, None, np.random.default_rng(0))
-    assert base["difference"] is None
-    assert other["difference"]["by_seed"] == pytest.approx({0: 0.3, 1: 0.1})
+    table = pd.concat(
+        [
+            results_of("lag", {"ideal": {0: 0.5, 1: 0.9}, "mlp": {0: 0.3}}),
+            results_of("mlp", {"ideal": {1: 1.0, 0: 0.7, 2: 0.0}, "mlp": {0: 0.7}}),
+        ]
+    )
+    generator = np.random.default_rng(0)
+    base, other = summarise_methods(table, COLUMNS, None, generator).to_dict("records")
+    assert np.isnan(base["difference"])
+    assert other["by_seed"] == pytest.approx({0: 0.3, 1: 0.1})
     assert other["conditions"] == ["ideal", "mlp"]
     # mean 0.2, standard error 0.1, t(0.975, 1) = 12.706
-    assert other["difference"]["ci95"] == pytest.approx((0.2 - 1.2706, 0.2 + 1.2706), abs=1e-4)
-    chosen = summarise_methods(results, {"actuator": "mlp"}, np.random.default_rng(0))
-    assert [method["is_baseline"] for method in chosen] == [False, True]
+    bounds = (other["difference_low"], other["difference_high"])
+    assert bounds == pytest.approx((0.2 - 1.2706, 0.2 + 1.2706), abs=1e-4)
+    chosen = summarise_methods(table, COLUMNS, {"actuator": "mlp"}, generator)
+    assert chosen["is_baseline"].tolist() == [False, True]
     with pytest.raises(ConfigError, match=r"0 rows have them.*'actuator': 'lag'"):
-        summarise_methods(results, {"actuator": "lagg"}, np.random.default_rng(0))
+        summarise_methods(table, COLUMNS, {"actuator": "lagg"}, generator)
 
 
 def test_the_latex_table_holds_names_that_tex_would_misread() -> None:
-    results = []
-    for name in ("load_sensing", "50%"):
-        results += results_of(name, {"": {0: 0.5, 1: 0.7}})
-    methods = summarise_methods(results, None, np.random.default_rng(0))
-    text = format_latex(build_seed_table(methods))
+    table = pd.concat(
+        [results_of(name, {"": {0: 0.5, 1: 0.7}}) for name in ("load_sensing", "50%")]
+    )
+    methods = summarise_methods(table, COLUMNS, None, np.random.default_rng(0))
+    text = format_latex(build_seed_table(methods, COLUMNS))
     assert r"load\_sensing & 2 & 0.600" in text and r"50\% & 2" in text
-    assert "$+0.000$" in text
+    assert "+0.000" in text
     assert text.startswith(r"\begin{tabular}") and r"\bottomrule" in text
     rows = [line for line in text.splitlines() if line.endswith(r"\\")]
     assert {row.count("&") - row.count(r"\&") for row in rows} == {5}
@@ -307,7 +316,7 @@ def test_the_command_writes_the_tables_over_seeds(
     done = brokk(*words, "compare.baseline={actuator: mlp}")
     assert done.code == 0 and "interquartile mean" in done.out and "-0.600" in done.out
     methods = json.loads((tmp_path / "compared/comparison.json").read_text())["methods"]
-    assert methods[0]["difference"]["by_seed"] == pytest.approx({"0": -0.7, "1": -0.5})
+    assert methods[0]["by_seed"] == pytest.approx({"0": -0.7, "1": -0.5})
     assert (tmp_path / "compared/seeds.png").read_bytes()[:4] == b"\x89PNG"
     assert r"\toprule" in (tmp_path / "compared/comparison.tex").read_text()
     assert brokk(*words, "compare.baseline={actuator: x}").code == 2
