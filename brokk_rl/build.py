@@ -11,7 +11,7 @@ import re
 import sys
 import traceback
 from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from importlib.abc import MetaPathFinder
 from pathlib import Path
@@ -24,6 +24,8 @@ from brokk_rl.spec import SpecError
 TARGET = "_target_"
 RUN = "run"
 """Key of the class of the mode; no mode has such a field, since `run` is its method."""
+BESIDE = {"machine", "sim"}
+"""Nodes that others are compared with."""
 SLOW = "torch"
 """Package whose import takes seconds."""
 
@@ -32,8 +34,8 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     """Return the mode of a composed configuration.
 
     Nodes whose classes do without torch are built first, so that their bad values are refused
-    before torch is loaded. A spec with a method `check_machine` is asked whether it fits the
-    machine beside it.
+    before torch is loaded. A spec with a method `check_machine` or `check_sim` is asked whether it
+    fits the machine or the simulator beside it.
 
     Args:
         values: The configuration as plain data, with `run`.
@@ -43,52 +45,58 @@ def build_mode(values: Mapping[str, Any], shared: Collection[str] = ()) -> Any:
     Raises:
         ConfigError: A class cannot be found, a key is unknown, or a value is refused.
     """
-    built, late = build_quick_nodes(values, shared)
     if RUN not in values:
         raise ConfigError(f"expected a key '{RUN}' with the class of a mode; choose mode=<mode>")
+    nodes = {key: value for key, value in values.items() if key != RUN}
+    built = build_quick_nodes(values, shared)
+    with _refuse_slow_import(), suppress(_SlowImport, _LackingPackageError):  # said below
+        _check_keys(load_class(values[RUN], ""), nodes.keys() - set(shared))
     kind = load_class(values[RUN], "")
+    _check_keys(kind, nodes.keys() - set(shared))
+    own = {field.name for field in fields(kind)}
+    for key in nodes.keys() - built.keys():
+        if key in own:
+            built[key] = build_node(nodes[key], key)
+    return _call(kind, {key: built[key] for key in nodes if key in built}, "")
+
+
+def _check_keys(kind: type, keys: Collection[str]) -> None:
+    """Refuse keys that a mode does not have."""
     known = [field.name for field in fields(kind)]
-    for key in late:
-        if key in known or key not in shared:
-            built[key] = build_node(values[key], key)
-    for key in built:
+    for key in sorted(keys):
         if key not in known:
             raise ConfigError(
                 f"the mode has no '{key}'; {list_choices(key, known)}. A preset or experiment that "
                 "sets it is for other modes: leave it out"
             )
-    return _call(kind, {key: built[key] for key in values if key in built}, "")
 
 
-def build_quick_nodes(
-    values: Mapping[str, Any], shared: Collection[str] = ()
-) -> tuple[dict[str, Any], list[str]]:
-    """Return the nodes whose classes do without torch, and the keys of the others.
+def build_quick_nodes(values: Mapping[str, Any], shared: Collection[str] = ()) -> dict[str, Any]:
+    """Return the nodes whose classes do without torch, but those that others take in.
 
     Raises:
         ConfigError: Classes cannot be found or refuse their values; all of them are named.
     """
-    built, late, refusals = {}, list(shared), []
+    built, refusals = {}, []
     with _refuse_slow_import():
         for key, value in values.items():
             if key == RUN or key in shared:
                 continue
             try:
-                built[key] = build_node(value, key)
-            except (_SlowImport, _LackingPackageError):
-                late.append(key)  # the mode itself says first which package it needs
+                with suppress(_SlowImport, _LackingPackageError):  # the mode says what it lacks
+                    built[key] = build_node(value, key)
             except ConfigError as error:
                 refusals.append(error)
-        machine = built.get("machine")
+    for other in built.keys() & BESIDE:
         for part in built.values():
-            if machine is not None and hasattr(part, "check_machine"):
-                try:
-                    part.check_machine(machine)
-                except ConfigError as error:
-                    refusals.append(error)
+            try:
+                if check := getattr(part, f"check_{other}", None):
+                    check(built[other])
+            except ConfigError as error:
+                refusals.append(error)
     if refusals:
         raise ConfigError("\n".join(map(str, refusals))) from refusals[0]
-    return built, late
+    return built
 
 
 def build_node(node: Any, place: str = "") -> Any:

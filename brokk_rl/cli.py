@@ -43,6 +43,13 @@ class FailedJob(BaseException):
     """
 
 
+class SweepError(BrokkError):
+    """A job of a sweep failed, and its process, the second argument, has said why."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
 def main() -> int:
     """Run the command and return its exit code.
 
@@ -98,6 +105,8 @@ def main() -> int:
         SweepFolder.drop_if_unused()
         cause = error.args[0] if isinstance(error, FailedJob) else error
         message = explain(cause)
+        if isinstance(cause, SweepError) and cause.args[1] == os.getpid():
+            message = "jobs of the sweep failed, for the reasons above"
         if trace or message is None:
             traceback.print_exception(cause)
         # Of several processes the first one reports an error of the configuration for all.
@@ -124,7 +133,7 @@ def run_job(cfg: DictConfig) -> float | None:
         # The other jobs go on. Hydra repeats only the first error, at the end, and an error of
         # another process comes without its cause.
         log.error("job %s failed: %s", HydraConfig.get().job.num, message)
-        raise BrokkError(message) from error
+        raise SweepError(message, os.getpid()) from error
 
 
 def _prepare_policy(arguments: Sequence[str]) -> list[str]:

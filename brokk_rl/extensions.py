@@ -7,7 +7,7 @@ effect; the command calls `register_options`.
 """
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -49,17 +49,44 @@ def register_options(arguments: Sequence[str]) -> None:
     """Make Hydra know the options of extensions and the option files in `arguments`.
 
     Raises:
-        ConfigError: Two packages offer the same option, of which Hydra would silently take the
-            first; or a file is invalid.
+        ConfigError: A file is invalid, or two packages offer an option and none of them is named.
     """
-    groups = {option.group for option in registry.list_options()}
+    options = registry.list_options()
+    groups = {option.group for option in options}
+    for option in options:
+        name = f"{option.prefix}/{option.path.stem}"
+        if option.name == name or any(name in argument for argument in arguments):
+            text = option.path.read_text()
+            node = OmegaConf.to_container(OmegaConf.create(text))
+            stated = PACKAGE.search(text)
+            folder, package = f"{option.group}/{option.prefix}", stated[1] if stated else None
+            ConfigStore.instance().store(option.path.stem, node, folder, package)
     Plugins.instance().register(Extensions)
     for argument in arguments:
         override = GROUP.fullmatch(argument)
         if override and override["group"] in groups:
+            refuse_ambiguous({override["group"]: override["value"]})
             for found in FILE.finditer(override["value"]):
                 name = found["double"] or found["single"] or found["plain"]
                 _offer_file(override["group"], name.strip())
+
+
+def refuse_ambiguous(choices: Mapping[str, Any]) -> None:
+    """Refuse options that several packages offer by one name: Hydra would take the first.
+
+    Args:
+        choices: Option, or options with commas between, by group, with or without `@package`.
+    """
+    options = registry.list_options()
+    known = {(option.group, option.name) for option in options}
+    for key, value in choices.items():
+        group = key.partition("@")[0]
+        for name in re.split(r"[\[\],]", str(value)):
+            offered = [one.name for one in options if one.group == group and one.path.stem == name]
+            if offered and (group, name) not in known:
+                raise ConfigError(
+                    f"{key}={value}: several packages offer '{name}'; {list_choices(name, offered)}"
+                )
 
 
 def load_option(group: str, name: str, **fields: object) -> Any:

@@ -28,6 +28,7 @@ log = logging.getLogger(__name__)
 def run(cfg: DictConfig) -> float | None:
     """Build the mode and run it, within its session where it has one."""
     sweep = HydraConfig.get().mode is RunMode.MULTIRUN
+    extensions.refuse_ambiguous(HydraConfig.get().runtime.choices)
     cfg = insert_policy(cfg)
     values, shared = extensions.read_values(cfg)
     if "session" not in values:

@@ -11,7 +11,7 @@ import ast
 import inspect
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata, resources, util
 from pathlib import Path
 from typing import Any
@@ -41,6 +41,11 @@ class Option:
     name: str
     package: str
     path: Path
+
+    @property
+    def prefix(self) -> str:
+        """Name of the package, which stands before that of an option where two packages have it."""
+        return self.package.split(".")[0]
 
     def summary(self) -> str:
         """Return the first sentence of the file's comment, else the first line of its target."""
@@ -73,21 +78,23 @@ def find_packages() -> dict[str, Path]:
 def list_options(only: str | None = None) -> list[Option]:
     """Return every option of every group, or of one group, sorted by group and name.
 
-    Raises:
-        ConfigError: Two packages offer the same option.
+    Where two packages offer an option of the same name, those of extensions have the name of their
+    package before their own: `machine=mine/arm`.
     """
-    found: dict[tuple[str, str], Option] = {}
+    found: dict[tuple[str, str], list[Option]] = {}
     for package, folder in find_packages().items():
         for path in sorted(folder.rglob("*.yaml")):
-            group, name = path.parent.relative_to(folder).as_posix(), path.stem
-            if group == "." or group.split("/")[0] in SETTINGS:
-                continue
-            if other := found.get((group, name)):
-                raise ConfigError(
-                    f"{group}={name} is offered twice, by {other.package} ({other.path}) and by {package} ({path}): rename one"
-                )
-            found[group, name] = Option(group, name, package, path)
-    return [found[key] for key in sorted(found) if only in (None, key[0])]
+            group = path.parent.relative_to(folder).as_posix()
+            if group != "." and group.split("/")[0] not in SETTINGS and only in (None, group):
+                option = Option(group, path.stem, package, path)
+                found.setdefault((group, path.stem), []).append(option)
+    listed = []
+    for options in found.values():
+        for option in options:
+            if len(options) > 1 and option.package != CORE:
+                option = replace(option, name=f"{option.prefix}/{option.name}")
+            listed.append(option)
+    return sorted(listed, key=lambda option: (option.group, option.name))
 
 
 def list_targets() -> frozenset[str]:

@@ -58,6 +58,8 @@ NonNegative = Annotated[float, Ge(0), AllowInfNan(False)]
 Share = Annotated[float, Interval(ge=0, le=1)]
 """A part of a whole, 0 to 1."""
 Count = Annotated[int, Ge(1)]
+WorldCount = Annotated[int, Interval(ge=1, le=10**7)]
+"""Worlds side by side; the largest that was measured is 65,536."""
 Index = Annotated[int, Ge(0)]
 """A whole number of 0 or more: an index, a seed, a count that may be none."""
 Range = Annotated[tuple[Finite, Finite], Ordered()]

@@ -76,12 +76,6 @@ class Train(PlantMode):
     together: ClassVar[bool] = True
     """Several processes that `torchrun` starts train one policy."""
 
-    def check(self) -> None:
-        parts = (self.sim, *vars(self.sim).values())  # sim=auto holds two simulators
-        worlds = [getattr(part, "num_worlds", 0) for part in parts]
-        if any(worlds) and self.rl.num_envs is None:
-            self.rl.check_batches(max(worlds))
-
     def run(self) -> float | None:
         """Train.
 

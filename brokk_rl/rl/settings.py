@@ -8,7 +8,7 @@ from __future__ import annotations
 import copy
 from typing import Annotated, Any, Literal
 
-from annotated_types import Gt, Interval, MinLen
+from annotated_types import Interval, MinLen
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import (
@@ -20,6 +20,7 @@ from brokk_rl.spec import (
     Positive,
     Range,
     Share,
+    WorldCount,
     require_value,
     spec,
 )
@@ -29,9 +30,7 @@ SETTLED_PART = 0.9
 `TrainingConfig.settling`."""
 CAPPED = "brokk_rl.rl.ppo:CappedGaussian"
 """The distribution whose cap `Exploration` moves."""
-PositiveShare = Annotated[float, Gt(0), Interval(le=1)]
-EnvCount = Annotated[int, Interval(ge=1, le=10**7)]
-"""The bound is for slips of the pen, chosen by hand; benchmarks go to 65,536."""
+PositiveShare = Annotated[float, Interval(gt=0, le=1)]
 Widths = Annotated[tuple[Count, ...], MinLen(1)]
 Activation = Literal[
     "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish",
@@ -211,7 +210,7 @@ class TrainingConfig:
             `num_steps_per_env`, …), handed on as it is.
     """
 
-    num_envs: EnvCount | None
+    num_envs: WorldCount | None
     num_starts: Count
     budget: TrainingBudget
     save_interval: Count
@@ -253,7 +252,7 @@ class TrainingConfig:
             if self._read_runner(f"algorithm.{name}") is not None:
                 raise ConfigError(f"runner.algorithm.{name}: {reason}")
         if self.num_envs is not None:
-            self.check_batches(self.num_envs)
+            self._check_batches(self.num_envs)
         distribution = self._read_runner("actor.distribution_cfg.class_name")
         if self.exploration and distribution != CAPPED:
             raise ConfigError(
@@ -261,12 +260,14 @@ class TrainingConfig:
                 f"(rl.runner.actor.distribution_cfg.class_name), got {distribution}"
             )
 
-    def check_batches(self, num_envs: int) -> None:
-        """Refuse more mini-batches than there are steps in a rollout of `num_envs` environments.
+    def check_sim(self, sim: Any) -> None:
+        """Refuse more mini-batches than there are steps in a rollout of all worlds of a simulator."""
+        parts = (sim, *vars(sim).values())  # sim=auto holds two simulators
+        worlds = [getattr(part, "num_worlds", 0) for part in parts]
+        if self.num_envs is None and any(worlds):
+            self._check_batches(max(worlds))
 
-        Raises:
-            ConfigError: A mini-batch would be empty.
-        """
+    def _check_batches(self, num_envs: int) -> None:
         num_steps = num_envs * self.runner["num_steps_per_env"]
         num_batches = self._read_runner("algorithm.num_mini_batches") or 1
         if num_batches > num_steps:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from brokk_rl.errors import DeviceError
 from brokk_rl.machine import Machine
-from brokk_rl.spec import Count, Index, Positive, spec
+from brokk_rl.spec import Count, Index, Positive, WorldCount, spec
 
 if TYPE_CHECKING:
     import torch
@@ -33,7 +33,7 @@ class NativeSimulator:
         num_threads: Threads; 0 takes all cores.
     """
 
-    num_worlds: Count
+    num_worlds: WorldCount
     substeps: Count
     num_threads: Index
 
@@ -83,7 +83,7 @@ class WarpSimulator:
             (`brokk_rl.sim.parity`); 0 for no comparison.
     """
 
-    num_worlds: Count
+    num_worlds: WorldCount
     substeps: Count
     num_contacts: Count
     num_constraints: Count

@@ -113,21 +113,28 @@ def test_its_options_show_in_the_list(mine: Path, brokk: Callable[..., Any]) -> 
 
 
 def test_its_options_run_beside_ours(mine: Path, brokk: Callable[..., Any], tmp_path: Path) -> None:
-    assert brokk("mode=show", "session.out=run").code == 0
+    assert brokk("mode=show", "actuator=mine/sticky", "session.out=run").code == 0
     assert (tmp_path / "run" / "seen.json").read_text() == '["Sticky", "Wave", "Dowser"]'
     assert brokk("mode=show", "perception=truth", "session.out=ours").code == 0
     assert (tmp_path / "ours" / "seen.json").read_text() == '["Sticky", "Wave", "TruthPerception"]'
 
 
-def test_an_option_that_two_packages_offer_is_an_error_that_names_both(
+def test_an_option_that_two_packages_offer_is_chosen_with_its_package(
     mine: Path, brokk: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sticky = "_target_: mine.parts.Sticky\nshare: 0.5\n"
     install_package(mine, "yours", {"conf/actuator/sticky.yaml": sticky}, monkeypatch)
-    done = brokk("mode=list")
-    assert done.code == 2
-    for part in ("actuator=sticky", "mine.conf", "yours.conf"):
-        assert part in done.err
+    listed = brokk("mode=list").out
+    assert "mine/sticky" in listed and "yours/sticky" in listed
+    for name, share in (("mine", 0.25), ("yours", 0.5)):
+        done = brokk(
+            "mode=train", f"actuator={name}/sticky", "--cfg", "job", "--package", "actuator"
+        )
+        assert f"share: {share}" in done.out
+    for words in (("mode=train", "actuator=sticky"), ("mode=show",)):
+        done = brokk(*words, "session.out=run")
+        assert done.code == 2
+        assert "actuator=sticky" in done.err and "mine/sticky, yours/sticky" in done.err
 
 
 def test_an_entry_point_without_its_package_is_named(mine: Path, brokk: Callable[..., Any]) -> None:

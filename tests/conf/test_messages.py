@@ -116,12 +116,13 @@ WRONG: dict[tuple[str, ...], tuple[str, ...]] = {
     (*COMPARE, "session.seed=abc"): ("session.seed: expected a whole number", "'abc'"),
     (*COMPARE, "session.seed=-1"): ("session.seed", "0 or more"),
     (*COMPARE, "session.device=gpu"): ("session.device", "cpu", "'gpu'"),
+    ("rl.runner.algorithm.num_mini_batches=100000",): ("num_mini_batches: expected at most 98304",),
+    ("mode=evaluate", "sim=native", "sim.num_worlds=1e12"): ("sim.num_worlds: expected", "1e+07"),
     ("mode=board", "board.rows=0"): ("expected a whole number of 2 or more, got 0",),
 }
 """A command, and parts of its message."""
 AFTER_TORCH = {
     ("mode=play", "preset=gpu"): ("the mode has no", "leave it out"),
-    ("rl.runner.algorithm.num_mini_batches=100000",): ("num_mini_batches: expected at most 98304",),
     ("--config-dir", "own", "actuator=typo"): ("has no 'FirstOrderLags'",),
     ("--config-dir", "own", "actuator=lost"): ("there is no module 'nowhere'", "PYTHONPATH"),
     ("--config-dir", "own", "actuator=fails"): ("fails.py, line 2", "squareroot"),
