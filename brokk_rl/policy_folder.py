@@ -34,6 +34,8 @@ from brokk_rl.session import write_json
 if TYPE_CHECKING:
     import torch
 
+    from brokk_rl.contracts.task import TaskProcess
+
 CONTRACT, WEIGHTS = "policy.json", "policy.safetensors"
 ONNX, GOLDEN = "policy.onnx", "golden.json"
 SCHEMA = 2
@@ -91,10 +93,6 @@ class TaskDescription:
             )
         return found
 
-    def compare(self, other: TaskDescription) -> dict[str, tuple[Any, Any]]:
-        """Return the values of both, `(own, other's)`, by dotted name where they differ."""
-        return dict(list_differences(self.behaviour, other.behaviour))
-
     def require_same(self, other: TaskDescription, who: str, advice: str) -> None:
         """Refuse a task `other` that is not the one of the policy or checkpoint `who`.
 
@@ -106,7 +104,7 @@ class TaskDescription:
                 f"{who} was trained for task={self.name}, not for task={other.name}; {advice}"
             )
         values = []
-        for key, (there, here) in self.compare(other).items():
+        for key, (there, here) in list_differences(self.behaviour, other.behaviour):
             values.append(f"task.{key} is {format_value(there)} there, {format_value(here)} here")
         if values:
             raise CheckpointError(f"{who} acts by another task: {'; '.join(values)}; {advice}")
@@ -181,8 +179,7 @@ def _name_class(value: object) -> str:
 
 def describe_policy(
     network: Mapping[str, Any],
-    observation: Mapping[str, Any] | None,
-    time_s: float,
+    process: TaskProcess,
     task: TaskDescription,
     machine: Machine,
     **plant: object,
@@ -191,14 +188,13 @@ def describe_policy(
 
     Args:
         network: Configuration of the network, `TrainingConfig.describe_network`.
-        observation: What the task's process says of its vector (`describe`); `None` for a task
-            that cannot be deployed.
-        time_s: Longest time of an episode.
+        process: The task's process; one that does not describe its vector cannot be deployed.
         task: Description of the task.
         machine: The machine.
         plant: Further specs of the plant that trained it, by the name of their group. The policy is
             evaluated with them where its machine is not the one of the command.
     """
+    observation = process.describe() if "describe" in process.offers else None
     rest = dict(observation or {})
     stop, masked = rest.pop("stop", {}), rest.pop("masked", True)
     names = list(machine.joint_names)
@@ -227,7 +223,7 @@ def describe_policy(
             "unit": "share of full valve opening, + towards larger positions; held for one period",
         },
         "observation": None if observation is None else rest,
-        "stop": {"time_s": time_s} | stop,
+        "stop": {"time_s": process.max_episode_steps * machine.period_s} | stop,
         "network": dict(network),
         "plant": describe_spec({"machine": machine} | plant),
     }
@@ -291,23 +287,6 @@ def write_golden_answers(
 
 
 @dataclass(frozen=True)
-class PolicyContent:
-    """Network of a policy, and what it was trained for.
-
-    Attributes:
-        weights: Weights of the actor by name.
-        network: Its configuration.
-        task: Its task.
-        fingerprint: Fingerprint of its machine.
-    """
-
-    weights: dict[str, torch.Tensor]
-    network: dict[str, Any]
-    task: TaskDescription
-    fingerprint: dict[str, str]
-
-
-@dataclass(frozen=True)
 class StoredPolicy:
     """A policy on disk, known by its contract: nothing of it needs torch but `read`.
 
@@ -354,29 +333,22 @@ class StoredPolicy:
                 nodes[key] = drop_targets(node, known)
         return nodes
 
-    def read(self, device: torch.device | str = "cpu") -> PolicyContent:
-        """Return network and task.
+    def read(self, device: torch.device | str = "cpu") -> dict[str, Any]:
+        """Return `weights` of the actor by name, and the contract's `network`, `task`, `fingerprint`.
 
         Raises:
             CheckpointError: A file is missing or corrupt, holds NaN, or is of another policy.
         """
         if self.is_checkpoint:
             content = read_checkpoint(self.file, device)
-            return PolicyContent(
-                weights=content["actor_state_dict"],
-                network=content["network"],
-                task=TaskDescription.from_json(content["task"], str(self.file)),
-                fingerprint=content["fingerprint"],
-            )
+            return content | {"weights": content["actor_state_dict"]}
         weights, stamp = _read_weights(self.file)
         if stamp != self.contract["task"]["fingerprint"]:
             raise CheckpointError(
                 f"{self.name}: {WEIGHTS} and {CONTRACT} are of different policies; export the "
                 "policy again (mode=export)"
             )
-        task = self.task
-        assert task is not None
-        return PolicyContent(weights, self.contract["network"], task, self.contract["fingerprint"])
+        return self.contract | {"weights": weights}
 
 
 def find_policy(name: str, may_lack: bool = False) -> StoredPolicy:

@@ -168,8 +168,7 @@ def train(spec: Train, folder: Path, options: argparse.Namespace) -> tuple[Any, 
     }
     contract = describe_policy(
         spec.rl.describe_network(),
-        loop.task.describe(),
-        loop.task.max_episode_steps * spec.machine.period_s,
+        loop.task,
         loop.description,
         spec.machine,
         actuator=spec.actuator,

@@ -12,13 +12,10 @@ from typing import Any, ClassVar
 import torch
 
 from brokk_rl.console_table import print_table
-from brokk_rl.contracts.actuator import Actuator, Effect, Follower
-from brokk_rl.contracts.task import Task
-from brokk_rl.contracts.world import Simulator
-from brokk_rl.machine import Machine
+from brokk_rl.modes.evaluate import PlantMode
 from brokk_rl.rl.execution import capture_graph
 from brokk_rl.rl.group import TrainingGroup
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
+from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import BenchmarkSizes, TrainingConfig
 from brokk_rl.session import Session, read_versions, write_json
@@ -39,28 +36,23 @@ contacts, the control step, training."""
 
 
 @spec
-class Benchmark:
+class Benchmark(PlantMode):
     """Measures rates of physics, control step and training.
 
     Attributes:
         session: Folder and device.
         machine: The machine.
         sim: Physics.
-        task: Task.
-        actuator: Actuator model.
-        effect: Effects, by name.
+        task: The task.
+        actuator: How commands become motion.
+        effect: Effects around the actuator model, by name.
+        event: Changes of the simulated machine, by name.
         follower: Who stands between policy and machine.
         rl: Training configuration.
         bench: What to measure.
     """
 
     session: Session
-    machine: Machine
-    sim: Simulator
-    task: Task
-    actuator: Actuator
-    effect: dict[str, Effect]
-    follower: Follower
     rl: TrainingConfig
     bench: BenchmarkSizes
 
@@ -74,14 +66,7 @@ class Benchmark:
             The training rate of the last row, that of all processes together.
         """
         device = self.session.torch_device()
-        plant = ControlLoopConfig(
-            machine=self.machine,
-            sim=self.sim,
-            task=self.task,
-            actuator=self.actuator,
-            effects=self.effect,
-            follower=self.follower,
-        )
+        plant = self.compose_loop()
         rows = []
         with TrainingGroup(device) as group:
             for num_envs in self.bench.num_envs:

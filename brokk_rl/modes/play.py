@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import time
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
-from brokk_rl.contracts.task import Policy
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
 from brokk_rl.modes.evaluate import PlantMode
@@ -19,7 +17,6 @@ from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.policy_folder import find_policy
-from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy
 from brokk_rl.session import Session
 from brokk_rl.spec import name_spec, spec
@@ -103,49 +100,21 @@ class Play(PlantMode):
         config = self.compose_loop()
         pool = max(NUM_STARTS, settings.worlds)
         loop = config.build(device, settings.worlds, pool, session.stream("starts"))
-        watch = None
+        watch, policies = None, {}
+        if not isinstance(self.policy, ClassicalPolicy):
+            policies[POLICY] = self.policy.build(loop, settings.seed)
+        if not policies or "classical_action" in loop.task.offers:
+            policies[CLASSICAL] = ClassicalPolicy(task=None).build(loop, settings.seed)
+        played = PlaySession(loop, policies, settings.neutral)
         if isinstance(self.policy, TrainedPolicy) and find_policy(self.policy.path).is_checkpoint:
             watch = CheckpointWatch(self.policy.path, loop)
-        found = _gather_policies(loop, self.policy, watch, settings.seed)
-        played = PlaySession(loop, found.policies, settings.neutral)
-        if watch is not None:
-            played.replace_policy(POLICY, found.policies[POLICY], _describe(watch))
+            played.replace_policy(POLICY, watch.load(), watch.note)
         if settings.driver not in (POLICY, played.driver):
             played.choose_driver(settings.driver)
         played.set_speed(settings.speed)
-        log.info("%s drives; %s", played.driver, found.note)
+        name = f"{name_spec(self.policy)} {getattr(self.policy, 'path', '')}".rstrip()
+        log.info("%s drives; policy=%s", played.driver, watch.note if watch else name)
         return played, watch
-
-
-@dataclass(frozen=True)
-class _Found:
-    """Policies by name, and where the first comes from."""
-
-    policies: dict[str, Policy]
-    note: str
-
-
-def _gather_policies(
-    loop: ControlLoop, policy: PolicySpec, watch: CheckpointWatch | None, seed: int
-) -> _Found:
-    """Return the policies that can drive, the one in question first."""
-    if watch is not None:
-        policies: dict[str, Policy] = {POLICY: watch.load()}
-        note = _describe(watch)
-    else:
-        policies = {POLICY: policy.build(loop, seed)}
-        note = f"policy={name_spec(policy)} {getattr(policy, 'path', '')}".rstrip()
-    if "classical_action" in loop.task.offers:
-        classical = ClassicalPolicy(task=None).build(loop, seed)
-        if type(policies[POLICY]) is type(classical):
-            return _Found({CLASSICAL: classical}, "the task's classical controller")
-        policies[CLASSICAL] = classical
-    return _Found(policies, note)
-
-
-def _describe(watch: CheckpointWatch) -> str:
-    assert watch.loaded is not None
-    return f"{watch.loaded.parent.name}/{watch.loaded.name}"
 
 
 def _drive(
@@ -161,8 +130,8 @@ def _drive(
             last_s = now_s
             page.update()
             if watch is not None and (policy := watch.poll()) is not None:
-                session.replace_policy(POLICY, policy, _describe(watch))
-                log.info("playing %s", _describe(watch))
+                session.replace_policy(POLICY, policy, watch.note)
+                log.info("playing %s", watch.note)
             if now_s >= report_s:
                 report_s = now_s + RATE_S
                 state = session.read()

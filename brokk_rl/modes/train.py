@@ -189,8 +189,7 @@ class Train(PlantMode):
         """Return the contract of the policy that is trained; see `brokk_rl.policy_folder`."""
         contract = describe_policy(
             self.rl.describe_network(),
-            loop.task.describe() if "describe" in loop.task.offers else None,
-            loop.task.max_episode_steps * self.machine.period_s,
+            loop.task,
             loop.description,
             self.machine,
             actuator=self.actuator,
@@ -224,7 +223,8 @@ class Train(PlantMode):
         if "deployable" in task.offers:
             export_onnx(folder, actor, task, self.machine, contract, answers)
         else:
-            log.warning(NOT_DEPLOYABLE.format(task=type(self.task).__name__))
+            name, text = type(self.task).__name__, "cannot be deployed, so there is no policy.onnx"
+            log.warning("the task (%s) %s; %s", name, text, NOT_DEPLOYABLE)
         return results
 
 

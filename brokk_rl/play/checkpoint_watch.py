@@ -28,14 +28,16 @@ class CheckpointWatch:
     def __init__(self, path: str, loop: ControlLoop) -> None:
         self._path, self._loop = path, loop
         self._next_s = 0.0
-        self.loaded: Path | None = None
-        """File that was loaded last."""
+        self._loaded: Path | None = None
+        self.note = ""
+        """Run and file of the checkpoint that was loaded last."""
 
     def load(self) -> NetworkPolicy:
         """Return the newest policy; errors as in `TrainedPolicy.build`."""
         stored = find_policy(self._path)
         policy = load_policy(stored, self._loop)
-        self.loaded = stored.file
+        self._loaded = stored.file
+        self.note = f"{stored.file.parent.name}/{stored.file.name}"
         return policy
 
     def poll(self) -> NetworkPolicy | None:
@@ -48,7 +50,7 @@ class CheckpointWatch:
             return None
         self._next_s = now_s + POLL_S
         try:
-            if find_policy(self._path).file == self.loaded:
+            if find_policy(self._path).file == self._loaded:
                 return None
             return self.load()
         except CheckpointError as error:

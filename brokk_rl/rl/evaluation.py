@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,23 +56,6 @@ class PolicyEvaluation:
     episodes: list[RecordedEpisode]
 
 
-@dataclass(frozen=True)
-class _Tape:
-    """Control steps of the recorded environments, `(T, R, …)` each once stacked."""
-
-    q: list[torch.Tensor]
-    u: list[torch.Tensor]
-    force_n: list[torch.Tensor]
-    running: list[torch.Tensor]
-
-    def append(self, loop: ControlLoop, running: torch.Tensor, num_recorded: int) -> None:
-        """Add the step that the control loop has just done."""
-        self.q.append(loop.end_q[:num_recorded].clone())
-        self.u.append(loop.end_u[:num_recorded].clone())
-        self.force_n.append(loop.end_force_n[:num_recorded].clone())
-        self.running.append(running[:num_recorded].clone())
-
-
 @torch.no_grad()
 def evaluate_policy(
     loop: ControlLoop,
@@ -102,7 +85,7 @@ def evaluate_policy(
     running = torch.ones(num, dtype=torch.bool, device=loop.device)
     figures = {name: torch.zeros_like(value) for name, value in loop.finished.items()}
     reason = torch.full((num,), -1.0, device=loop.device)
-    tape = _Tape([], [], [], [])
+    tape = []
     groups = loop.get_observations()
     for step in range(loop.task.max_episode_steps):
         if step % CHECKED_EVERY == 0 and not running.any():
@@ -113,7 +96,8 @@ def evaluate_policy(
         for name, value in loop.finished.items():
             figures[name] = torch.where(ended, value, figures[name])
         reason = torch.where(ended, loop.reason, reason)
-        tape.append(loop, running, num_recorded)
+        shown = (loop.end_q, loop.end_u, loop.end_force_n, running)
+        tape.append([value[:num_recorded].clone() for value in shown])
         running &= ~done
         if loop.sensor is not None:
             loop.sensor.attend(running.cpu().numpy())
@@ -166,12 +150,10 @@ def _estimate_share(happened: np.ndarray) -> dict[str, Any]:
 
 
 def _collect_episodes(
-    tape: _Tape, starts: Starts, success: torch.Tensor, period_s: float
+    tape: Sequence[Sequence[torch.Tensor]], starts: Starts, success: torch.Tensor, period_s: float
 ) -> list[RecordedEpisode]:
-    """Cut the tape into one episode per recorded environment."""
-    q, u, force_n, running = (
-        torch.stack(steps).cpu().numpy() for steps in (tape.q, tape.u, tape.force_n, tape.running)
-    )
+    """Cut positions, commands, forces and running of all steps into one episode per environment."""
+    q, u, force_n, running = (torch.stack(steps).cpu().numpy() for steps in zip(*tape, strict=True))
     episodes, targets = [], starts.get("target_m")
     for row in range(q.shape[1]):
         length = max(2, int(running[:, row].sum()))

@@ -27,11 +27,8 @@ MAX_EDGE_SHARE = 0.005
 bit of a float decides between two commands. Chosen by hand."""
 OPSET = 18
 """ONNX operator set; chosen by hand, onnxruntime on the machine reads it."""
-NOT_DEPLOYABLE = (
-    "the task ({task}) cannot be deployed, so there is no policy.onnx: it has no methods "
-    "`describe` and `deployable` (brokk_rl.contracts.task); policy=trained can evaluate the "
-    "policy of a run folder without them"
-)
+NOT_DEPLOYABLE = "policy=<run folder> evaluates the policy without policy.onnx"
+"""Advice for a task whose policies cannot be exported."""
 
 
 def export_onnx(

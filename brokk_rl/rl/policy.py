@@ -20,7 +20,7 @@ from brokk_rl.contracts.task import Policy, Task, TaskProcess
 from brokk_rl.errors import CheckpointError, ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.policy_folder import StoredPolicy, find_policy
+from brokk_rl.policy_folder import StoredPolicy, TaskDescription, find_policy
 from brokk_rl.rl.loop import ControlLoop
 from brokk_rl.rl.settings import TrainingConfig
 from brokk_rl.spec import spec
@@ -119,19 +119,49 @@ class ShippedPolicy(TrainedPolicy):
 
 def load_policy(stored: StoredPolicy, loop: ControlLoop) -> NetworkPolicy:
     """Return a stored policy for a control loop; errors as in `TrainedPolicy.build`."""
-    who = f"the policy in {stored.name}"
-    content = stored.read(loop.device)
-    loop.machine.check_fingerprint(content.fingerprint, who)
-    content.task.require_same(loop.description, who, "give the values of the policy")
-    actor = make_actor(content.network, loop.get_observations(), loop.num_actions)
-    try:
-        actor.load_state_dict(content.weights)
-    except RuntimeError as error:
-        raise CheckpointError(
-            f"{who}: the weights do not fit task and machine "
-            f"({str(error).splitlines()[-1].strip()}); give those that it was trained with"
-        ) from error
+    who, content = f"the policy in {stored.name}", stored.read(loop.device)
+    groups = loop.get_observations()
+    actor = restore_actor(content, who, loop.machine, loop.description, groups, loop.num_actions)
     return NetworkPolicy(actor, loop)
+
+
+def restore_actor(
+    content: Mapping[str, Any],
+    who: str,
+    machine: Machine,
+    task: TaskDescription,
+    observations: TensorDict,
+    num_actions: int,
+) -> MLPModel:
+    """Return the actor of a policy.
+
+    Args:
+        content: What `StoredPolicy.read` returned.
+        who: The policy, for messages.
+        machine: The machine on which it is to act.
+        task: Description of the task in which it is to act.
+        observations: Observation groups of that task.
+        num_actions: Width of an action.
+
+    Raises:
+        CheckpointError: It was made for another machine or task.
+    """
+    machine.check_fingerprint(content["fingerprint"], who)
+    own = TaskDescription.from_json(content["task"], who)
+    own.require_same(task, who, "give the values of the policy")
+    actor = make_actor(content["network"], observations, num_actions)
+    _load_weights(actor, content["weights"], f"{who}: the weights do not fit task and machine")
+    return actor
+
+
+def _load_weights(actor: torch.nn.Module, weights: Mapping[str, Any], problem: str) -> None:
+    try:
+        actor.load_state_dict(weights)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[-1].strip()
+        raise CheckpointError(
+            f"{problem} ({reason}); give those that it was trained with"
+        ) from error
 
 
 class _ClassicalActor:
@@ -223,16 +253,10 @@ def load_initial_weights(actor: torch.nn.Module, path: str, machine: Machine) ->
         CheckpointError: The policy cannot be used, or its network has another shape.
     """
     content = find_policy(path).read()
-    machine.check_fingerprint(content.fingerprint, f"the policy in {path}")
-    weights = dict(content.weights)
+    machine.check_fingerprint(content["fingerprint"], f"the policy in {path}")
+    weights = dict(content["weights"])
     for name, value in actor.state_dict().items():
         if name.startswith(EXPLORATION_PREFIX):
             weights[name] = value
-    try:
-        actor.load_state_dict(weights)
-    except RuntimeError as error:
-        raise CheckpointError(
-            f"policy={path}: it does not fit task, machine and rl.runner.actor "
-            f"({str(error).splitlines()[-1].strip()}); train with those it was made with, "
-            "or leave policy= out"
-        ) from error
+    problem = f"policy={path}: it does not fit task, machine and rl.runner.actor"
+    _load_weights(actor, weights, problem)

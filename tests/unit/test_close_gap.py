@@ -130,7 +130,7 @@ def test_training_that_begins_with_a_policy_has_its_network_and_its_own_explorat
         spread(old).fill_(-3.0)  # as one that has settled
     env = runner.env
     network = training.describe_network()
-    contract = describe_policy(network, None, 20.0, env.description, machine)
+    contract = describe_policy(network, env.task, env.description, machine)
     write_policy(tmp_path / "old", contract, old.state_dict())
     loop = plant(machine).build(CPU, 16, 64, 0)
     actor = make_actor(network, loop.get_observations(), loop.num_actions)

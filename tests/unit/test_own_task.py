@@ -28,6 +28,7 @@ from brokk_rl.policy_folder import (
     describe_policy,
     describe_task,
     find_policy,
+    list_differences,
     read_checkpoint,
     write_policy,
 )
@@ -62,8 +63,7 @@ def newest(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     actor, process = runner.alg.get_policy(), loop.task
     contract = describe_policy(
         training.describe_network(),
-        process.describe(),  # type: ignore[attr-defined]
-        process.max_episode_steps * machine.period_s,
+        process,
         loop.description,
         machine,
         actuator=option("actuator", "lag"),
@@ -100,7 +100,8 @@ def test_each_field_of_the_behaviour_counts() -> None:
     own = describe_task(task)
     for key, other in changed.items():
         found = describe_task(other)
-        assert list(own.compare(found)) == [key] and found.fingerprint() != own.fingerprint()
+        differing = dict(list_differences(own.behaviour, found.behaviour))
+        assert list(differing) == [key] and found.fingerprint() != own.fingerprint()
     conditions = insertion(episode_s=1.0, noise=replace(task.noise, target_bias_m=0.1))
     assert describe_task(conditions) == own
 

@@ -60,10 +60,7 @@ def export_policy(machine: Machine, folder: Path, name: str, kind: str) -> Bundl
     with torch.no_grad():
         for parameter in actor.mlp.parameters():
             parameter.copy_(torch.randn_like(parameter) * 0.1)
-    time_s = loop.task.max_episode_steps * machine.period_s
-    contract = describe_policy(
-        network, loop.task.describe(), time_s, loop.description, machine, actuator=None
-    )
+    contract = describe_policy(network, loop.task, loop.description, machine, actuator=None)
     write_policy(folder, contract, actor.state_dict())
     seen = []
     for _ in range(25):
