@@ -31,7 +31,7 @@ LOW, HIGH = "_low", "_high"
 """Endings of the columns with the 95 % interval of a figure."""
 NOT_FIGURES = ("episodes", "seed")
 """Numbers of `evaluation.json` that are not compared."""
-NOT_COMPARED = ("session", "mode", "hydra", "ablation", "preset")
+NOT_COMPARED = ("session", "mode", "hydra", "preset")
 """Choices and overrides that say how a run was started, not what it was."""
 EVALUATED_ON = "evaluated on"
 """Column of the actuator on which policies of other runs were evaluated."""

@@ -113,15 +113,15 @@ def load_option(group: str, name: str, **fields: object) -> Any:
 
 
 def load_part(name: str) -> Any:
-    """Return the spec of a part that has no other options: `load_part("session")`.
+    """Return the spec of a part that has no other options, of `conf/<name>.yaml`.
 
     Raises:
         ConfigError: A value is refused.
     """
     from brokk_rl.build import build_node
 
-    path = registry.find_packages()[registry.CORE] / f"{name}.yaml"
-    return build_node(yaml.safe_load(path.read_text()), name)
+    with hydra.initialize_config_module("conf", version_base="1.3"):
+        return build_node(OmegaConf.to_container(hydra.compose(name), resolve=True), name)
 
 
 def load_mode(*words: str) -> Any:

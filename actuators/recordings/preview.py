@@ -96,7 +96,7 @@ class PreviewResult:
 
 
 class EffectPreview(Protocol):
-    """A spec in `conf/preview`: foretells what a diagnosis could tell from some motions."""
+    """The spec in `conf/preview.yaml`: foretells what a diagnosis could tell from some motions."""
 
     def assess(
         self,

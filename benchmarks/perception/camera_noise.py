@@ -2,7 +2,7 @@
 
     uv run --with scikit-image python benchmarks/perception/camera_noise.py <out.json> --count 3
 
-Every pair is matched with `stereo=sgbm`, refined and not. The error of a disparity is its difference
+Every pair is matched with `conf/stereo.yaml`, refined and not. The error of a disparity is its difference
 from the truth; counted are errors within 1 px of their median, away from steps of the depth. Rendered:
 the block's face around a hole at 1, 2 and 3 m. Real: the motorcycle of Middlebury 2014 (Scharstein et al.), in the
 size that scikit-image ships, two photographs by single-lens reflex cameras.

@@ -4,7 +4,7 @@
 
 Scenes of `scene=hidden` at one distance. The fixed camera takes three pictures from its place. The
 moving one takes the first there too. Then it may go up to 0.4 m sideways, up or down and turn to the
-hole, where `perception/next_view` sends it, for two more. A hole counts as found when it was found
+hole, where `conf/next_view.yaml` sends it, for two more. A hole counts as found when it was found
 once. The machine's sensors tell where the arm is; where the hole is, is known to 30 mm.
 """
 
@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from brokk_rl.errors import FrameError
-from brokk_rl.extensions import load_option
+from brokk_rl.extensions import load_option, load_part
 from brokk_rl.statistics import compute_wilson_interval
 from perception.mount.mounts import MountError
 from perception.mount.next_view import HoleBelief
@@ -84,7 +84,7 @@ def look(number: int, distance_m: float) -> dict[str, Any]:
     hint_m = hole_m + HINT_M * generator.standard_normal(3)
     mount = ReachingMount(base, hint_m)
     machine = load_option("machine", "brokk170")
-    chooser = load_option("perception/next_view", "expected_covariance")
+    chooser = load_part("next_view")
     planner = chooser.build(machine, mount, rig, SceneArm(scene, base))
     camera = Camera(rig, kind, scene, hole_m)
     first = camera.sees(base, hint_m, generator)
@@ -108,7 +108,7 @@ class Camera:
 
     def __init__(self, rig: StereoRig, kind: Any, scene: Scene, hole_m: np.ndarray) -> None:
         self._rig, self._kind, self._scene, self._hole_m = rig, kind, scene, hole_m
-        self._stereo = load_option("stereo", "sgbm")
+        self._stereo = load_part("stereo")
         self._finder = load_option("perception", "plane_conic").build()
 
     def sees(self, pose: np.ndarray, hint_m: np.ndarray, generator: np.random.Generator) -> bool:

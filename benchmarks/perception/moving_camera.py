@@ -21,7 +21,7 @@ from typing import Any
 from brokk_rl.cli import main as run_command
 from brokk_rl.statistics import compute_wilson_interval
 
-TRUE_HOLE = ("target=drawn", "task.noise.target_sample_m=0", "task.noise.target_bias_m=0")
+TRUE_HOLE = ("task.noise.target_sample_m=0", "task.noise.target_bias_m=0")
 
 
 def main() -> None:

@@ -20,7 +20,7 @@ from PIL import Image
 
 from brokk_rl.contracts.vision import CameraView, TrackedHole
 from brokk_rl.errors import FrameError
-from brokk_rl.extensions import load_option
+from brokk_rl.extensions import load_option, load_part
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from perception.mount.approach import plan_approach_motion
@@ -55,13 +55,13 @@ def film(machine: Machine, scene: list[float]) -> list[Image.Image]:
             **{"rig.width": 1280, "rig.height": 720, "rig.focal_px": 528.0},
         ),
         mount=load_option("perception/mount", "mast"),
-        next_view=load_option("perception/next_view", "expected_covariance"),
+        next_view=load_part("next_view"),
         arm=load_option("target", "perceived").arm,
         machine=machine,
         hint_m=0.1,
     )
     finder = load_option("perception", "plane_conic").build()
-    tracker = load_option("perception/tracker", "fusion").build()
+    tracker = load_part("tracker").build()
     hole_m = np.array(scene[:3])
     plan = plan_approach_motion(machine, np.array(START), hole_m, NUM_STEPS, STEP_S)
     pictures, hole, frame = [], None, None

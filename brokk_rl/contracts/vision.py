@@ -277,7 +277,7 @@ class HoleTracker(Protocol):
 
 
 class TrackerSpec(Protocol):
-    """A spec in `conf/perception/tracker`."""
+    """The spec in `conf/tracker.yaml`."""
 
     def build(self) -> HoleTracker:
         """Return a tracker that has seen nothing yet."""

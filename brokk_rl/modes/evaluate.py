@@ -94,7 +94,7 @@ class Evaluate(PlantMode):
     def check(self) -> None:
         if self.target is not None and not hasattr(self.target, "sense"):
             raise ConfigError(
-                f"target={name_spec(self.target)}: mode=evaluate takes target=drawn or "
+                f"target={name_spec(self.target)}: mode=evaluate takes target=null or "
                 "target=perceived; the others are for mode=deploy"
             )
 

@@ -146,7 +146,7 @@ class ControlLoop(VecEnv):
         self.machine, self.world, self.task = machine, world, task
         self.sensor = sensor
         if sensor:
-            task.require("take_estimate", "give target=drawn")
+            task.require("take_estimate", "give target=null")
         self.description = description
         self.actuator, self.follower = actuator, follower
         self.num_envs = world.num_worlds

@@ -26,7 +26,7 @@ class TwinBench:
         operator: Simulated person who moves the levers as they are shown; `null`: none, the levers
             stay in neutral.
         guidance: How the levers are shown.
-        assumed: Assumptions of policies for such an operator (`advice=person`), for the record;
+        assumed: Assumptions of policies for such an operator (`conf/advice.yaml`), for the record;
             `null` without one.
     """
 

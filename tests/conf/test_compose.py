@@ -5,14 +5,12 @@ from __future__ import annotations
 import hydra
 import pytest
 from composed import every
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from brokk_rl import registry
 from brokk_rl.build import build_node
 
-OVERRIDES = ("experiment", "ablation", "preset", "search", "exam_protocol")
+OVERRIDES = ("experiment", "preset", "search", "exam_protocol")
 ASKING_FOR_A_POLICY = ("doctor_policy", "export", "why")
 """Modes without a policy of their own; `test_values` holds what they answer without one."""
 PARTS = [
@@ -57,17 +55,6 @@ def test_every_preset_composes(name: str) -> None:
 def test_every_exam_protocol_composes(name: str) -> None:
     cfg = composed("mode=exam", f"exam_protocol={name}")
     assert cfg.exam.sealed is (name == "sealed")
-
-
-@every("ablation")
-def test_every_job_of_every_ablation_composes(name: str) -> None:
-    cfg = composed(f"ablation={name}")
-    assert cfg.hydra.mode.name == "MULTIRUN", "an ablation is a sweep: hydra.mode: MULTIRUN"
-    params = [f"{key}={value}" for key, value in cfg.hydra.sweeper.params.items()]
-    jobs = BasicSweeper.split_arguments(OverridesParser.create().parse_overrides(params), None)[0]
-    assert jobs
-    for job in jobs:
-        composed(f"ablation={name}", *job)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from drawn import CENTER, K, drawn
 from packages import install_package
 
 from brokk_rl.checks import check_finder
+from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from deploy.runtime import perception_process
 from deploy.runtime.perception_process import CameraConfig
@@ -80,7 +81,7 @@ def test_the_camera_process_publishes_its_holes(name: str, finder_spec: Any) -> 
     camera = CameraConfig(
         source=TwoFrames(frame),
         finder=finder_spec if name == "own" else option("perception", "truth"),
-        tracker=option("perception/tracker", "fusion"),
+        tracker=load_part("tracker"),
         rate_hz=100.0,
         num_px=frame.depth_m.size,
         stale_s=1.0,

@@ -1,7 +1,6 @@
-"""Every experiment and every job of every ablation: trained for a moment, evaluated, exported, and the answers are the same.
+"""Every experiment and changes of the task: trained for a moment, evaluated, exported, and the answers are the same.
 
-`make test` takes the other task, the experiment that trains a task of its own, and of each ablation that changes the behaviour
-of the task the last job. The others change the plant, the noise or the reward, and are marked slow.
+`make test` takes the other task, and the experiment that trains a task of its own.
 """
 
 from __future__ import annotations
@@ -15,13 +14,10 @@ import numpy as np
 import onnxruntime
 import pytest
 import yaml
-from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.utils import instantiate
 
 from brokk_rl import cli, registry
 from brokk_rl.policy_folder import describe_task
-from tasks.borehole_insertion import BoreholeInsertion
 
 SHORT = (
     "session.device=cpu", "sim=native", "evaluation.episodes=2", "evaluation.num_recorded=1", "evaluation.video=false",
@@ -35,6 +31,10 @@ TRAINED = (
 """Two iterations of 8 environments."""
 
 
+CHANGES_OF_BEHAVIOUR = ("follower=person", "task.memory=1", "task.action.mask=false")
+"""Words that change what a policy learns with, and so the fingerprint of its task."""
+
+
 def read_options(group: str) -> dict[str, dict[str, Any]]:
     """Returns the content of each option's file: composing all of them takes longer than a test."""
     return {
@@ -42,12 +42,6 @@ def read_options(group: str) -> dict[str, dict[str, Any]]:
         for one in registry.list_options()
         if one.group == group
     }
-
-
-def changes_behaviour(key: str) -> bool:
-    """Return whether a swept key belongs to the task's behaviour, or brings a part of it."""
-    fields = tuple(f"task.{name}" for name in BoreholeInsertion.behaviour)
-    return key.startswith("follower.") or key.startswith(fields)
 
 
 def list_cases() -> list[Any]:
@@ -62,16 +56,8 @@ def list_cases() -> list[Any]:
                 words = tuple(word for word in stage["command"][1:] if "{folder}" not in word)
                 marks = [pytest.mark.slow]
                 cases.append(pytest.param(words, (), id=f"experiment={name}", marks=marks))
-    for name, content in read_options("ablation").items():
-        params = content["hydra"]["sweeper"]["params"]
-        swept = [key for key in params if key != "session.seed"]
-        parsed = OverridesParser.create().parse_overrides([f"{key}={params[key]}" for key in swept])
-        jobs = BasicSweeper.split_arguments(parsed, None)[0]
-        for job in jobs:
-            words = (f"ablation={name}", *job)
-            quick = job is jobs[-1] and any(map(changes_behaviour, swept))
-            marks = [] if quick else [pytest.mark.slow]
-            cases.append(pytest.param(words, words, id=" ".join(words), marks=marks))
+    for word in CHANGES_OF_BEHAVIOUR:
+        cases.append(pytest.param((word,), (word,), id=word))
     return cases
 
 
@@ -103,13 +89,11 @@ def test_what_was_trained_is_evaluated_and_exported_as_what_it_is(
     words: tuple[str, ...], shared: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    # an ablation is a sweep; its jobs are single commands here
-    single = ("hydra.mode=RUN",) if any(word.startswith("ablation=") for word in words) else ()
-    command(*words, *TRAINED, *SHORT, *single, "session.out=run")
+    command(*words, *TRAINED, *SHORT, "session.out=run")
     made = read(tmp_path / "run" / "policy.json")
     assert made["task"]["fingerprint"] == describe_words(words)
 
-    command("mode=evaluate", "policy=./run", *shared, *SHORT, *single, "session.out=seen")
+    command("mode=evaluate", "policy=./run", *shared, *SHORT, "session.out=seen")
     found = read(tmp_path / "seen" / "evaluation.json")
     assert found["task"] == made["task"]
     if shared:  # on the same plant the figures are those of the training

@@ -15,6 +15,7 @@ from composed import option
 
 from brokk_rl.contracts.vision import CameraView, FrameDetections, HolePose
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
@@ -100,7 +101,7 @@ def test_a_frame_is_handed_on_whole_or_shrunk_with_its_camera(exchange: LoopMemo
 
 def show(exchange: LoopMemory, *poses: HolePose, now_s: float | None = None) -> None:
     now_s = time.monotonic() if now_s is None else now_s
-    tracked = option("perception/tracker", "fusion").build().update(poses, now_s)
+    tracked = load_part("tracker").build().update(poses, now_s)
     perception_process.write_holes(exchange.holes, tracked, time.monotonic())
 
 
@@ -293,7 +294,7 @@ def camera(source: Any) -> CameraConfig:
     return CameraConfig(
         source=source,
         finder=source,
-        tracker=option("perception/tracker", "fusion"),
+        tracker=load_part("tracker"),
         rate_hz=100.0,
         num_px=PIXELS,
         stale_s=1.0,

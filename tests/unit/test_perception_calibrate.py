@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 
 from brokk_rl import record
 from brokk_rl.errors import FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from perception import dataset
@@ -296,7 +297,7 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     assert "corners of the board" in lost["left_out"]
     folder = FrameFolder(
         folder=str(footage), rate_hz=1.0, least_known=0.0, needs="camera", base_from_camera="run/calibration.yaml",
-        stereo=option("stereo", "sgbm"), pair=option("perception/pair", "matched_features"),
+        stereo=load_part("stereo"), pair=option("perception/pair", "matched_features"),
     )  # fmt: skip
     with folder.build() as source:
         frame = source.read_latest()
@@ -445,7 +446,7 @@ def test_a_given_point_is_as_exact_as_a_click_of_the_camera_that_is_known(
         calibration = touched_points.TouchCalibration(
             source=FrameFolder(
                 folder=str(tmp_path),
-                stereo=option("stereo", "sgbm"),
+                stereo=load_part("stereo"),
                 pair=option("perception/pair", "matched_features"),
                 rate_hz=10.0,
                 least_known=0.01,

@@ -11,6 +11,7 @@ from composed import every, option
 
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from brokk_rl.kinematics import compute_link_pose, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from perception.mount.next_view import HoleBelief
@@ -31,7 +32,7 @@ def believe(std_m: float = 0.01) -> HoleBelief:
 
 def plan(machine: Machine, name: str, **fields: Any) -> tuple[Any, Any]:
     mount = option("perception/mount", name, **fields).build(machine)
-    chooser = option("perception/next_view", "expected_covariance")
+    chooser = load_part("next_view")
     return mount, chooser.build(machine, mount, RIG, ARM)
 
 
@@ -121,7 +122,7 @@ def test_a_camera_that_sees_the_hole_as_well_as_any_stays(machine: Machine) -> N
 
 
 def test_what_is_not_seen_ages_in_the_tracker_and_is_corrected_by_the_next_view() -> None:
-    fusion = replace(option("perception/tracker", "fusion"), drift_m_sqrt_s=0.001)
+    fusion = replace(load_part("tracker"), drift_m_sqrt_s=0.001)
     cov = 0.001**2 * np.eye(3)
     pose = HolePose(HOLE_M, UP, 0.05, cov, np.zeros((3, 3)), "base", 0.9, 0.0)
     tracker = fusion.build()

@@ -15,6 +15,7 @@ import pytest
 from composed import names, option
 
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from perception import dataset
 from perception.render.block_sampler import build_frame, draw_block
@@ -81,7 +82,7 @@ def studio(
     return FrameRenderer(
         rig=rig,
         scene=kind(name),
-        stereo=option("stereo", "sgbm"),
+        stereo=load_part("stereo"),
         depth=depth,
         pair=True,
         surfaces=NO_PHOTOGRAPHS,
@@ -285,7 +286,7 @@ def test_matched_depth_is_as_uncertain_as_real_pairs_and_has_no_bias(rig: Stereo
         )
         for view in views
     )
-    stereo = option("stereo", "sgbm")
+    stereo = load_part("stereo")
     face = cv2.erode((views[0].solid == 0).astype(np.uint8), np.ones((21, 21))).astype(bool)
     face &= ~cv2.dilate(views[0].mouth.astype(np.uint8), np.ones((21, 21))).astype(bool)
     error, known = {}, {}

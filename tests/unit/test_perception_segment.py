@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from brokk_rl.errors import CheckpointError, ConfigError, FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import dataset
 from perception.dataset import FrameLabel
@@ -252,7 +253,7 @@ def test_the_network_that_ships_sees_blocks_and_mouths_it_was_not_trained_on() -
         studio = FrameRenderer(
             rig=rig,
             scene=kind,
-            stereo=option("stereo", "sgbm"),
+            stereo=load_part("stereo"),
             depth="none",
             pair=False,
             surfaces=NO_PHOTOGRAPHS,

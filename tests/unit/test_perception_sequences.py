@@ -15,6 +15,7 @@ from composed import option
 
 from brokk_rl import record
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception import dataset
@@ -51,7 +52,7 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     studio = FrameRenderer(
         rig=rig,
         scene=kind,
-        stereo=option("stereo", "sgbm"),
+        stereo=load_part("stereo"),
         depth="none",
         pair=False,
         surfaces=NO_PHOTOGRAPHS,

@@ -16,6 +16,7 @@ import yaml
 from composed import option
 
 from brokk_rl.errors import ConfigError, FrameError
+from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import dataset
 from perception.calibrate.extrinsics import CameraExtrinsics
@@ -53,7 +54,7 @@ def folder(path: Path, **changes: Any) -> FrameFolder:
                 "least_known": 0.01,
                 "needs": "depth",
                 "base_from_camera": None,
-                "stereo": option("stereo", "sgbm"),
+                "stereo": load_part("stereo"),
                 "pair": option("perception/pair", "matched_features"),
             }
             | changes

@@ -24,7 +24,7 @@ SLANT = 30.0 + 0.02 * np.arange(WIDTH, dtype=np.float32)[None, :].repeat(HEIGHT,
 
 @pytest.fixture(scope="module")
 def stereo() -> Stereo:
-    return instantiate(OmegaConf.load("conf/stereo/sgbm.yaml"))
+    return instantiate(OmegaConf.load("conf/stereo.yaml"))
 
 
 def make_pair(disparity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +91,7 @@ def test_an_occluder_outside_the_band_keeps_its_coarse_depth(stereo: Stereo) -> 
 
 
 def test_fine_depth_and_depth_without_a_pair_stay() -> None:
-    faces = FaceDepth(stereo=instantiate(OmegaConf.load("conf/stereo/sgbm.yaml")), radius_px=12.0, extent=6.0)  # fmt: skip
+    faces = FaceDepth(stereo=instantiate(OmegaConf.load("conf/stereo.yaml")), radius_px=12.0, extent=6.0)  # fmt: skip
     frame, on = make_frame(SLANT, SLANT, 4), np.ones_like(SLANT, bool)
     assert faces.build(replace(frame, depth_shrink=1), on) is None
     assert faces.build(replace(frame, right=None), on) is None

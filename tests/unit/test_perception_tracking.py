@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from composed import option
 
 from brokk_rl.contracts.vision import HolePose
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from perception.calibrate import transforms
 
-FUSION = replace(option("perception/tracker", "fusion"), drift_m_sqrt_s=0.0)
+FUSION = replace(load_part("tracker"), drift_m_sqrt_s=0.0)
 """A base that does not move: what is averaged can be worked out by hand."""
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -48,7 +48,7 @@ def test_a_reader_that_stops_early_causes_no_traceback() -> None:
 
 def test_an_override_is_described_by_the_first_sentence_of_its_comment(tmp_path: Path) -> None:
     text = "# @package _global_\n# What happens without\n# a mask. Sweeps 2 seeds.\n# More.\ntask: {}\n"
-    assert option(tmp_path, "ablation", text).summary() == "What happens without a mask."
+    assert option(tmp_path, "experiment", text).summary() == "What happens without a mask."
 
 
 LONGEST_SUMMARY = 58

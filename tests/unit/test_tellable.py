@@ -204,7 +204,7 @@ def test_a_delay_and_an_offset_of_clocks_look_alike_in_any_motion(machine: Machi
     excitations = {name: option("excitation", name) for name in ("levels", "ramps")}
     one = preview(("clock_offset", "dead_time", "dead_band"), excitations=excitations)
     result = assess(
-        replace(one, error=option("preview", "default").error), machine, motions(machine, 300.0, 3)
+        replace(one, error=load_part("preview").error), machine, motions(machine, 300.0, 3)
     )
     (pair,) = result.pairs
     assert pair.effects == ("clock_offset", "dead_time") and pair.joints == machine.joint_names
@@ -228,7 +228,7 @@ def test_noise_that_is_measured_hides_small_effects(axis: Machine) -> None:
 
 def test_a_coarse_sensor_has_the_noise_of_rounding(axis: Machine) -> None:
     """The root mean square of a rounding error is the step over sqrt(12)."""
-    step, error = 0.004, option("preview", "default").error
+    step, error = 0.004, load_part("preview").error
     some = motions(axis, 150.0, 4)
     coarse = [replace(one, q=(np.round(one.q / step) * step).astype(np.float32)) for one in some]
     assert error.measure_reading(coarse, axis) == pytest.approx([step / np.sqrt(12.0)], rel=0.05)
@@ -267,7 +267,7 @@ def test_too_short_motions_are_refused(axis: Machine) -> None:
 def test_machines_without_masses_have_a_preview() -> None:
     machine = option("machine", "mini_excavator")
     some = motions(machine, 120.0, 1, "reversals")
-    result = assess(replace(option("preview", "default"), excitations={}), machine, some)
+    result = assess(replace(load_part("preview"), excitations={}), machine, some)
     joint = machine.joint_names[0]
     assert limit(result, "creep", joint).number == "drift_rad_s"
     assert limit(result, "backlash", joint).unit == "m" and limit(result, "backlash", joint).is_told
@@ -282,7 +282,7 @@ def test_joints_commanded_by_targets_or_torques_have_no_preview(
     assert some, "there is motion: the interface alone is the reason"
     caplog.set_level("INFO")
     generator = np.random.default_rng(0)
-    assert run_preview(option("preview", "default"), some, machine, generator, True) is None
+    assert run_preview(load_part("preview"), some, machine, generator, True) is None
     assert "known for joints commanded by speed only" in caplog.text
 
 
