@@ -236,10 +236,14 @@ def require_new_folder(folder: Path) -> None:
         raise StorageError(f"cannot write into {place}. Choose session.out=<folder>.")
     if before := read_record(folder):
         mode, outcome = before.get("mode", "?"), before.get("outcome", "?")
-        raise StorageError(
-            f"{folder} already holds a run ({mode}, {outcome}). Give another folder with "
-            "session.out=<folder>, or delete this one."
-        )
+        advice = "Give another folder with session.out=<folder>, or delete this one."
+        checkpoints = list(folder.glob("model_*.pt"))
+        if mode == "train" and checkpoints:
+            newest = max(checkpoints, key=lambda path: path.stat().st_mtime)
+            advice += (
+                f" To go on from {newest}: brokk mode=train policy={folder} session.out={folder}"
+            )
+        raise StorageError(f"{folder} already holds a run ({mode}, {outcome}). {advice}")
 
 
 def read_earlier_job(folder: Path, resolved: str) -> dict[str, Any] | None:

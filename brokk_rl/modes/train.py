@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
+from scipy import stats
 
 from brokk_rl import distributed
 from brokk_rl.contracts.task import SUCCESS
@@ -36,6 +37,7 @@ from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.session import Session, read_record, write_json
 from brokk_rl.spec import name_spec, spec
+from brokk_rl.statistics import CONFIDENCE
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +112,7 @@ class Train(PlantMode):
             if not is_first:
                 return None
             logger = runner.logger
-            _log_success(logger, group.rank.count * loop.num_envs * loop.task.max_episode_steps)
+            _log_success(logger)
             results = self._finish(config, runner)
             files = [path for name in TRACKED for path in sorted(folder.glob(name))]
             logger.writer.report(flatten_figures(results["policies"], "evaluation"), files)
@@ -216,9 +218,12 @@ class Train(PlantMode):
             "untrained": UntrainedPolicy(training=self.rl),
         }
         results = evaluate_policies(config, self.evaluation, self.session, policies)
-        controller = results["policies"].get("classical")
-        line = controller and controller[SUCCESS]["mean"]
-        draw_curves(folder / PROGRESS, folder / "learning_curves.png", loop.task.figures, line)
+        line = None
+        if controller := results["policies"].get("classical"):
+            line = controller[SUCCESS]["mean"]
+            log.info("%s", _word_gain(results["policies"]["trained"], controller))
+        picture, words = folder / "learning_curves.png", loop.task.figures
+        draw_curves(folder / PROGRESS, picture, words, book.first_episodes, line)
         task = config.task.build(self.machine, 1, torch.device("cpu"))
         if "deployable" in task.offers:
             export_onnx(folder, actor, task, self.machine, contract, answers)
@@ -239,17 +244,25 @@ def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
     return found
 
 
-def _log_success(logger: TrainingLogger, first_episodes: int) -> None:
-    """Log how many seconds of training the levels of success took.
-
-    Args:
-        logger: Holds the rows of the training.
-        first_episodes: Control steps of the first episodes; see `find_passing`.
-    """
+def _log_success(logger: TrainingLogger) -> None:
+    """Log how many seconds of training the levels of success took."""
     for level in LEVELS:
-        passed = find_passing(logger.rows, level, first_episodes)
+        passed = find_passing(logger.rows, level, logger.first_episodes)
         text = "not reached" if passed is None else f"after {float(passed['seconds']):.1f} s"
         log.info("success of %.2f while learning: %s", level, text)
+
+
+def _word_gain(trained: Mapping[str, Any], controller: Mapping[str, Any]) -> str:
+    """Return whether training has gained over the controller, by Fisher's exact test."""
+    table = []
+    for row in (trained, controller):
+        successes = round(row["episodes"] * row[SUCCESS]["mean"])
+        table.append([successes, row["episodes"] - successes])
+    own, other = trained[SUCCESS]["mean"], controller[SUCCESS]["mean"]
+    verdict = "no gain shown"
+    if stats.fisher_exact(table, alternative="greater").pvalue < 1.0 - CONFIDENCE:
+        verdict = f"better than the controller by {own - other:.3f}"
+    return f"success {own:.3f} against the controller's {other:.3f}: {verdict}"
 
 
 def _log_setup(loop: ControlLoop, group: TrainingGroup) -> None:

@@ -226,6 +226,9 @@ class TrainingLogger:
         self.env_steps, self.seconds = 0, 0.0
         num_steps = int(training.runner["num_steps_per_env"])
         self.steps_per_iteration = loop.num_envs * num_steps * group.rank.count
+        self.first_episodes = loop.num_envs * group.rank.count * loop.task.max_episode_steps
+        """Control steps in which the first episodes end. Mostly short ones are among them, and short
+        ones are successes: their success is not told."""
         self._loop, self._training, self._group = loop, training, group
         self._folder, self._path = folder, folder / PROGRESS
         self.rows: list[dict[str, Any]] = []
@@ -308,9 +311,10 @@ class TrainingLogger:
         self.rows.append({"iteration": it, **figures})
         self._num_unwritten += 1
         self.writer.log(figures, it)
-        rate, success = figures["rate/env_steps_per_s"], figures.get(SUCCESS, 0.0)
+        note = f"{figures['rate/env_steps_per_s']:,.0f} steps/s"
+        if self.env_steps > self.first_episodes and SUCCESS in figures:
+            note += f", success {figures[SUCCESS]:.2f}"
         # the last iteration may go beyond the budget
-        note = f"{rate:,.0f} steps/s, success {success:.2f}"
         self._progress.reach(min(1.0, self.share_done), note=note)
         if not self._told_first and not self._quiet:
             self._told_first = True
@@ -405,7 +409,11 @@ def find_passing(
 
 
 def draw_curves(
-    progress: Path, picture: Path, words: Mapping[str, Figure], controller: float | None = None
+    progress: Path,
+    picture: Path,
+    words: Mapping[str, Figure],
+    first_episodes: int = 0,
+    controller: float | None = None,
 ) -> None:
     """Draw `progress.csv` over control steps into a PNG; an empty file gives no picture.
 
@@ -413,12 +421,16 @@ def draw_curves(
         progress: The file.
         picture: The PNG.
         words: Figures that the task names, by the name in `TaskProcess.episode`.
+        first_episodes: Control steps for which no success is drawn; see `TrainingLogger`.
         controller: Success of the classical controller, drawn as a line; `None` for none.
     """
     rows = pd.read_csv(progress, dtype=float)
     if rows.empty:
         return
     panels = _list_panels(words)
+    for _, column, _ in panels["Success"]:
+        if column in rows:
+            rows[column] = rows[column].where(rows["env_steps"] > first_episodes)
     num_rows = -(-len(panels) // NUM_COLUMNS)
     figure = make_figure(13, 3.25 * num_rows)
     axes = figure.subplots(num_rows, NUM_COLUMNS, squeeze=False).flat
@@ -432,7 +444,7 @@ def draw_curves(
         axis.set_xlabel("control steps, millions")
         draw_grid(axis)
         if title == "Success":
-            axis.set_ylim(0.0, 1.0)
+            axis.set_ylim(0.0, 1.02)
             if controller is not None:
                 axis.axhline(controller, label="controller", color=GREY, linestyle="--")
         if len(axis.lines) > 1:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pytest
+
+from brokk_rl.modes.train import _word_gain
 from brokk_rl.rl.logger import find_passing
 
 
@@ -27,3 +30,17 @@ def test_a_level_is_passed_by_the_newest_episodes_and_not_by_few_of_them() -> No
     assert find_passing(early, 0.95, after=100, window=20)["seconds"] == 3.0
     # an iteration without an episode repeats older figures, which count for nothing
     assert find_passing(rows((10, 0.0), (0, 1.0), (10, 0.0)), 0.5, window=20) is None
+
+
+@pytest.mark.parametrize(
+    ("successes", "verdict"),
+    # of 1,024 each, against 973
+    [(979, "no gain shown"), (1015, "better than the controller by 0.041"), (900, "no gain shown")],
+)
+def test_a_gain_over_the_controller_is_said_only_where_it_is_shown(
+    successes: int, verdict: str
+) -> None:
+    trained, controller = (
+        {"episodes": 1024, "success_strict": {"mean": count / 1024}} for count in (successes, 973)
+    )
+    assert _word_gain(trained, controller).endswith(verdict)

@@ -13,7 +13,7 @@ import torch
 
 from brokk_rl.errors import ConfigError, DeviceError, StorageError
 from brokk_rl.explain import explain
-from brokk_rl.session import Session, describe_commit, read_record, write_json
+from brokk_rl.session import Session, describe_commit, read_record, require_new_folder, write_json
 
 
 def session(folder: Path, seed: int = 0, device: str = "cpu") -> Session:
@@ -108,6 +108,17 @@ def test_a_run_that_is_refused_after_it_wrote_something_keeps_it(tmp_path: Path)
     with pytest.raises(ConfigError):
         begin_and_fail()
     assert read_record(tmp_path / "a")["outcome"] == "failed"
+
+
+def test_the_folder_of_a_training_that_was_killed_is_refused_with_the_command_that_goes_on(
+    tmp_path: Path,
+) -> None:
+    write_json(tmp_path / "session.json", {"mode": "train", "outcome": "running"})
+    for iteration in (9, 20):
+        (tmp_path / f"model_{iteration}.pt").touch()
+    command = f"go on from {tmp_path}/model_20.pt: brokk mode=train policy={tmp_path} session.out="
+    with pytest.raises(StorageError, match=command):
+        require_new_folder(tmp_path)
 
 
 def test_a_folder_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
