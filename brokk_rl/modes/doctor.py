@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from packaging.specifiers import SpecifierSet
+from packaging.utils import canonicalize_name
 from rich.text import Text
 
 import brokk_rl
@@ -70,7 +71,6 @@ class Doctor:
             "Python": check_python,
             "packages": check_packages,
             "torch": check_torch,
-            "CUDA graphs": check_cuda_graphs,
             "Warp": check_warp,
             "rendering": check_rendering,
             "disk": lambda: check_disk(folder, min_free_gib),
@@ -119,28 +119,25 @@ def check_packages() -> DoctorFinding:
     if about is None:
         text = f"{extras.DISTRIBUTION} runs from its sources and is not installed"
         return DoctorFinding("warn", f"{text}; versions are not checked", "make setup")
-    complete, partial, others = [], [], []
+    installed = {canonicalize_name(one.name): one.version for one in metadata.distributions()}
+    lacking, others = {}, {}
     for extra, requirements in extras.read_extras().items():
-        missing = []
-        for requirement in requirements:
-            try:
-                version = metadata.version(requirement.name)
-            except metadata.PackageNotFoundError:
-                missing.append(requirement.name)
-                continue
-            if not requirement.specifier.contains(version, prereleases=True):
-                others.append(f"{requirement.name} {version} instead of {requirement.specifier}")
-        if not missing:
-            complete.append(extra or "base")
-        elif extra:
-            partial.append(f"{extra} (lacks {', '.join(missing)})")
-        else:
-            return DoctorFinding("fail", f"{', '.join(missing)}: missing", "make setup")
+        lacking[extra] = []
+        for one in requirements:
+            version = installed.get(canonicalize_name(one.name))
+            if version is None:
+                lacking[extra].append(one.name)
+            elif not one.specifier.contains(version, prereleases=True):
+                others[one.name] = f"{one.name} {version} instead of {one.specifier}"
+    if lacking[""]:
+        return DoctorFinding("fail", f"{', '.join(lacking[''])}: missing", "make setup")
+    complete = [extra or "base" for extra, names in lacking.items() if not names]
+    partial = [f"{extra} (lacks {', '.join(names)})" for extra, names in lacking.items() if names]
     text = f"{extras.DISTRIBUTION} {about['Version']}; complete: {', '.join(complete)}"
     if partial:
         text += f"; not installed: {', '.join(partial)}"
     if others:
-        return DoctorFinding("warn", f"{text}; {', '.join(dict.fromkeys(others))}", "make setup")
+        return DoctorFinding("warn", f"{text}; {', '.join(others.values())}", "make setup")
     return DoctorFinding("ok", text)
 
 
@@ -174,25 +171,20 @@ def _read_driver_version() -> str | None:
     return next(iter(done.stdout.split()), None)
 
 
-def check_cuda_graphs() -> DoctorFinding:
-    """Check that a control step can be captured; without CUDA graphs a GPU is several times slower."""
+def check_warp() -> DoctorFinding:
+    """Report Warp, its kernel cache, and whether a GPU captures a control step in a CUDA graph."""
     import torch
 
-    if not torch.cuda.is_available():
-        return DoctorFinding("ok", "not needed without a GPU")
-    try:
-        return DoctorFinding("ok", f"captured and replayed one on {probe.capture_graph()}")
-    except Exception as error:
-        advice = "training works, several times slower; a newer driver usually mends it"
-        return DoctorFinding("warn", f"cannot capture: {error}", advice)
-
-
-def check_warp() -> DoctorFinding:
-    """Report the version of Warp and its kernel cache, which saves minutes of compilation."""
     cache = probe.find_kernel_cache()
     num_bytes = sum(path.stat().st_size for path in cache.rglob("*") if path.is_file())
     text = f"{probe.get_warp_version()}, kernel cache {cache} ({num_bytes / 2**20:.1f} MiB)"
-    return DoctorFinding("ok", text)
+    if not torch.cuda.is_available():
+        return DoctorFinding("ok", f"{text}; without a GPU no CUDA graphs are needed")
+    try:
+        return DoctorFinding("ok", f"{text}; captured a CUDA graph on {probe.capture_graph()}")
+    except Exception as error:
+        advice = "training works, several times slower; a newer driver usually mends it"
+        return DoctorFinding("warn", f"{text}; cannot capture a CUDA graph: {error}", advice)
 
 
 def check_rendering() -> DoctorFinding:
@@ -224,10 +216,9 @@ def check_import_names() -> DoctorFinding:
     foreign = []
     for name in IMPORT_NAMES:
         found = util.find_spec(name)
-        places = list(found.submodule_search_locations or ()) if found else []
-        if not places or Path(places[0]) != home / name:
-            origin = found.origin if found else "missing"
-            foreign.append(f"'{name}' is {places[0] if places else origin}, not {home / name}")
+        places = list(found.submodule_search_locations or ()) if found else ["missing"]
+        if places[:1] != [str(home / name)]:
+            foreign.append(f"'{name}' is {', '.join(places)}, not {home / name}")
     if foreign:
         advice = "install the project in an environment of its own"
         return DoctorFinding("fail", "; ".join(foreign), advice)
@@ -237,8 +228,8 @@ def check_import_names() -> DoctorFinding:
 def check_extensions() -> DoctorFinding:
     """Report installed packages that add options by entry point."""
     try:
-        others = [one for one in registry.find_packages() if one != registry.CORE]
         registry.list_options()
     except BrokkError as error:
         return DoctorFinding("fail", str(error))
+    others = [one for one in registry.find_packages() if one != registry.CORE]
     return DoctorFinding("ok", ", ".join(others) or "none installed")

@@ -221,7 +221,7 @@ class Train(PlantMode):
         line = None
         if controller := results["policies"].get("classical"):
             line = controller[SUCCESS]["mean"]
-            log.info("%s", _word_gain(results["policies"]["trained"], controller))
+            log.info("%s", describe_gain(results["policies"]["trained"], controller))
         picture, words = folder / "learning_curves.png", loop.task.figures
         draw_curves(folder / PROGRESS, picture, words, book.first_episodes, line)
         task = config.task.build(self.machine, 1, torch.device("cpu"))
@@ -252,7 +252,7 @@ def _log_success(logger: TrainingLogger) -> None:
         log.info("success of %.2f while learning: %s", level, text)
 
 
-def _word_gain(trained: Mapping[str, Any], controller: Mapping[str, Any]) -> str:
+def describe_gain(trained: Mapping[str, Any], controller: Mapping[str, Any]) -> str:
     """Return whether training has gained over the controller, by Fisher's exact test."""
     table = []
     for row in (trained, controller):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from brokk_rl.modes.train import _word_gain
+from brokk_rl.modes.train import describe_gain
 from brokk_rl.rl.logger import find_passing
 
 
@@ -43,4 +43,4 @@ def test_a_gain_over_the_controller_is_said_only_where_it_is_shown(
     trained, controller = (
         {"episodes": 1024, "success_strict": {"mean": count / 1024}} for count in (successes, 973)
     )
-    assert _word_gain(trained, controller).endswith(verdict)
+    assert describe_gain(trained, controller).endswith(verdict)
