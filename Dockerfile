@@ -8,7 +8,7 @@ WORKDIR /brokk_rl
 ARG TORCH=cpu
 # the packages first: a change of the code does not install them again
 COPY pyproject.toml uv.lock Makefile README.md ./
-RUN mkdir brokk_rl conf tasks actuators perception deploy diagnosis exam \
+RUN mkdir brokk_rl conf tasks actuators perception deploy diagnosis exam study \
  && UV_NO_CACHE=1 make setup TORCH=$TORCH
 COPY . .
 RUN touch .venv/.synced

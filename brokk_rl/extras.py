@@ -28,8 +28,7 @@ DISTRIBUTION_NAMES = {
 """Distributions that are named otherwise than the module that they bring, and those that bring a
 module of another one."""
 EXTRA_OF_MODULE = (
-    ("deploy.study", "study"),
-    ("deploy.modes.study", "study"),
+    ("study", "study"),
     ("deploy", "deploy"),
     ("perception", "perception"),
     ("diagnosis", "diagnose"),

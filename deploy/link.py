@@ -20,9 +20,9 @@ from brokk_rl.session import Session
 from brokk_rl.signals import Command, JointState
 from brokk_rl.spec import spec
 from deploy.bus.can_bus import CanBus
-from deploy.guard.guard import GuardState
-from deploy.guard.limits import GuardLimits
-from deploy.runtime.bus_process import BusProcessConfig
+from deploy.kernel.bus_process import BusProcessConfig
+from deploy.kernel.guard import GuardState
+from deploy.kernel.limits import GuardLimits
 from deploy.runtime.operator_state import OperatorControls, OperatorState, RequestedCommand
 from deploy.runtime.process import ChildProcess, ask_for_priority, give_up_priority
 from deploy.runtime.process_group import BUS_PRIORITY, PATIENCE_S
@@ -135,11 +135,12 @@ class CanLink:
         can, machine = self._can, self._machine
         self._memory = LoopMemory.new(machine.num_joints, commands=True)
         # Recordings are made before there is a model of this machine: no observer yet.
-        limits = replace(can.limits, observer=None)
+        # Nobody watches a page, and the operator stands at the machine.
+        limits = replace(can.limits, observer=None, vigilance_s=None)
         config = BusProcessConfig(can.wire, can.dbc, machine, limits)
         arguments, files = (config, self._memory), self._memory.files
         priority = BUS_PRIORITY if can.realtime else None
-        target = "deploy.runtime.bus_process:run"
+        target = "deploy.kernel.bus_process:run"
         self._child = ChildProcess("bus", target, arguments, files, priority)
         until_s = time.monotonic() + can.patience_s
         try:

@@ -1,7 +1,7 @@
 """Calibration of the observer: its file, and its alarms in recordings of a healthy machine.
 
-The file holds a model, the thresholds and the scores of the drift watch. Thresholds and scores come
-from recordings of one machine that the model was not fitted to; the file names their sources.
+The file holds a model and thresholds. The thresholds come from recordings of one machine that the
+model was not fitted to; the file names their sources.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from brokk_rl.record import Recording, read_recordings
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
-from deploy.guard.limits import GuardLimits, ObserverLimits
-from deploy.guard.observer import Observer
-from deploy.guard.valve_model import SCHEMA, describe_sources, load_observer_file
+from deploy.kernel.limits import GuardLimits
+from deploy.kernel.observer import Observer
+from deploy.kernel.valve_model import SCHEMA, describe_sources, load_observer_file
 
 FILE, COUNTS = "observer.json", "observed.json"
 FAR = 0.3
@@ -49,9 +49,7 @@ class AlarmCounts:
         num_joints: Number of joints, `J`.
         seconds: Length of all recordings.
         faults: Alarms by joint and fault.
-        misfits: Alarms of the drift watch, one a run at most, by joint and effect.
         num_runs: Number of runs.
-        scores: Scores of the drift watch, of each joint.
         num_moving: Windows in which a joint should move far, `(J,)`; see `FAR`.
         num_found: Of these, those in which a joint that stands still would be found, and one that
             moves the wrong way, `(2, J)`.
@@ -61,22 +59,15 @@ class AlarmCounts:
     seconds: float = 0.0
     num_runs: int = 0
     faults: Counter[str] = field(default_factory=Counter)
-    misfits: Counter[str] = field(default_factory=Counter)
-    scores: list[list[float]] = field(init=False)
     num_moving: np.ndarray = field(init=False)
     num_found: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.scores = [[] for _ in range(self.num_joints)]
         self.num_moving = np.zeros(self.num_joints, int)
         self.num_found = np.zeros((2, self.num_joints), int)
 
     def note(self, observer: Observer, machine: Machine) -> None:
         """Take in what an observer found in one period, and clear its fault."""
-        for joint, score in enumerate(observer.scores):
-            if score is not None:
-                self.scores[joint].append(score)
-        observer.scores = []
         seen = observer.window
         is_far = np.abs(seen.wanted) > FAR * machine.max_speed * observer.window_s
         self.num_moving += is_far
@@ -108,7 +99,7 @@ class AlarmCounts:
 
 @spec
 class ThresholdSettings:
-    """Settings by which thresholds are taken from recordings; see `deploy.guard.observer`.
+    """Settings by which thresholds are taken from recordings; see `deploy.kernel.observer`.
 
     Attributes:
         window_s: Time over which measured and predicted motion are compared.
@@ -146,8 +137,7 @@ class ObserverCalibration:
             ConfigError: the model or the file is not one of this machine.
             RecordingError: nothing matches, or a recording cannot be read.
         """
-        limits = self.limits.observer
-        if limits is None:
+        if self.limits.observer is None:
             raise ConfigError(
                 "mode=observe: expected limits of the observer, got guard.observer=null"
             )
@@ -161,32 +151,26 @@ class ObserverCalibration:
             content: dict[str, Any] = {"schema": SCHEMA, "machine": machine.name}
             content |= {"fingerprint": machine.fingerprint(), "model": tables}
             content["sources"] = sorted({_find_source(one) for one in recordings})
-            content["scores"] = [[] for _ in machine.joints]
-            content["thresholds"] = find_thresholds(
-                self.thresholds, limits, content, machine, recordings
-            )
+            content["thresholds"] = find_thresholds(self.thresholds, content, machine, recordings)
         else:
             content = load_observer_file(resolve_package_path(self.path))
             machine.check_fingerprint(content["fingerprint"], self.path)
-        counts = count_alarms(limits, content, machine, recordings, session.stream("observe"))
+        counts = count_alarms(content, machine, recordings)
         minutes = f"{counts.seconds / 60:.0f} minutes of {counts.num_runs} runs"
         if self.path is None:
-            content["scores"] = [sorted(round(one, 6) for one in own) for own in counts.scores]
             write_json(session.folder / FILE, content)
             return _describe_file(content, machine, minutes)
         lines = [
             f"{minutes}: {counts.faults.total()} false alarms, {counts.faults_a_shift:.1f} a shift of 8 h"
         ]
         lines += [f"  {name}: {number}" for name, number in counts.faults.most_common()]
-        lines.append(f"drift watch: alarms in {counts.misfits.total()} of {counts.num_runs} runs")
-        lines += [f"  {name}: {number}" for name, number in counts.misfits.most_common()]
         lines += counts.describe_sensitivity(machine)
         found = {
             "minutes": counts.seconds / 60,
             "runs": counts.num_runs,
             "faults": dict(counts.faults),
         }
-        found |= {"faults_a_shift": counts.faults_a_shift, "misfits": dict(counts.misfits)}
+        found["faults_a_shift"] = counts.faults_a_shift
         found |= {"moving": counts.num_moving.tolist(), "found": counts.num_found.tolist()}
         write_json(session.folder / COUNTS, found)
         return lines
@@ -194,7 +178,6 @@ class ObserverCalibration:
 
 def find_thresholds(
     settings: ThresholdSettings,
-    limits: ObserverLimits,
     content: Mapping[str, Any],
     machine: Machine,
     recordings: Sequence[Recording],
@@ -203,7 +186,7 @@ def find_thresholds(
     thresholds = {"window_s": settings.window_s, "share": settings.share}
     # No alarm ends a window: all of them count.
     deaf = dict(content) | {"thresholds": thresholds | {"slack_s": [math.inf] * machine.num_joints}}
-    observer = Observer(limits, deaf, machine, seed=0)
+    observer = Observer(deaf, machine)
     needed, seconds = np.zeros(machine.num_joints), 0.0
     for recording in recordings:
         observer.forget()
@@ -219,11 +202,7 @@ def find_thresholds(
 
 
 def count_alarms(
-    limits: ObserverLimits,
-    content: dict[str, Any],
-    machine: Machine,
-    recordings: list[Recording],
-    seed: int,
+    content: dict[str, Any], machine: Machine, recordings: list[Recording]
 ) -> AlarmCounts:
     """Return the alarms of an observer in recordings; parts of one run follow each other.
 
@@ -233,17 +212,14 @@ def count_alarms(
     runs: dict[str, list[Recording]] = {}
     for recording in recordings:
         runs.setdefault(recording.run, []).append(recording)
-    for number, parts in enumerate(runs.values()):
-        observer = Observer(limits, content, machine, seed + machine.num_joints * number)
+    for parts in runs.values():
+        observer = Observer(content, machine)
         for part in parts:
             observer.forget()
             counts.seconds += part.duration_s
             for _ in _replay(observer, part, machine):
                 counts.note(observer, machine)
         counts.num_runs += 1
-        found = observer.observation
-        if found.misfit_joint >= 0:
-            counts.misfits[f"{machine.joint_names[found.misfit_joint]} {found.misfit.value}"] += 1
     return counts
 
 
@@ -265,12 +241,9 @@ def _find_source(recording: Recording) -> str:
 
 def _describe_file(content: Mapping[str, Any], machine: Machine, minutes: str) -> list[str]:
     slack_s = content["thresholds"]["slack_s"]
-    pairs = zip(machine.joint_names, slack_s, content["scores"], strict=True)
-    lines = [f"{FILE}: thresholds and scores of {minutes}, {describe_sources(content)}"]
-    for name, slack, scores in pairs:
-        lines.append(
-            f"  {name}: {slack:g} s of full speed, {len(scores)} scores for the drift watch"
-        )
+    lines = [f"{FILE}: thresholds of {minutes}, {describe_sources(content)}"]
+    for name, slack in zip(machine.joint_names, slack_s, strict=True):
+        lines.append(f"  {name}: {slack:g} s of full speed")
     return [*lines, f"count its alarms in other recordings: observe.path={FILE}"]
 
 

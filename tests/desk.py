@@ -19,10 +19,10 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.bus.can_bus import CanBus
 from deploy.bus.description import BusDescription
-from deploy.bus.protection import MessageFault
-from deploy.guard.limits import GuardLimits
-from deploy.runtime.bus_process import BusProcessConfig
-from deploy.runtime.operator_state import OperatorControls, RequestedCommand, StopRequest
+from deploy.kernel.bus_process import BusProcessConfig
+from deploy.kernel.limits import GuardLimits
+from deploy.kernel.protection import MessageFault
+from deploy.runtime.operator_state import OperatorControls, PageSignal, RequestedCommand
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import request_fault
@@ -115,7 +115,7 @@ class Desk:
         """Starts `twin`, `bus` or `commander`."""
         what: dict[str, tuple[str, tuple[Any, ...], int | None]] = {
             "twin": ("deploy.twin.twin:run", self._twin_arguments, 60),
-            "bus": ("deploy.runtime.bus_process:run", (self._setting, self.memory), 55),
+            "bus": ("deploy.kernel.bus_process:run", (self._setting, self.memory), 55),
             "commander": ("desk:command", (self.machine.home, self.memory), 50),
         }
         target, arguments, priority = what[name]
@@ -146,7 +146,7 @@ class Desk:
     def press_stop(self) -> float:
         """Presses the page's stop, straight to the bus process; returns when."""
         now_s = time.monotonic()
-        self.memory.stop.write(StopRequest(now_s))
+        self.memory.page.write(PageSignal(now_s, stopped_s=now_s, present_s=0.0))
         return now_s
 
     def heard(self, message: str, seconds: float) -> list[tuple[float, dict[str, float]]]:

@@ -1,7 +1,7 @@
 """Mutants of the core: one small change each, to see whether the tests notice.
 
     python tests/mutants.py                          # all of the core, about half an hour
-    python tests/mutants.py deploy.guard.guard       # one module
+    python tests/mutants.py deploy.kernel.guard       # one module
 
 Comparisons turned, off by one boundary, negated conditions, arithmetic exchanged, constants
 changed, statements dropped. Each mutant runs in a forked process. What survives stands in
@@ -30,19 +30,19 @@ from typing import Any
 TESTS = Path(__file__).parent
 EXPLAINED = TESTS / "survivors.json"
 CORE = {
-    "deploy.bus.protection": ["test_deploy_protection.py"],
-    "deploy.bus.clock": ["test_deploy_protection.py"],
-    "deploy.guard.guard": ["test_deploy_guard.py"],
-    "deploy.guard.plausibility": ["test_deploy_guard.py"],
-    "deploy.runtime.receiver": ["test_deploy_receiver.py"],
-    "deploy.runtime.bus_logic": ["test_deploy_logic.py"],
+    "deploy.kernel.protection": ["test_deploy_protection.py"],
+    "deploy.kernel.clock": ["test_deploy_protection.py"],
+    "deploy.kernel.guard": ["test_deploy_guard.py"],
+    "deploy.kernel.plausibility": ["test_deploy_guard.py"],
+    "deploy.kernel.receiver": ["test_deploy_receiver.py"],
+    "deploy.kernel.bus_logic": ["test_deploy_logic.py"],
+    "deploy.kernel.bus_process": ["test_deploy_bus_process.py"],
     "deploy.twin.gateway": ["test_deploy_gateway.py"],
     "deploy.policy.policy_process": ["test_deploy_adviser.py"],
-    "deploy.guard.envelope": ["test_deploy_envelope.py"],
-    "deploy.guard.shapes": ["test_deploy_envelope.py"],
-    "deploy.guard.valve_model": ["test_deploy_observer.py"],
-    "deploy.guard.observer": ["test_deploy_observer.py"],
-    "deploy.guard.drift_watch": ["test_deploy_drift_watch.py"],
+    "deploy.kernel.envelope": ["test_deploy_envelope.py"],
+    "deploy.bus.shapes": ["test_deploy_envelope.py"],
+    "deploy.kernel.valve_model": ["test_deploy_observer.py"],
+    "deploy.kernel.observer": ["test_deploy_observer.py"],
 }
 """Modules that decide what reaches the valves, and the tests of each."""
 PYTEST = ["-x", "-q", "--no-header", "--assert=plain"]

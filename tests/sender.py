@@ -8,10 +8,10 @@ from desk import DBC
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
-from deploy.bus.protection import MessageFault
-from deploy.guard.guard import GuardDecision, GuardInput, GuardState, GuardTrip
+from deploy.kernel.guard import GuardDecision, GuardInput, GuardState, GuardTrip
+from deploy.kernel.protection import MessageFault
+from deploy.kernel.receiver import BusReceiver
 from deploy.runtime.operator_state import OperatorState
-from deploy.runtime.receiver import BusReceiver
 
 LIMITS = option("guard", "default")
 MACHINE = option("machine", "brokk170")
@@ -37,7 +37,7 @@ class Sender:
         self.bus, self.now_s = bus, 1000.0
         self.receiver = BusReceiver(bus, machine, LIMITS)
         self.counters = dict.fromkeys(PERIODS_S, 0)
-        self.values: dict[str, float] = dict(USUAL)
+        self.values: dict[str, float] = USUAL | bus.identity
 
     def build(self, name: str, late_s: float = 0.0, **values: float) -> CanFrame:
         self.counters[name] += 1
@@ -60,4 +60,4 @@ class Sender:
         return self.receiver.build_guard_input(self.now_s, True, controls_age_s)
 
     def state(self, bus_up: bool = True) -> OperatorState:
-        return self.receiver.build_state(self.now_s, bus_up, DECISION, 7)
+        return self.receiver.build_state(self.now_s, bus_up, DECISION, GuardTrip.NONE, 7)

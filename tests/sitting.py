@@ -14,10 +14,10 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.study import design, study_folder
-from deploy.study.conductor import Conductor, Words
-from deploy.study.trial import Times
-from deploy.study.twin_control import MachineView
+from study import design, study_folder
+from study.conductor import Conductor, Words
+from study.trial import Times
+from study.twin_control import MachineView
 
 TEXT = {"en": ("You may stop at any time.",), "de": ("Sie können jederzeit aufhören.",)}
 FACTS = {"simulated": False, "twin": True}
@@ -44,7 +44,7 @@ def plan(
 
 
 class Arm:
-    """A stage (`deploy.study.twin_control.Stage`) with an arm that is where a test says, and a clock that a test moves."""
+    """A stage (`study.twin_control.Stage`) with an arm that is where a test says, and a clock that a test moves."""
 
     def __init__(self, machine: Machine) -> None:
         self.machine, self.now_s = machine, 100.0

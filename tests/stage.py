@@ -27,9 +27,9 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
+from deploy.kernel.bus_process import BusProcess, BusProcessConfig
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyAdviser, PolicyProcessConfig
-from deploy.runtime.bus_process import BusProcess, BusProcessConfig
 from deploy.runtime.operator_state import LoopSnapshot
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.twin.faults import FaultPort
@@ -228,7 +228,7 @@ def write_nominal_observer(machine: Machine, folder: Path) -> Path:
     model |= dict.fromkeys(("demand", "play", "spool_s", "speed_s"), none)
     model |= {"knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line, "pose": None}
     content = {"schema": 2, "machine": machine.name, "fingerprint": machine.fingerprint()}
-    content |= {"sources": ["nominal machine"], "model": model, "scores": [[] for _ in ones]}
+    content |= {"sources": ["nominal machine"], "model": model}
     thresholds = {"window_s": 1.0, "share": 0.25, "slack_s": [0.06 for _ in ones], "minutes": 0.0}
     path = folder / "nominal_observer.json"
     path.write_text(json.dumps(content | {"thresholds": thresholds}))
@@ -281,13 +281,10 @@ class Stage:
             )
             self.start_twin()
             limits, wire = option("guard", "default"), self.air
-            if hasattr(limits, "observer"):
-                observer = replace(
-                    limits.observer, path=str(write_nominal_observer(machine, folder))
-                )
-                limits = replace(limits, observer=observer)
-                if not watched:
-                    limits = replace(limits, observer=None, envelope=None)
+            observer = replace(limits.observer, path=str(write_nominal_observer(machine, folder)))
+            limits = replace(limits, observer=observer)
+            if not watched:
+                limits = replace(limits, observer=None, envelope=None)
             self.bus_process = BusProcess(BusProcessConfig(wire, DBC, machine, limits), self.memory)  # type: ignore[arg-type]
             policy = "tasks:policies/borehole_insertion"
             counsel = PolicyProcessConfig(
@@ -350,14 +347,12 @@ class Stage:
     def arm(self, armed: bool | None = None) -> None:
         """Arm or disarm, as the supervisor does; without a word as the mode has it."""
         armed = self.mode != "listen" if armed is None else armed
-        self._switches: dict[str, Any] = {"armed": armed}
-        if hasattr(self.memory, "stop"):
-            self._switches["armed_t_s"] = self.now_s
+        self._switches: dict[str, Any] = {"armed": armed, "armed_t_s": self.now_s}
         self._write("controls", t_s=self.now_s, **self._switches)
 
     def stop(self) -> None:
         """Press the page's stop: straight to the bus process."""
-        self._write("stop", t_s=self.now_s)
+        self._write("page", t_s=self.now_s, stopped_s=self.now_s)
 
     @property
     def moves(self) -> bool:

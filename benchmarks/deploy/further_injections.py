@@ -267,7 +267,7 @@ def forget_stop(stage: Stage, trial: int) -> None:
     """STOP is pressed, then its memory is damaged; the dead-man is pressed again."""
     stage.stop()
     stage.go(0.1)
-    memory, draw = stage.memory.stop.memory, np.random.default_rng(trial)
+    memory, draw = stage.memory.page.memory, np.random.default_rng(trial)
     for at in range(8, memory.size):
         memory.bytes[at] ^= int(draw.integers(1, 256))
     stage.fault("deadman_released")

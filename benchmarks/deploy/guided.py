@@ -47,7 +47,7 @@ def main(folder: Path, trials: int, at_once: int) -> None:
         command = [
             *BROKK, "preset=bench", *choice, f"link.start={q}", f"link.hole_in_base_m={hole}",
             f"target.center_in_base_m={hole}", f"bus.port={PORT + jobs.index(job)}", f"deploy.seconds={SECONDS[kind]}",
-            "deploy.show=false", "page=none", f"session.seed={n}", f"session.out={out}",
+            "page=none", f"session.seed={n}", f"session.out={out}",
         ]  # fmt: skip
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode:

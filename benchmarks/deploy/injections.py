@@ -27,7 +27,7 @@ from stage import Mode, Stage  # noqa: E402
 
 from brokk_rl.kinematics import compute_tool_kinematics  # noqa: E402
 from brokk_rl.machine import Machine  # noqa: E402
-from deploy.guard.guard import GuardState  # noqa: E402
+from deploy.kernel.guard import GuardState  # noqa: E402
 
 LATCHED = GuardState.LATCHED
 USUALLY_WATCHED_S = 4.0

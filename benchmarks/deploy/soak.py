@@ -79,7 +79,7 @@ def main(folder: Path, seconds: float) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     command = [
         sys.executable, "-P", "-m", "brokk_rl", "preset=bench", "bench=guided", "link=simulated", "target=file",
-        f"target.path={folder / 'target.json'}", f"deploy.seconds={seconds}", "deploy.show=false", f"session.out={folder}",
+        f"target.path={folder / 'target.json'}", f"deploy.seconds={seconds}", f"session.out={folder}",
         f"bus.port={20000 + os.getpid() % 20000}", "page.port=0",
     ]  # fmt: skip
     run = subprocess.Popen(command)

@@ -35,7 +35,7 @@ def computed_s(pid: int) -> float:
 def trial(folder: Path) -> dict[str, Any]:
     command = [
         sys.executable, "-P", "-m", "brokk_rl", "preset=machine", "bus=udp", f"bus.port={20000 + os.getpid() % 20000}",
-        "target=given", "deploy.show=false", "page.port=0", f"session.out={folder}",
+        "target=given", "page.port=0", f"session.out={folder}",
     ]  # fmt: skip
     begun_s = time.monotonic()
     run = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)

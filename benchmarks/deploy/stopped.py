@@ -28,7 +28,7 @@ from desk import DBC, free_port  # noqa: E402
 
 from deploy.bus.can_bus import CanBus, OpenCanBus  # noqa: E402
 from deploy.bus.description import BusDescription  # noqa: E402
-from deploy.bus.protection import MessageFault  # noqa: E402
+from deploy.kernel.protection import MessageFault  # noqa: E402
 from deploy.runtime.process import ask_for_priority  # noqa: E402
 from deploy.twin.faults import request_fault  # noqa: E402
 
@@ -73,7 +73,7 @@ class Loop:
         arguments = [
             "preset=bench", "deploy=auto", "link=nominal", "target=file", f"target.path={folder / 'target.json'}",
             "guard.observer=null", "bench.twin.again_s=null", f"bench.twin.fault_port={fault_port}", f"bus.port={port}",
-            f"bus.channel={CHANNEL}", "page.port=0", "deploy.show=true", f"session.out={folder / 'run'}",
+            f"bus.channel={CHANNEL}", "page.port=0", f"session.out={folder / 'run'}",
         ]  # fmt: skip
         command = [sys.executable, "-P", "-m", "brokk_rl", *arguments]
         nothing = subprocess.DEVNULL

@@ -23,7 +23,7 @@ from brokk_rl.errors import BrokkError
 from brokk_rl.sim import probe
 from brokk_rl.spec import NonNegative, spec
 
-IMPORT_NAMES = ("brokk_rl", "conf", "tasks", "actuators", "perception", "deploy", "diagnosis", "exam")  # fmt: skip
+IMPORT_NAMES = ("brokk_rl", "conf", "tasks", "actuators", "perception", "deploy", "diagnosis", "exam", "study")  # fmt: skip
 COLORS = {"ok": "green", "warn": "yellow", "fail": "red"}
 
 

@@ -1,7 +1,7 @@
 """C header for the firmware of a gateway: identifiers, times and end-to-end protection of one DBC.
 
 cantools generates the C source that packs and unpacks (`cantools generate_c_source <dbc>`); the
-header adds `brokk_crc8` and `brokk_take`, which decide about a message as `deploy.bus.protection`
+header adds `brokk_crc8` and `brokk_take`, which decide about a message as `deploy.kernel.protection`
 does. Gateway and PC then go by one file and one set of rules.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 
 from deploy.bus.description import BusDescription
-from deploy.bus.protection import (
+from deploy.kernel.protection import (
     BURST_S,
     FINAL,
     MASK,

@@ -8,9 +8,11 @@ hangs. Nothing here uses them.
 from __future__ import annotations
 
 import logging
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Literal, Self
 
 import can
@@ -18,6 +20,7 @@ from can.io.blf import BLFParseError, BLFReader
 
 from brokk_rl.errors import LinkError
 from brokk_rl.spec import Positive, spec
+from deploy.plain_files import check_plain_file
 
 log = logging.getLogger(__name__)
 
@@ -187,6 +190,7 @@ class BusReplay:
         """
         wanted = None if frame_ids is None else frozenset(frame_ids)
         try:
+            check_plain_file(Path(self.path), sys.maxsize)
             return OpenBusReplay(BLFReader(self.path), self.speed, wanted)
         except (OSError, ValueError, BLFParseError) as error:
             raise LinkError(f"bus.path={self.path}: nothing can be replayed ({error})") from error

@@ -3,7 +3,9 @@
 Signals are found by their names, whatever message they travel in. A DBC of another gateway takes
 the place of the example as long as it names them alike: `Command_<joint>`, `CommandMode`,
 `Position_<joint>`, `Valid_<joint>`, `Flow_<joint>`, `FlowSource`, `Lever_<left|right>_<theta|psi>`,
-`ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`. Optional are `Stamp` (without it
+`ButtonRight`, `DeadMan`, `RemoteOn`, `EStop`, `ExclusiveSelected`. Where commands are to be sent,
+the gateway says by `DescriptionHash` and `MachineHash` that it goes by this very file and machine.
+Optional are `Stamp` (without it
 a message is as old as its arrival), `RoundTrip` (without it a delay that is there from the beginning
 is not seen), `OilTemperature` and all others, which are recorded. Protected messages have a
 `Counter`, a `Crc` of one whole byte and the attribute `E2EDataId`. Cycle times are the DBC's
@@ -12,24 +14,31 @@ is not seen), `OilTemperature` and all others, which are recorded. Protected mes
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import cantools
 from cantools.database import Database
-from cantools.database.can import Message
+from cantools.database.can import Message, Signal
 
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
-from deploy.bus.protection import MessageFault, ProtectedChannel, compute_crc8
+from deploy.kernel.protection import MessageFault, ProtectedChannel, compute_crc8
+from deploy.plain_files import check_plain_file
 
 COUNTER, CRC, STAMP = "Counter", "Crc", "Stamp"
-"""Signals of the end-to-end protection; for the stamp see `deploy.bus.clock`."""
+"""Signals of the end-to-end protection; for the stamp see `deploy.kernel.clock`."""
 ROUNDING = 1e-6
 """Part of a step by which a stamp may miss it through rounding."""
 CRC_BITS = 8
+MOST_BYTES = 1 << 24
+"""Size beyond which a file is no DBC; those of cars have a MB."""
+HASH_BYTES = 3
+"""Of the hash of description and machine; both fit into one message with counter and CRC."""
 PC, GATEWAY, REMOTE = "PC", "GATEWAY", "REMOTE"
 """Nodes of the bus."""
 LEVER_AXES = ("left_theta", "left_psi", "right_theta", "right_psi")
@@ -117,8 +126,24 @@ class BusDescription:
                 raise ConfigError(
                     f"bus: {name} has no signal '{signal}', which machine '{machine.name}' needs"
                 )
+        for joint in machine.joint_names:
+            self._check_command_range(f"Command_{joint}")
+        self.identity = {
+            "DescriptionHash": _hash(_list_facts(self._database)),
+            "MachineHash": _hash(machine.fingerprint()),
+        }
+        """Values of the signals by which gateway and PC know that they go by one description."""
         self.command = self.layouts[self.message_of(f"Command_{machine.joint_names[0]}")]
         """The message with the valve commands."""
+
+    def _check_command_range(self, name: str) -> None:
+        """Refuse a command that cannot be zero, or stands for another number."""
+        signal = self._messages[self._home[name]].get_signal_by_name(name)
+        if _clip(0.0, signal) != 0.0:
+            raise ConfigError(
+                f"bus: {self.name}: expected 0 within the range of '{name}', got "
+                f"[{signal.minimum}, {signal.maximum}]; mend the DBC"
+            )
 
     def has_signal(self, signal: str) -> bool:
         """Return whether any message has `signal`."""
@@ -155,10 +180,14 @@ class BusDescription:
     def encode(self, name: str, values: Mapping[str, float], counter: int) -> bytes:
         """Return the data of message `name`, with counter and CRC; missing signals are 0.
 
-        `Stamp` is a time in s that is wrapped and rounded down here.
+        A value beyond its signal's range becomes the nearest one. `Stamp` is a time in s that is wrapped and rounded down here.
         """
         layout, message = self.layouts[name], self._messages[name]
-        data = {signal.name: values.get(signal.name, 0) for signal in message.signals}
+        data: dict[str, float] = {}
+        for signal in message.signals:
+            value = values.get(signal.name, 0)
+            # Stamps are wrapped below, and lie within their range then.
+            data[signal.name] = value if signal.name == STAMP else _clip(value, signal)
         if layout.stamp_step_s:
             steps = math.floor(data[STAMP] / layout.stamp_step_s + ROUNDING)
             num_steps = round(layout.stamp_wrap_s / layout.stamp_step_s)
@@ -183,9 +212,36 @@ class BusDescription:
         return {name: float(value) for name, value in decoded.items()}  # type: ignore[arg-type]
 
 
+def _clip(value: float, signal: Signal) -> float:
+    low = value if signal.minimum is None else float(signal.minimum)
+    high = value if signal.maximum is None else float(signal.maximum)
+    return max(low, min(high, value))
+
+
+def _list_facts(database: Database) -> list[object]:
+    """Return all of a DBC that both ends of the bus must share."""
+    facts: list[object] = []
+    for message in sorted(database.messages, key=lambda one: one.frame_id):
+        attributes = message.dbc.attributes if message.dbc else {}
+        data_id = attributes.get("E2EDataId")
+        facts.append([message.name, message.frame_id, message.length, message.cycle_time])
+        facts.append(None if data_id is None else int(data_id.value))
+        for signal in sorted(message.signals, key=lambda one: one.name):
+            place = [signal.name, signal.start, signal.length, signal.byte_order, signal.is_signed]
+            numbers = (signal.scale, signal.offset, signal.minimum, signal.maximum)
+            facts.append([*place, *(None if one is None else float(one) for one in numbers)])
+    return facts
+
+
+def _hash(facts: object) -> int:
+    """Return 24 bits of the hash of plain data."""
+    return int.from_bytes(hashlib.sha256(json.dumps(facts).encode()).digest()[:HASH_BYTES], "big")
+
+
 def _load_database(name: str) -> Database:
     path = resolve_package_path(name)
     try:
+        check_plain_file(path, MOST_BYTES)
         database = cantools.database.load_file(path)
     except OSError as error:
         raise ConfigError(f"bus.dbc={name}: cannot be read ({error.strerror or error})") from error

@@ -1,1 +1,1 @@
-"""Modes of the machine's computer: `deploy`, `twin`, `bringup`, `recover`, `page`, `study`."""
+"""Modes of the machine's computer: `deploy`, `twin`, `bringup`, `recover`, `page`."""

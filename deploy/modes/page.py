@@ -1,4 +1,4 @@
-"""`brokk mode=page`: serves the operator's page with a simulated or recorded state."""
+"""`brokk mode=page`: plays a recorded session on the operator's page."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from deploy.video.settings import VideoProcessConfig, VideoSettings
 
 @spec
 class PageMode:
-    """Serve the operator's page, simulated or recorded; `brokk preset=bench` shows the loop's own."""
+    """Play a recorded session on the operator's page; `brokk preset=bench` shows the loop's own."""
 
     session: Session
     machine: Machine

@@ -32,12 +32,24 @@ LONGEST = 256
 """Bytes of a request. Chosen by hand: the page's own are below 100."""
 
 
-def list_own_hosts(host: str, port: int, others: tuple[str, ...]) -> frozenset[str]:
-    """Return the values of the `Host` header that are this server's."""
+def list_own_names(host: str, others: tuple[str, ...]) -> frozenset[str]:
+    """Return the names in the `Host` header that are this server's."""
     every = {host, *others}
     if host in (*LOCAL, *ANY_ADDRESS):
         every |= set(LOCAL)
-    return frozenset(f"{name}:{port}" for name in every)
+    return frozenset(every)
+
+
+def is_own_host(host: str | None, mine: frozenset[str]) -> bool:
+    """Return whether a `Host` header names this server.
+
+    Its port may be any: behind a forwarded port (`ssh -L`) it is another one. Rebinding changes the
+    name, not the port.
+    """
+    if host is None:
+        return False
+    name, _, port = host.rpartition(":")
+    return host in mine or (name in mine and port.isdecimal())
 
 
 def is_same_origin(origin: str | None, host: str | None, mine: frozenset[str]) -> bool:
@@ -45,7 +57,7 @@ def is_same_origin(origin: str | None, host: str | None, mine: frozenset[str]) -
 
     A program that sends no `Origin` is no browser, and may watch.
     """
-    return host in mine and (origin is None or origin == f"http://{host}")
+    return is_own_host(host, mine) and (origin is None or origin == f"http://{host}")
 
 
 def compare_tokens(given: object, token: str) -> bool:
@@ -78,7 +90,7 @@ def find_refusal(request: OperatorRequest, state: PageState) -> RefusalReason | 
     """Return why a request must not be passed on now, `None` where it may."""
     if (request.kind in ("seek", "play")) != (state.replay is not None):
         return "live" if state.replay is None else "replay"
-    if request.kind in ("stop", "seek", "play"):
+    if request.kind in ("stop", "present", "seek", "play"):
         return None
     if not state.deadman:
         return "deadman"

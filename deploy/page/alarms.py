@@ -10,13 +10,28 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from deploy.guard.drift_watch import Misfit
-from deploy.guard.guard import GuardState, GuardTrip
+from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.protocol import PageState
 
 AlarmLevel = Literal["alarm", "caution"]
 EARLY = 0.5
 """Share of the limit from which a delay is a caution. Chosen by hand."""
+FAULTS = (
+    GuardTrip.TIME_GAP,
+    GuardTrip.CHANNEL_INVALID,
+    GuardTrip.JOINTS_INVALID,
+    GuardTrip.SECOND_SENDER,
+    GuardTrip.JOINT_STILL,
+    GuardTrip.JOINT_TURNED,
+    GuardTrip.JOINT_WEAK,
+    GuardTrip.JOINT_DRIFTS,
+    GuardTrip.FLOW_UNASKED,
+    GuardTrip.FLOW_TURNED,
+    GuardTrip.FLOW_SCALED,
+    GuardTrip.DESCRIPTION,
+    GuardTrip.PULSES,
+)
+"""Faults that no age shows: alarms also where nothing is sent."""
 EXPECTED = ("camera", "borehole")
 """Sources without which the loop goes on: a borehole that never came is a caution."""
 
@@ -56,9 +71,12 @@ def _check_guard(shown: PageState) -> Iterator[Alarm]:
         yield Alarm("alarm", GuardTrip.ESTOP.value)
     if state.guard is GuardState.LATCHED and state.cause is not GuardTrip.ESTOP:
         yield Alarm("alarm", state.cause.value, _name_joint(state.observed_joint))
-    if state.misfit is not Misfit.NONE:
-        joint = _name_joint(state.misfit_joint)
-        yield Alarm("caution", "the model no longer fits", f"{joint} {state.misfit.value}".strip())
+    if state.target is not GuardTrip.NONE and state.target is not state.cause:
+        yield Alarm("alarm", state.target.value)
+    if state.guard is not GuardState.LATCHED and state.trip in FAULTS:
+        yield Alarm("alarm", state.trip.value, _name_joint(state.observed_joint))
+    if state.prompt:
+        yield Alarm("alarm", "are you there")
 
 
 def _check_sources(shown: PageState) -> Iterator[Alarm]:

@@ -2,14 +2,17 @@
 
 The slots that it reads are overwritten by their writers, who wait for nobody; it writes into two
 pipes that count their losses. However slow a browser is, or if this process dies, the loop feels
-nothing of it. `stop` has a slot of its own, which the bus process reads in each cycle.
+nothing of it, except where commands are sent: then the page's signal, which the bus process reads in
+each cycle, has to come. `stop` travels in it, too.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import logging
-import math
+import os
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,6 +26,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from deploy.guidance import LeverGuidance, convert_to_positions, find_full_angles_rad
+from deploy.kernel.bus_process import TEXT
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
@@ -40,8 +44,7 @@ from deploy.page.scene import locate_borehole, measure_insertion, plan_approach,
 from deploy.page.server import serve_page
 from deploy.page.settings import LINK, PageSettings
 from deploy.page.video_relay import VideoRelay
-from deploy.runtime.bus_process import TEXT
-from deploy.runtime.operator_state import LoopSnapshot, OperatorState, PolicyAdvice, StopRequest
+from deploy.runtime.operator_state import LoopSnapshot, OperatorState, PageSignal, PolicyAdvice
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shm_layout import LOG_BYTES, VIEW, LoopMemory
@@ -59,6 +62,12 @@ looks 20 times a second. Chosen by hand."""
 SUPERVISOR_S = 1.0
 """Age of the supervisor's switches from which it counts as silent: 20 of its cycles. Chosen by
 hand."""
+BEAT_S = 0.01
+"""Between two signals of the page: a cycle of the bus process."""
+TURN_S = 0.3
+"""Time since the server last asked for a state from which it hangs. Chosen by hand: 75 of its turns."""
+BEAT_PRIORITY = 20
+"""Priority of the thread that signals, under SCHED_FIFO, below the supervisor."""
 UNNAMED = "+"
 """Name of a borehole that perception does not know: one from a file, from the configuration, or
 pointed at."""
@@ -106,6 +115,7 @@ def run(stop: Stop, config: PageProcessConfig, memory: LoopMemory) -> None:
         log.info("%s; the link with the token, for requests, stands in %s", host, link)
 
     feed = LoopFeed(config, memory)
+    threading.Thread(target=feed.beat, args=(stop,), daemon=True, name="beat").start()
     extensions = (VideoRelay(config.video_folder),) if config.video_folder else ()
     serve_page(config.page, stop, config.machine, feed, config.session, announce, *extensions)
 
@@ -127,14 +137,33 @@ class LoopFeed:
     ) -> None:
         # Guidance is on at the start: a page that opens late must not find it switched off.
         self._config, self._memory, self._clock = config, memory, clock
-        self._guiding, self._stopped_s = True, -math.inf
+        self._guiding, self._stopped_s, self._present_s = True, 0.0, 0.0
+        self._turned_s, self._signalling = clock(), threading.Lock()
         machine = config.machine
         self._full_rad = find_full_angles_rad(config.guidance.levers or machine.levers)
         self._exclusive = machine.is_exclusive
 
     def read_advice_number(self) -> int | None:
-        """See `PageFeed`."""
+        """See `PageFeed`; the server asks in each of its turns."""
+        self._turned_s = self._clock()
         return self._memory.advice.peek("number")
+
+    def beat(self, stop: Stop) -> None:
+        """Signal until asked to stop, as long as the server lives."""
+        with contextlib.suppress(OSError):
+            policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+            thread = threading.get_native_id()
+            os.sched_setscheduler(thread, policy, os.sched_param(BEAT_PRIORITY))
+        while not stop():
+            if self._clock() - self._turned_s < TURN_S:
+                self.signal()
+            time.sleep(BEAT_S)
+
+    def signal(self) -> None:
+        """Tell the bus process that the page lives, and when STOP was pressed last."""
+        with self._signalling:
+            signal = PageSignal(self._clock(), self._stopped_s, self._present_s)
+            self._memory.page.write(signal)
 
     def read_state(self) -> PageState:
         """See `PageFeed`."""
@@ -147,7 +176,7 @@ class LoopFeed:
         return PageState(
             t_s=snapshot.t_s,
             alive=snapshot.alive,
-            guiding=self._guiding,
+            guiding=self._is_guiding(snapshot),
             advice=None if advice is None else self._convert_advice(advice),
             state=state,
             commands=snapshot.commands,
@@ -160,6 +189,12 @@ class LoopFeed:
             block_in_base_m=None,
             view=self._read_view(),
         )
+
+    def _is_guiding(self, snapshot: LoopSnapshot) -> bool:
+        """Return whether advice is shown, or, where commands may be sent, whether they are."""
+        if not snapshot.commands:
+            return self._guiding
+        return snapshot.state is not None and snapshot.state.guard.sends
 
     def read_frame(self, after_s: float) -> Frame | None:
         """See `PageFeed`."""
@@ -174,6 +209,10 @@ class LoopFeed:
     def submit(self, request: OperatorRequest) -> bool:
         """See `PageFeed`."""
         facts: dict[str, Any] = {}
+        self._present_s = self._clock()
+        if request.kind == "present":
+            self.signal()
+            return True
         if request.kind in ("target", "point"):
             targets = self._list_targets(self._memory.target.read())
             # A borehole that is chosen already is granted without moving the target.
@@ -192,7 +231,7 @@ class LoopFeed:
         if request.kind == "stop":
             # Straight to the bus process: the supervisor may hang.
             self._stopped_s = self._clock()
-            self._memory.stop.write(StopRequest(self._stopped_s))
+            self.signal()
         if request.kind in ("start", "stop"):
             facts = {"asked_s": self._clock()}
         # The request goes through a pipe: this process may not touch the loop's slots.

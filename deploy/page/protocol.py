@@ -18,7 +18,7 @@ from deploy.guidance import LeverPositions
 from deploy.runtime.operator_state import OperatorState, convert_to_plain
 
 Vector = tuple[float, float, float]
-RequestKind = Literal["start", "stop", "record", "target", "point", "seek", "play"]
+RequestKind = Literal["start", "stop", "present", "record", "target", "point", "seek", "play"]
 REQUEST_KINDS: tuple[RequestKind, ...] = get_args(RequestKind)
 
 
@@ -237,9 +237,8 @@ class PageState:
             "deadman": state.deadman,
             "estop": state.estop,
             "bus_up": state.bus_up,
+            "prompt": state.prompt,
             "observed_joint": state.observed_joint,
-            "misfit": state.misfit.value,
-            "misfit_joint": state.misfit_joint,
         }
 
     @property
@@ -283,7 +282,7 @@ class OperatorRequest:
     """A request of the operator; token, origin and dead-man are checked already.
 
     Attributes:
-        kind: `start` and `stop` guiding, `record` on or off, choose a `target`, `point` at a
+        kind: `start` and `stop` guiding, `present` where the page asks, `record` on or off, choose a `target`, `point` at a
             borehole in the picture; `seek` and `play` in a recording.
         value: `on` or `off` for `record`, the name of the `target`, `x,y` of the point as parts of
             the picture from its upper left corner, the time in s to `seek`, the speed to `play` at

@@ -21,9 +21,8 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
-from deploy.guard.drift_watch import Misfit
-from deploy.guard.guard import GuardState, GuardTrip
 from deploy.guidance import AXES, convert_to_positions, find_full_angles_rad
+from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.protocol import (
     BoreholeChoice,
     DrawReport,
@@ -245,7 +244,7 @@ class ReplayFeed:
         positions = [self._read_signal(f"Position_{name}", at_s) for name in names]
         levers = [self._read_signal(f"Lever_{side}_{axis}", at_s) for side, axis in AXES]
         ages_s = {"positions": max(age for _, age in positions), "levers": levers[0][1]}
-        guard, misfit = self._find("guard", at_s), self._find("misfit", at_s)
+        guard = self._find("guard", at_s)
         state = replace(
             self._blank,
             t_s=at_s,
@@ -268,9 +267,6 @@ class ReplayFeed:
                 cause=GuardTrip(values["cause"]),
                 observed_joint=names.index(joint) + 1 if joint else 0,
             )
-        if misfit is not None:
-            joint, effect = misfit[2]["joint"], Misfit(misfit[2]["effect"])
-            state = replace(state, misfit=effect, misfit_joint=names.index(joint) + 1)
         return state, ages_s
 
     def _convert_advice(self, number: int, values: dict[str, Any]) -> ShownAdvice:
@@ -348,7 +344,7 @@ class _View:
 
 
 def _list_marks(topics: dict[str, _Topic], begin_s: float) -> tuple[TimelineMark, ...]:
-    """Return the changes of the guard, requests of the operator and misfits, in order of time."""
+    """Return the changes of the guard, and requests of the operator, in order of time."""
     found, before = [], None
     for t_s, values in topics["guard"].rows if "guard" in topics else ():
         # The reason for sending nothing may change while the state stays.
@@ -360,8 +356,6 @@ def _list_marks(topics: dict[str, _Topic], begin_s: float) -> tuple[TimelineMark
         found.append(TimelineMark(t_s - begin_s, "alarm" if latched else "state", name))
     for t_s, values in topics["wish"].rows if "wish" in topics else ():
         found.append(TimelineMark(t_s - begin_s, "request", values["kind"]))
-    for t_s, _ in topics["misfit"].rows if "misfit" in topics else ():
-        found.append(TimelineMark(t_s - begin_s, "alarm", "the model no longer fits"))
     # Where there are too many, alarms say most.
     found.sort(key=lambda mark: mark.kind != "alarm")
     return tuple(sorted(found[:MOST_MARKS], key=lambda mark: mark.t_s))

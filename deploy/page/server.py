@@ -144,9 +144,9 @@ def build_link(page: PageSettings, port: int, token: str) -> str:
 def write_link(session: Session, address: str) -> None:
     """Write the link into the run folder, readable for its owner alone."""
     path = session.folder / LINK
-    # The mode is given at creation: changing it later would leave the token readable for a
-    # moment.
-    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "w") as file:
+    # Another's file, or a link to one, goes; a new file has the mode from its creation on.
+    path.unlink(missing_ok=True)
+    with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w") as file:
         file.write(address + "\n")
 
 
@@ -181,8 +181,7 @@ class PageServer:
         for extension in extensions:
             self._files |= extension.files
             self._handlers[extension.path] = extension.talk
-        # Filled when the port is known; until then every host name is refused.
-        self._hosts: frozenset[str] = frozenset()
+        self._names = access.list_own_names(page.host, page.names)
         self._state: LatestValue[tuple[PageState | None, str]] = LatestValue((None, ""))
         self._frame = LatestValue(b"")
         self._num_pages = 0
@@ -224,7 +223,6 @@ class PageServer:
                 f"page: cannot listen on {page.host}:{page.port} ({error.strerror}); choose page.port=…"
             ) from error
         port = next(iter(server.sockets)).getsockname()[1]
-        self._hosts = access.list_own_hosts(page.host, port, page.names)
         socket_log.setLevel(logging.WARNING)
         async with server, asyncio.TaskGroup() as group:
             tasks = [group.create_task(self._watch()), group.create_task(self._watch_frames())]
@@ -292,7 +290,7 @@ class PageServer:
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Answer requests for files; `None` lets a WebSocket in."""
         path, host = request.path.partition("?")[0], request.headers.get("Host")
-        if host not in self._hosts:
+        if not access.is_own_host(host, self._names):
             # A browser that is led to this server by a foreign name (DNS rebinding) still sends
             # that name.
             return _build_refusal(
@@ -306,7 +304,7 @@ class PageServer:
         origin = request.headers.get("Origin")
         # programs send no origin; they may watch
         needs_origin = path not in (STATE, FRAMES)
-        is_ours = access.is_same_origin(origin, host, self._hosts)
+        is_ours = access.is_same_origin(origin, host, self._names)
         if not is_ours or (needs_origin and origin is None):
             log.warning("refused a connection from another origin")
             return _build_refusal(HTTPStatus.FORBIDDEN, "another origin")

@@ -21,16 +21,22 @@ from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, restore_encoder
 from brokk_rl.policy_folder import TaskDescription
 from brokk_rl.registry import resolve_package_path
+from deploy.plain_files import check_plain_file, read_json
 
 log = logging.getLogger(__name__)
 
 CONTRACT, ONNX, GOLDEN = "policy.json", "policy.onnx", "golden.json"
 SCHEMAS = (1, 2)
 """Versions of the contract that are read; the first does not describe the policy's task."""
+MOST_JSON_BYTES, MOST_ONNX_BYTES = 1 << 26, 1 << 30
+"""Sizes beyond which a file is none of a policy; the shipped ones have 10 KB and 300 KB."""
 ERRORS_ONLY = 3
 """Severity of onnxruntime's log."""
 ROUNDING = 1e-6
 """Largest difference of two equal numbers of a contract."""
+TRAINED = 2.0
+"""Distance of a target from the middle of those of the training, over their spread, up to which the
+policy knows it. Chosen by hand: the shipped policy's targets lie within 1."""
 TOLERANCE = 1e-3
 """Largest difference of a command (of full) to the golden answers; the same as at the export."""
 
@@ -52,6 +58,16 @@ class PolicyBundle:
     """
 
     def __init__(self, folder: str, machine: Machine) -> None:
+        try:
+            self._load(folder, machine)
+        # Whatever a file from elsewhere lacks or holds instead.
+        except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+            raise CheckpointError(
+                f"policy {folder}: {CONTRACT} or {GOLDEN} is malformed ({type(error).__name__}: "
+                f"{error}); export it again (mode=export)"
+            ) from error
+
+    def _load(self, folder: str, machine: Machine) -> None:
         place = resolve_package_path(folder)
         self.contract = _read(place / CONTRACT, folder)
         _check_contract(self.contract, machine, folder)
@@ -103,6 +119,12 @@ class PolicyBundle:
                 "leave it out, or give a policy that asks for one"
             )
 
+    def is_trained_for(self, target_m: np.ndarray) -> bool:
+        """Return whether a target, `(3,)`, lies near those of the training."""
+        scaling = self.contract["observation"]["target"]
+        off_m = np.abs(target_m - np.array(scaling["mean_m"]))
+        return bool((off_m <= TRAINED * np.array(scaling["std_m"])).all())
+
     def command(self, observation: np.ndarray) -> np.ndarray:
         """Return masked commands, `(B, J)`, for observation vectors, `(B, O)`."""
         return np.asarray(
@@ -112,6 +134,10 @@ class PolicyBundle:
     def _check_golden(self, golden: dict[str, Any], folder: str) -> None:
         observations = np.array(golden["observation"], np.float32)
         expected = np.array(golden["command"], np.float32)
+        if not len(observations) or observations.shape[1:] != (self.encoder.size,):
+            raise CheckpointError(
+                f"{folder}: {GOLDEN} holds no answers to compare; export it again (mode=export)"
+            )
         for one, answer in zip(observations, expected, strict=True):
             found = self.command(one[None])[0]
             if found.shape != answer.shape or not np.abs(found - answer).max() <= TOLERANCE:
@@ -180,7 +206,7 @@ def _is_different(mine: Any, other: Any) -> bool:
 
 def _read(path: Path, folder: str) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text())
+        return read_json(path, MOST_JSON_BYTES)
     except FileNotFoundError:
         hint = (
             "export it again (mode=export)"
@@ -202,17 +228,20 @@ def _open_session(
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = ERRORS_ONLY
     try:
+        # Weights may lie in a file beside the network, which is looked for beside its path.
+        for one in sorted({path, *path.parent.glob(f"{ONNX}*")}):
+            check_plain_file(one, MOST_ONNX_BYTES)
         session = onnxruntime.InferenceSession(
-            path.read_bytes(), options, providers=["CPUExecutionProvider"]
+            str(path), options, providers=["CPUExecutionProvider"]
         )
     except FileNotFoundError:
         raise CheckpointError(
             f"policy {folder}: {ONNX} is missing; export it (mode=export)"
         ) from None
+    except OSError as error:
+        raise CheckpointError(f"policy {folder}: {ONNX} cannot be read ({error})") from error
     except Exception as error:  # onnxruntime's errors have no base of their own
-        raise CheckpointError(
-            f"policy {folder}: {ONNX} is damaged or truncated ({str(error).splitlines()[0]})"
-        ) from error
+        raise CheckpointError(f"policy {folder}: {_explain(str(error), path)}") from error
     metadata = session.get_modelmeta().custom_metadata_map
     said = {}
     for key in ("fingerprint", "task"):
@@ -223,3 +252,20 @@ def _open_session(
             f"policy {folder}: {CONTRACT} and {ONNX} do not belong together; export it again (mode=export)"
         )
     return session
+
+
+def _explain(text: str, path: Path) -> str:
+    """Return in words why onnxruntime does not open a network."""
+    line = text.splitlines()[0] if text else "no reason given"
+    if "IR version" in text or "opset" in text.lower():
+        return (
+            f"{ONNX} was written by a newer onnx than this onnxruntime {onnxruntime.__version__} reads "
+            f"({line}); update onnxruntime, or export with an older onnx"
+        )
+    if "external" in text.lower() or f"{ONNX}.data" in text:
+        files = ", ".join(sorted(one.name for one in path.parent.iterdir()))
+        return (
+            f"the weights of {ONNX} lie in a file of their own, which is missing or cut off ({line}); "
+            f"copy it, mostly {ONNX}.data, beside {ONNX}; the folder holds {files}"
+        )
+    return f"{ONNX} is damaged or truncated ({line})"

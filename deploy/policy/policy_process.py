@@ -16,8 +16,9 @@ import numpy as np
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET
 from deploy.guidance import LeverDisplay, LeverGuidance
+from deploy.kernel.bus_process import TEXT
+from deploy.kernel.guard import GuardTrip
 from deploy.policy.bundle import PolicyBundle
-from deploy.runtime.bus_process import TEXT
 from deploy.runtime.operator_state import (
     AdviceStatus,
     OperatorState,
@@ -168,6 +169,10 @@ class PolicyAdviser:
                 status = AdviceStatus.NO_TARGET
             elif now_s - float(target["t_s"]) > self._config.target_s:
                 status = AdviceStatus.TARGET_OLD
+            elif state is not None and state.target is not GuardTrip.NONE:
+                status = AdviceStatus.TARGET_REFUSED
+            elif not self._bundle.is_trained_for(target_m):
+                status = AdviceStatus.TARGET_UNKNOWN
         if status is AdviceStatus.VALID:
             begun = time.perf_counter()
             answer = self._infer(target_m)
@@ -192,6 +197,9 @@ class PolicyAdviser:
         if not state.q_plausible or not state.trusted:
             self._history.empty()
             return AdviceStatus.IMPLAUSIBLE
+        if state.observed_joint:
+            self._history.empty()
+            return AdviceStatus.FAULT
         self._history.sample(state, missed)
         return AdviceStatus.VALID if self._history.full else AdviceStatus.WARMING_UP
 

@@ -28,9 +28,9 @@ from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
 from brokk_rl.signals import Frame
 from deploy.bus.description import BusDescription, MessageLayout
-from deploy.bus.protection import MessageFault
+from deploy.kernel.bus_process import FRAME, FRAMES
+from deploy.kernel.protection import MessageFault
 from deploy.recorder.topics import TIME, TOPICS, TopicSchema, describe_bus_fields
-from deploy.runtime.bus_process import FRAME, FRAMES
 from deploy.runtime.perception_process import read_frame
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
@@ -50,8 +50,8 @@ FLUSH_S = 0.5
 MCAP, BLF = "capture.mcap", "frames.blf"
 EARLY = 0.9
 """Part of the time between pictures from which one is due: a camera's period is not exact."""
-FACTS = "brokk"
-"""Name of the metadata record."""
+FACTS, NUM_FACTS = "brokk", 3
+"""Name of the metadata record, and how often it is written: the majority counts."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,9 @@ class CaptureWriter:
             "schema": "1", "machine": machine.name, "fingerprint": json.dumps(machine.fingerprint()), "dbc": capture.dbc,
             "started_ns": str(time.time_ns()),
         }  # fmt: skip
-        self._mcap.add_metadata(FACTS, facts | capture.facts)
+        # Without them no capture can be read, and one wrong byte spoils one of them.
+        for _ in range(NUM_FACTS):
+            self._mcap.add_metadata(FACTS, facts | capture.facts)
         now_ns = time.time_ns()
         self._mcap.add_attachment(
             now_ns,

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
+import mmap
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from io import BytesIO
+from mmap import PROT_READ
 from pathlib import Path
 from typing import Any, overload
 
 import can
 import numpy as np
+import zstandard
 from can.io.blf import BLFReader
-from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Chunk, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.records import (
+    Attachment,
+    Channel,
+    Chunk,
+    Message,
+    MessageIndex,
+    Metadata,
+    Schema,
+    Statistics,
+)
+from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
+from mcap.summary import Summary
 from mcap.writer import CompressionType, Writer
 
 from brokk_rl.errors import RecordingError
@@ -27,6 +42,15 @@ from deploy.recorder.capture import FACTS, DurableBlfWriter
 from deploy.recorder.topics import PACKAGE, TIME, decode_message, load_message_class
 
 log = logging.getLogger(__name__)
+
+MCAP_MAGIC = bytes((137, 77, 67, 65, 80, 48, 13, 10))
+"""First and last bytes of a file (mcap.dev/spec)."""
+HEAD_BYTES, CHUNK_HEAD_BYTES = 9, 28
+"""Of opcode and length of a record, and of the times, size and CRC with which a chunk begins."""
+COMPRESSION = b"\x04\x00\x00\x00zstd"
+"""What follows them in each chunk of a capture."""
+MOST_CHUNK_BYTES = 1 << 28
+"""Size of an opened chunk; those of a capture are flushed twice a second and hold a few MB."""
 
 
 class TopicMessages(Sequence[tuple[float, dict[str, Any]]]):
@@ -94,6 +118,8 @@ class CaptureContents:
         views: Messages for viewers that were asked for, by topic, not decoded: (t_s, data).
         wall_ns: Wall-clock time of the first message.
         whole: Whether the file was closed properly.
+        num_lost: Messages that are missing, as far as the file says how many it held.
+        num_damaged: Places at which something could not be read.
     """
 
     facts: dict[str, str] = field(default_factory=dict)
@@ -101,6 +127,8 @@ class CaptureContents:
     views: dict[str, list[tuple[float, bytes]]] = field(default_factory=dict)
     wall_ns: int = 0
     whole: bool = True
+    num_lost: int = 0
+    num_damaged: int = 0
 
 
 def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
@@ -115,14 +143,16 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
     """
     contents, decoder, ahead_ns = CaptureContents(whole=is_whole(path)), _Decoder(), None
     seen: list[tuple[str, Message]] = []
-    for record in _iterate_records(path):
+    scan, facts = CaptureScan(path), list[dict[str, str]]()
+    for record in (*_list_summary(path), *scan):
         if isinstance(record, Metadata) and record.name == FACTS:
-            contents.facts = dict(record.metadata)
+            facts.append(dict(record.metadata))
         elif isinstance(record, Schema):
             decoder.schemas[record.id] = record
         elif isinstance(record, Channel):
             decoder.channels[record.id] = record
-        elif isinstance(record, Message):
+        # Where the summary is lost, too, a channel may be unknown.
+        elif isinstance(record, Message) and record.channel_id in decoder.channels:
             topic = decoder.channels[record.channel_id].topic
             values = decoder.decode(record)
             if values is not None:
@@ -132,6 +162,9 @@ def read_capture(path: Path, views: tuple[str, ...] = ()) -> CaptureContents:
                 contents.messages.setdefault(topic, TopicMessages()).add(t_s, values)
             elif topic in views:
                 seen.append((topic, record))
+    contents.num_lost, contents.num_damaged = scan.num_lost, scan.num_damaged
+    # They are written several times, and have no check sum.
+    contents.facts = max(facts, key=facts.count, default={})
     if not contents.facts:
         raise RecordingError(
             f"{path}: no capture of this framework, or cut off within its first second"
@@ -166,60 +199,77 @@ class _Decoder:
 
 def is_whole(path: Path) -> bool:
     """Return whether the capture at `path` was closed properly."""
+    if not path.exists():
+        raise RecordingError(f"{path}: no such capture")
+    return _read_summary(path) is not None
+
+
+def _read_summary(path: Path) -> Summary | None:
+    if not path.is_file():
+        return None
     try:
         with path.open("rb") as file:
-            return make_reader(file).get_summary() is not None
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: no such capture") from error
-    except (McapError, OSError, ValueError):
-        return False
+            return make_reader(file).get_summary()
+    except Exception:  # as in `_read_record`
+        return None
 
 
-def recover_mcap(path: Path, out: Path) -> int:
-    """Write the readable part of a cut-off capture as a whole one; return its number of messages.
+def _list_summary(path: Path) -> list[Any]:
+    """Return schemas and channels from the end of a capture: those in a damaged chunk are known, too."""
+    summary = _read_summary(path)
+    if summary is None:
+        return []
+    return [*summary.schemas.values(), *summary.channels.values()]
+
+
+def recover_mcap(path: Path, out: Path) -> tuple[int, int]:
+    """Write the readable part of a capture as a whole one.
+
+    Returns:
+        Its number of messages, and of places where something is lost.
 
     Raises:
         RecordingError: nothing can be read.
     """
-    count, schemas, channels = 0, {0: 0}, {}
+    count, scan = 0, CaptureScan(path)
+    schemas: dict[int, Schema] = {}
+    channels: dict[int, Channel] = {}
+    given: dict[int, int] = {}
     part = out.with_name(f".{out.name}.part")
     with part.open("wb") as file:
         writer = Writer(file, compression=CompressionType.ZSTD)
         writer.start(profile="brokk", library="brokk-rl")
-        for record in _iterate_records(path):
+        for record in (*_list_summary(path), *scan):
             if isinstance(record, Schema):
-                schemas.setdefault(
-                    record.id, writer.register_schema(record.name, record.encoding, record.data)
-                )
-            elif isinstance(record, Channel) and record.id not in channels:
-                channels[record.id] = writer.register_channel(
-                    record.topic, record.message_encoding, schemas[record.schema_id]
-                )
-            elif isinstance(record, Message):
-                writer.add_message(
-                    channels[record.channel_id],
-                    record.log_time,
-                    record.data,
-                    record.publish_time,
-                    record.sequence,
-                )
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message) and record.channel_id in channels:
+                channel = channels[record.channel_id]
+                if channel.id not in given:
+                    schema = schemas[channel.schema_id]
+                    number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                    encoding = channel.message_encoding
+                    given[channel.id] = writer.register_channel(channel.topic, encoding, number)
+                times_ns = record.log_time, record.publish_time
+                number = given[channel.id]
+                writer.add_message(number, times_ns[0], record.data, times_ns[1], record.sequence)
                 count += 1
             elif isinstance(record, Metadata):
                 writer.add_metadata(record.name, dict(record.metadata))
             elif isinstance(record, Attachment):
-                writer.add_attachment(
-                    record.create_time, record.log_time, record.name, record.media_type, record.data
-                )
+                kind, data = record.media_type, record.data
+                writer.add_attachment(record.create_time, record.log_time, record.name, kind, data)
         writer.finish()
     if not count:
         part.unlink()
         raise RecordingError(f"{path}: not a single message can be read")
     part.replace(out)
-    return count
+    return count, scan.num_damaged
 
 
-def recover_blf(path: Path, out: Path) -> int:
-    """Write the readable part of a cut-off BLF as a whole one; return its number of frames."""
+def recover_blf(path: Path, out: Path) -> tuple[int, int]:
+    """Write the readable part of a cut-off BLF as a whole one; return as `recover_mcap`."""
     part, count = out.with_name(f".{out.name}.part"), 0
     writer = DurableBlfWriter(part)
     try:
@@ -229,7 +279,7 @@ def recover_blf(path: Path, out: Path) -> int:
     finally:
         writer.stop()
     part.replace(out)
-    return count
+    return count, 0
 
 
 def iterate_blf_frames(path: Path) -> Iterator[can.Message]:
@@ -243,28 +293,127 @@ def iterate_blf_frames(path: Path) -> Iterator[can.Message]:
         log.warning("%s: ends before its end (%s)", path, error)
 
 
-def _iterate_records(path: Path) -> Iterator[Any]:
-    """Yield records as far as the file can be read; chunks are opened."""
+class CaptureScan:
+    """Records of a capture, chunk by chunk; what is damaged is left out and counted.
+
+    A record that cannot be read costs itself, and a chunk its messages: the scan goes on at the next
+    record, or at the next chunk where the damage hides how long the record is.
+
+    Args:
+        path: The capture.
+
+    Attributes:
+        num_lost: Messages that are missing, as far as the file says how many it held.
+        num_damaged: Places at which something could not be read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.num_lost, self.num_damaged = path, 0, 0
+
+    def __iter__(self) -> Iterator[Any]:
+        """Yield the records.
+
+        Raises:
+            RecordingError: the file cannot be read.
+        """
+        try:
+            if not self.path.is_file():
+                raise FileNotFoundError(errno.ENOENT, "no such file, or no plain one")
+            if self.path.stat().st_size == 0:
+                return
+            # A link is followed; a pipe or a device was refused.
+            with self.path.open("rb") as file, mmap.mmap(file.fileno(), 0, prot=PROT_READ) as data:
+                yield from self._scan(data)
+        except (OSError, ValueError) as error:
+            raise RecordingError(f"{self.path}: cannot be read ({error})") from error
+        if self.num_damaged:
+            text = "%s: damaged in %d places, at least %d messages are lost"
+            log.warning(text, self.path, self.num_damaged, self.num_lost)
+
+    def _scan(self, data: mmap.mmap) -> Iterator[Any]:
+        at, count, is_hidden, num_hidden = MAGIC_SIZE, 0, False, 0
+        is_closed = data[-MAGIC_SIZE:] == MCAP_MAGIC
+        while not _is_file_end(data, at):
+            record, end = _read_record(data, at)
+            if isinstance(record, Chunk):
+                inner = _open_chunk(record)
+                is_hidden = inner is None
+                self.num_damaged += is_hidden
+                for one in inner or ():
+                    count += isinstance(one, Message)
+                    yield one
+            elif isinstance(record, MessageIndex) and is_hidden:
+                num_hidden += len(record.records)
+            elif isinstance(record, Statistics):
+                # A wrong opcode may turn a chunk into a record of another kind.
+                num_hidden = max(num_hidden, record.message_count - count)
+                self.num_damaged = max(self.num_damaged, int(num_hidden > 0))
+            elif record is not None:
+                yield record
+            self.num_lost = num_hidden
+            # A wrong length leads to where no record begins.
+            if record is None or not _is_record_start(data, end):
+                end = _find_record(data, at + 1)
+                if end == len(data) and not is_closed:
+                    log.warning("%s: ends before its end", self.path)
+                    return
+                self.num_damaged += 1
+            at = end
+
+
+def _read_record(data: mmap.mmap, at: int) -> tuple[Any | None, int]:
+    """Return the record that begins at `at`, `None` where it cannot be read, and where it ends."""
+    end = at + HEAD_BYTES + int.from_bytes(data[at + 1 : at + HEAD_BYTES], "little")
+    if end > len(data):
+        return None, end
+    reader = StreamReader(BytesIO(data[at:end]), skip_magic=True, emit_chunks=True)
     try:
-        file = path.open("rb")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
-    with file:
-        reader = StreamReader(file, emit_chunks=True, validate_crcs=True).records
-        while True:
-            try:
-                record = next(reader)
-                inner = (
-                    breakup_chunk(record, validate_crc=True)
-                    if isinstance(record, Chunk)
-                    else [record]
-                )
-            except StopIteration:
-                return
-            except Exception as error:  # a cut-off file fails wherever it was cut
-                log.warning("%s: ends before its end (%s: %s)", path, type(error).__name__, error)
-                return
-            yield from inner
+        return next(reader.records), end
+    except Exception:  # damage may raise whatever the parser meets first
+        return None, end
+
+
+def _is_record_start(data: mmap.mmap, at: int) -> bool:
+    """Return whether a record, or the end of the file, may be at `at`."""
+    if at + HEAD_BYTES > len(data):
+        return _is_file_end(data, at)
+    length = int.from_bytes(data[at + 1 : at + HEAD_BYTES], "little")
+    return _is_file_end(data, at) or (
+        0 < data[at] <= max(Opcode) and at + HEAD_BYTES + length <= len(data)
+    )
+
+
+def _is_file_end(data: mmap.mmap, at: int) -> bool:
+    return at == len(data) or (at == len(data) - MAGIC_SIZE and data[at:] == MCAP_MAGIC)
+
+
+def _open_chunk(chunk: Chunk) -> list[Any] | None:
+    """Return the records of a chunk, `None` where it is damaged."""
+    try:
+        # The size that the compressed data themselves announce: memory is taken for all of it.
+        size = chunk.uncompressed_size
+        if chunk.compression == "zstd":
+            size = max(size, zstandard.frame_content_size(chunk.data))
+        if size > MOST_CHUNK_BYTES:
+            log.warning("a chunk claims %d MB, more than any of a capture", size >> 20)
+            return None
+        return breakup_chunk(chunk, validate_crc=True)
+    except Exception:  # as above
+        return None
+
+
+def _find_record(data: mmap.mmap, at: int) -> int:
+    """Return where the next chunk begins, or a record of facts before it, or the end of the file."""
+    name = len(FACTS).to_bytes(4, "little") + FACTS.encode()
+    facts = data.find(name, at + HEAD_BYTES) - HEAD_BYTES
+    if facts >= at and data[facts] == Opcode.METADATA and _is_record_start(data, facts):
+        return facts
+    while (mark := data.find(COMPRESSION, at)) >= 0:
+        begin = mark - CHUNK_HEAD_BYTES - HEAD_BYTES
+        if begin >= at and data[begin] == Opcode.CHUNK and _is_record_start(data, begin):
+            return begin
+        at = mark + 1
+    return len(data)
 
 
 KINDS = {".mcap": recover_mcap, ".blf": recover_blf}
@@ -284,8 +433,8 @@ class CaptureRecovery:
         """Write each recovered file under its own name, led by that of its folder, into `folder`.
 
         Raises:
-            RecordingError: nothing matches, two would have the same name, or nothing can be read of
-                one.
+            RecordingError: nothing matches, two would have the same name, nothing can be read of one,
+                or, at the end, something of one is lost.
         """
         candidates = find_files(self.input, "capture")
         paths = [path for path in candidates if path.suffix in KINDS]
@@ -298,6 +447,14 @@ class CaptureRecovery:
             raise RecordingError(
                 "recover.input: two captures lie in folders of the same name; recover one after the other"
             )
+        damaged = []
         for path, name in track_items(list(zip(paths, names, strict=True)), "recovering"):
-            count = KINDS[path.suffix](path, folder / name)
+            count, num_damaged = KINDS[path.suffix](path, folder / name)
             log.info("%s: %d messages recovered into %s", path, count, folder / name)
+            if num_damaged:
+                damaged.append(str(path))
+        if damaged:
+            raise RecordingError(
+                f"recover: the rest is in {folder}, but something is lost of {', '.join(damaged)}; "
+                "its lines above say how much"
+            )

@@ -37,8 +37,8 @@ from google.protobuf.message import Message
 from brokk_rl.kinematics import compute_tool_kinematics, rotate_about_axis
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
-from deploy.guard.guard import GuardState
-from deploy.guard.shapes import BASE, MachineShapes, read_machine_shapes
+from deploy.bus.shapes import BASE, MachineShapes, read_machine_shapes
+from deploy.kernel.guard import GuardState
 from deploy.page.scene import plan_approach
 from deploy.picture import decode_jpeg, encode_jpeg
 from deploy.recorder.topics import CAMERA_POSE, CLOUD, LENS, PICTURE
@@ -253,9 +253,6 @@ def describe_event(
         reason = values["cause"] if latched else values["trip"]
         about = f" ({values['joint']})" if values.get("joint") else ""
         return LEVELS.ERROR if latched else LEVELS.INFO, f"guard {values['state']}: {reason}{about}"
-    if topic == "misfit":
-        text = f"the model no longer fits {values['joint']}, probably {values['effect']}"
-        return LEVELS.WARNING, text
     if topic == "bus":
         return LEVELS.ERROR, f"bus down: {values['down']}"
     if topic == "wish":

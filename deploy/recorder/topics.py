@@ -16,9 +16,8 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import Message
 
 from deploy.bus.description import BusDescription, MessageLayout
-from deploy.bus.protection import MessageFault
-from deploy.guard.drift_watch import Misfit
-from deploy.guard.guard import GuardState, GuardTrip
+from deploy.kernel.guard import GuardState, GuardTrip
+from deploy.kernel.protection import MessageFault
 from deploy.runtime.operator_state import AdviceStatus
 
 FieldKind = Literal["number", "integer", "flag", "text"]
@@ -88,10 +87,6 @@ TOPICS: dict[str, tuple[TopicField, ...]] = {
         TopicField("trip", "text", f"why nothing passes now; {_list_values(GuardTrip)}"),
         TopicField("cause", "text", f"why it latched last; {_list_values(GuardTrip)}"),
         TopicField("joint", "text", "joint that does not move as commanded", optional=True),
-    ),
-    "misfit": (
-        TopicField("joint", "text", "joint that the observer's model no longer fits"),
-        TopicField("effect", "text", f"probable reason; {_list_values(Misfit)}"),
     ),
     "fault": (
         TopicField("frame_id", "integer", "CAN identifier of the frame that was refused"),

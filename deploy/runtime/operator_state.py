@@ -1,7 +1,7 @@
 """The state of machine, operator and guard, and the policy's advice, as all processes read them.
 
 The bus process writes `OperatorState` into shared memory, the policy process `PolicyAdvice`; page,
-terminal and study read them from there. Times are monotonic, in s, and 0 where nothing has come
+study read them from there. Times are monotonic, in s, and 0 where nothing has come
 yet. Old values are never left out: their age says how old they are.
 """
 
@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from deploy.guard.drift_watch import Misfit
-from deploy.guard.guard import GuardState, GuardTrip
 from deploy.guidance import LeverPositions
+from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.runtime.shared_memory import Axes, Joints, Point
 
 ALIVE_S = 0.2
@@ -32,6 +31,9 @@ class AdviceStatus(Enum):
     WARMING_UP = "history is filling"
     NO_TARGET = "no borehole is known"
     TARGET_OLD = "the borehole was found too long ago"
+    TARGET_REFUSED = "the borehole is beyond its limits"
+    TARGET_UNKNOWN = "the policy was not trained for such a borehole"
+    FAULT = "a sensor or valve is faulty"
     REJECTED = "the policy's answer makes no sense"
 
 
@@ -71,10 +73,10 @@ class OperatorState:
         refused: Messages refused so far.
         lost: Messages lost so far.
         missed: Cycles missed so far.
-        observed_joint: Number, from 1, of the joint that does not move as commanded; 0 while all
-            do.
-        misfit: Why the observer's model no longer fits, by its drift watch.
-        misfit_joint: Number of its joint, from 1; 0 while it fits.
+        target: Fault of the borehole, `GuardTrip.NONE` for none.
+        prompt: Whether the operator is asked to show that they are there.
+        observed_joint: Number, from 1, of the joint that is not driven or does not move as asked; 0
+            while all do.
     """
 
     t_s: float
@@ -107,9 +109,9 @@ class OperatorState:
     refused: int
     lost: int
     missed: int
+    target: GuardTrip
+    prompt: bool
     observed_joint: int
-    misfit: Misfit
-    misfit_joint: int
 
     @property
     def levers(self) -> LeverPositions:
@@ -182,14 +184,18 @@ class OperatorControls:
 
 
 @dataclass(frozen=True)
-class StopRequest:
-    """The operator's stop. It reaches the bus process directly, without the supervisor.
+class PageSignal:
+    """Word of the operator's page. It reaches the bus process directly, without the supervisor.
 
     Attributes:
-        t_s: When it was pressed.
+        t_s: When it was written; a page that is dead writes no more.
+        stopped_s: When STOP was pressed last; 0: never.
+        present_s: When a person touched the page last; 0: never.
     """
 
     t_s: float
+    stopped_s: float
+    present_s: float
 
 
 @dataclass(frozen=True)
@@ -275,8 +281,6 @@ class LoopSnapshot:
             "lost": state.lost,
             "log_dropped": self.log_dropped,
             "observed_joint": state.observed_joint,
-            "misfit": state.misfit.value,
-            "misfit_joint": state.misfit_joint,
         }
 
 

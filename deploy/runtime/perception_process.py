@@ -30,8 +30,8 @@ from brokk_rl.contracts.vision import (
 from brokk_rl.errors import FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import NonNegative, Positive, spec
+from deploy.kernel.bus_process import TEXT
 from deploy.picture import shrink_picture
-from deploy.runtime.bus_process import TEXT
 from deploy.runtime.process import Stop
 from deploy.runtime.shared_memory import Slot
 from deploy.runtime.shm_layout import MOST_HOLES, LoopMemory

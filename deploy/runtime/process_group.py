@@ -11,11 +11,11 @@ from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.bus.can_bus import BusReplay, CanBus
 from deploy.bus.description import BusDescription
-from deploy.guard.limits import GuardLimits
 from deploy.guidance import LeverGuidance, LeverMap
+from deploy.kernel.bus_process import BusProcessConfig
+from deploy.kernel.limits import GuardLimits
 from deploy.policy.bundle import PolicyBundle
 from deploy.policy.policy_process import PolicyProcessConfig
-from deploy.runtime.bus_process import BusProcessConfig
 from deploy.runtime.process import ChildProcess
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import TargetSpec
@@ -28,8 +28,7 @@ BUS_PRIORITY, POLICY_PRIORITY = 55, 50
 """Priorities under SCHED_FIFO, 1 to 99. Chosen by hand: the bus before the policy, and both before
 twin (45) and commander (40)."""
 OPTIONAL = {
-    "page": "nothing is shown any more",
-    "terminal": "nothing is shown here any more",
+    "page": "nothing is shown any more, and where commands are sent they end",
     "camera": "nothing new is seen any more",
     "video": "the page shows no video any more",
 }
@@ -123,7 +122,12 @@ class BusAndPolicySettings:
         PolicyBundle(self.policy, machine)
 
     def start_processes(
-        self, group: ProcessGroup, machine: Machine, target_s: float, pitch_rad: float | None
+        self,
+        group: ProcessGroup,
+        machine: Machine,
+        target_s: float,
+        pitch_rad: float | None,
+        needs_page: bool = False,
     ) -> None:
         """Start bus and policy.
 
@@ -132,14 +136,15 @@ class BusAndPolicySettings:
             machine: The machine.
             target_s: Age of the borehole from which there is no advice.
             pitch_rad: Wanted pitch of the tool, for policies that ask for one.
+            needs_page: Whether commands are sent only while the operator's page lives.
 
         Raises:
             ConfigError: The pitch contradicts the policy's task.
         """
         PolicyBundle(self.policy, machine).check_pitch(pitch_rad)
-        bus = BusProcessConfig(self.wire, self.dbc, machine, self.limits)
+        bus = BusProcessConfig(self.wire, self.dbc, machine, self.limits, needs_page)
         policy = PolicyProcessConfig(
             machine, self.policy, self.guidance, self.limits.joints_s, target_s, pitch_rad
         )
-        group.start("bus", "deploy.runtime.bus_process:run", (bus,), BUS_PRIORITY)
+        group.start("bus", "deploy.kernel.bus_process:run", (bus,), BUS_PRIORITY)
         group.start("policy", "deploy.policy.policy_process:run", (policy,), POLICY_PRIORITY)

@@ -14,9 +14,9 @@ from deploy.runtime.operator_state import (
     LoopSnapshot,
     OperatorControls,
     OperatorState,
+    PageSignal,
     PolicyAdvice,
     RequestedCommand,
-    StopRequest,
 )
 from deploy.runtime.shared_memory import Pipe, RecordSlot, Slot
 
@@ -91,7 +91,7 @@ class LoopMemory:
         request: Commands to be sent; `None` where nothing ever is.
         target: The borehole.
         controls: From the operator's side.
-        stop: From the page, straight to the bus process.
+        page: From the page, straight to the bus process.
         frame: Newest frame of the camera; `None` without one.
         holes: Boreholes that perception knows.
         view: Where a moving camera looks.
@@ -108,7 +108,7 @@ class LoopMemory:
     request: RecordSlot[RequestedCommand] | None
     target: Slot
     controls: RecordSlot[OperatorControls]
-    stop: RecordSlot[StopRequest]
+    page: RecordSlot[PageSignal]
     frame: Slot | None
     holes: Slot
     view: Slot
@@ -135,7 +135,7 @@ class LoopMemory:
             request=request,
             target=Slot("target", TARGET),
             controls=RecordSlot("controls", OperatorControls, num_joints),
-            stop=RecordSlot("stop", StopRequest, num_joints),
+            page=RecordSlot("page", PageSignal, num_joints),
             frame=Slot("frame", build_frame_fields(frame_px)) if frame_px else None,
             holes=Slot("holes", HOLES),
             view=Slot("view", VIEW),

@@ -19,11 +19,10 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
-from deploy.guidance import find_full_angles_rad
+from deploy.kernel.bus_process import read_observer_content
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.recorder.capture import CaptureConfig
-from deploy.runtime.bus_process import read_observer_content
 from deploy.runtime.detached_log import detach_logging
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.perception_process import CameraConfig
@@ -56,7 +55,6 @@ class DeploymentLoop(BusAndPolicySettings):
         armed: Whether sending is armed from the beginning; the dead-man must be held all the same.
         record: Whether everything is recorded.
         seconds: Length of the run; `null`: until told to stop.
-        show: Whether to show levers and state in the terminal.
         page: The operator's page; `null`: none.
         camera: Camera beside the loop; `null`: there is none.
         video: Live video on the page; `null`: none.
@@ -68,7 +66,6 @@ class DeploymentLoop(BusAndPolicySettings):
     armed: bool
     record: bool
     seconds: Positive | None
-    show: bool
     page: PageSettings | None
     camera: CameraConfig | None
     video: VideoSettings | None
@@ -149,7 +146,8 @@ class DeploymentLoop(BusAndPolicySettings):
             memory.close()
 
     def _start(self, group: ProcessGroup, machine: Machine, session: Session, sockets: str) -> None:
-        self.start_processes(group, machine, self.target_s, self.pitch_rad)
+        needs_page = self.page is not None
+        self.start_processes(group, machine, self.target_s, self.pitch_rad, needs_page)
         if self.page is not None:
             config = self.build_page_config(self.page, machine, session)
             if self.video is not None:
@@ -157,10 +155,6 @@ class DeploymentLoop(BusAndPolicySettings):
                 video = VideoProcessConfig(self.video, sockets)
                 group.start("video", "deploy.video.video_process:run", (video,))
             group.start("page", "deploy.page.loop_feed:run", (config,))
-        if self.show:
-            # A process of its own: a terminal that is not read blocks whoever writes to it.
-            full_rad = find_full_angles_rad(self.guidance.levers or machine.levers)
-            group.start("terminal", "deploy.runtime.terminal:run", (full_rad,))
         if self.camera is not None:
             group.start("camera", "deploy.runtime.perception_process:run", (self.camera,))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,10 +11,15 @@ import numpy as np
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.spec import spec
+from deploy.plain_files import read_json
 from deploy.runtime.shared_memory import Slot
 
 NEAR_M = 0.1
 """Distance below which two boreholes are the same: holes of 0.1 m are drilled further apart."""
+
+
+MOST_BYTES = 1 << 16
+"""Size beyond which a file is none of a target."""
 
 
 @dataclass(frozen=True)
@@ -211,12 +215,12 @@ class _WatchedFile:
             if changed == self._changed:
                 return None
             before, self._changed = self._changed, changed
-            found = json.loads(self._path.read_text())
+            found = read_json(self._path, MOST_BYTES)
             center_m = np.array(found["center_in_base_m"], dtype=float)
             std_m = float(found.get("std_m", 0.0))
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, OverflowError) as error:
             raise ConfigError(
                 f"target.path={self._path}: expected JSON with center_in_base_m: [x, y, z] ({error})"
             ) from error

@@ -19,8 +19,8 @@ import numpy as np
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import COUNTER, LEVER_AXES, STAMP, BusDescription
-from deploy.bus.protection import ChannelTrust, MessageFault
 from deploy.guidance import AXES, LeverMap, find_full_angles_rad
+from deploy.kernel.protection import ChannelTrust, MessageFault
 
 TIMEOUT_S = 0.07
 """Age of the last valid command from which there is none; three cycles and a half, within the 100

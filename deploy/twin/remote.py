@@ -15,10 +15,10 @@ from brokk_rl.gamepad import Gamepad
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 from deploy.bus.can_bus import CanBus, CanFrame, OpenCanBus
-from deploy.bus.clock import GatewayClock
 from deploy.bus.description import LEVER_AXES, STAMP, BusDescription
-from deploy.bus.protection import MessageFault
 from deploy.guidance import AXES, LeverMap, find_full_angles_rad
+from deploy.kernel.clock import GatewayClock
+from deploy.kernel.protection import MessageFault
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
 

@@ -262,6 +262,7 @@ class RunningTwin:
             "GatewayState": state.value,
             "RoundTrip": gateway.report_round_trip_s(now_s),
             "OilTemperature": self._oil_c,
+            **self._description.identity,
         }
         for name, u in zip(self._machine.joint_names, self._flow, strict=True):
             values[f"Flow_{name}"] = float(u)

@@ -10,7 +10,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOMS = ("tasks", "actuators", "perception", "deploy", "diagnosis")
-EXTENSIONS = ("exam",)
+EXTENSIONS = ("exam", "study")
 """Packages that stand on all rooms, as a package from elsewhere would."""
 ROOM_DOORS = {"diagnosis": ("actuators",)}
 """Rooms that a room may import: a diagnosis is about the models and recordings of actuators."""
@@ -66,12 +66,11 @@ DOORS = {
 }
 CLOSED = {
     "deploy": ("brokk_rl.sim", "brokk_rl.rl", "mujoco", "warp", "rsl_rl"),
-    "deploy.guard.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.guard.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.guard.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
-    "deploy.guard.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.guard.observer": ("torch", "os", "pathlib", "socket", "io", "time"),
-    "deploy.guard.drift_watch": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.kernel.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.kernel.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.kernel.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.kernel.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.kernel.observer": ("torch", "os", "pathlib", "socket", "io", "time"),
 }
 """What a package must not import, whatever its floor: the machine's own computer has neither
 simulator nor trainer."""

@@ -35,13 +35,12 @@ class Room:
 
 
 # The bound is the size at the last change of this table. It only falls, until it is the budget.
-# The study is still a part of deploy and takes its lines along.
 ROOMS = (
     Room(("brokk_rl", "tasks", "conf"), bound=15_015, budget=10_500),
     Room(("actuators", "diagnosis", "exam"), bound=31_648, budget=16_500),
     Room(("perception",), bound=13_658, budget=9_500),
-    Room(("deploy",), bound=12_398, budget=7_500),
-    Room(("study",), bound=0, budget=1_800),
+    Room(("deploy",), bound=8_750, budget=7_500),
+    Room(("study",), bound=3_830, budget=1_800),
     Room(("tests",), bound=37_162, budget=25_000),
     Room(("benchmarks",), bound=7_965, budget=2_000),
 )

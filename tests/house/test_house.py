@@ -87,7 +87,7 @@ def test_numbers_of_the_configuration_are_explained() -> None:
         (rules.doors, "brokk_rl.modes.list", "from omegaconf import OmegaConf"),
         (rules.doors, "brokk_rl.rl.runner", "import warp as wp"),
         (rules.doors, "deploy.runtime", "from brokk_rl.sim import scene"),
-        (rules.doors, "deploy.guard.guard", "import torch"),
+        (rules.doors, "deploy.kernel.guard", "import torch"),
         (rules.prints, "brokk_rl.session", "print('hello')"),
         (rules.vague_names, "brokk_rl.rl.utils", ""),
         (rules.docstrings, "brokk_rl.a", '"""A."""\nclass B:\n    """B."""\n    def c(self): pass'),

@@ -14,13 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from block import BLOCK_M, TARGETS, BlockCamera
 from desk import free_port
 from PIL import Image
 from websockets.asyncio.client import connect
 
-from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
-
-FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 0.0)
+FRAME = BlockCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 0.0)
 TOKEN = "correct horse battery staple"
 
 
@@ -34,7 +33,6 @@ def test_the_loop_is_shown_recorded_again_on_a_wish_and_outlives_its_page(tmp_pa
         "from brokk_rl.cli import main; main()",
         "preset=bench",
         "bench=guided",
-        "deploy.show=false",
     ]
     command += [
         f"session.out={tmp_path / 'run'}",

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from composed import option
 
+from deploy.kernel.bus_process import TEXT
+from deploy.kernel.guard import GuardTrip
 from deploy.policy import policy_process
 from deploy.policy.policy_process import PolicyAdviser, PolicyHistory, PolicyProcessConfig
-from deploy.runtime.bus_process import TEXT
 from deploy.runtime.operator_state import AdviceStatus, OperatorState
 from deploy.runtime.shared_memory import RecordLayout
 from deploy.runtime.shm_layout import LoopMemory
@@ -45,6 +46,10 @@ class Bundle:
 
     def __init__(self) -> None:
         self.encoder, self.answer, self.asked = Encoder(), ANSWER, 0
+        self.knows = True
+
+    def is_trained_for(self, target_m: np.ndarray) -> bool:
+        return self.knows
 
     def command(self, observation: np.ndarray) -> np.ndarray:
         assert observation.shape == (1, self.encoder.size)
@@ -339,3 +344,24 @@ def test_the_process_runs_until_it_is_asked_to_stop_and_reports(
     assert report["process"] == "policy" and report["cycles"] == 2
     assert report["period_s"] == MACHINE.period_s
     memory.close()
+
+
+@pytest.mark.parametrize(
+    ("changes", "status"),
+    [
+        ({"observed_joint": 3}, AdviceStatus.FAULT),
+        ({"target": GuardTrip.TARGET_GROUND}, AdviceStatus.TARGET_REFUSED),
+    ],
+)
+def test_a_faulty_joint_and_a_borehole_beyond_its_limits_end_the_advice(
+    desk: Desk, changes: dict[str, Any], status: AdviceStatus
+) -> None:
+    desk.advised()
+    assert desk.go(**changes) is status
+    assert desk.request.t_s == -math.inf and not desk.advice.valid
+
+
+def test_a_borehole_unlike_those_of_the_training_gets_no_advice(desk: Desk) -> None:
+    desk.advised()
+    desk.bundle.knows = False
+    assert desk.go() is AdviceStatus.TARGET_UNKNOWN

@@ -24,7 +24,7 @@ from brokk_rl.session import Session
 from deploy.bringup import BringupResult, JointResponse, _StateChecks, measure_joint_response
 from deploy.bus.can_bus import CanBus, CanFrame
 from deploy.bus.description import BusDescription
-from deploy.bus.protection import MessageFault
+from deploy.kernel.protection import MessageFault
 from deploy.modes.bringup import BringupMode
 from deploy.runtime.process import ChildProcess, CycleTimer
 from deploy.twin.faults import ActiveFaults, request_fault

@@ -24,7 +24,7 @@ from deploy.bus import description as described
 from deploy.bus.c_header import generate_c_header
 from deploy.bus.can_bus import BusReplay, CanBus, CanFrame
 from deploy.bus.description import BusDescription
-from deploy.bus.protection import MessageFault
+from deploy.kernel.protection import MessageFault
 
 
 @pytest.fixture(scope="module")

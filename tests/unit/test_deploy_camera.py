@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from block import BLOCK_M, TARGETS, BlockCamera
 from composed import option
 
 from brokk_rl.contracts.vision import CameraView, FrameDetections, HolePose
@@ -18,7 +19,6 @@ from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
 from deploy.page.loop_feed import UNNAMED, LoopFeed, PageProcessConfig
 from deploy.page.protocol import OperatorRequest
 from deploy.page.scene import locate_borehole
@@ -39,7 +39,7 @@ from deploy.runtime.target import (
 )
 
 MACHINE = option("machine", "brokk170")
-FRAME = DemoCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 12.0)
+FRAME = BlockCamera(640, 360, BLOCK_M, TARGETS).take_frame(0, 12.0)
 PIXELS = 640 * 360
 
 

@@ -7,6 +7,7 @@ import math
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,10 +17,9 @@ from composed import option
 import brokk_rl.sim
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
-from deploy.guard import shapes
-from deploy.guard.envelope import Envelope, measure_segment_to_box
-from deploy.guard.limits import StayOutBox
-from deploy.guard.shapes import (
+from brokk_rl.machine import Machine
+from deploy.bus import shapes
+from deploy.bus.shapes import (
     LinkCapsule,
     MachineShapes,
     RoundedBox,
@@ -28,9 +28,13 @@ from deploy.guard.shapes import (
     fit_capsules,
     read_machine_shapes,
 )
+from deploy.kernel.envelope import Envelope, measure_segment_to_box
+from deploy.kernel.limits import EnvelopeLimits, Numbers, StayOutBox
+from deploy.kernel.under_way import CommandsUnderWay
 
 MACHINE = option("machine", "brokk170")
-LIMITS = option("guard", "default").envelope
+GUARD = option("guard", "default")
+LIMITS = GUARD.envelope
 SHAPES = read_machine_shapes(MACHINE)
 assert SHAPES is not None
 MJCF = Path(brokk_rl.sim.__file__).parent / "assets" / "brokk170.xml"
@@ -45,7 +49,19 @@ SPEED = np.array([joint.max_speed.value for joint in MACHINE.joints])
 
 def build_envelope(**change: object) -> Envelope:
     assert SHAPES is not None
-    return Envelope(replace(LIMITS, **change), MACHINE, SHAPES)
+    return make_envelope(replace(LIMITS, **change), SHAPES)
+
+
+def make_envelope(
+    limits: EnvelopeLimits, shapes: MachineShapes, machine: Machine = MACHINE
+) -> Envelope:
+    return Envelope(limits, machine, shapes, GUARD.speed_margin, GUARD.reaction_s)
+
+
+def limit(envelope: Envelope, u: Numbers, q: np.ndarray, face: Numbers | None = None) -> Any:
+    """The command within the envelope for an arm at rest."""
+    faces = None if face is None else (face,)
+    return envelope.limit_command(u, tuple(q), STILL, faces, is_seen=True)
 
 
 def draw_poses(count: int, seed: int = 0) -> np.ndarray:
@@ -126,10 +142,7 @@ def test_distances_are_those_of_mujoco() -> None:
     clear = expected > 1e-3
     assert clear.sum() >= 15 and (~clear).sum() >= 5
     assert found[clear] == pytest.approx(expected[clear], abs=2e-5)
-    assert (found[~clear] < 1.1e-3).all()
-    near = envelope.measure_clearance(poses, 0.3)
-    assert near[expected < 0.3] == pytest.approx(found[expected < 0.3])
-    assert (near <= found + 1e-12).all() and (near[expected > 0.3] > 0.29).all()
+    assert (found[~clear] < 1.1e-3).all() and found[~clear].min() < -0.1
 
 
 def test_shapes_enclose_what_mujoco_draws_and_little_more() -> None:
@@ -143,13 +156,15 @@ def test_shapes_enclose_what_mujoco_draws_and_little_more() -> None:
     poses = draw_poses(25, seed=1)
     found = envelope.measure_clearance(poses)
     expected = np.array([find_distance_m(model, q, arm, other) for q in poses])
-    assert (found <= expected.clip(0.0) + 2e-5).all()
+    assert (found <= expected + 2e-5)[expected > 0.0].all() and (found <= 2e-5)[
+        expected <= 0.0
+    ].all()
     # The widest link has its cylinders 0.2 m beside its axis.
     clear = expected > 0.02
     assert clear.sum() >= 8 and (expected[clear] - found[clear]).max() < 0.25
 
 
-def test_distances_beyond_interest_may_be_bounds_but_no_near_one_is_missed() -> None:
+def test_distances_beyond_interest_may_be_left_out_but_no_near_one_is_missed() -> None:
     assert SHAPES is not None
     # Without the undercarriage, near whose turntable the boom always is.
     posts = {}
@@ -157,19 +172,19 @@ def test_distances_beyond_interest_may_be_bounds_but_no_near_one_is_missed() -> 
         low = (x, y, 1.0)
         posts[str(number)] = StayOutBox(lower_m=low, upper_m=(x + 0.05, y + 0.05, 1.05))
     limits = replace(LIMITS, stay_out=posts, ground_m=None)
-    envelope = Envelope(limits, MACHINE, replace(SHAPES, body=()))
+    envelope = make_envelope(limits, replace(SHAPES, body=()))
     poses = draw_poses(1500, seed=4)
     exact = envelope.measure_clearance(poses)
     for near_m in (0.05, 0.4):
         # One by one, as in a cycle: what is left out depends on the pose.
         found = np.array(
-            [float(envelope.measure_clearance(q[None], near_m)[0]) for q in poses[:400]]
+            [envelope._measure_pairs(q[None], near_m).min(initial=np.inf) for q in poses[:400]]
         )
         near = exact[:400] <= near_m
         assert near.sum() > 9 and found[near] == pytest.approx(exact[:400][near], abs=1e-12)
         far = ~near
-        assert (found[far] > near_m).all() and (found[far] <= exact[:400][far] + 1e-12).all()
-    nothing = Envelope(replace(LIMITS, ground_m=None), MACHINE, replace(SHAPES, body=()))
+        assert (found[far] > near_m).all() and np.isinf(found[far]).any()
+    nothing = make_envelope(replace(LIMITS, ground_m=None), replace(SHAPES, body=()))
     assert np.isinf(nothing.measure_clearance(poses[:3])).all()
 
 
@@ -182,7 +197,7 @@ def test_links_are_placed_as_the_kinematics_place_them_slides_and_slanted_axes_t
         joints[number] = replace(joints[number], kind=kind, body=replace(body, axis=slanted))
     machine = replace(MACHINE, joints=tuple(joints))
     assert SHAPES is not None
-    envelope, poses = Envelope(LIMITS, machine, SHAPES), draw_poses(5)
+    envelope, poses = make_envelope(LIMITS, SHAPES, machine), draw_poses(5)
     expected = compute_tool_kinematics(machine, poses).tip_in_base_m
     assert envelope.locate_tip(poses) == pytest.approx(expected, abs=1e-9)
 
@@ -201,11 +216,11 @@ def test_a_fast_arm_that_would_pass_the_surface_is_slowed() -> None:
     middle = (heights[gap] + heights[gap + 1]) / 2
     assert heights[gap] - middle > LIMITS.face_near_m
     tip = envelope.locate_tip(way)[gap]
-    assert envelope._find_slowdown(u, q, rest, (tip[0], tip[1], middle)) < 0.9
-    assert envelope._find_slowdown(u, q, rest, (tip[0], tip[1] + 3.0, middle)) == 1.0
+    assert envelope._find_slowdown(u, q, rest, [(tip[0], tip[1], middle)]) < 0.9
+    assert envelope._find_slowdown(u, q, rest, [(tip[0], tip[1] + 3.0, middle)]) == 1.0
     # Beyond the place of rest nothing is slowed.
     below = float(heights.min()) - LIMITS.face_near_m - 0.02
-    assert envelope._find_slowdown(u, q, rest, (there[0], there[1], below)) == 1.0
+    assert envelope._find_slowdown(u, q, rest, [(there[0], there[1], below)]) == 1.0
 
 
 def test_the_tip_is_where_mujoco_has_it() -> None:
@@ -230,8 +245,13 @@ def test_distance_of_a_segment_to_a_box_is_the_least_of_all_its_points() -> None
     beyond = np.maximum(np.abs(points) - half, 0.0)
     expected = np.linalg.norm(beyond, axis=-1).min(0)
     found = measure_segment_to_box(begin, end, half)
-    assert found == pytest.approx(expected, abs=2e-3) and (found <= expected + 1e-9).all()
-    assert (found[30:40] == 0.0).all()
+    assert found.clip(0.0) == pytest.approx(expected, abs=2e-3)
+    assert (found <= expected + 1e-9).all()
+    assert (found[30:40] < -0.2).all()
+    # How deep: the way out of the deepest of all points.
+    inside = expected == 0.0
+    depth = (half[inside] - np.abs(points[:, inside])).min(-1).max(0)
+    assert inside.sum() > 50 and found[inside] == pytest.approx(-depth.clip(0.0), abs=2e-3)
 
 
 def test_worked_distances() -> None:
@@ -241,10 +261,11 @@ def test_worked_distances() -> None:
         ((5.0, 0.0, 0.0), (3.0, 0.0, 0.0), 2.0),  # pointing at it
         ((-5.0, 0.0, 3.0), (5.0, 0.0, 3.0), 2.0),  # passing above
         ((0.0, 4.0, 2.0), (0.0, 2.0, 4.0), 4.0 / math.sqrt(2)),  # around an edge
-        ((-5.0, 0.0, 0.0), (5.0, 0.0, 0.0), 0.0),  # through it
+        ((-5.0, 0.0, 0.0), (5.0, 0.0, 0.0), -1.0),  # through it
+        ((-0.5, 0.2, 0.8), (5.0, 0.2, 0.8), -0.2),  # into it, below its upper side
         ((0.5, 3.0, 0.0), (1.5, 2.8, 0.0), 1.9 / math.sqrt(1.04)),  # foot of the edge's normal
     ):
-        found = measure_segment_to_box(np.array(begin), np.array(end), half)
+        (found,) = measure_segment_to_box(np.array([begin]), np.array([end]), half)
         assert found == pytest.approx(expected)
 
 
@@ -257,32 +278,16 @@ def build_lone_rod(**change: object) -> tuple[Envelope, np.ndarray, np.ndarray]:
     mujoco.mj_kinematics(model, data)
     link = data.body("q3_link")
     ends_m = [link.xpos + link.xmat.reshape(3, 3) @ end for end in (ROD.begin_m, ROD.end_m)]
-    return Envelope(limits, MACHINE, MachineShapes((ROD,), ())), ends_m[0], ends_m[1]
-
-
-def test_the_bound_of_far_shapes_is_that_of_their_enclosing_balls() -> None:
-    post = StayOutBox(lower_m=(8.0, 3.0, 2.0), upper_m=(8.4, 3.6, 2.8))
-    envelope, begin_m, end_m = build_lone_rod(stay_out={"post": post})
-    center_m = np.array([8.2, 3.3, 2.4])
-    apart_m = float(np.linalg.norm((begin_m + end_m) / 2 - center_m))
-    bound_m = apart_m - 0.6 - 0.05 - math.hypot(0.2, 0.3, 0.4)
-    assert envelope.measure_clearance(HOME[None], 0.5)[0] == pytest.approx(bound_m)
-    # A post beyond the end of the rod, far from its middle, is computed.
-    along = (end_m - begin_m) / np.linalg.norm(end_m - begin_m)
-    at_m = end_m + 0.25 * along
-    near = StayOutBox(lower_m=tuple(at_m - 0.01), upper_m=tuple(at_m + 0.01))
-    envelope, _, _ = build_lone_rod(stay_out={"post": near})
-    assert envelope.measure_clearance(HOME[None], 0.25)[0] == pytest.approx(0.2, abs=0.02)
-    assert envelope.measure_clearance(HOME[None], 0.25) == envelope.measure_clearance(HOME[None])
+    return make_envelope(limits, MachineShapes((ROD,), ())), ends_m[0], ends_m[1]
 
 
 def test_what_lies_below_the_ground_touches_it() -> None:
     envelope, begin_m, end_m = build_lone_rod()
-    above_m = max(begin_m[2], end_m[2]) + 1.0
-    rod = Envelope(replace(LIMITS, ground_m=above_m), MACHINE, MachineShapes((ROD,), ()))
-    assert rod.measure_clearance(HOME[None])[0] == pytest.approx(-0.05)
+    above_m = min(begin_m[2], end_m[2]) + 1.0
+    rod = make_envelope(replace(LIMITS, ground_m=above_m), MachineShapes((ROD,), ()))
+    assert rod.measure_clearance(HOME[None])[0] == pytest.approx(-1.05)
     below_m = min(begin_m[2], end_m[2]) - 1.0
-    rod = Envelope(replace(LIMITS, ground_m=below_m), MACHINE, MachineShapes((ROD,), ()))
+    rod = make_envelope(replace(LIMITS, ground_m=below_m), MachineShapes((ROD,), ()))
     assert rod.measure_clearance(HOME[None])[0] == pytest.approx(0.95)
     assert np.isinf(envelope.measure_clearance(HOME[None])).all()
 
@@ -302,7 +307,7 @@ def test_the_way_to_rest_is_looked_at_and_nothing_beyond(monkeypatch: pytest.Mon
         tips_m[:] = np.array(face)
         tips_m[:, 1] += aside_m
         tips_m[:, 2] += heights_m
-        return envelope._find_slowdown(np.ones(5), HOME, rest, face) < 1.0
+        return envelope._find_slowdown(np.ones(5), HOME, rest, [face]) < 1.0
 
     far_m = LIMITS.face_radius_m + 1.0
     assert is_slow([0.5, -0.5, -0.5, -0.5, -0.5], [0.0] * 5)
@@ -322,15 +327,7 @@ def test_a_command_that_leads_nowhere_is_not_withheld() -> None:
     envelope = build_envelope(ground_m=0.7 + clear_m - LIMITS.margin_m / 2)
     outward = (1.0, 0.0, 0.0, 0.0, 0.0)
     assert 0.0 < envelope.measure_clearance(at[None])[0] < LIMITS.margin_m
-    assert envelope.limit_command(1.0, outward, tuple(at), None) == (outward, False)
-
-
-def test_commands_that_have_come_to_rest_are_forgotten() -> None:
-    envelope, period_s = build_envelope(), 0.01
-    for number in range(3000):
-        envelope.note_sent(number * period_s, STILL)
-    horizon_s = MACHINE.dead_time_s + LIMITS.coast_s
-    assert len(envelope._sent) <= horizon_s / period_s + 2
+    assert limit(envelope, outward, at) == (outward, False)
 
 
 def list_corners(box: RoundedBox) -> np.ndarray:
@@ -519,6 +516,8 @@ class Arm:
         self.envelope, self.q, self.now_s = envelope, q.copy(), 50.0
         self.speed = faster * SPEED
         self.waiting = deque([np.zeros(5)] * round(MACHINE.dead_time_s / DT_S))
+        horizon_s = MACHINE.dead_time_s + GUARD.coast_s
+        self.under_way = CommandsUnderWay(5, horizon_s)
         self.held, self.least_m = 0, math.inf
 
     def go(
@@ -526,8 +525,9 @@ class Arm:
     ) -> tuple[float, ...]:
         sent = STILL
         for number in range(round(seconds / DT_S)):
-            sent, held = self.envelope.limit_command(self.now_s, u, tuple(self.q), face)
-            self.envelope.note_sent(self.now_s, sent)
+            way_s, faces = self.under_way.integrate(self.now_s), None if face is None else (face,)
+            sent, held = self.envelope.limit_command(u, tuple(self.q), way_s, faces, is_seen=True)
+            self.under_way.note(self.now_s, sent)
             self.held += held
             self.waiting.append(np.array(sent))
             step = self.waiting.popleft() * self.speed * DT_S
@@ -610,32 +610,74 @@ def test_a_withheld_command_passes_again_only_with_more_room() -> None:
         (between, down),
     ):
         at[2] = angle
-        found.append(envelope.limit_command(1.0, u, tuple(at), None)[1])
+        found.append(limit(envelope, u, at)[1])
     assert found == [False, True, True, False, False]
     at[2] = begin
-    assert envelope.limit_command(1.0, down, tuple(at), None)[1]
+    assert limit(envelope, down, at)[1]
     # Letting go of the levers forgets it.
-    assert envelope.limit_command(1.0, STILL, tuple(at), None) == (STILL, False)
+    assert limit(envelope, STILL, at) == (STILL, False)
     at[2] = between
-    assert not envelope.limit_command(1.0, down, tuple(at), None)[1]
+    assert not limit(envelope, down, at)[1]
+
+
+@pytest.mark.parametrize("joint", range(5))
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_inside_an_obstacle_only_what_leads_out_passes(joint: int, sign: float) -> None:
+    """Boxes around the tip, so that the arm begins in them; the clearance may never shrink."""
+    tip_m = build_envelope().locate_tip(HOME[None])[0]
+    for half_m in (0.1, 0.4):
+        box = StayOutBox(lower_m=tuple(tip_m - half_m), upper_m=tuple(tip_m + half_m))
+        arm = Arm(build_envelope(stay_out={"box": box}, ground_m=None), HOME, faster=1.0)
+        begin_m = float(arm.envelope.measure_clearance(HOME[None])[0])
+        u = np.zeros(5)
+        u[joint] = sign
+        arm.go(tuple(u.tolist()), 5.0)
+        assert begin_m < -0.05 and arm.least_m >= begin_m - 1e-3
+
+
+def test_a_deep_pair_hides_no_other() -> None:
+    """Begun in a box at its elbow, the arm still stops before a wall."""
+    elbow = StayOutBox(lower_m=(1.2, -0.3, 1.5), upper_m=(1.6, 0.3, 3.0))
+    envelope = build_envelope(stay_out={"elbow": elbow, "wall": WALL}, ground_m=None)
+    wall = build_envelope(stay_out={"wall": WALL}, ground_m=None)
+    assert envelope.measure_clearance(HOME[None])[0] < -0.05
+    arm = Arm(envelope, HOME)
+    # Turning away from the box does not deepen it.
+    for _ in range(60):
+        arm.go((1.0, 0.0, 0.0, 0.0, 0.0), 0.1)
+        assert wall.measure_clearance(arm.q[None])[0] > 0.0
+    assert arm.held > 0
 
 
 def test_commands_under_way_count_until_they_have_come_to_rest() -> None:
-    horizon_s = MACHINE.dead_time_s + LIMITS.coast_s
-    envelope = build_envelope()
-    envelope.note_sent(10.0, (1.0, 0, 0, 0, 0))
-    envelope.note_sent(10.1, (0.5, 0, 0, 0, 0))
-    envelope.note_sent(10.3, STILL)
-    total = envelope._integrate_sent(10.5)
-    assert total == pytest.approx([0.1 * 1.0 + 0.2 * 0.5, 0, 0, 0, 0])
+    horizon_s = MACHINE.dead_time_s + GUARD.coast_s
+    under_way = CommandsUnderWay(5, horizon_s)
+    under_way.note(10.0, (1.0, 0, 0, 0, 0))
+    under_way.note(10.1, (0.5, 0, 0, 0, 0))
+    under_way.note(10.3, STILL)
+    assert under_way.integrate(10.5) == pytest.approx((0.1 * 1.0 + 0.2 * 0.5, 0, 0, 0, 0))
     for now_s, expected in (
         (10.0 + horizon_s + 0.05, 0.05 + 0.1),
         (10.2 + horizon_s, 0.05),
         (10.4 + horizon_s, 0.0),
     ):
-        assert envelope._integrate_sent(now_s)[0] == pytest.approx(expected)
-        envelope.note_sent(now_s, STILL)
-        assert envelope._integrate_sent(now_s)[0] == pytest.approx(expected)
+        assert under_way.integrate(now_s)[0] == pytest.approx(expected)
+        under_way.note(now_s, STILL)
+        assert under_way.integrate(now_s)[0] == pytest.approx(expected)
+    for number in range(3000):
+        under_way.note(20.0 + 0.01 * number, STILL)
+    assert len(under_way._sent) <= horizon_s / 0.01 + 2
+
+
+def test_while_no_face_is_seen_the_tip_is_slow_everywhere() -> None:
+    envelope, u = build_envelope(ground_m=None), (0.0, 0.0, 1.0, 0.0, 0.0)
+    far_m = tuple(envelope.locate_tip(HOME[None])[0] - [0.0, 0.0, 3.0])
+    assert limit(envelope, u, HOME, far_m) == (u, False)
+    sent, held = envelope.limit_command(u, tuple(HOME), STILL, (far_m,), is_seen=False)
+    assert sent[2] < 0.5 and not held
+    # One that is seen elsewhere counts, too.
+    near_m = tuple(envelope.locate_tip(HOME[None])[0])
+    assert envelope.limit_command(u, tuple(HOME), STILL, (far_m, near_m), True)[0][2] < 0.5
 
 
 def test_near_the_work_surface_the_tip_is_slow() -> None:
@@ -662,7 +704,7 @@ def test_near_the_work_surface_the_tip_is_slow() -> None:
         (tip + (wide_m + 0.01) * beside, False),
         (tip + (wide_m - 0.01) * beside + np.array([0.0, 0.0, near_m - 0.01]), True),
     ):
-        sent, held = envelope.limit_command(1.0, u, tuple(q), tuple(face))
+        sent, held = limit(envelope, u, q, tuple(face))
         assert not held
         if is_slow:
             assert measure_speed(sent) == pytest.approx(LIMITS.face_speed_m_s, rel=0.01)
@@ -670,8 +712,8 @@ def test_near_the_work_surface_the_tip_is_slow() -> None:
         else:
             assert sent == u
     slow = tuple(0.05 * one for one in u)
-    assert envelope.limit_command(1.0, slow, tuple(q), tuple(tip))[0] == pytest.approx(slow)
-    assert envelope.limit_command(1.0, u, tuple(q), None) == (u, False)
+    assert limit(envelope, slow, q, tuple(tip))[0] == pytest.approx(slow)
+    assert limit(envelope, u, q) == (u, False)
 
 
 def test_the_tip_is_slow_when_it_arrives_not_only_when_it_is_there() -> None:
@@ -759,8 +801,8 @@ def test_degrees_quaternions_classes_and_nested_bodies_are_read_as_mujoco_reads_
 @pytest.mark.parametrize(
     "change",
     [
-        {"margin_m": 0.0}, {"release_m": 0.0}, {"coast_s": 0.0}, {"reaction_s": math.inf}, {"face_near_m": -1.0},
-        {"face_radius_m": 0.0}, {"face_speed_m_s": 0.0}, {"speed_margin": 0.9}, {"face_normal": (0.0, 0.0, 2.0)},
+        {"margin_m": 0.0}, {"release_m": 0.0}, {"face_near_m": -1.0},
+        {"face_radius_m": 0.0}, {"face_speed_m_s": 0.0}, {"face_normal": (0.0, 0.0, 2.0)},
     ],
 )  # fmt: skip
 def test_limits_that_make_no_sense_are_refused(change: dict[str, object]) -> None:

@@ -316,7 +316,7 @@ def test_memory_that_cannot_be_read_takes_no_stop_back_and_hides_no_surface(
     if pressed:
         stage.stop()
         stage.go(0.1)
-    slot = stage.memory.stop if pressed else stage.memory.target
+    slot = stage.memory.page if pressed else stage.memory.target
     # All of both records, behind the number of the newest.
     slot.memory.bytes[8:] = bytes(one ^ 0x5A for one in slot.memory.bytes[8:])
     assert stage.stops_within_s(0.3) <= 0.011

@@ -20,7 +20,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from deploy.bus.can_bus import CanFrame
 from deploy.bus.description import BusDescription
-from deploy.bus.protection import MessageFault
+from deploy.kernel.protection import MessageFault
 from deploy.twin.bench import GamepadBench
 from deploy.twin.remote import GamepadRemote, run_gamepad
 from deploy.twin.twin import Twin

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from brokk_rl.errors import ConfigError
 from deploy.bus.description import BusDescription
-from deploy.guard.guard import (
+from deploy.kernel.guard import (
     CommandRequest,
     Guard,
     GuardDecision,
@@ -22,19 +22,27 @@ from deploy.guard.guard import (
     GuardState,
     GuardTrip,
 )
-from deploy.guard.limits import GuardLimits, build_joint_bounds
-from deploy.guard.plausibility import PlausibilityFilter
+from deploy.kernel.limits import FlowLimits, GuardLimits, TargetLimits, build_joint_bounds
+from deploy.kernel.plausibility import PlausibilityFilter
 
-BODY = build_joint_bounds([-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False])
+BODY = build_joint_bounds(
+    [-1.0, -2.0, 0.0], [1.0, 2.0, 3.0], [0.5, 0.5, 0.5], [False, True, False], 0.2
+)
+FLOW = FlowLimits(tolerance=0.02, settle_s=0.04, num_messages=2, lever_scale=1.5)
+TARGET = TargetLimits(
+    age_s=600.0, jump_m=0.05, settle_s=0.5, seen_s=5.0, face_step_m=0.15, face_radius_m=1.0
+)
 LIMITS = GuardLimits(
-    max_command=0.8, max_rate_1_s=5.0, max_reversals_1_s=3, overrun=0.001, neutral=0.05, stop_margin=0.1, joints_s=0.15,
+    max_command=0.8, max_rate_1_s=5.0, max_reversals_1_s=3, max_starts_1_s=30, overrun=0.001, neutral=0.05,
+    stop_margin=0.1, stop_release=0.05, speed_margin=1.0, coast_s=0.1, reaction_s=0.02, joints_s=0.15, page_s=0.08,
+    vigilance_s=60.0, answer_s=10.0, flow=FLOW, target=TARGET,
     levers_s=0.16, status_s=0.17, request_s=0.18, ignored_s=0.3, controls_s=0.19, round_trip_s=0.14, gap_s=0.2, jump_margin=3.0,
     jump_slack=0.01, range_slack=0.2, num_jumps=3, envelope=None, observer=None,
 )  # fmt: skip
 WELL = GuardInput(
     q=(0.0, 0.0, 1.0), joints_age_s=0.01, joints_plausible=True, trusted=True, levers_age_s=0.01, lever=0.0, deadman=True,
     status_age_s=0.01, estop=False, bus_up=True, alone=True, followed=True, feedback_age_s=0.01, controls_age_s=0.01,
-    round_trip_s=0.03, observed=GuardTrip.NONE,
+    round_trip_s=0.03, page_age_s=0.0, present_age_s=math.inf, described=True, observed=GuardTrip.NONE,
 )  # fmt: skip
 RELEASED = replace(WELL, deadman=False)
 STILL = (0.0, 0.0, 0.0)
@@ -56,7 +64,7 @@ class Hand:
     ) -> GuardDecision:
         self.now_s += change.pop("dt", DT)
         age_s = change.pop("age_s", 0.0)
-        request = None if u is None else CommandRequest(u, age_s, None)
+        request = None if u is None else CommandRequest(u, age_s)
         return self.guard.decide(self.now_s, armed, replace(seen, **change), request)
 
     def active(self) -> Hand:
@@ -68,37 +76,32 @@ class Hand:
 
 
 class Fence:
-    """An envelope that withholds what moves the first joint, halves the rest, and notes all."""
+    """An envelope that withholds what moves the first joint, and halves the rest."""
 
     def __init__(self) -> None:
         self.asked: list[tuple[Any, ...]] = []
-        self.sent: list[tuple[float, tuple[float, ...]]] = []
 
     def limit_command(self, *asked: Any) -> tuple[tuple[float, ...], bool]:
         self.asked.append(asked)
-        u = asked[1]
+        u = asked[0]
         return (STILL, True) if u[0] else (tuple(one / 2 for one in u), False)
 
-    def note_sent(self, now_s: float, u: tuple[float, ...]) -> None:
-        self.sent.append((now_s, u))
 
-
-def test_the_envelope_has_the_last_word_and_hears_of_all_that_is_sent() -> None:
+def test_the_envelope_has_the_last_word_and_hears_of_what_is_under_way() -> None:
     hand, fence = Hand(), Fence()
     hand.guard = Guard(LIMITS, BODY, fence)  # type: ignore[arg-type]
     hand.active()
-    assert fence.asked == [] and [u for _, u in fence.sent] == [STILL] * 3
-    face = (2.0, 0.1, 0.8)
-    for u, expected, trip in (
-        ((0.0, 0.0, 0.08), (0.0, 0.0, 0.04), GuardTrip.NONE),
-        ((0.08, 0.0, 0.0), STILL, GuardTrip.ENVELOPE),
+    assert fence.asked == []
+    faces = ((2.0, 0.1, 0.8),)
+    for u, expected, trip, way_s in (
+        ((0.0, 0.0, 0.08), (0.0, 0.0, 0.04), GuardTrip.NONE, 0.0),
+        ((0.08, 0.0, 0.0), STILL, GuardTrip.ENVELOPE, 0.04 * DT),
     ):
         hand.now_s += DT
-        request = CommandRequest(u, 0.0, face)
+        request = CommandRequest(u, 0.0, GuardTrip.NONE, faces, True)
         decision = hand.guard.decide(hand.now_s, True, WELL, request)
         assert decision == GuardDecision(GuardState.ACTIVE, expected, trip, GuardTrip.NONE)
-        assert fence.asked[-1] == (hand.now_s, u, WELL.q, face)
-        assert fence.sent[-1] == (hand.now_s, expected)
+        assert fence.asked[-1] == (u, WELL.q, (0.0, 0.0, pytest.approx(way_s)), faces, True)
 
 
 def test_nothing_is_sent_until_somebody_arms_it_on_purpose() -> None:
@@ -162,6 +165,7 @@ WRONG = [
     ({"dt": -0.001}, GuardTrip.TIME_GAP),
     ({"estop": True}, GuardTrip.ESTOP),
     ({"trusted": False}, GuardTrip.CHANNEL_INVALID),
+    ({"described": False}, GuardTrip.DESCRIPTION),
     ({"observed": GuardTrip.JOINT_TURNED}, GuardTrip.JOINT_TURNED),
     ({"observed": GuardTrip.JOINT_STILL}, GuardTrip.JOINT_STILL),
     ({"observed": GuardTrip.JOINT_WEAK}, GuardTrip.JOINT_WEAK),
@@ -343,6 +347,10 @@ WAY = [
     ({"round_trip_s": LIMITS.round_trip_s + 0.001}, GuardTrip.ROUND_TRIP),
     ({"round_trip_s": math.inf}, GuardTrip.ROUND_TRIP),
     ({"round_trip_s": math.nan}, GuardTrip.ROUND_TRIP),
+    ({"page_age_s": LIMITS.page_s + 0.001}, GuardTrip.PAGE_SILENT),
+    ({"page_age_s": math.inf}, GuardTrip.PAGE_SILENT),
+    ({"page_age_s": -LIMITS.page_s - 0.001}, GuardTrip.PAGE_SILENT),
+    ({"described": None}, GuardTrip.DESCRIPTION),
 ]
 
 
@@ -363,21 +371,76 @@ def test_old_switches_and_feedback_and_an_unknown_way_latch_but_matter_only_wher
     assert hand.decide(estop=True, **change).trip is GuardTrip.ESTOP, "what is worse is said"
 
 
-@pytest.mark.parametrize("number", range(3))
-def test_a_work_surface_that_is_no_place_refuses_the_command(number: int) -> None:
-    """No comparison with NaN holds, so that the tip would not be slowed there."""
-    hand, face = Hand().active(), [2.0, 0.0, 1.0]
-    for value, trip in ((0.5, GuardTrip.NONE), (math.nan, GuardTrip.REQUEST_INVALID)):
-        face[number] = value
-        request = CommandRequest((0.1, 0.0, 0.1), 0.0, tuple(face))
+def test_a_borehole_beyond_its_limits_latches() -> None:
+    hand = Hand().active()
+    for trip in (GuardTrip.NONE, GuardTrip.TARGET_REACH):
+        request = CommandRequest((0.1, 0.0, 0.1), 0.0, trip)
         hand.now_s += DT
-        assert hand.guard.decide(hand.now_s, True, WELL, request).trip is trip
+        decision = hand.guard.decide(hand.now_s, True, WELL, request)
+        assert decision.trip is trip and any(decision.u) == (trip is GuardTrip.NONE)
+    assert decision.state is GuardState.LATCHED
+
+
+def test_a_joint_leaves_rest_so_often_in_a_second_and_no_more() -> None:
+    """A dead-man that bounces at 10 Hz, and a policy that asks for 1, 0, 1, 0."""
+    limits = replace(LIMITS, max_starts_1_s=3)
+    for bounces in (True, False):
+        hand, sent = Hand(limits).active(), []
+        for number in range(100):
+            rests = number % 5 == 0
+            u = STILL if rests and not bounces else (0.05, 0.0, 0.0)
+            sent.append(hand.decide(RELEASED if rests and bounces else WELL, u))
+        values = [one.u[0] for one in sent]
+        starts = [k for k in range(1, 100) if values[k] and not values[k - 1]]
+        assert 6 <= len(starts) <= 7, "three a second"
+        assert GuardTrip.PULSES in {one.trip for one in sent}
+
+
+def test_a_joint_ends_its_way_outward_so_early_that_it_rests_before_its_stop() -> None:
+    limits = replace(LIMITS, max_command=1.0, speed_margin=1.3)
+    hand, under_way, q = Hand(limits).active(), [0.0] * 10, 0.3
+    for _ in range(200):
+        under_way.append(hand.decide(u=(1.0, 0.0, 0.0), q=(q, 0.0, 1.0)).u[0])
+        q += 1.3 * 0.5 * DT * under_way.pop(0)  # the dead time of 0.2 s
+    assert 0.7 < q < BODY.upper[0] - LIMITS.stop_margin and not any(under_way[-5:])
+    assert hand.decide(u=(-0.05, 0.0, 0.0), q=(q, 0.0, 1.0)).u[0] == -0.05
+
+
+def test_who_holds_the_dead_man_for_long_is_asked_and_has_to_answer() -> None:
+    hand = Hand().active()
+    prompts: list[float] = []
+    for number in range(4000):
+        decision = hand.decide(u=(0.0, 0.0, 0.0))
+        prompts += [number * DT] if decision.prompt else []
+        if decision.state is not GuardState.ACTIVE:
+            break
+    assert decision.cause is GuardTrip.VIGILANCE
+    assert prompts[0] == pytest.approx(60.0, abs=0.1) and number * DT == pytest.approx(70, abs=0.1)
+    hand.active()
+    for number in range(6000):
+        present_age_s = max(0.0, number * DT - 65.0) if number * DT > 65.0 else math.inf
+        decision = hand.decide(present_age_s=present_age_s)
+        assert decision.state is GuardState.ACTIVE
+    hand.active()
+    for number in range(6000):
+        decision = hand.decide(RELEASED if number % 2500 == 2499 else WELL)
+        assert decision.state is not GuardState.LATCHED and not decision.prompt
+
+
+@pytest.mark.parametrize("described", [None, False])
+def test_a_gateway_of_another_description_never_gets_ready(described: bool | None) -> None:
+    hand = Hand()
+    hand.decide(RELEASED, described=described)
+    for _ in range(5):
+        decision = hand.decide(RELEASED, described=described)
+        assert decision.state is GuardState.LATCHED and decision.trip is GuardTrip.DESCRIPTION
+    assert hand.decide(RELEASED).state is GuardState.READY
 
 
 def test_switches_and_way_at_their_limits_will_do() -> None:
     hand = Hand().active()
     seen = {"controls_age_s": LIMITS.controls_s, "round_trip_s": LIMITS.round_trip_s}
-    seen["feedback_age_s"] = LIMITS.status_s
+    seen |= {"feedback_age_s": LIMITS.status_s, "page_age_s": LIMITS.page_s}
     assert hand.decide(u=(0.1, 0.0, 0.1), **seen).u == pytest.approx((0.1, 0.0, 0.1))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 from composed import option
 from hypothesis import given, settings
@@ -283,6 +285,116 @@ def test_a_bundle_that_is_mixed_damaged_or_incomplete_is_refused(
         PolicyBundle("nowhere", machine)
 
 
+def write_network(folder: Path, kind: str) -> None:
+    """Write the network as a newer onnx does, or with its weights in a file of their own."""
+    network = onnx.load(folder / "policy.onnx")
+    if kind == "newer format":
+        network.ir_version = 99
+    elif kind == "newer operators":
+        network.opset_import[0].version = 99
+    if not kind.startswith("weights"):
+        onnx.save(network, folder / "policy.onnx")
+        return
+    path, data = str(folder / "policy.onnx"), "policy.onnx.data"
+    onnx.save(network, path, save_as_external_data=True, location=data, size_threshold=100)
+    if kind == "weights left behind":
+        (folder / data).unlink()
+    elif kind == "weights cut off":
+        (folder / data).write_bytes((folder / data).read_bytes()[:100])
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("newer format", "update onnxruntime"),
+        ("newer operators", "update onnxruntime"),
+        ("weights left behind", r"copy it, mostly policy\.onnx\.data"),
+        ("weights cut off", r"missing or cut off"),
+        ("weights beside it", None),
+    ],
+)
+def test_networks_of_other_tools_work_or_say_what_is_missing(
+    machine: Machine, copied: Path, kind: str, message: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_network(copied, kind)
+    monkeypatch.chdir("/")
+    if message is None:
+        PolicyBundle(str(copied), machine)
+        return
+    with pytest.raises(CheckpointError, match=message):
+        PolicyBundle(str(copied), machine)
+
+
+@pytest.mark.parametrize("name", ["policy.json", "golden.json", "policy.onnx"])
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder", "huge", "nested", "list", "{}", "7"])
+def test_what_is_no_file_of_a_policy_is_refused_at_once(
+    machine: Machine, copied: Path, name: str, kind: str
+) -> None:
+    path, begun_s = copied / name, time.monotonic()
+    path.unlink()
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "folder":
+        path.mkdir()
+    elif kind == "huge":
+        path.touch()
+        os.truncate(path, 1 << 33)
+    else:
+        path.write_text({"nested": "[" * 100_000, "list": "[1, 2]"}.get(kind, kind))
+    with pytest.raises(CheckpointError, match=f"{re.escape(name)}|the contract"):
+        PolicyBundle(str(copied), machine)
+    assert time.monotonic() - begun_s < 2.0
+
+
+@pytest.mark.parametrize(
+    "golden",
+    [
+        {"observation": [], "command": []},
+        {"observation": [[]], "command": [[]]},
+        {"observation": "x", "command": 1},
+        {"observation": [[0.0]], "command": [[0.0]]},
+    ],
+)
+def test_golden_answers_that_are_none_are_refused(
+    machine: Machine, copied: Path, golden: dict[str, Any]
+) -> None:
+    (copied / "golden.json").write_text(json.dumps(golden))
+    with pytest.raises(CheckpointError, match=r"golden\.json"):
+        PolicyBundle(str(copied), machine)
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{"observation": 3}, {"observation": {}}, {"command": []}, {"fingerprint": 1}, {"task": [1]}],
+    ids=str,
+)
+def test_a_malformed_contract_is_refused(
+    machine: Machine, copied: Path, values: dict[str, Any]
+) -> None:
+    change(copied, "policy.json", **values)
+    with pytest.raises(CheckpointError):
+        PolicyBundle(str(copied), machine)
+
+
+@pytest.mark.parametrize("kind", ["pipe", "device", "nested", "large", "endless number"])
+def test_a_target_file_that_is_none_is_refused_at_once(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "target.json"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    elif kind == "large":
+        path.write_text(" " * (1 << 17))
+    elif kind == "nested":
+        path.write_text("[" * 60_000)
+    else:
+        path.write_text(f'{{"center_in_base_m": [1{"0" * 400}, 0, 0]}}')
+    with pytest.raises(ConfigError, match="expected JSON with center_in_base_m"):
+        FileTarget(path=str(path)).build().news([])
+
+
 @pytest.fixture
 def adviser(machine: Machine) -> PolicyAdviser:
     memory = LoopMemory.new(machine.num_joints, commands=False)
@@ -338,7 +450,7 @@ def test_an_answer_that_makes_no_sense_is_not_shown(
 ) -> None:
     memory, now_s = adviser._memory, 1000.0
     target = memory.target.new()
-    target["t_s"] = now_s
+    target["t_s"], target["center_in_base_m"] = now_s, (2.5, 0.0, 0.75)
     memory.target.write(target)
     for answer in (
         np.array([np.nan, 0, 0, 0, 0]),
@@ -379,7 +491,7 @@ def test_the_machines_computer_needs_no_torch_no_simulator_and_no_trainer() -> N
     rooms = (
         "runtime.supervisor",
         "policy.policy_process",
-        "runtime.bus_process",
+        "kernel.bus_process",
         "recorder.capture",
         "link",
     )

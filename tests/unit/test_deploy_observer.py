@@ -14,10 +14,9 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
-from deploy.guard.drift_watch import Misfit
-from deploy.guard.guard import GuardTrip
-from deploy.guard.observer import NOTHING_OBSERVED, Observer, classify_fault
-from deploy.guard.valve_model import ValvePredictor, describe_sources, load_observer_file
+from deploy.kernel.guard import GuardTrip
+from deploy.kernel.observer import NOTHING_OBSERVED, Observer, classify_fault
+from deploy.kernel.valve_model import ValvePredictor, describe_sources, load_observer_file
 from deploy.observer_file import ThresholdSettings
 
 MACHINE = option("machine", "brokk170")
@@ -112,16 +111,11 @@ SETTINGS = ThresholdSettings(window_s=1.0, share=SHARE, least_slack_s=SLACK_S, m
 class Joints:
     """A plain machine behind an observer; a fault changes what its sensors say."""
 
-    def __init__(
-        self,
-        slack_s: float | list[float] = SLACK_S,
-        scores: list[list[float]] | None = None,
-        **change: Any,
-    ):
+    def __init__(self, slack_s: float | list[float] = SLACK_S, **change: Any):
         slacks_s = slack_s if isinstance(slack_s, list) else [slack_s] * 5
         thresholds = {"window_s": 1.0, "share": SHARE, "slack_s": slacks_s, "minutes": 60.0}
-        content = {"model": build_tables(**change), "scores": scores or [[]] * 5}
-        self.observer = Observer(LIMITS, content | {"thresholds": thresholds}, MACHINE, 0)
+        content = {"model": build_tables(**change)}
+        self.observer = Observer(content | {"thresholds": thresholds}, MACHINE)
         self.q, self.now_s, self.waiting = HOME.copy(), 20.0, [np.zeros(5)] * 4
         self.offset, self.drift, self.gain = np.zeros(5), np.zeros(5), np.ones(5)
 
@@ -320,23 +314,6 @@ def test_the_newest_quarter_of_the_window_names_the_fault() -> None:
     assert name_fault([0.0, 2.0, -1.0], [1.0] * 3) is GuardTrip.JOINT_TURNED
 
 
-def test_the_watch_hears_of_each_period_and_its_finding_is_passed_on() -> None:
-    joints = Joints(scores=[[0.02, 0.03, 0.04, 0.05] * 50] * 5)
-    scores: list[list[float]] = []
-    joints.gain[2] = 0.85
-    for number in range(3000):
-        sign = 1.0 if number // 30 % 2 else -1.0
-        joints.go((0.0, 0.0, sign, 0.0, 0.0), PERIOD_S)
-        scores += [[one for one in joints.observer.scores if one is not None]]
-    found = [own[0] for own in scores if own]
-    # Ten seconds of motion each. Of the three halves of a second between two reversals one holds 0.2
-    # s of the way back, the dead time: 15 % of (0.5 + 0.5 + 0.1) / 1.5 of the way.
-    assert len(found) == pytest.approx(3000 * PERIOD_S / 10.0, abs=2)
-    assert found[3] == pytest.approx(0.15 * 1.1 / 1.5, rel=0.05)
-    observation = joints.observer.observation
-    assert (observation.misfit, observation.misfit_joint) == (Misfit.FLOW_GAIN, 2)
-
-
 def test_a_period_is_due_when_it_is_over() -> None:
     observer = Joints().observer
     assert observer.is_due(0.0)
@@ -371,9 +348,9 @@ def test_classes_of_faults() -> None:
 def test_the_shipped_file_is_that_of_the_machine() -> None:
     content = load_observer_file(SHIPPED)
     assert content["fingerprint"] == MACHINE.fingerprint() and content["machine"] == "brokk170"
-    assert len(content["scores"]) == 5 and min(content["thresholds"]["slack_s"]) >= SLACK_S
+    assert min(content["thresholds"]["slack_s"]) >= SLACK_S
     assert any("Hydraulic" in one for one in content["sources"])
-    assert Observer(LIMITS, content, MACHINE, 0).observation == NOTHING_OBSERVED
+    assert Observer(content, MACHINE).observation == NOTHING_OBSERVED
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"schema": 1}', "{"])

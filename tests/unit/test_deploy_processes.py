@@ -13,7 +13,7 @@ from composed import option
 from desk import COMMAND, Desk
 
 from brokk_rl.machine import Machine
-from deploy.guard.guard import GuardState
+from deploy.kernel.guard import GuardState
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 SLACK = 3.0 if os.environ.get("CI") or os.cpu_count() == 2 else 1.0

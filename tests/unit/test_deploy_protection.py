@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Iterable
 
 import pytest
 from crccheck.crc import Crc8SaeJ1850
 
-from deploy.bus.clock import GatewayClock
-from deploy.bus.protection import ChannelTrust, MessageFault, ProtectedChannel, compute_crc8
+from deploy.kernel.clock import NUM_AGREEING, GatewayClock
+from deploy.kernel.protection import ChannelTrust, MessageFault, ProtectedChannel, compute_crc8
 
 PERIOD_S, WRAP_S = 0.02, 2.048
 GOOD, CRC, REPEATED = None, MessageFault.CRC, MessageFault.REPEATED
@@ -256,7 +257,7 @@ def test_a_constant_delay_is_still_seen_after_half_an_hour() -> None:
 def test_the_shortest_transit_counts_as_none_and_stamps_of_the_future_as_unknown() -> None:
     clock = GatewayClock()
     assert clock.find_sent_s(0.0, 2.048, 5.0) == -math.inf
-    clock.learn(7.0, CLOCK_WRAP_S, 10.05)
+    clock.learn(7.0, CLOCK_WRAP_S, 10.04)
     clock.learn(7.2, CLOCK_WRAP_S, 10.20)
     assert clock.find_sent_s(7.2 % 2.048, 2.048, 10.20) == pytest.approx(10.20, abs=1e-3)
     assert clock.find_sent_s(7.1 % 2.048, 2.048, 10.20) == pytest.approx(10.10, abs=1e-3)
@@ -291,6 +292,67 @@ def test_a_stamp_up_to_half_a_turn_ahead_is_newer_and_three_quarters_late_is_lat
     other.learn(1.0, CLOCK_WRAP_S, 10.0)
     assert other.find_sent_s(1.49, 2.048, 10.0) == -math.inf
     assert other.find_sent_s((1.0 - 1.53) % 2.048, 2.048, 10.0) == pytest.approx(8.47)
+
+
+def hear(clock: GatewayClock, stamps: Iterable[float], now_s: float) -> float:
+    """Let stamps come every 3 ms from `now_s` on; return the time of the last."""
+    for stamp_s in stamps:
+        now_s += 0.003
+        clock.learn(stamp_s % CLOCK_WRAP_S, CLOCK_WRAP_S, now_s)
+    return now_s
+
+
+def test_one_stamp_of_the_future_teaches_nothing_and_a_clock_that_was_set_ahead_is_learned() -> (
+    None
+):
+    clock = GatewayClock()
+    now_s = hear(clock, [5.0 + 0.003 * k for k in range(100)], 100.0)
+    clock.learn(15.3, CLOCK_WRAP_S, now_s + 0.001)
+    assert clock.newest_s < 6.0 and clock.is_early(15.3, CLOCK_WRAP_S, now_s)
+    now_s = hear(clock, [5.3], now_s)
+    assert clock.find_sent_s(5.3, CLOCK_WRAP_S, now_s) == pytest.approx(now_s, abs=0.01)
+    now_s = hear(clock, [15.3 + 0.003 * k for k in range(NUM_AGREEING - 1)], now_s)
+    assert clock.is_early(15.375, CLOCK_WRAP_S, now_s + 0.003)
+    now_s = hear(clock, [15.3 + 0.003 * NUM_AGREEING], now_s)
+    assert clock.newest_s == pytest.approx(15.375)
+    assert clock.find_sent_s(15.375, CLOCK_WRAP_S, now_s) == pytest.approx(now_s, abs=1e-6)
+
+
+def test_random_stamps_teach_nothing() -> None:
+    clock, draw = GatewayClock(), random.Random(3)
+    now_s = hear(clock, [5.0 + 0.003 * k for k in range(100)], 100.0)
+    now_s = hear(clock, [draw.uniform(0.0, CLOCK_WRAP_S) for _ in range(1000)], now_s)
+    stamp_s = 5.297 + now_s - 100.3
+    assert clock.find_sent_s(stamp_s, CLOCK_WRAP_S, now_s) == pytest.approx(now_s, abs=2e-3)
+    assert clock.newest_s <= stamp_s + 0.05
+
+
+@pytest.mark.parametrize(("back_s", "accepted"), [(0.3, True), (0.1, False)])
+def test_a_clock_that_was_set_back_is_learned_when_a_person_says_so(
+    back_s: float, accepted: bool
+) -> None:
+    clock = GatewayClock()
+    now_s = hear(clock, [5.0 + 0.003 * k for k in range(100)], 100.0)
+    clock.accept_delay(5.297, 0.135)
+    stamps = [5.3 - back_s + 0.003 * k for k in range(100)]
+    now_s = hear(clock, stamps, now_s)
+    late_s = now_s - clock.find_sent_s(stamps[-1], CLOCK_WRAP_S, now_s)
+    assert late_s == pytest.approx(back_s, abs=2e-3)
+    clock.accept_delay(stamps[-1], 0.135)
+    late_s = now_s - clock.find_sent_s(stamps[-1], CLOCK_WRAP_S, now_s)
+    assert late_s == pytest.approx(0.0 if accepted else back_s, abs=2e-3)
+    assert clock.newest_s == stamps[-1]
+
+
+def test_delays_that_differ_are_no_clock_that_was_set_back() -> None:
+    clock = GatewayClock()
+    now_s = hear(clock, [5.0 + 0.003 * k for k in range(100)], 100.0)
+    stamps = [5.3 + 0.003 * k - (0.3 if k % 2 else 0.38) for k in range(100)]
+    now_s = hear(clock, stamps, now_s)
+    clock.accept_delay(stamps[-1], 0.135)
+    assert now_s - clock.find_sent_s(stamps[-1], CLOCK_WRAP_S, now_s) == pytest.approx(
+        0.3, abs=2e-3
+    )
 
 
 @pytest.mark.parametrize("data", [b"", b"\x00", b"\x12\x34\x56\x78\x9a\xbc\xde\xf0", b"\xff" * 8])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import random
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,17 +14,19 @@ from typing import Any
 import can
 import numpy as np
 import pytest
+import zstandard
 from desk import DBC
 from mcap.reader import make_reader
+from mcap.records import Chunk
 
 from brokk_rl import record
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
+from deploy.kernel.bus_process import FRAME, FRAMES, TEXT
 from deploy.recorder import capture_reader
 from deploy.recorder.capture import BLF, MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.conversion import CaptureLogReader
-from deploy.runtime.bus_process import FRAME, FRAMES, TEXT
 
 READER = CaptureLogReader(longest_gap_s=0.15, shortest_s=1.0)
 
@@ -156,7 +160,10 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
     for name in (MCAP, BLF):
         content = (tmp_path / name).read_bytes()
         (tmp_path / f"cut_{name}").write_bytes(content[: int(part * len(content))])
-    count = capture_reader.recover_mcap(tmp_path / f"cut_{MCAP}", tmp_path / "new.mcap")
+    count, num_damaged = capture_reader.recover_mcap(
+        tmp_path / f"cut_{MCAP}", tmp_path / "new.mcap"
+    )
+    assert num_damaged == 0, "what was cut off was never flushed"
     with (tmp_path / "new.mcap").open("rb") as file:
         summary = make_reader(file).get_summary()
     assert (
@@ -171,9 +178,67 @@ def test_a_capture_cut_off_anywhere_is_recovered_up_to_there(
         and 0 < len(found.messages["JointPos1"]) <= whole
     )
     assert len(found.messages["JointPos1"]) >= min(1.0, part - 0.25) * whole
-    assert capture_reader.recover_blf(tmp_path / f"cut_{BLF}", tmp_path / "new.blf") == len(
-        list(can.BLFReader(tmp_path / "new.blf"))
-    )
+    num_frames, _ = capture_reader.recover_blf(tmp_path / f"cut_{BLF}", tmp_path / "new.blf")
+    assert num_frames == len(list(can.BLFReader(tmp_path / "new.blf")))
+
+
+def test_a_wrong_byte_anywhere_costs_at_most_its_chunk(
+    machine: Machine, tmp_path: Path, brokk: Callable[..., Any]
+) -> None:
+    write(tmp_path, machine, seconds=6.0)
+    path, draw = tmp_path / MCAP, random.Random(5)
+    content = path.read_bytes()
+    whole = capture_reader.read_capture(path)
+    num_messages = sum(map(len, whole.messages.values()))
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None and whole.num_lost == whole.num_damaged == 0
+    chunks = summary.chunk_indexes
+    # The first bytes of each chunk hide its length, and those of the file what it is.
+    places = [one.chunk_start_offset + k for one in chunks[1:4] for k in (0, 1, 3, 8, 20, 40)]
+    places += [
+        0,
+        8,
+        9,
+        20,
+        40,
+        len(content) - 20,
+        *(draw.randrange(len(content)) for _ in range(60)),
+    ]
+    for place in places:
+        wrong = bytearray(content)
+        wrong[place] ^= 1 << draw.randrange(8)
+        path.write_bytes(wrong)
+        found = capture_reader.read_capture(path)
+        lost = num_messages - sum(map(len, found.messages.values()))
+        assert lost <= num_messages / len(chunks) * 2.5, place
+        assert found.facts == whole.facts and (lost == 0 or found.num_damaged)
+    # A chunk in the middle: its number of messages is known, and the command says it by its code.
+    wrong = bytearray(content)
+    wrong[chunks[2].chunk_start_offset + 60] ^= 1
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / MCAP).write_bytes(wrong)
+    found = capture_reader.read_capture(tmp_path / "run" / MCAP)
+    # Messages for viewers are lost with it.
+    assert found.num_lost >= num_messages - sum(map(len, found.messages.values())) > 0
+    assert found.num_damaged == 1
+    done = brokk("mode=recover", f"recover.input={tmp_path}/run/*.mcap", "session.out=mended")
+    assert done.code == 2 and "something is lost" in done.err
+    assert list((tmp_path / "mended").glob("*.mcap"))
+
+
+def test_a_chunk_that_claims_gigabytes_is_not_opened() -> None:
+    data = zstandard.ZstdCompressor().compress(bytes(1 << 20))
+    chunk = Chunk("zstd", data, 0, 0, 0, 1 << 33)
+    assert capture_reader._open_chunk(chunk) is None
+    bomb = zstandard.ZstdCompressor().compress(bytes(capture_reader.MOST_CHUNK_BYTES + 1))
+    assert capture_reader._open_chunk(Chunk("zstd", bomb, 0, 0, 0, 100)) is None
+
+
+def test_a_pipe_is_no_capture(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / MCAP)
+    with pytest.raises(RecordingError, match="no plain one"):
+        capture_reader.read_capture(tmp_path / MCAP)
 
 
 def test_frames_that_were_refused_are_kept_and_said(machine: Machine, tmp_path: Path) -> None:

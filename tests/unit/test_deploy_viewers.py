@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from block import BLOCK_M, TARGETS, BlockCamera
 from composed import option
 from desk import DBC
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -18,14 +19,13 @@ from mcap.reader import make_reader
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from deploy.bus.description import BusDescription
-from deploy.bus.protection import MessageFault
-from deploy.guard.guard import GuardState, GuardTrip
-from deploy.page.demo import BLOCK_M, TARGETS, DemoCamera
+from deploy.kernel.bus_process import FRAME, FRAMES, TEXT
+from deploy.kernel.guard import GuardState, GuardTrip
+from deploy.kernel.protection import MessageFault
 from deploy.page.replay import ReplayFeed
 from deploy.recorder.capture import MCAP, CaptureConfig, CaptureWriter
 from deploy.recorder.capture_reader import read_capture
 from deploy.recorder.topics import TOPICS, TopicSchema
-from deploy.runtime.bus_process import FRAME, FRAMES, TEXT
 from deploy.runtime.operator_state import AdviceStatus
 
 BEGIN_S = 700.0
@@ -38,7 +38,6 @@ SAID: dict[str, dict[str, Any]] = {
     },
     "guard": {"state": "LATCHED", "trip": "remote missing", "cause": "remote missing", "joint": "q2"},
     "fault": {"frame_id": 4660, "fault": "wrong CRC"},
-    "misfit": {"joint": "q3", "effect": "flow_gain"},
     "bus": {"down": "no such device"},
     "wish": {
         "kind": "target", "value": "1", "taken": False, "asked_s": 1.5, "center_in_base_m": [2.6, 0.0, 0.75],
@@ -64,7 +63,7 @@ HOLES = [
 def folder(machine: Machine, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A capture of one second with every topic, and two pictures where viewers' messages are written."""
     folder, bus = tmp_path_factory.mktemp("capture"), BusDescription(DBC, machine)
-    camera = DemoCamera(160, 90, BLOCK_M, TARGETS)
+    camera = BlockCamera(160, 90, BLOCK_M, TARGETS)
     with CaptureWriter(CaptureConfig(folder, DBC, machine, {"source": "test"}, 1.0)) as log:
 
         def say(topic: str, t_s: float, values: dict[str, Any]) -> None:
@@ -224,7 +223,7 @@ def test_the_replay_shows_the_pictures_again(folder: Path, machine: Machine) -> 
     views = ("camera", "camera/calibration", "camera/points", "tf/camera")
     feed = ReplayFeed(replay, machine, read_capture(folder / MCAP, views), lambda: now[0])
     assert feed.read_frame(-1.0) is None, "nothing was taken yet"
-    taken = DemoCamera(160, 90, BLOCK_M, TARGETS).take_frame(1, 0.0)
+    taken = BlockCamera(160, 90, BLOCK_M, TARGETS).take_frame(1, 0.0)
     now[0] = 0.9
     again = feed.read_frame(-1.0)
     assert again is not None and again.t_s == 0.9 and feed.read_frame(0.9) is None

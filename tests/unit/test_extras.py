@@ -73,7 +73,7 @@ def test_the_loop_runs_records_and_is_recovered_with_the_extra_deploy_alone(
     run = tmp_path / "run"
     port = 20000 + os.getpid() % 20000
     bench = ("preset=bench", "link=nominal", f"bus.port={port}", "page.port=0")
-    done = _run(light, run, *bench, "deploy.seconds=5", "deploy.show=false")
+    done = _run(light, run, *bench, "deploy.seconds=5")
     assert done.returncode == 0, done.stderr
     messages = capture_reader.read_capture(run / "capture.mcap").messages
     assert messages["advice"] and messages["guard"]
@@ -83,8 +83,8 @@ def test_the_loop_runs_records_and_is_recovered_with_the_extra_deploy_alone(
     assert list(recovered.rglob("*.mcap"))
 
 
-@pytest.mark.parametrize("mode", ["mode=page seconds=0.1 page.port=0", "mode=bringup bus=udp"])
-def test_page_and_bring_up_start_with_the_extra_deploy_alone(
+@pytest.mark.parametrize("mode", ["mode=bringup bus=udp"])
+def test_bring_up_starts_with_the_extra_deploy_alone(
     mode: str, light: dict[str, str], tmp_path: Path
 ) -> None:
     words = [sys.executable, "-P", "-m", "brokk_rl", *mode.split(), f"session.out={tmp_path / 'o'}"]
@@ -110,7 +110,7 @@ def test_page_and_bring_up_start_with_the_extra_deploy_alone(
         ("can", "deploy.bus.can_bus", "deploy"),
         ("cv2", "perception.pose", "perception"),
         ("cv2", "deploy.picture", "deploy"),
-        ("jinja2", "deploy.modes.study.StudyMode", "study"),
+        ("jinja2", "study.modes.study.StudyMode", "study"),
         ("scipy.spatial", "perception.ellipse.edges", "perception"),
         ("rsl_rl", "brokk_rl.rl.ppo", "train"),
         ("aiortc", "deploy.video.sender", "video"),

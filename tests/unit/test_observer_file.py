@@ -15,8 +15,8 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.record import Recording, make_motion, write_recording
+from deploy.kernel.bus_process import build_observer, is_from_machine, read_observer_content
 from deploy.observer_file import FILE, ThresholdSettings, count_alarms, find_thresholds
-from deploy.runtime.bus_process import build_observer, is_from_machine, read_observer_content
 
 MACHINE = option("machine", "brokk170")
 GUARD = option("guard", "default")
@@ -25,11 +25,11 @@ SETTINGS = ThresholdSettings(window_s=1.0, share=0.25, least_slack_s=0.06, margi
 
 
 def build_content() -> dict[str, Any]:
-    """A model with a dead time of 0.2 s, speed times command, and no scores."""
+    """A model with a dead time of 0.2 s, speed times command."""
     line, none = [[0.0, 1.0]] * 5, [0.0] * 5
     model = {"dead_time_s": [0.2] * 5, "play": none, "spool_s": none, "speed_s": none}
     model |= {"demand": none, "knots": [0.0, 1.0], "curve_extend": line, "curve_retract": line}
-    return {"model": model | {"pose": None}, "scores": [[] for _ in MACHINE.joints]}
+    return {"model": model | {"pose": None}}
 
 
 def record(jump_rad: float, source: str = "machine: socketcan can0, excitation: sine") -> Recording:
@@ -47,7 +47,7 @@ def record(jump_rad: float, source: str = "machine: socketcan can0, excitation: 
 
 
 def test_slack_is_the_largest_difference_in_the_recordings_times_the_margin() -> None:
-    found = find_thresholds(SETTINGS, GUARD.observer, build_content(), MACHINE, [record(0.1)])
+    found = find_thresholds(SETTINGS, build_content(), MACHINE, [record(0.1)])
     least, second_s = [0.06] * 3, 1.5 * 0.1 / SPEED[1]
     assert found["slack_s"] == pytest.approx([0.06, second_s, *least], abs=1e-3)
     assert (found["window_s"], found["share"], found["minutes"]) == (1.0, 0.25, 1.0)
@@ -55,11 +55,9 @@ def test_slack_is_the_largest_difference_in_the_recordings_times_the_margin() ->
 
 def test_thresholds_raise_no_alarm_where_they_come_from_and_one_beyond() -> None:
     content = build_content()
-    content["thresholds"] = find_thresholds(
-        SETTINGS, GUARD.observer, content, MACHINE, [record(0.1)]
-    )
+    content["thresholds"] = find_thresholds(SETTINGS, content, MACHINE, [record(0.1)])
     for jump_rad, number in ((0.1, 0), (0.149, 0), (0.151, 1)):
-        counts = count_alarms(GUARD.observer, content, MACHINE, [record(jump_rad)], 0)
+        counts = count_alarms(content, MACHINE, [record(jump_rad)])
         assert counts.faults.total() == number, jump_rad
     assert counts.seconds == pytest.approx(60.0, abs=0.1)
     assert counts.faults_a_shift == pytest.approx(480.0, rel=0.01)
@@ -87,7 +85,7 @@ def test_the_counts_say_what_these_thresholds_would_find() -> None:
     content = build_content()
     for slack_s, still, turned in ((0.06, 1.0, 1.0), (0.31, 0.0, 1.0), (0.71, 0.0, 0.0)):
         content["thresholds"] = {"window_s": 1.0, "share": 0.25, "slack_s": [slack_s] * 5}
-        counts = count_alarms(GUARD.observer, content, MACHINE, [record(0.0)], 0)
+        counts = count_alarms(content, MACHINE, [record(0.0)])
         # A second at 0.4 of full speed: 0.4 s of way, of which 0.1 s are borne.
         moving = counts.num_moving
         assert (moving[[0, 2, 3, 4]] > 50).all() and moving[1] == 0

@@ -16,11 +16,12 @@ from composed import option
 from PIL import Image
 
 from brokk_rl.signals import Frame
-from deploy.guard.guard import GuardState, GuardTrip
+from deploy.kernel.guard import GuardState, GuardTrip
 from deploy.page.protocol import OperatorRequest, RecordingStatus, SourceAge
 
 SIZE = {"width": 1280, "height": 800}
 TRAVEL = 95.0
+NOT_CONFIRMED = "document.getElementById('answer').textContent.startsWith('STOP NOT CONFIRMED')"
 FAILED = RecordingStatus(on=False, seconds=0.0, dropped=0, failed=True)
 GREEN, BLUE = np.array([0, 117, 43]), np.array([10, 75, 209])
 
@@ -233,6 +234,62 @@ def test_the_page_comes_back_after_the_server_was_away(
         assert set(feed.requests) == {OperatorRequest("start", "")}
 
 
+def test_a_stop_at_a_hung_or_dead_server_is_not_confirmed_and_nothing_old_is_shown(
+    feed: Scripted, opened: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    active = change_state(SHOWN, guard=GuardState.ACTIVE, trip=GuardTrip.NONE)
+    feed.now = replace(active, commands=True)
+    with served(feed) as port:
+        page = opened(port)
+        page.wait_for_selector("body:not(.lost)")
+        assert page.locator("#safety").inner_text() == "COMMANDS VALVES – all is well"
+        # The server hangs for two seconds: its one thread waits for the feed.
+        monkeypatch.setattr(feed, "submit", lambda request: time.sleep(2.0) or True)
+        page.keyboard.press("Escape")
+        pressed_s = time.monotonic()
+        until(page, NOT_CONFIRMED, 1.0)
+        page.wait_for_selector("body.lost", timeout=1500)
+        assert time.monotonic() - pressed_s < 1.0
+        assert page.locator("#safety").inner_text() == "Unknown"
+        assert page.locator("#deadman").inner_text() == "Unknown"
+        assert page.locator("#scene").is_hidden() and page.locator("#left").is_hidden()
+        alarms = page.locator("#alarms .alarm").all_inner_texts()
+        assert [one.partition(":")[0].partition(" ·")[0] for one in alarms] == [
+            "STOP NOT CONFIRMED",
+            "NO CONNECTION",
+        ]
+        monkeypatch.undo()
+        page.wait_for_selector("body:not(.lost)")
+        page.keyboard.press("Escape")
+        eventually(lambda: page.locator("#answer").inner_text() == "")
+    page.wait_for_selector("body.lost")
+    page.keyboard.press("Escape")
+    until(page, NOT_CONFIRMED, 1.0)
+
+
+def test_words_follow_the_mode(feed: Scripted, port: int, opened: Callable[..., Any]) -> None:
+    page = opened(port)
+    start, advice = page.locator("#start b"), page.locator("#advice")
+    assert (start.inner_text(), advice.inner_text()) == ("Guide me", "Bring your levers to green")
+    feed.now = replace(SHOWN, commands=True)
+    eventually(lambda: start.inner_text() == "Arm")
+    assert advice.inner_text() == "The machine moves by itself: hands off the levers"
+    feed.now = replace(SHOWN, commands=True, guiding=False)
+    eventually(lambda: advice.inner_text() == "Nothing is sent")
+
+
+def test_a_touch_answers_the_question_whether_somebody_is_there(
+    feed: Scripted, port: int, opened: Callable[..., Any]
+) -> None:
+    page = opened(port)
+    page.click("#levers")
+    feed.now = change_state(SHOWN, prompt=True)
+    eventually(lambda: "Still there?" in page.locator("#alarms").inner_text())
+    assert feed.requests == []
+    page.click("#levers")
+    eventually(lambda: feed.requests == [OperatorRequest("present", "")])
+
+
 def test_safety_and_connection_are_told_apart_in_words(
     feed: Scripted, port: int, opened: Callable[..., Any]
 ) -> None:
@@ -421,8 +478,10 @@ def test_without_dead_man_or_token_nothing_is_done_and_the_page_says_why(
     feed.now = SHOWN
     for token in ("wrong", None):
         stranger = opened(port, token=token)
-        stranger.click("#stop")
+        stranger.click("#start")
         until(stranger, "document.getElementById('answer').textContent.startsWith('No access')")
+        stranger.click("#stop")
+        until(stranger, NOT_CONFIRMED)
     time.sleep(0.2)
     assert len(feed.requests) == 1
 
@@ -514,6 +573,15 @@ def test_nothing_overlaps_and_stop_stays_in_sight(
     stop = page.locator("#stop").bounding_box()
     assert stop["x"] >= 0 and stop["x"] + stop["width"] <= size[0]
     assert stop["y"] >= 0 and stop["y"] + stop["height"] <= size[1]
+    for name in ("#start", "#record"):
+        other = page.locator(name).bounding_box()
+        aside = max(other["x"] - stop["x"] - stop["width"], stop["x"] - other["x"] - other["width"])
+        above = max(
+            other["y"] - stop["y"] - stop["height"], stop["y"] - other["y"] - other["height"]
+        )
+        assert max(aside, above) >= 20
+    if size[0] <= 600:
+        assert page.locator("#view #along").count() == 0, "it would cover the machine"
     cut = page.evaluate(
         """() => [...document.querySelectorAll("button, dl, .inserted, #levers, #middle, #advice, #boreholes, header, header > *")]
         .filter(node =>

@@ -14,11 +14,11 @@ import pytest
 from composed import option
 
 from brokk_rl.session import Session
-from deploy.guard.guard import GuardState
 from deploy.guidance import LeverPositions
+from deploy.kernel.bus_process import TEXT
+from deploy.kernel.guard import GuardState
 from deploy.page.loop_feed import LoopFeed, PageProcessConfig
 from deploy.page.protocol import DrawReport, OperatorRequest
-from deploy.runtime.bus_process import TEXT
 from deploy.runtime.operator_requests import RecordingControl, RequestHandler
 from deploy.runtime.shm_layout import LoopMemory
 from deploy.runtime.target import FileTarget, TargetSelector
@@ -212,15 +212,15 @@ def test_a_stop_goes_straight_to_the_bus_process_and_is_confirmed_by_the_guard(
     memory: LoopMemory, feed: LoopFeed
 ) -> None:
     say(memory, guard=GuardState.ACTIVE)
-    assert memory.stop.read() is None and not feed.confirms_stop()
+    assert memory.page.read() is None and not feed.confirms_stop()
     begun_s = time.monotonic()
     assert feed.submit(OperatorRequest("stop", ""))
-    asked = memory.stop.read()
-    assert asked is not None and begun_s <= asked.t_s <= time.monotonic()
+    asked = memory.page.read()
+    assert asked is not None and begun_s <= asked.stopped_s <= time.monotonic()
     assert not feed.confirms_stop(), "it was active before the stop"
     say(memory, guard=GuardState.LATCHED)
     assert not feed.confirms_stop(), "latched still sends"
-    say(memory, guard=GuardState.SILENT, t_s=asked.t_s)
+    say(memory, guard=GuardState.SILENT, t_s=asked.stopped_s)
     assert not feed.confirms_stop(), "decided before"
     say(memory, guard=GuardState.SILENT)
     assert feed.confirms_stop()
@@ -233,11 +233,11 @@ def test_a_start_that_was_asked_for_before_a_stop_does_not_undo_it(
     feed.submit(OperatorRequest("start", ""))
     supervisor.refresh()
     feed.submit(OperatorRequest("stop", ""))
-    asked = memory.stop.read()  # the supervisor hangs, and still says "armed"
-    assert asked is not None and controls(memory).armed_t_s < asked.t_s
+    asked = memory.page.read()  # the supervisor hangs, and still says "armed"
+    assert asked is not None and controls(memory).armed_t_s < asked.stopped_s
     feed.submit(OperatorRequest("start", ""))
     supervisor.refresh()
-    assert controls(memory).armed and controls(memory).armed_t_s > asked.t_s
+    assert controls(memory).armed and controls(memory).armed_t_s > asked.stopped_s
 
 
 def test_a_loop_that_sends_nothing_has_nothing_to_confirm(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ import pytest
 from browser import TOKEN, chromium, served
 from sitting import Arm, conductor, feed, in_trial, machine, plan
 
-from deploy.study import tlx
-from deploy.study.conductor import Conductor
-from deploy.study.study_server import StudyFeed, StudyPages
+from study import tlx
+from study.conductor import Conductor
+from study.study_server import StudyFeed, StudyPages
 
 MACHINE = machine()
 SIZE = {"width": 1280, "height": 800}

@@ -17,7 +17,7 @@ from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 from brokk_rl.session import write_json
-from deploy.study import analysis, design, report, study_folder, tlx
+from study import analysis, design, report, study_folder, tlx
 
 RATE_HZ = 20.0
 

@@ -11,9 +11,9 @@ import torch
 from brokk_rl.kinematics import Kinematics, compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from deploy.study import measures, tlx
-from deploy.study.design import Hole, Success
-from deploy.study.measures import compute_sparc
+from study import measures, tlx
+from study.design import Hole, Success
+from study.measures import compute_sparc
 
 RATE_HZ = 20.0
 SUCCESS = Success(depth_m=0.1, clearance_m=0.013)

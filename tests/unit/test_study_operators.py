@@ -15,11 +15,11 @@ import torch
 from composed import every, option
 
 from actuators.person import HumanFollower
-from brokk_rl.contracts.operator import OperatorView
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
-from deploy.study.operators.hands import Hands
-from deploy.study.operators.traits import Traits
+from study.operators.hands import Hands
+from study.operators.traits import Traits
+from study.trial_contract import OperatorView
 
 RNG = np.random.default_rng(0)
 START = np.array([0.0, -0.95, 0.5, 1.15, 0.6]) + RNG.uniform(-0.3, 0.3, (8, 5)) * [
@@ -128,9 +128,7 @@ def test_every_operator_says_that_it_is_simulated_in_the_list(name: str) -> None
 def test_a_study_of_simulated_operators_from_nothing_by_one_command(
     brokk: Callable[..., Any], tmp_path: Path
 ) -> None:
-    hole = (
-        "{_target_: deploy.study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
-    )
+    hole = "{_target_: study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
     done = brokk(
         "mode=study", "study.do=simulate", "session.out=run", "study.num_studies=10", "study.design.num_participants=4",
         "study.design.limit_s=2.0", "study.practice.base_s=1.0",
@@ -161,7 +159,7 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
 
 def test_a_study_needs_neither_torch_nor_simulator() -> None:
     code = (
-        "import sys, deploy.modes.study, deploy.study.study_steps;"
+        "import sys, study.modes.study, study.study_steps;"
         "print([m for m in ('torch', 'mujoco', 'warp') if m in sys.modules])"
     )
     assert (

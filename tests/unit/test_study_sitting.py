@@ -22,11 +22,11 @@ from sitting import FACTS, Arm, conductor, in_trial, machine, plan, saved
 from brokk_rl import record
 from brokk_rl.errors import ConfigError
 from deploy.page.protocol import OperatorRequest
-from deploy.study import analysis, study_folder, tlx
-from deploy.study.conductor import Conductor
-from deploy.study.sitting import reserve_study
-from deploy.study.steps import find_next_step
-from deploy.study.study_server import StudyFeed
+from study import analysis, study_folder, tlx
+from study.conductor import Conductor
+from study.sitting import reserve_study
+from study.steps import find_next_step
+from study.study_server import StudyFeed
 
 MACHINE = machine()
 
@@ -335,7 +335,7 @@ def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None
         pass
 
 
-HOLE = "{_target_: deploy.study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
+HOLE = "{_target_: study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
 SMALL = (
     "study.design.num_participants=2", "study.design.practice_trials=0", "study.design.limit_s=9.0", "study.practice.base_s=4.0",
     "~study.design.holes", f"+study.design.holes={{A: {HOLE}, B: {HOLE}}}",

@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from deploy.study import permutation_tests, sample_size
-from deploy.study.crossover_analysis import (
-    compute_dz_interval,
-    estimate_effect,
-    estimate_hodges_lehmann,
-)
-from deploy.study.design import Design, Hole, Success, draw_sequences
-from deploy.study.practice import Practice, share_significant
+from study import permutation_tests, sample_size
+from study.crossover_analysis import compute_dz_interval, estimate_effect, estimate_hodges_lehmann
+from study.design import Design, Hole, Success, draw_sequences
+from study.practice import Practice, share_significant
 
 DARWIN = np.array([49, -67, 8, 16, 6, 23, 28, 41, 14, 29, 56, 24, 75, 60, -48], float)
 """Darwin's maize, eighths of an inch; Fisher 1935 counted by hand that 1726 of 32768 flips are as

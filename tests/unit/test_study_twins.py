@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from composed import option
 
-from brokk_rl.contracts.operator import OperatorView, TrialBatch
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.session import Session
 from brokk_rl.signals import Command
-from deploy.study.twins import BEFORE_S, make_desks
 from deploy.twin.faults import ActiveFaults
+from study.trial_contract import OperatorView, TrialBatch
+from study.twins import BEFORE_S, make_desks
 
 MACHINE = option("machine", "brokk170")
 GROUND = option("ground", "twin")

@@ -77,14 +77,13 @@ function draw() {
   const since_s = (performance.now() - came) / 1000;
   const lost = newest === null || since_s > setup.stale_s;
   document.body.classList.toggle("lost", lost);
-  if (lost) put($("connection"), say("lost"), "bad");
   const now = performance.now(), calmly = now - calm >= CALM_MS || lost;
   if (calmly) drawAlarms(lost, now);
-  if (newest === null) return;
+  if (lost) { drawUnknown(); return; }
   const shown = newest.shown;
-  if (!lost && shown.replay) put($("connection"), say("replay"), "careful");
-  else if (!lost) put($("connection"), say(shown.alive ? "connected" : "dead"), shown.alive ? "good" : "bad");
-  const good = name => !lost && shown.alive && fresh(shown, name, since_s);
+  if (shown.replay) put($("connection"), say("replay"), "careful");
+  else put($("connection"), say(shown.alive ? "connected" : "dead"), shown.alive ? "good" : "bad");
+  const good = name => shown.alive && fresh(shown, name, since_s);
   drawLevers(shown, { own: good("levers"), advised: good("advice") && good("positions") && Boolean(shown.advice?.valid) });
   if (!calmly) return;
   calm = now;
@@ -94,23 +93,37 @@ function draw() {
   overlay.draw(shown);
   timeline.draw(shown.replay, say);
   document.body.classList.toggle("replay", Boolean(shown.replay));
-  drawSafety(shown, lost, good("levers"));
+  drawSafety(shown, good("levers"));
   drawStreams(shown, since_s);
   $("camera").hidden = !shown.streams.some(one => one.name === "camera");
   $("camera").classList.toggle("stale", !good("camera"));
   drawView(shown.view, shown.streams.find(one => one.name === "camera"));
   drawTargets(shown);
+  put($("start").querySelector("b"), say(byMode(shown, "start")));
   $("start").setAttribute("aria-pressed", shown.guiding);
   $("record").setAttribute("aria-pressed", shown.recording.on);
 }
 
+// Without a connection nothing is known: the style sheet hides the rest.
+function drawUnknown() {
+  put($("connection"), say("lost"), "bad");
+  for (const name of ["safety", "deadman", "recording"]) put($(name), say("unknown"), "bad");
+  $("start").setAttribute("aria-pressed", false);
+  $("record").setAttribute("aria-pressed", false);
+}
+
+// Words differ where the machine moves by itself and no person follows an advice.
+function byMode(shown, name) { return shown.safety?.commands ? `${name} auto` : name; }
+
 function drawAlarms(lost, now) {
-  if (newest === null && now - opened < PATIENCE_MS) return;  // the page has only just been opened
-  const grave = lost ? [{ level: "alarm", name: "lost", detail: "" }] : [...video?.listAlarms(now) ?? [], ...newest?.shown.alarms ?? []];
+  const grave = unconfirmed ? [{ level: "alarm", name: "refused unconfirmed", detail: "" }] : [];
+  const isNew = newest === null && now - opened < PATIENCE_MS;  // the page has only just been opened
+  if (lost && !isNew) grave.push({ level: "alarm", name: "lost", detail: "" });
+  if (!lost) grave.push(...video?.listAlarms(now) ?? [], ...newest.shown.alarms);
   if (alarms.draw(grave, tell, now)) signals.give("alarm");
 }
 
-function drawSafety(shown, lost, known) {
+function drawSafety(shown, known) {
   const { safety, recording } = shown;
   const held = known && safety?.deadman && !safety.estop;
   put($("deadman"), say(held ? "dead-man held" : "dead-man released"), held ? "good" : "careful");
@@ -119,7 +132,7 @@ function drawSafety(shown, lost, known) {
     const wrong = safety.estop ? "emergency stop" : safety.trip;
     const calm = safety.commands ? wrong === "nothing" : !safety.estop && safety.bus_up;
     const why = safety.commands || safety.estop || !safety.bus_up ? ` – ${wrong.startsWith("a joint ") && safety.observed_joint ? `${nameOf(setup.joints[safety.observed_joint - 1])}: ` : ""}${say(safety.bus_up ? wrong : "bus down")}` : "";
-    const kind = lost || safety.estop || safety.state === "LATCHED" || !safety.bus_up ? "bad" : safety.state === "ACTIVE" ? "careful" : calm ? "good" : "careful";
+    const kind = safety.estop || safety.state === "LATCHED" || !safety.bus_up ? "bad" : safety.state === "ACTIVE" ? "careful" : calm ? "good" : "careful";
     put($("safety"), say(state) + why, kind);
   } else put($("safety"), say("nothing from the bus"), "bad");
   const minutes = `${Math.floor(recording.seconds / 60)}:${String(Math.floor(recording.seconds % 60)).padStart(2, "0")}`;
@@ -132,7 +145,7 @@ function drawLevers(shown, sure) {
   const advice = shown.guiding ? shown.advice : null;
   const button = Boolean(advice?.levers.button_right);
   for (const view of Object.values(views)) view.draw(shown.own, advice?.levers ?? null, sure, button, nameOf);
-  put($("advice"), !shown.guiding ? say("stopped") : shown.advice?.valid ? say("guiding") : say(shown.advice?.reason ?? "nothing from the bus"));
+  put($("advice"), !shown.guiding ? say(byMode(shown, "stopped")) : shown.advice?.valid ? say(byMode(shown, "guiding")) : say(shown.advice?.reason ?? "nothing from the bus"));
   $("advice").classList.toggle("none", shown.guiding && !shown.advice?.valid);
   const due = advice && sure.advised ? advice.button_due_s : null;
   const now = sure.advised && button, soon = !now && due !== null && due > 0;
@@ -203,8 +216,14 @@ const control = token ? new Socket("/control", {
   },
 }) : null;
 
+// The browser times each wish itself: a dead server says nothing.
+const ANSWER_MS = 1000, STOP_MS = 300;
+const waiting = new Map();  // by kind of wish: its timer
+let unconfirmed = false;
+
 function answered(said) {
-  if (said.refused === "unconfirmed") signals.give("alarm");
+  clearTimeout(waiting.get(said.kind));
+  if (said.kind === "stop") unconfirmed = Boolean(said.refused);
   if (said.ready) { measured.allowed = true; answer(""); } else answer(said.refused ? `refused ${said.refused}` : "");
 }
 
@@ -212,10 +231,16 @@ let answerKey = "";
 function answer(key) { answerKey = key; put($("answer"), key ? say(key) : ""); }
 
 function wish(kind, value = "") {
-  if (!control || measured.allowed === false) answer("refused token");
-  else if (!measured.allowed || !control.ready) answer("refused lost");
-  else control.send(JSON.stringify({ kind, value }));
+  const isStop = kind === "stop", refuse = refused => answered({ kind, refused: isStop ? "unconfirmed" : refused });
+  if (!control || measured.allowed === false) { refuse("token"); return; }
+  if (!measured.allowed || !control.ready) { refuse("lost"); return; }
+  clearTimeout(waiting.get(kind));
+  waiting.set(kind, setTimeout(() => refuse("lost"), isStop ? STOP_MS : ANSWER_MS));
+  control.send(JSON.stringify({ kind, value }));
 }
+
+// Whoever touches the page while it asks is there.
+for (const name of ["pointerdown", "keydown"]) addEventListener(name, () => { if (newest?.shown.safety?.prompt) wish("present"); }, true);
 
 const timeline = new Timeline($("timeline"), wish);
 $("start").onclick = () => wish("start");
@@ -256,7 +281,7 @@ function speak() {
   calm = 0;
   document.documentElement.lang = language;
   document.title = `${setup.machine} – ${say("title")}`;
-  for (const id of ["start", "stop", "record"]) put($(id).querySelector("b"), say(id));
+  for (const id of ["stop", "record"]) put($(id).querySelector("b"), say(id));
   put($("language"), language === "en" ? "DE" : "EN");
   put($("along").querySelector("b"), say("along the tool"));
   for (const name of ["sound", "night"]) { $(name).setAttribute("aria-label", say(name)); $(name).title = say(name); }
@@ -317,6 +342,9 @@ function startScene() {
 const wide = matchMedia("(min-width: 1001px) and (min-height: 660px) and (min-aspect-ratio: 1/1)");
 wide.onchange = () => (wide.matches ? $("actions").insertBefore($("tools"), $("answer")) : $("work").append($("tools")));
 wide.onchange();
+const phone = matchMedia("(max-width: 600px)");  // there is no room on the machine's picture
+phone.onchange = () => (phone.matches ? $("tools") : $("view")).append($("along"));
+phone.onchange();
 $("button").hidden = !setup.button;
 speak();
 if (!token) answer("refused token");

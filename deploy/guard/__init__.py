@@ -1,1 +1,0 @@
-"""The guard between a proposed command and the valves."""

@@ -1,0 +1,241 @@
+"""Measures of a trial's recording, one number each; NaN where the recording does not show it.
+
+Everything is counted from the start of the recording to the insertion, or to the limit where there
+was none.
+Axes: `T` time, `J` joints.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.record import Recording
+from study.design import Hole, Success
+
+PIECE_S = 0.5
+"""A path is measured between means over so long: shorter pieces would add up the encoders' noise,
+longer ones cut corners."""
+MOVING = 0.05
+"""Share of a joint's top speed above which it moves."""
+LEVER_ON, LEVER_OFF = 0.10, 0.05
+"""Deflection from which a lever is being moved, and below which it is let go; two, so that tremor
+does not count."""
+MOST_LAG_S = 2.0
+"""Longest lag behind the advice that is looked for."""
+CONTACT_N = 50.0
+"""Force from which the tool touches something; the recordings' own column, not measured on every
+machine."""
+
+
+@dataclass(frozen=True)
+class Measure:
+    """One measure.
+
+    Attributes:
+        name: Key in files.
+        title: Words in tables and pictures.
+        unit: Its unit, '' for a plain number.
+        better: +1 where more is better, -1 where less is, 0 where neither.
+    """
+
+    name: str
+    title: str
+    unit: str
+    better: int
+
+
+MEASURES = (
+    Measure("time_s", "time to insertion", "s", -1),
+    Measure("success", "trials inserted", "share", 1),
+    Measure("path_m", "path of the tool", "m", -1),
+    Measure("efficiency", "shortest way over path", "share", 1),
+    Measure("several_joints", "time with two or more joints moving", "share", 1),
+    Measure("lever_movements", "lever movements", "", -1),
+    Measure("joint_switches", "changes from one joint to another", "", -1),
+    Measure("exclusive_share", "time with q2 commanded", "share", 0),
+    Measure("smoothness", "smoothness of the tool's speed (SPARC)", "", 1),
+    Measure("control_effort", "lever travel a second", "1/s", -1),
+    Measure("advice_error", "distance from the advice", "1", -1),
+    Measure("advice_lag_s", "lag behind the advice", "s", -1),
+    Measure("contacts", "contacts", "", -1),
+    Measure("peak_force_n", "largest contact force", "N", -1),
+)
+GUIDED_ONLY = ("advice_error", "advice_lag_s")
+"""Measures that say something only where advice was shown, and so cannot be compared."""
+
+
+def measure(
+    recording: Recording, machine: Machine, hole: Hole, success: Success, limit_s: float
+) -> dict[str, float]:
+    """Return every measure of `MEASURES` of one trial.
+
+    Args:
+        recording: From the start of the trial.
+        machine: Its machine.
+        hole: The hole of the trial.
+        success: When the tool is in.
+        limit_s: Time limit of the trial.
+    """
+    tip = compute_tool_kinematics(machine, recording.q).tip_in_base_m
+    t_s = recording.t_s - recording.t_s[0]
+    last = find_insertion(tip, hole, success)
+    within = t_s <= limit_s
+    inserted = last is not None and bool(within[last])
+    # The sample of the insertion counts; after it the arm is moved away.
+    num = last + 1 if inserted and last is not None else int(within.sum())
+    period_s = 1.0 / recording.rate_hz
+    q, u, tip, t_s = (
+        recording.q[:num].astype(float),
+        recording.u[:num].astype(float),
+        tip[:num],
+        t_s[:num],
+    )
+    path_m = measure_path_length(tip, period_s)
+    # The goal lies below the rim by the required depth.
+    goal = np.array(hole.center_in_base_m) - [0.0, 0.0, success.depth_m]
+    onsets = detect_lever_movements(u)
+    found = {
+        "time_s": float(t_s[-1]) if inserted else limit_s,
+        "success": float(inserted),
+        "path_m": path_m,
+        # The straight way over the path; rounding may take it above 1.
+        "efficiency": min(1.0, float(np.linalg.norm(goal - tip[0])) / path_m)
+        if inserted and path_m
+        else math.nan,
+        "several_joints": float((detect_motion(q, machine, period_s).sum(1) >= 2).mean()),
+        "lever_movements": float(len(onsets)),
+        "joint_switches": float(np.count_nonzero(np.diff(onsets[:, 1]))),
+        "exclusive_share": float((np.abs(u[:, machine.is_exclusive]) > LEVER_OFF).any(1).mean())
+        if machine.exclusive
+        else math.nan,
+        "smoothness": compute_sparc(
+            np.linalg.norm(np.diff(average_windows(tip, 5), axis=0), axis=1), recording.rate_hz
+        ),
+        "control_effort": float(np.abs(np.diff(u, axis=0)).sum() / (period_s * max(1, num - 1))),
+        "advice_error": math.nan,
+        "advice_lag_s": math.nan,
+        "contacts": math.nan,
+        "peak_force_n": math.nan,
+    }
+    # Without advice in the recording there is nothing to follow.
+    names = [f"advice_{joint}" for joint in recording.joints]
+    if all(name in recording.extra for name in names):
+        advice = np.stack([recording.extra[name][:num] for name in names], 1).astype(float)
+        found |= measure_tracking(u, advice, period_s)
+    if "force_n" in recording.extra:
+        touching = recording.extra["force_n"][:num] > CONTACT_N
+        # Each rise of the contact is one contact, also one at the start.
+        found["contacts"] = float(np.count_nonzero(np.diff(touching.astype(int), prepend=0) > 0))
+        found["peak_force_n"] = float(np.max(recording.extra["force_n"][:num], initial=0.0))
+    return found
+
+
+def find_insertion(tip_in_base_m: np.ndarray, hole: Hole, success: Success) -> int | None:
+    """Return the first sample at which the tip, `(T, 3)`, is in the hole, `None` where it never is."""
+    away = tip_in_base_m - np.array(hole.center_in_base_m)
+    inside = (np.hypot(away[:, 0], away[:, 1]) <= success.clearance_m) & (
+        away[:, 2] <= -success.depth_m
+    )
+    return int(inside.argmax()) if inside.any() else None
+
+
+def measure_path_length(tip_in_base_m: np.ndarray, period_s: float) -> float:
+    """Return the length of a path, `(T, 3)`, between means over pieces of `PIECE_S`, m; first and last sample are its ends."""
+    # Means over pieces, so that noise of the encoders adds no length.
+    size = max(1, round(PIECE_S / period_s))
+    inner = len(tip_in_base_m) // size * size
+    corners = tip_in_base_m[:inner].reshape(-1, size, 3).mean(1)
+    points = np.concatenate((tip_in_base_m[:1], corners, tip_in_base_m[-1:]))
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def detect_motion(q: np.ndarray, machine: Machine, period_s: float) -> np.ndarray:
+    """Return which joints move, `(T, J)` bool, by the slope over a quarter of a second."""
+    if len(q) < 2:
+        return np.zeros(q.shape, bool)
+    # Five samples around each: differences of single samples are mostly noise.
+    speed = np.gradient(average_windows(q, 5), period_s, axis=0)
+    return np.abs(speed) > MOVING * machine.max_speed
+
+
+def detect_lever_movements(u: np.ndarray) -> np.ndarray:
+    """Return when and which lever axis began to move, `(M, 2)` of sample and joint, in order; commands `u`, `(T, J)`."""
+    on, off = np.abs(u) >= LEVER_ON, np.abs(u) < LEVER_OFF
+    # 1 and 0 are beyond a threshold; -1 lies between both and keeps the state (hysteresis).
+    crossed = np.where(on, 1, np.where(off, 0, -1))
+    rows = np.where(crossed >= 0, np.arange(len(u))[:, None], -1)
+    # Row of the newest sample beyond a threshold; a recording begins with levers released.
+    newest = np.maximum.accumulate(rows, axis=0)
+    held = np.where(newest >= 0, np.take_along_axis(crossed, np.maximum(newest, 0), 0), 0)
+    return np.argwhere(np.diff(held.astype(int), axis=0, prepend=0) > 0)
+
+
+def measure_tracking(u: np.ndarray, advice: np.ndarray, period_s: float) -> dict[str, float]:
+    """Return root mean square distance of commands from the advice, and the lag at which both agree best; `(T, J)` each.
+
+    Advice that is NaN was not shown.
+    """
+    shown = np.asarray(~np.isnan(advice).any(1))
+    if not shown.any():
+        return {"advice_error": math.nan, "advice_lag_s": math.nan}
+    away = np.where(shown[:, None], u - np.nan_to_num(advice), 0.0)
+    error = math.sqrt(float((away**2).sum() / (shown.sum() * u.shape[1])))
+    asked = np.nan_to_num(advice)
+    # No lag longer than the trial.
+    most = min(round(MOST_LAG_S / period_s), len(u) - 1)
+    agreement = [float((u[lag:] * asked[: len(u) - lag]).sum()) for lag in range(most + 1)]
+    # Correlation without normalisation: only the place of its maximum counts.
+    return {
+        "advice_error": error,
+        "advice_lag_s": int(np.argmax(agreement)) * period_s if max(agreement) > 0 else math.nan,
+    }
+
+
+def average_windows(values: np.ndarray, size: int) -> np.ndarray:
+    """Return centred moving means over `size` samples, `(T, …)`, over fewer at the ends."""
+    # Differences of cumulative sums: the time does not depend on the window.
+    total = np.concatenate((np.zeros_like(values[:1]), np.cumsum(values, 0)))
+    index = np.arange(len(values))
+    low, high = np.maximum(index - size // 2, 0), np.minimum(index + size // 2 + 1, len(values))
+    return (total[high] - total[low]) / (high - low).reshape(-1, *[1] * (values.ndim - 1))
+
+
+# Defaults of SPARC (Balasubramanian et al., J. NeuroEng. Rehabil. 12 (2015) 112): cut-off, share
+# of the peak below which the spectrum is left out, and powers of two of zero padding.
+CUT_OFF_HZ = 10.0
+THRESHOLD = 0.05
+PADDING = 4
+
+
+def compute_sparc(speed: np.ndarray, rate_hz: float) -> float:
+    """Return minus the length of the spectrum's outline: near -1.4 for one smooth stroke, lower with every stop and start.
+
+    Args:
+        speed: Speed over time, `(T,)`, any unit.
+        rate_hz: Samples a second.
+
+    Returns:
+        NaN where nothing moved.
+    """
+    if len(speed) < 2 or not np.any(speed):
+        return math.nan
+    # Zero padding refines the spectrum.
+    size = 2 ** (math.ceil(math.log2(len(speed))) + PADDING)
+    frequency = np.arange(size) * rate_hz / size
+    spectrum = np.abs(np.fft.fft(speed, size))
+    spectrum = spectrum / spectrum.max()
+    # Above the cut-off there is no voluntary motion.
+    within = frequency <= CUT_OFF_HZ
+    frequency, spectrum = frequency[within], spectrum[within]
+    above = np.flatnonzero(spectrum >= THRESHOLD)
+    frequency, spectrum = frequency[above[0] : above[-1] + 1], spectrum[above[0] : above[-1] + 1]
+    if len(frequency) < 2:
+        return math.nan
+    # Both axes of the outline are scaled to 1, so that duration and size drop out.
+    across = np.diff(frequency) / (frequency[-1] - frequency[0])
+    return -float(np.hypot(across, np.diff(spectrum)).sum())

@@ -1,0 +1,1 @@
+"""`brokk mode=study`."""

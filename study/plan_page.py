@@ -1,0 +1,184 @@
+"""The plan as a page to print: the power of the design, the rules, everybody's order of trials with room for notes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from brokk_rl.report import Cell, Report
+from study import sample_size
+from study.design import Design, Trial
+
+RULES = (
+    "Names are pseudonyms (P01, …). Who is who is written on paper, kept apart, and destroyed after the study; "
+    "study.do=erase deletes a participant on request.",
+    "The primary measure is fixed before the first trial; everything else is secondary and corrected for looking at many (Holm).",
+    "A trial ends at insertion, at the time limit, or when the participant or the experimenter stops it; "
+    "nothing is repeated without a note.",
+    "A participant may stop at any time without a reason. What was done until then is kept unless they ask for it to be erased.",
+    "The questionnaire is filled in after each period, before the other begins.",
+)
+
+
+def build_plan_page(
+    design: Design,
+    machine: str,
+    seed: int,
+    planned: list[Trial],
+    errors: dict[str, Any],
+    notice: str = "",
+) -> Report:
+    """Return the page.
+
+    Args:
+        design: The design of the plan.
+        machine: Name of the machine.
+        seed: Seed of the draw.
+        planned: All trials.
+        errors: How often simulated studies of this plan err; see `study.study_steps`.
+        notice: Said on top.
+    """
+    num, num_trials, inside = design.num_participants, len(design.holes), design.success
+    # Everything is computed for this plan, so that the page can be judged before the study.
+    paired_least, sequence_least = sample_size.find_smallest_sizes(design.alpha)
+    summary, tone = _judge_design(design, sequence_least)
+    found = Report(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
+    found.add_text(notice, "warn")
+    found.add_facts(
+        {
+            "participants": num,
+            "trials each": f"{num_trials} with guidance, {num_trials} without, {design.practice_trials} of practice before",
+            "order": design.order,
+            "primary measure": design.primary,
+            "time limit of a trial": f"{design.limit_s:g} s",
+            "inserted": f"{inside.depth_m:g} m below the rim, within {1000 * inside.clearance_m:.0f} mm of the axis",
+            "seed of the draw": seed,
+        }
+    )
+    _add_sample_sizes(found, design, paired_least, sequence_least)
+    _add_error_rates(found, errors)
+    found.add_heading("Rules")
+    found.add_list(RULES)
+    found.add_heading("Places")
+    found.add_table(
+        ["hole", "x, m", "y, m", "rim z, m", "radius, m"],
+        [[n, *h.center_in_base_m, h.radius_m] for n, h in design.holes.items()],
+    )
+    num_joints = len(next(iter(design.starts.values())))
+    found.add_table(
+        ["start", *(f"joint {i + 1}" for i in range(num_joints))],
+        [[n, *q] for n, q in design.starts.items()],
+    )
+    found.add_heading("Order of trials")
+    found.add_text(
+        "A hole and a start a trial, in this order; tick what is done, write down what went otherwise."
+    )
+    _add_schedule(found, planned)
+    return found
+
+
+def _judge_design(design: Design, sequence_least: int) -> tuple[str, str]:
+    """Return a sentence on the power of the design, and whether it is good, bad or a warning."""
+    num = design.num_participants
+    can = sample_size.evaluate_size(num, design.alpha)
+    wanted = sample_size.find_sufficient_size(design.alpha)
+    if design.order == "fixed":
+        summary, tone = (
+            "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.",
+            "bad",
+        )
+    elif can.smallest_p > design.alpha:
+        summary, tone = (
+            f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is {can.smallest_p:.3f}. It takes "
+            f"{sequence_least} to be able to, and {wanted} to find a large effect (dz 0.8) in four of five studies.",
+            "bad",
+        )
+    else:
+        summary = f"{num} participants find an effect of dz 0.8 in {100 * can.power[1]:.0f} of 100 studies."
+        # Four of five is the usual power; less is a warning.
+        tone = "good" if can.power[1] >= 0.8 else "warn"
+        summary += "" if tone == "good" else f" {wanted} would find it in four of five."
+    return summary, tone
+
+
+def _add_sample_sizes(
+    found: Report, design: Design, paired_least: int, sequence_least: int
+) -> None:
+    found.add_heading("How many participants")
+    found.add_text(
+        "An exact paired test cannot go below p = 0.0625 with five participants: such a study can never be significant at 0.05. "
+        f"It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from guidance. "
+        f"Power is the share of up to {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
+        "standard deviations of it."
+    )
+    columns = [
+        "participants",
+        "smallest p, paired",
+        "with the period in the model",
+        *(f"dz {dz:g}" for dz in sample_size.EFFECTS_DZ),
+    ]
+    # The plan's own number stands among the usual ones.
+    sizes = sorted({*sample_size.SIZES, design.num_participants})
+    rows = []
+    for size in (sample_size.evaluate_size(num, design.alpha) for num in sizes):
+        here = size.num_participants == design.num_participants
+        name = Cell(str(size.num_participants), note="this plan" if here else "")
+        rows.append(
+            [
+                name,
+                f"{size.smallest_paired_p:.2g}",
+                f"{size.smallest_p:.2g}",
+                *(f"{power:.2f}" for power in size.power),
+            ]
+        )
+    found.add_table(
+        columns, rows, "smallest possible p of both tests, and power with the period in the model"
+    )
+
+
+def _add_error_rates(found: Report, errors: dict[str, Any]) -> None:
+    found.add_heading("How such a study errs")
+    found.add_text(
+        "Studies drawn from a fast model of people at work (skill, practice by the power law, holes, chance; no machine), "
+        "analysed as this one will be."
+    )
+    rows = []
+    for entry in errors["studies"]:
+        low, high = entry["ci95"]
+        rows.append(
+            [
+                entry["what"],
+                str(entry["num_participants"]),
+                f"{entry['planted_dz']:g}",
+                Cell(f"{entry['share']:.3f}", f"{low:.3f} to {high:.3f}"),
+            ]
+        )
+    found.add_table(
+        ["study", "participants", "true dz", "called significant"],
+        rows,
+        f"{errors['studies'][0]['studies']} studies each; below: 95 % interval",
+    )
+
+
+def _add_schedule(found: Report, planned: list[Trial]) -> None:
+    # In the order of the plan, without repetition.
+    for participant in dict.fromkeys(trial.participant for trial in planned):
+        mine = []
+        for trial in planned:
+            if trial.participant == participant:
+                mine.append(trial)
+        found.add_heading(participant, 3)
+        largest = max(trial.number for trial in mine)
+        columns = ["", *map(str, range(1, largest + 1))]
+        rows = []
+        for period in sorted({trial.period for trial in mine}):
+            here = [trial for trial in mine if trial.period == period]
+            title = "practice" if not period else f"period {period}: {here[0].condition}"
+            cells: list[str | Cell] = []
+            for trial in here:
+                text = f"{trial.hole} from {trial.start}"
+                # In practice the condition changes from trial to trial.
+                cells.append(text if period else Cell(text, trial.condition))
+            # Empty cells leave room for notes by hand.
+            rows.append([title, *cells, *[""] * (len(columns) - 1 - len(here))])
+            rows.append(["notes", *[""] * (len(columns) - 1)])
+        found.add_table(columns, rows)

@@ -1,0 +1,295 @@
+"""The running trial of a sitting, with its phases: ready, recording, countdown, running, saving."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from brokk_rl import record
+from brokk_rl.errors import BrokkError
+from brokk_rl.kinematics import compute_tool_kinematics
+from brokk_rl.machine import Machine
+from brokk_rl.spec import spec
+from study import study_folder as folders
+from study.design import Hole, Success, Trial
+from study.measures import find_insertion
+from study.twin_control import FILLED, Stage
+
+log = logging.getLogger(__name__)
+
+Phase = Literal["ready", "starting", "countdown", "running", "settling", "saving", "over"]
+LOST_S = 1.0
+"""Time without positions after which a trial is aborted."""
+STARTING_S = 10.0
+"""Longest wait for a recording to begin, s."""
+
+
+@spec
+class Times:
+    """Times and tolerance of a trial.
+
+    Attributes:
+        countdown_s: Time from the press on the page to the beginning.
+        settle_s: Time for which a recording goes on after the end.
+        start_tolerance: Distance from the start, rad or m, up to which the page shows a joint as
+            being there.
+    """
+
+    countdown_s: float
+    settle_s: float
+    start_tolerance: float
+
+
+class Attempt:
+    """The trial that runs now; see the module.
+
+    Args:
+        folder: The study's.
+        design: The plan's design, as plain data.
+        trial: The planned trial.
+        hole: Its hole, as plain data.
+        start: Joint positions to begin from, `(J,)`.
+        machine: The machine.
+        stage: Where it takes place.
+        times: Countdown and the like.
+        facts: Further fields of the trial.
+        clock: Monotonic time, s.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        design: dict[str, Any],
+        trial: Trial,
+        hole: dict[str, Any],
+        start: np.ndarray,
+        machine: Machine,
+        stage: Stage,
+        times: Times,
+        facts: dict[str, Any],
+        clock: Callable[[], float],
+    ) -> None:
+        self.trial = trial
+        self._folder, self._start, self._machine, self._stage, self._times = (
+            folder,
+            start,
+            machine,
+            stage,
+            times,
+        )
+        self._hole = Hole(
+            center_in_base_m=tuple(hole["center_in_base_m"]), radius_m=float(hole["radius_m"])
+        )
+        self._success, self._limit_s = Success(**design["success"]), float(design["limit_s"])
+        self._facts, self._clock = facts, clock
+        self._phase: Phase = "ready"
+        # All clocks begin now, so that nothing has timed out before the first tick.
+        self._since_s = self._began_s = self._seen_s = clock()
+        self._path: Path | None = None
+        self._outcome, self._reason, self._seconds = "", "", 0.0
+        self._saving: Future[None] | None = None
+        # One worker: recordings are converted beside the page, one after the other.
+        self._worker = ThreadPoolExecutor(1)
+        stage.prepare(self._hole, start)
+
+    @property
+    def running(self) -> bool:
+        """True while the trial runs."""
+        return self._phase == "running"
+
+    @property
+    def over(self) -> bool:
+        """True once the trial is saved."""
+        return self._phase == "over"
+
+    def begin(self) -> str:
+        """Begin the recording, then the countdown; returns why not, where it cannot."""
+        if self._phase != "ready":
+            return "not now"
+        if self._stage.sight().q is None:
+            return "no positions"
+        hole = {"name": self.trial.hole, **asdict(self._hole)}
+        facts: dict[str, Any] = {
+            **asdict(self.trial),
+            "hole": hole,
+            "limit_s": self._limit_s,
+            **self._facts,
+        }
+        # Until the trial is over, its file describes it as interrupted.
+        unfinished = {
+            "outcome": "aborted",
+            "reason": "interrupted: the sitting ended during the trial",
+        }
+        # On the disk before the recording begins: no capture is without a trial.
+        self._path = folders.write_trial(self._folder, self.trial.name, facts | unfinished)
+        self._stage.record(self._captured)
+        self._enter("starting")
+        return ""
+
+    def stop(self) -> str:
+        """End the trial at the participant's wish; a trial that has not begun stays as it is."""
+        return (
+            self._end("stopped", "")
+            if self._phase == "running"
+            else self.abort("stopped before it began")
+        )
+
+    def abort(self, reason: str) -> str:
+        """End the trial for a fault: it is kept, does not count, and is repeated."""
+        if self._phase in ("starting", "countdown", "running"):
+            return self._end("aborted", reason)
+        return "not now"
+
+    def tick(self) -> None:
+        """Advance to the next phase where time, positions or recording allow it."""
+        now_s, sight = self._clock(), self._stage.sight()
+        in_phase_s = now_s - self._since_s
+        # The time at which positions were last known.
+        self._seen_s = now_s if sight.q is not None else self._seen_s
+        if self._phase in ("countdown", "running") and now_s - self._seen_s > LOST_S:
+            self.abort("positions stopped coming")
+        elif self._phase == "starting" and sight.recording:
+            self._enter("countdown")
+        elif self._phase == "starting" and in_phase_s > STARTING_S:
+            self.abort("the recording did not begin")
+        elif self._phase == "countdown" and in_phase_s >= self._times.countdown_s:
+            self._began_s = now_s
+            if self._path is not None and sight.q is not None:
+                # The start error tells later how well the start was met.
+                folders.rewrite(
+                    self._path, {"start_error": np.round(sight.q - self._start, 4).tolist()}
+                )
+            self._enter("running")
+        elif self._phase == "running" and sight.q is not None:
+            inside = (
+                find_insertion(
+                    compute_tool_kinematics(self._machine, sight.q).tip_in_base_m[None],
+                    self._hole,
+                    self._success,
+                )
+                is not None
+            )
+            # Inserted wins where both happen in one tick.
+            if inside or in_phase_s >= self._limit_s:
+                self._end("inserted" if inside else "time limit", "")
+        elif self._phase == "settling" and in_phase_s >= self._times.settle_s:
+            self._save()
+        elif self._phase == "saving" and self._saving is not None and self._saving.done():
+            self._enter("over")
+
+    def view(self) -> dict[str, Any]:
+        """Return the trial as plain data for the pages."""
+        now_s, sight = self._clock(), self._stage.sight()
+        away = None if sight.q is None else sight.q - self._start
+        joints = []
+        if away is not None:
+            for name, value in zip(self._machine.joint_names, away, strict=True):
+                is_there = bool(abs(value) <= self._times.start_tolerance)
+                joints.append({"joint": name, "away": round(float(value), 3), "there": is_there})
+        left_s = {"countdown": self._times.countdown_s, "running": self._limit_s}.get(
+            self._phase, 0.0
+        ) - (now_s - self._since_s)
+        return {
+            "phase": self._phase, "number": self.trial.number, "hole": self.trial.hole, "start": self.trial.start, "joints": joints,
+            "advised": sight.advised, "left_s": round(max(0.0, left_s), 1), "outcome": self._outcome, "reason": self._reason,
+            "seconds": round(self._seconds, 1),
+        }  # fmt: skip
+
+    def close(self) -> None:
+        """Wait until everything is on the disk."""
+        if self._phase == "settling":
+            self._save()
+        self._worker.shutdown(wait=True)
+
+    def leave(self) -> None:
+        """End the trial now; a missing recording is made from the capture at the next start."""
+        self.abort("the program ended")
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    @property
+    def _captured(self) -> Path:
+        assert self._path is not None
+        return self._folder.resolve() / folders.CAPTURES / self._path.stem
+
+    def _enter(self, phase: Phase) -> None:
+        self._phase, self._since_s = phase, self._clock()
+
+    def _end(self, outcome: str, reason: str) -> str:
+        ran = self._phase == "running"
+        # A trial that never ran took no time.
+        self._seconds = self._clock() - self._began_s if ran else 0.0
+        self._outcome, self._reason = outcome, reason
+        assert self._path is not None
+        folders.rewrite(
+            self._path, {"outcome": outcome, "reason": reason, "seconds": round(self._seconds, 2)}
+        )
+        self._enter("settling")
+        # Nothing to settle where nothing moved.
+        if not ran:
+            self._save()
+        return ""
+
+    def _save(self) -> None:
+        end_s = self._clock()
+        self._stage.record(None)
+        assert self._path is not None
+        # Without a window there is nothing to keep: the trial never ran.
+        if self._seconds:
+            window_s = [self._began_s, end_s]
+            folders.rewrite(
+                self._path,
+                {"capture": f"{folders.CAPTURES}/{self._path.stem}", "window_s": window_s},
+            )
+        self._saving = self._worker.submit(
+            # The conversion takes seconds; the page must go on.
+            keep,
+            self._folder,
+            self._path,
+            self._machine,
+            self._stage,
+        )
+        self._enter("saving")
+
+
+def keep(folder: Path, path: Path, machine: Machine, stage: Stage) -> None:
+    """Write the captured trial as a recording to the file `path`; faults are reported in that file.
+
+    A trial that began has a `window_s`, so that this can be done again where it was interrupted:
+    the clock is that of the capture.
+    """
+    trial = json.loads(path.read_text())
+    # Already kept, or found impossible: this makes the call safe to repeat.
+    if "window_s" not in trial or "recording" in trial or "recording_problem" in trial:
+        return
+    changes: dict[str, Any] = {}
+    try:
+        found = stage.keep(folder.resolve() / trial["capture"], *trial["window_s"])
+        name = f"{folders.RECORDINGS}/{path.stem}.parquet"
+        record.write_recording(_describe_target(found, trial), folder / name)
+        changes["recording"] = name
+        if FILLED in found.metadata:
+            changes["recording_problem"] = found.metadata[FILLED]
+    except (BrokkError, OSError) as error:
+        log.error("%s: %s", path.stem, error)
+        changes["recording_problem"] = str(error)
+    folders.rewrite(path, changes)
+
+
+def _describe_target(found: record.Recording, trial: dict[str, Any]) -> record.Recording:
+    """Return the recording with the hole, and without advice that was not shown."""
+    guided = trial["condition"] == "guided"
+    extra = {}
+    for name, values in found.extra.items():
+        if guided or not name.startswith("advice_"):
+            extra[name] = values
+    # The hole stands in the recording as constant columns, as in recordings of other tools.
+    at = zip("xyz", trial["hole"]["center_in_base_m"], strict=True)
+    extra |= {f"target_{axis}_m": np.full(len(found.t_s), value, np.float32) for axis, value in at}
+    return replace(found, extra=extra)
