@@ -365,6 +365,8 @@ class _StateChecks:
         target = self._checklist.target.build()
         # The target is chosen once: it must not jump during the shadow run.
         TargetSelector(target, self._memory.target, self._memory.holes).refresh()
+        # A new borehole counts once it has stayed where it is.
+        self._collect(2.0 * self._checklist.limits.target.settle_s)
         counts: Counter[AdviceStatus] = Counter()
         # Advices have numbers, so that none is counted twice.
         end_s, number = time.monotonic() + self._checklist.shadow_s, -1

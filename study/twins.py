@@ -284,7 +284,8 @@ class _Desk:
     def _advise(self) -> None:
         """Publish the state as the bus process does, and let the policy propose a command."""
         now_s = self._now_s
-        state = self._receiver.build_state(now_s, bus_up=True, decision=self._silent, missed=0)
+        target = GuardTrip.NONE
+        state = self._receiver.build_state(now_s, True, self._silent, target, missed=0)
         self._shared.state.write(state)
         self._adviser.run_cycle(0, now_s)
         advice = self._shared.advice.read()
