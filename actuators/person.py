@@ -26,7 +26,7 @@ import torch
 
 from actuators.effects.ranges import CHANCE, EffectNumber, ParameterRanges, Value
 from actuators.models import random_draws
-from actuators.models.transport import open_valve, select_commands_in_force
+from actuators.models.parameters import open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine, mask_exclusive_joints

@@ -6,7 +6,7 @@ import contextlib
 import errno
 import re
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -175,7 +175,7 @@ def _explain_missing_choice(group: str) -> str:
 
 def _explain_absence(cfg: DictConfig, key: str, value: str, text: str) -> str:
     """Return what a configuration has in the place of a key that it does not have."""
-    mode = f"mode={read_mode_name(cfg)}"
+    mode = f"mode={registry.read_mode_name(cfg)}"
     if isinstance(table := OmegaConf.select(cfg, key, default=None), DictConfig):
         fields = [str(field) for field in table if field != "_target_"]
         return f"'{key}' is a table, whose values are given as {key}.<name>=…; {list_choices(value, fields)}"
@@ -284,8 +284,3 @@ def list_chosen_options(arguments: Sequence[str]) -> list[str]:
             line = f"{line.partition('=')[0]}={next(iter(override.sweep_string_iterator()))}"
         chosen.append(line)
     return chosen
-
-
-def read_mode_name(cfg: Mapping[Any, Any]) -> str:
-    """Return the mode that a composed configuration runs."""
-    return str(cfg["run"]).split(".")[-2]

@@ -14,10 +14,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
-from brokk_rl import distributed, extensions
+from brokk_rl import distributed, extensions, registry
 from brokk_rl.build import build_mode
 from brokk_rl.errors import ConfigError, list_choices
-from brokk_rl.explain import read_mode_name
 from brokk_rl.policy_choice import insert_policy, is_going_on
 from brokk_rl.session import read_earlier_job, remove_empty_folders, require_new_folder
 from brokk_rl.sweep import name_job
@@ -62,7 +61,7 @@ def _run_in_session(mode: Any, values: dict[str, Any], sweep: bool, goes_on: boo
         mode = dataclasses.replace(mode, resume=str(folder))
     resume = bool(before) or goes_on
     log.info("run folder: %s", folder)
-    facts = _collect_facts(read_mode_name(values), mode)
+    facts = _collect_facts(registry.read_mode_name(values), mode)
     with mode.session.start(resolved, facts, resume) as record:
         objective = mode.run()
         record.fields["objective"] = (
@@ -118,7 +117,7 @@ def choose_run_folder(values: Mapping[str, Any]) -> Path:
     name = settings.runtime.choices.get("experiment") or settings.runtime.choices.get("task")
     name = Path(name).stem if name else None  # An option may be a file: experiment=@<path>.
     stem = "_".join(
-        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", read_mode_name(values), name))
+        filter(None, (f"{datetime.now():%Y-%m-%d_%H-%M-%S}", registry.read_mode_name(values), name))
     )
     return Path("runs") / stem
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata, resources, util
 from pathlib import Path
@@ -95,6 +95,11 @@ def list_options(only: str | None = None) -> list[Option]:
                 option = replace(option, name=f"{option.prefix}/{option.name}")
             listed.append(option)
     return sorted(listed, key=lambda option: (option.group, option.name))
+
+
+def read_mode_name(cfg: Mapping[Any, Any]) -> str:
+    """Return the mode that a composed configuration runs."""
+    return str(cfg["run"]).split(".")[-2]
 
 
 def list_targets() -> frozenset[str]:

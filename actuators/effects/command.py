@@ -7,7 +7,7 @@ import torch
 from actuators.effects.effect import ANY_INTERFACE, EffectSpec, Memory, StepInputs
 from actuators.effects.ranges import EffectNumber, Joints, Value
 from actuators.effects.timing import append_command
-from actuators.models.transport import open_valve
+from actuators.models.parameters import open_valve
 from brokk_rl.spec import spec
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch.nn.utils.rnn import pad_sequence
 
-from actuators.models.random_draws import hash_uniform
+from actuators.models.parameters import hash_uniform
 from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine

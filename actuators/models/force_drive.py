@@ -15,8 +15,13 @@ from typing import Any, ClassVar, Protocol
 import torch
 
 from actuators.models.friction import LOADS, STRIBECK_SPEED, compute_dry_friction
-from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
-from actuators.models.transport import select_commands_in_force
+from actuators.models.parameters import (
+    PerJoint,
+    SpreadParameters,
+    check_interface,
+    read_parameters,
+    select_commands_in_force,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

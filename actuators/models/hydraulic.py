@@ -31,10 +31,12 @@ from annotated_types import Interval
 from actuators.models.parameters import (
     PerJoint,
     SpreadParameters,
+    check_dead_time,
     check_interface,
     expand_per_joint,
+    open_valve,
+    select_commands_in_force,
 )
-from actuators.models.transport import check_dead_time, open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import Gravity
 from brokk_rl.history import History

@@ -5,8 +5,15 @@ from typing import ClassVar
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
-from actuators.models.transport import open_valve, select_commands_in_force, split_run_commands
+from actuators.models.parameters import (
+    PerJoint,
+    SpreadParameters,
+    check_interface,
+    open_valve,
+    read_parameters,
+    select_commands_in_force,
+    split_run_commands,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

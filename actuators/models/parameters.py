@@ -1,5 +1,11 @@
-"""Parameters of an actuator: one value or one per joint, and drawn per episode if asked for."""
+"""Parameters of an actuator: one value or one per joint, drawn per episode, dead time and dead band.
 
+Random numbers come from a counter in the state instead of a generator. No host is involved, a CUDA
+graph may hold the draws, and a run that is restored from its state goes on exactly; a generator would
+be memory outside the state, which the contract of an actuator model forbids.
+"""
+
+import math
 from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
@@ -7,8 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from actuators.models.random_draws import hash_uniform
-from actuators.models.transport import check_dead_time
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 
@@ -179,3 +183,113 @@ class SpreadParameters:
             uniform = hash_uniform(self._draw[:, None] * 7_919 + self._joint + column * 104_729)
             drawn = self._nominal[name] * (1.0 + width * (2.0 * uniform - 1.0))
             self.value[name].copy_(torch.where(mask[:, None], drawn, self.value[name]))
+
+
+# random numbers
+
+
+def start_counter(num_envs: int, salt: int, device: torch.device) -> torch.Tensor:
+    """Return the first counter of each environment, `(N,)` int64, from torch's seed.
+
+    `salt` keeps effects apart.
+    """
+    seed = (torch.initial_seed() + salt * 2_654_435_761) % 2**31
+    return torch.arange(num_envs, dtype=torch.int64, device=device) * 2_654_435_761 + seed
+
+
+def draw_uniform(draw: torch.Tensor, column: int, width: int) -> torch.Tensor:
+    """Return numbers in [0, 1), `(N, width)`, for the counter `(N,)`.
+
+    Each `column` (below 256) gives independent ones.
+    """
+    place = torch.arange(width, dtype=torch.int64, device=draw.device) + 256 * column
+    return hash_uniform(draw[:, None] * 65_536 + place)
+
+
+def hash_uniform(key: torch.Tensor) -> torch.Tensor:
+    """Return uniform numbers in [0, 1) for int64 keys.
+
+    Mixing steps of splitmix64 (Steele et al. 2014), which wrap around.
+    """
+    key = key * -7_046_029_254_386_353_131
+    key = (key ^ ((key >> 30) & 0x3FFFFFFFF)) * -4_658_895_280_553_007_687
+    key = (key ^ ((key >> 27) & 0x1FFFFFFFFF)) * -7_723_592_293_110_705_685
+    return ((key >> 40) & 0xFFFFFF).to(torch.float32) / float(1 << 24)
+
+
+def draw_normal(draw: torch.Tensor, column: int, width: int) -> torch.Tensor:
+    """Return standard normal numbers, `(N, width)` (Box and Muller).
+
+    Uses `column` and `column + 1`.
+    """
+    radius = torch.sqrt(-2.0 * torch.log(1.0 - draw_uniform(draw, column, width)))
+    return radius * torch.cos(2.0 * math.pi * draw_uniform(draw, column + 1, width))
+
+
+# dead time and dead band
+
+
+def check_dead_time(longest_s: float, machine: Machine, where: str) -> None:
+    """Raise a `ConfigError` when the machine's history does not reach back `longest_s`."""
+    reach_s = (machine.num_history - 1) * machine.period_s
+    if not 0.0 <= longest_s <= reach_s + 1e-6:
+        raise ConfigError(
+            f"{where}: a dead time of {longest_s:.3f} s (spread included) does not fit the {reach_s:.3f} s that the history of "
+            f"machine '{machine.name}' reaches back; shorten it or raise machine.num_history"
+        )
+
+
+def select_commands_in_force(
+    u: torch.Tensor, delay_periods: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Split the coming control period at the moment when the delayed command changes.
+
+    A command is held for one period, so with a dead time of `n + f` periods the valve sees the
+    command of `n + 1` periods ago for the first part `f` of the period and that of `n` periods ago
+    for the rest. Nothing is interpolated: this is exact.
+
+    Args:
+        u: Command history, shape `(N, H, J)`, newest last.
+        delay_periods: Dead time in control periods, shape `(N, J)`, in [0, H - 1].
+
+    Returns:
+        The earlier command, the later command, and the part of the period in which the earlier one
+        acts, each `(N, J)`.
+    """
+    last = u.shape[1] - 1
+    # half a millionth of a period forgives 0.55 / 0.05 = 11.000000000000002
+    whole = torch.floor(delay_periods + 5e-7)
+    part = (delay_periods - whole).clamp(0.0, 1.0)
+    newest = last - whole.to(torch.int64)
+    later = u.gather(1, newest.clamp(0, last)[:, None]).squeeze(1)
+    earlier = u.gather(1, (newest - 1).clamp(0, last)[:, None]).squeeze(1)
+    return earlier, later, part
+
+
+def split_run_commands(
+    u: torch.Tensor, delay_periods: torch.Tensor, first: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return `select_commands_in_force` of each step of a run, the two commands `(T - first + 1, N, J)`.
+
+    Args:
+        u: Commands of the run, `(T, N, J)`; step `k` follows command `first + k - 1`.
+        delay_periods: Dead time in control periods, `(N, J)`.
+        first: Length of the history at the first step.
+    """
+    whole = torch.floor(delay_periods + 5e-7)  # see `select_commands_in_force`
+    part = (delay_periods - whole).clamp(0.0, 1.0)
+    steps = torch.arange(first - 2, len(u), device=u.device)[:, None, None]
+    found = u.gather(0, (steps - whole.to(torch.int64)).clamp(0, len(u) - 1))
+    return found[:-1], found[1:], part
+
+
+def open_valve(
+    u: torch.Tensor, dead_band_extend: torch.Tensor, dead_band_retract: torch.Tensor
+) -> torch.Tensor:
+    """Return the valve opening in [-1, 1], shape of `u`.
+
+    Zero inside the dead band, one at full command each way.
+    """
+    extend = torch.relu(u - dead_band_extend) / (1.0 - dead_band_extend)
+    retract = torch.relu(-u - dead_band_retract) / (1.0 - dead_band_retract)
+    return extend - retract

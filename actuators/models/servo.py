@@ -22,8 +22,14 @@ from typing import ClassVar, NamedTuple
 
 import torch
 
-from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
-from actuators.models.transport import select_commands_in_force, split_run_commands
+from actuators.models.parameters import (
+    PerJoint,
+    SpreadParameters,
+    check_interface,
+    read_parameters,
+    select_commands_in_force,
+    split_run_commands,
+)
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec

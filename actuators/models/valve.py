@@ -22,8 +22,14 @@ import numpy as np
 import torch
 
 from actuators.models.joint_weight import build_joint_weight
-from actuators.models.parameters import PerJoint, SpreadParameters, check_interface, read_parameters
-from actuators.models.transport import select_commands_in_force, split_run_commands
+from actuators.models.parameters import (
+    PerJoint,
+    SpreadParameters,
+    check_interface,
+    read_parameters,
+    select_commands_in_force,
+    split_run_commands,
+)
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine

@@ -13,8 +13,8 @@ from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.contracts.world import Simulator
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
-from brokk_rl.sim.drive import FASTEST_MODE, find_fastest_mode
 from brokk_rl.sim.faults import FaultRecorder
+from brokk_rl.sim.model import FASTEST_MODE, find_fastest_mode
 from brokk_rl.sim.scene import make_empty_scenes
 
 TRIAL_S = 1.0

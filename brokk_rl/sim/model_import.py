@@ -14,7 +14,7 @@ import yaml
 
 from brokk_rl.machine import Machine
 from brokk_rl.sim.arm_model import TIP, ArmModel, ModelChoices, normalise_axis
-from brokk_rl.sim.drive import FASTEST_MODE, compute_inertia, find_fastest_mode
+from brokk_rl.sim.model import FASTEST_MODE, compute_inertia, find_fastest_mode
 from brokk_rl.sim.model_source import KINDS, UNITS, JointLimits
 
 HYDRAULIC_NAMES = re.compile("boom|stick|bucket|dipper|cylinder", re.IGNORECASE)

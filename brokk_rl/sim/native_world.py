@@ -11,9 +11,7 @@ from mujoco.batch import Batch, SimulationError
 
 from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
-from brokk_rl.sim.drive import DriveReferences
-from brokk_rl.sim.model import compile_model, mask_contact_sensors
-from brokk_rl.sim.model_features import check_simulated
+from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model, mask_contact_sensors
 from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 

@@ -10,7 +10,7 @@ import torch
 
 from brokk_rl.contracts.world import PROPERTIES, Property
 from brokk_rl.machine import Machine
-from brokk_rl.sim.drive import DriveReferences
+from brokk_rl.sim.model import DriveReferences
 
 FIELDS: dict[Property, tuple[str, ...]] = {
     "mass": ("body_mass", "body_inertia", "body_subtreemass"),

@@ -4,7 +4,7 @@
 # pyright: reportGeneralTypeIssues=false, reportAssignmentType=false
 """Forces on an arm before contacts, and its step in time after them: one Warp launch each.
 
-Before the contacts: the mass matrix M, the forces of the servos (`brokk_rl.sim.drive`) and the
+Before the contacts: the mass matrix M, the forces of the servos (`brokk_rl.sim.model`) and the
 inertial forces of the present motion. They follow from Newton's and Euler's laws of every body,
 projected onto the joints (Kane and Levinson, "Dynamics: Theory and Applications", 1985):
 
@@ -256,7 +256,7 @@ class ArmDynamics:
 
     Args:
         mujoco_model: The arm: joints in one chain, each driven by the servo of its number
-            (`brokk_rl.sim.drive`).
+            (`brokk_rl.sim.model`).
         model: The same on the device.
         data: Worlds of the model.
     """

@@ -20,9 +20,7 @@ import warp as wp
 
 from brokk_rl.contracts.world import Property
 from brokk_rl.machine import Machine
-from brokk_rl.sim.drive import DriveReferences
-from brokk_rl.sim.model import compile_model
-from brokk_rl.sim.model_features import check_simulated
+from brokk_rl.sim.model import DriveReferences, check_simulated, compile_model
 from brokk_rl.sim.properties import WorldProperties, list_fields
 from brokk_rl.sim.scene import ScenePlacement, make_nominal_scenes
 from brokk_rl.sim.warp_dynamics import ArmDynamics

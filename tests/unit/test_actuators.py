@@ -13,8 +13,7 @@ from composed import option
 
 from actuators.models.hydraulic import Hydraulic
 from actuators.models.lag import FirstOrderLag
-from actuators.models.parameters import expand_per_joint
-from actuators.models.transport import open_valve, select_commands_in_force
+from actuators.models.parameters import expand_per_joint, open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.gravity import GRAVITY_M_S2, Gravity
 from brokk_rl.history import History

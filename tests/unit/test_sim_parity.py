@@ -9,8 +9,7 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
-from brokk_rl.sim import model_features
-from brokk_rl.sim.model import ASSETS, compile_model
+from brokk_rl.sim.model import ASSETS, check_simulated, compile_model
 from brokk_rl.sim.parity import POSITION_TOLERANCE, check_parity, measure_parity
 from brokk_rl.sim.simulator import NativeSimulator
 
@@ -145,7 +144,7 @@ def test_refusals_name_only_backends_that_simulate_the_part(machine, tmp_path):
     def refuse(name: str) -> str:
         model = compile_model(change_mjcf(machine, tmp_path, CHANGES[name]), 0.01)
         with pytest.raises(ConfigError) as refusal:
-            model_features.check_simulated(model, "brokk170", "fused")
+            check_simulated(model, "brokk170", "fused")
         return str(refusal.value)
 
     assert refuse("friction").endswith("choose sim=native")
