@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import logging
 import re
-from dataclasses import asdict
 from pathlib import Path
 
-from actuators.recordings import conversion, log_guess, map_draft
-from actuators.recordings.clock_guess import Guess
-from actuators.recordings.column_guess import CommandKind, GivenColumns
+from actuators.recordings import conversion, log_draft
 from actuators.recordings.column_names import UNITS, read_unit
+from actuators.recordings.guess import CommandKind, GivenColumns, Guess
+from actuators.recordings.log_draft import Draft
 from actuators.recordings.log_files import Damaged
 from actuators.recordings.log_reader import LogReader
-from actuators.recordings.map_draft import Draft
 from brokk_rl.console_table import print_table, print_text
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.report import Report
 from brokk_rl.session import Session, read_record, write_json, write_text
-from brokk_rl.spec import spec
+from brokk_rl.spec import Positive, spec
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +46,12 @@ class LogSelection:
             for all joints, or a table by joint; `null` to guess.
         clock_offset_s: Seconds added to the clock of a table, a number by table; `null`: none.
         dbc: DBC file of logs of a CAN bus: a path, or `package:path`.
+        time: Column of the time, or those of seconds and nanoseconds, where names do not say it; `null`
+            to guess.
+        rate_hz: Rate of a log without times, whose rows are equally spaced; `null`: it has times.
+        wraps: Value of the log at which positions begin again, such as 4096 or 6.28318: one for all
+            joints, or a table by joint; 0 for none, `null` to guess.
+        channel: Channel of the recorder of a CAN bus; `null` where each message comes on one.
         damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
     """
 
@@ -57,7 +61,11 @@ class LogSelection:
     command: CommandKind | None
     position_unit: str | dict[str, str] | None
     clock_offset_s: dict[str, float] | None
+    time: tuple[str, ...] | None
+    rate_hz: Positive | None
+    wraps: float | dict[str, float] | None
     dbc: str | None
+    channel: int | None
     damaged: Damaged
 
     def check(self) -> None:
@@ -119,20 +127,27 @@ class ImportLogs:
             return
         paths = conversion.find_logs(self.log.input)
         given = GivenColumns(
-            self.log.joints, self.log.command, self.log.position_unit, self.log.clock_offset_s
+            self.log.joints,
+            self.log.command,
+            self.log.position_unit,
+            self.log.clock_offset_s,
+            self.log.time,
+            self.log.rate_hz,
+            self.log.wraps,
         )
-        guess = log_guess.guess_logs(paths, given, self.log.dbc, self.log.damaged)
-        folder = self.session.folder
-        figure = log_guess.draw_guess(guess)
-        figure.savefig(folder / PICTURE_FILE, dpi=110)
-        log.info("picture: %s", folder / PICTURE_FILE)
-        draft = log_guess.make_draft(guess, paths, self.log.name or _name_machine(paths[0]))
+        name = self.log.name or _name_machine(paths[0])
+        draft = log_draft.make_draft(
+            paths, name, given, self.log.dbc, self.log.damaged, self.log.channel
+        )
+        picture = self.session.folder / PICTURE_FILE
+        log_draft.draw_draft(draft).savefig(picture, dpi=110)
+        log.info("picture: %s", picture)
         self._write(draft, paths)
 
     def _write(self, draft: Draft, paths: list[Path]) -> None:
         folder, guesses = self.session.folder, draft.list_guesses()
-        write_text(folder / MAP_FILE, map_draft.format_map(draft))
-        write_text(folder / MACHINE_FILE, map_draft.format_machine(draft))
+        write_text(folder / MAP_FILE, log_draft.format_map(draft))
+        write_text(folder / MACHINE_FILE, log_draft.format_machine(draft))
         unsure = [guess for guess in guesses if guess.sureness == "unsure"]
         write_json(
             folder / GUESS_FILE,
@@ -141,7 +156,7 @@ class ImportLogs:
                 "machine": draft.name,
                 "logs": [str(path) for path in paths],
                 "minutes": draft.survey.minutes,
-                "guesses": [asdict(guess) for guess in guesses],
+                "guesses": [guess.plain() for guess in guesses],
                 "num_unsure": len(unsure),
                 "remarks": list(draft.remarks),
             },
@@ -172,11 +187,13 @@ def _summarise(draft: Draft, guesses: list[Guess]) -> str:
     end = "No guess is unsure."
     if unsure:
         many = "1 guess is" if unsure == 1 else f"{unsure} guesses are"
-        end = f"{many} unsure: fill in {map_draft.MISSING} in {MAP_FILE}."
-    if any(joint.guesses["unit"].sureness == "unsure" for joint in draft.joints):
+        end = f"{many} unsure: fill in {log_draft.MISSING} in {MAP_FILE}."
+        if not any(guess.is_open for guess in guesses):
+            end = f"{many} unsure: the numbers speak against what was given."
+    if any(joint.guesses["unit"].is_open for joint in draft.joints):
         end += f" Without a unit {MACHINE_FILE} lacks limits and speeds: better run this again with log.position_unit=…"
     if any(joint.kind == "torque" for joint in draft.joints):
-        end += f" The force at full command is not in the logs: fill in {map_draft.MISSING} in {MACHINE_FILE}."
+        end += f" The force at full command is not in the logs: fill in {log_draft.MISSING} in {MACHINE_FILE}."
     return (
         f"{draft.survey.num_runs} runs, {draft.survey.minutes:.1f} minutes, {len(draft.joints)} joints at "
         f"{1.0 / draft.survey.period_s:.4g} Hz. {end}"
@@ -185,7 +202,9 @@ def _summarise(draft: Draft, guesses: list[Guess]) -> str:
 
 def _write_page(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> None:
     is_unsure = any(guess.sureness == "unsure" for guess in guesses)
-    page = Report(f"Logs of {draft.name}", _summarise(draft, guesses), "bad" if is_unsure else "plain")  # fmt: skip
+    page = Report(
+        f"Logs of {draft.name}", _summarise(draft, guesses), "bad" if is_unsure else "plain"
+    )
     page.add_picture(
         folder / PICTURE_FILE,
         "Positions (blue) and commands (orange) as the logs have them, in the units of the logs.",
@@ -209,5 +228,10 @@ def _show(draft: Draft, guesses: list[Guess], folder: Path, command: str) -> Non
     for guess in guesses:
         rows.append((guess.subject, guess.value, guess.sureness, guess.reason))
     print_table(HEAD, rows)
-    for text in (*draft.remarks, _summarise(draft, guesses), f"look at {folder / PAGE_FILE}, then:", command):  # fmt: skip
+    for text in (
+        *draft.remarks,
+        _summarise(draft, guesses),
+        f"look at {folder / PAGE_FILE}, then:",
+        command,
+    ):
         print_text(text)

@@ -12,30 +12,21 @@ import zlib
 from collections.abc import Collection, Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.lib import format as npy
 from scipy import io as matlab
 
-from actuators.recordings.log_tables import BLOCK_ROWS, LogFile, LogRun, StoredColumns, Table
+from actuators.recordings.log_tables import LogFile, LogRun, Table
 from brokk_rl.errors import RecordingError
 
 EPISODE = "episode_index"
 """Column of a LeRobotDataset that says which episode a row belongs to."""
-
-MATLAB_NUMBERS = (
-    "double",
-    "single",
-    *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)),
-)
-"""Classes of real arrays as MATLAB names them."""
-
+BATCH_ROWS = 65536
 PARQUET_ERRORS = (OSError, pa.ArrowException, ValueError)
 """Errors of pyarrow on a damaged file; a name that is no text is a `ValueError`."""
-
 NPZ_ERRORS = (OSError, EOFError, ValueError, NotImplementedError, zipfile.BadZipFile, zlib.error)
 """Errors of the libraries on a damaged archive."""
 
@@ -97,123 +88,132 @@ class LeRobotLog(LogFile):
             columns = _read_parquet(file, items, {*names, EPISODE}, max_rows)
             if EPISODE not in columns:
                 raise RecordingError(f"{file}: column '{EPISODE}' is missing")
-            arrays = dict(columns)
-            numbers = arrays[EPISODE]
+            numbers = columns[EPISODE]
             if not len(numbers):
                 raise RecordingError(f"{file}: has no rows")
             edges = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist(), len(numbers)]
             for begin, end in pairwise(edges):
                 run = f"{self.path.resolve().name}_{int(numbers[begin]):06d}"
-                part = {name: values[begin:end] for name, values in arrays.items()}
+                part = {name: values[begin:end] for name, values in columns.items()}
                 where = f"{file}, episode {int(numbers[begin])}"
                 yield LogRun(run, where, {"": Table(part)})
             if max_rows is not None:
                 return
 
 
-class NumpyLog(LogFile):
-    """A NumPy archive (`.npz`) as a log with one table; pickled objects are never loaded."""
+class ArrayLog(LogFile):
+    """Named arrays as a log: those of one length are a table, each structure with a time another one."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        shapes, member = {}, None
-        try:
-            with zipfile.ZipFile(path) as archive:
-                for member in archive.namelist():
-                    with archive.open(member) as file:
-                        shape, _, kind = _read_npy_header(file)
-                    if kind.kind in "fiu" and len(shape) in (1, 2) and shape[0] > 1:
-                        shapes[member] = shape
-        except NPZ_ERRORS as error:
-            if member is None:
-                raise RecordingError(
-                    f"{path}: cannot be read as a NumPy archive ({error})"
-                ) from error
-            raise RecordingError(f"{path}: array '{member}' is damaged ({error})") from error
-        self._members = _select_longest(shapes)
-
-    def list_tables(self) -> dict[str, list[str]]:
-        """Return the real vectors of the most frequent length, and columns of such matrices."""
-        return {"": [name for member in self._members for name in self._name_columns(member)]}
-
-    def read_runs(
-        self, wanted: Mapping[str, Collection[str]], max_rows: int | None
-    ) -> Iterator[LogRun]:
-        """Yield the archive as one run."""
-        names = wanted.get("", ())
-        columns = StoredColumns(names)
-        with zipfile.ZipFile(self.path) as archive:
-            for member in self._members:
-                several = self._name_columns(member)
-                kept = {at: name for at, name in enumerate(several) if name in names}
-                if not kept:
+        tables = _read_matlab(path) if path.suffix.lower() == ".mat" else _read_npz(path)
+        self._tables: dict[str, dict[str, np.ndarray]] = {}
+        for table, arrays in tables.items():
+            lengths = [len(values) for values in arrays.values()]
+            length = max(lengths, key=lengths.count, default=0)
+            columns: dict[str, np.ndarray] = {}
+            for name, values in arrays.items():
+                if len(values) != length:
                     continue
-                try:
-                    with archive.open(member) as file:
-                        for block in _read_npy_blocks(file, max_rows):
-                            for at, name in kept.items():
-                                columns.add(name, block[:, at])
-                except NPZ_ERRORS as error:
-                    raise RecordingError(
-                        f"{self.path}: array '{member}' is damaged ({error})"
-                    ) from error
-        yield LogRun(self.path.stem, str(self.path), {"": Table(columns)})
-
-    def _name_columns(self, member: str) -> list[str]:
-        return _name_array_columns(member.removesuffix(".npy"), self._members[member])
-
-
-class MatlabLog(LogFile):
-    """A MATLAB file up to version 7 as a log with one table."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        shapes = {}
-        for name, shape, kind in self._call(matlab.whosmat):
-            if kind in MATLAB_NUMBERS and len(shape) == 2 and max(shape) > 1:
-                shapes[name] = (max(shape),) if min(shape) == 1 else shape
-        self._shapes = _select_longest(shapes)
+                if values.ndim == 1:
+                    columns[name] = values.astype(float)
+                else:
+                    columns |= {
+                        f"{name}[{i}]": values[:, i].astype(float) for i in range(values.shape[1])
+                    }
+            self._tables[table] = columns
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the real vectors of the most frequent length, and columns of such matrices."""
-        found = []
-        for name, shape in self._shapes.items():
-            found += _name_array_columns(name, shape)
-        return {"": found}
+        return {table: [*columns] for table, columns in self._tables.items()}
 
     def read_runs(
         self, wanted: Mapping[str, Collection[str]], max_rows: int | None
     ) -> Iterator[LogRun]:
-        """Yield the file as one run; arrays are read one at a time."""
-        names = wanted.get("", ())
-        columns = StoredColumns(names)
-        for array, shape in self._shapes.items():
-            several = _name_array_columns(array, shape)
-            if not any(name in names for name in several):
-                continue
-            at_array = f"array '{array}' "
-            values = self._call(matlab.loadmat, at_array, variable_names=[array])[array]
-            if values.dtype.kind not in "fiu":
-                raise RecordingError(f"{self.path}: array '{array}' is not real")
-            values = values.reshape(-1, 1) if len(shape) == 1 else values
-            for at, name in enumerate(several):
-                if name in names:
-                    columns.add(name, values[:max_rows, at])
-            # Two arrays of a long log would fill the memory.
-            del values
-        yield LogRun(self.path.stem, str(self.path), {"": Table(columns)})
+        """Yield the file as one run."""
+        tables = {}
+        for table, names in wanted.items():
+            tables[table] = Table({name: self._tables[table][name][:max_rows] for name in names})
+        yield LogRun(self.path.stem, str(self.path), tables)
 
-    def _call(self, reader: Any, place: str = "", **options: Any) -> Any:
-        try:
-            return reader(self.path, **options)
-        except NotImplementedError as error:
-            raise RecordingError(
-                f"{self.path}: a MATLAB file of version 7.3; save it again with save(…, '-v7')"
-            ) from error
-        except Exception as error:  # SciPy raises what its parser stumbles over
-            raise RecordingError(
-                f"{self.path}: {place}cannot be read as a MATLAB file up to version 7 ({error})"
-            ) from error
+
+def _read_npz(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Return the real vectors and matrices of a NumPy archive; pickled objects are never loaded."""
+    found, member = {}, None
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for member in archive.namelist():
+                with archive.open(member) as file:
+                    version = np.lib.format.read_magic(file)
+                    read_head = (
+                        np.lib.format.read_array_header_1_0
+                        if version == (1, 0)
+                        else np.lib.format.read_array_header_2_0
+                    )
+                    shape, _, kind = read_head(file)
+                if kind.kind in "fiub" and len(shape) in (1, 2) and shape[0] > 1:
+                    with archive.open(member) as file:
+                        found[member.removesuffix(".npy")] = np.lib.format.read_array(
+                            file, allow_pickle=False
+                        )
+    except NPZ_ERRORS as error:
+        if member is None:
+            raise RecordingError(f"{path}: cannot be read as a NumPy archive ({error})") from error
+        raise RecordingError(f"{path}: array '{member}' is damaged ({error})") from error
+    return {"": found}
+
+
+def _read_matlab(path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Return the arrays of a MATLAB file up to version 7, those of Simulink structures by their labels."""
+    tables: dict[str, dict[str, np.ndarray]] = {"": {}}
+    for name in [name for name, *_ in _call_matlab(path, matlab.whosmat, "")]:
+        options = {"variable_names": [name], "simplify_cells": True}
+        content = _call_matlab(path, matlab.loadmat, f"array '{name}' ", **options)
+        _add_array(tables, name, content.get(name))
+    if not any(tables.values()):
+        raise RecordingError(
+            f"{path}: holds no array of numbers that can be read; save arrays or structures with time, "
+            "for objects (timeseries, Dataset) Simulink's format 'Structure With Time'"
+        )
+    return {name: arrays for name, arrays in tables.items() if arrays}
+
+
+def _add_array(tables: dict[str, dict[str, np.ndarray]], name: str, value: Any) -> None:
+    """Add a variable to the tables: an array, the fields of a structure, or a structure of Simulink."""
+    if isinstance(value, Mapping) and "signals" in value:
+        time = np.atleast_1d(value.get("time", np.empty(0)))
+        arrays = tables.setdefault(name, {"time": time}) if time.size > 1 else tables[""]
+        signals = value["signals"]
+        several = signals if isinstance(signals, (list, np.ndarray)) else [signals]
+        for number, signal in enumerate(several):
+            label = str(signal.get("label") or signal.get("blockName") or f"{name}[{number}]")
+            _add_array(
+                {"": arrays},
+                label if label not in arrays else f"{label}[{number}]",
+                signal["values"],
+            )
+    elif isinstance(value, Mapping):
+        for field, inner in value.items():
+            _add_array(tables, f"{name}.{field}", inner)
+    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub" and value.size > 1:
+        plain = value.squeeze()
+        if plain.ndim == 3:  # Simulink keeps matrices over time as (rows, columns, T)
+            plain = plain.reshape(-1, plain.shape[-1]).T
+        if plain.ndim <= 2:
+            tables[""][name] = plain
+
+
+def _call_matlab(path: Path, read: Any, place: str, **options: Any) -> Any:
+    try:
+        return read(path, **options)
+    except NotImplementedError as error:
+        raise RecordingError(
+            f"{path}: a MATLAB file of version 7.3; save it again with save(…, '-v7')"
+        ) from error
+    except Exception as error:  # SciPy raises what its parser stumbles over
+        raise RecordingError(
+            f"{path}: {place}cannot be read as a MATLAB file up to version 7 ({error})"
+        ) from error
 
 
 def _read_labels(features: Mapping[str, Any]) -> dict[str, list[str]]:
@@ -231,131 +231,81 @@ def _read_labels(features: Mapping[str, Any]) -> dict[str, list[str]]:
 
 def _name_items(path: Path, labels: Mapping[str, list[str]]) -> dict[str, list[str]]:
     """Return the names that each column of a Parquet file gives: itself, or those of its items."""
-    file = _open_parquet(path)
     try:
-        return _name_fields(file, labels)
-    except PARQUET_ERRORS as error:
-        raise RecordingError(f"{path}: damaged in its first rows ({error})") from error
-
-
-def _name_fields(file: pq.ParquetFile, labels: Mapping[str, list[str]]) -> dict[str, list[str]]:
-    items, uncertain = {}, []
-    for field in file.schema_arrow:
-        if _is_number(field.type):
-            items[field.name] = [field.name]
-        elif pa.types.is_fixed_size_list(field.type) and _is_number(field.type.value_type):
-            items[field.name] = _name_list(field.name, field.type.list_size, labels)
-        elif _is_list(field.type) and _is_number(field.type.value_type):
-            uncertain.append(field.name)
-    if uncertain and file.metadata.num_rows:
-        head = next(file.iter_batches(batch_size=1, columns=uncertain))
-        for name in uncertain:
-            items[name] = _name_list(name, len(head.column(name)[0]), labels)
-    return items
-
-
-def _name_list(column: str, length: int, labels: Mapping[str, list[str]]) -> list[str]:
-    names = labels.get(column, [])
-    if len(names) != length or len(set(names)) != length:
-        names = [str(i) for i in range(length)]
-    return [f"{column}[{name}]" for name in names]
-
-
-def _is_number(kind: pa.DataType) -> bool:
-    return pa.types.is_floating(kind) or pa.types.is_integer(kind)
-
-
-def _is_list(kind: pa.DataType) -> bool:
-    return pa.types.is_list(kind) or pa.types.is_large_list(kind)
-
-
-def _open_parquet(path: Path) -> pq.ParquetFile:
-    try:
-        file = pq.ParquetFile(path)
-        # Names of columns are decoded here.
-        _ = file.schema_arrow
-        return file
+        with pq.ParquetFile(path) as file:
+            schema = file.schema_arrow  # names of columns are decoded here
+            head = next(file.iter_batches(batch_size=1), None)
     except FileNotFoundError as error:
         raise RecordingError(f"{path}: no such log") from error
     except PARQUET_ERRORS as error:
         raise RecordingError(f"{path}: cannot be read as parquet ({error})") from error
+    items = {}
+    for field in schema:
+        kind = field.type
+        if _is_number(kind):
+            items[field.name] = [field.name]
+        elif _is_list(kind) and _is_number(kind.value_type) and head is not None and len(head):
+            length = len(head.column(field.name)[0] or [])
+            names = labels.get(field.name, [])
+            if len(names) != length or len(set(names)) != length:
+                names = [str(i) for i in range(length)]
+            items[field.name] = [f"{field.name}[{name}]" for name in names]
+    return items
+
+
+def _is_number(kind: pa.DataType) -> bool:
+    return (
+        pa.types.is_floating(kind)
+        or pa.types.is_integer(kind)
+        or pa.types.is_boolean(kind)
+        or pa.types.is_timestamp(kind)
+    )
+
+
+def _is_list(kind: pa.DataType) -> bool:
+    return (
+        pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)
+    )
 
 
 def _read_parquet(
     path: Path, items: Mapping[str, list[str]], names: Collection[str], max_rows: int | None
-) -> StoredColumns:
+) -> dict[str, np.ndarray]:
     """Return the named columns, each `(T,)`; NaN for an empty cell."""
     wanted = [column for column, several in items.items() if any(n in names for n in several)]
-    columns = StoredColumns(n for column in wanted for n in items[column] if n in names)
+    parts: dict[str, list[np.ndarray]] = {}
     row = 0
     try:
-        for batch in _open_parquet(path).iter_batches(batch_size=BLOCK_ROWS, columns=wanted):
-            for column in wanted:
-                values = _convert_array(batch.column(column), len(items[column]))
-                for at, name in enumerate(items[column]):
-                    if name in names:
-                        columns.add(name, values[:, at])
-            row += batch.num_rows
-            if max_rows is not None and row >= max_rows:
-                break
+        with pq.ParquetFile(path) as file:
+            for batch in file.iter_batches(batch_size=BATCH_ROWS, columns=wanted):
+                for column in wanted:
+                    values = _convert_array(batch.column(column), len(items[column]))
+                    for at, name in enumerate(items[column]):
+                        if name in names:
+                            parts.setdefault(name, []).append(values[:, at])
+                row += batch.num_rows
+                if max_rows is not None and row >= max_rows:
+                    break
     except PARQUET_ERRORS as error:
         raise RecordingError(
-            f"{path}: damaged in the {BLOCK_ROWS} rows from row {row} on ({error})"
+            f"{path}: damaged in the {BATCH_ROWS} rows from row {row} on ({error})"
         ) from error
-    return columns
+    return {name: np.concatenate(several) for name, several in parts.items()}
 
 
 def _convert_array(values: pa.Array, length: int) -> np.ndarray:
-    """Return numbers or lists of numbers as `(T, K)`.
+    """Return numbers or lists of numbers as `(T, K)`; times as s since 1970.
 
     Raises:
         ValueError: A list has another length.
     """
+    if pa.types.is_timestamp(values.type):
+        plain = values.cast(pa.timestamp("ns")).cast(pa.int64()).to_numpy(zero_copy_only=False)
+        return np.asarray(plain, dtype=float).reshape(-1, 1) / 1e9
     if _is_number(values.type):
-        return values.cast(pa.float64()).to_numpy(zero_copy_only=False).reshape(-1, 1)
+        kind = pa.uint8() if pa.types.is_boolean(values.type) else values.type
+        return values.cast(kind).cast(pa.float64()).to_numpy(zero_copy_only=False).reshape(-1, 1)
     flat = values.flatten()
     if len(flat) != length * len(values) or values.null_count:
         raise ValueError(f"a list of another length than {length}")
     return flat.cast(pa.float64()).to_numpy(zero_copy_only=False).reshape(-1, length)
-
-
-def _select_longest(shapes: Mapping[str, tuple[int, ...]]) -> dict[str, tuple[int, ...]]:
-    """Return the arrays of the most frequent number of rows."""
-    lengths = [shape[0] for shape in shapes.values()]
-    length = max(lengths, key=lengths.count, default=0)
-    return {name: shape for name, shape in shapes.items() if shape[0] == length}
-
-
-def _name_array_columns(name: str, shape: tuple[int, ...]) -> list[str]:
-    return [name] if len(shape) == 1 else [f"{name}[{i}]" for i in range(shape[1])]
-
-
-def _read_npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Return shape, whether columns lie together, and type of an array."""
-    version = npy.read_magic(file)
-    if version == (1, 0):
-        return npy.read_array_header_1_0(file)
-    if version == (2, 0):
-        return npy.read_array_header_2_0(file)
-    raise ValueError(f"array of format version {version}, expected 1.0 or 2.0")
-
-
-def _read_npy_blocks(file: IO[bytes], max_rows: int | None) -> Iterator[np.ndarray]:
-    """Yield blocks of rows, `(B, K)`, of an array of one or two axes."""
-    shape, is_by_column, kind = _read_npy_header(file)
-    num_rows, width = shape[0], shape[1] if len(shape) == 2 else 1
-    if is_by_column and width > 1:  # the rows do not lie together: read it whole
-        data = np.frombuffer(_read_exactly(file, num_rows * width * kind.itemsize), kind)
-        yield data.reshape(width, num_rows).T[:max_rows]
-        return
-    for begin in range(0, min(num_rows, max_rows or num_rows), BLOCK_ROWS):
-        count = min(BLOCK_ROWS, num_rows - begin)
-        data = _read_exactly(file, count * width * kind.itemsize)
-        yield np.frombuffer(data, kind).reshape(count, width)
-
-
-def _read_exactly(file: IO[bytes], size: int) -> bytes:
-    data = file.read(size)
-    if len(data) < size:
-        raise EOFError(f"{len(data)} of {size} bytes are there")
-    return data

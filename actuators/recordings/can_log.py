@@ -1,14 +1,15 @@
-"""Logs of a CAN bus (BLF or ASC), decoded by a DBC file.
+"""Logs of a CAN bus (BLF, ASC, TRC, candump), decoded by a DBC file.
 
-Each message of the DBC is a table with its signals and `time`, the time of the frame in s. Frames are
-read and decoded by blocks: a BLF file of 1 GB holds tens of millions of them.
+Each message of the DBC is a table with its signals and `time`, the time of the frame in s. A message is
+known by its number and its kind, 11-bit or 29-bit. Signals of one page of a multiplexed message are
+missing in the rows of the others. Frames are read and decoded by blocks.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -16,38 +17,45 @@ from typing import Any
 import can
 import cantools
 import numpy as np
-from can.io.asc import ASC_MESSAGE_REGEX
 
-from actuators.recordings.log_tables import BLOCK_ROWS, LogFile, LogRun, StoredColumns, Table
+from actuators.recordings.advice import advise
+from actuators.recordings.log_tables import LogFile, LogRun, Table
 from brokk_rl import registry
 from brokk_rl.errors import ConfigError, RecordingError
 
 TIME = "time"
 HEAD_FRAMES = 20000
 """Frames from the beginning in which messages are looked for: slow ones come once a second."""
+BLOCK_FRAMES = 65536
 WORD_BYTES = 8
 """Data of a classic frame."""
 BLF_FRAME = np.dtype(
     [
-        ("signature", "S4"), ("header_size", "<u2"), ("version", "<u2"), ("size", "<u4"), ("kind", "<u4"),
-        ("time_unit", "<u4"), ("client", "<u2"), ("object_version", "<u2"), ("ticks", "<u8"),
-        ("channel", "<u2"), ("flags", "u1"), ("length", "u1"), ("frame_id", "<u4"), ("data", "u1", (WORD_BYTES,)),
+        ("signature", "S4"),
+        ("header_size", "<u2"),
+        ("version", "<u2"),
+        ("size", "<u4"),
+        ("kind", "<u4"),
+        ("time_unit", "<u4"),
+        ("client", "<u2"),
+        ("object_version", "<u2"),
+        ("ticks", "<u8"),
+        ("channel", "<u2"),
+        ("flags", "u1"),
+        ("length", "u1"),
+        ("frame_id", "<u4"),
+        ("data", "u1", (WORD_BYTES,)),
     ]
-)  # fmt: skip
+)
 """A classic frame in a BLF file, as `can.io.blf` unpacks it: object header, its version 1, CAN message."""
 CLASSIC_KIND, REMOTE_FLAG, ID_BITS = 1, 0x80, 0x1FFFFFFF
-ASC_BLOCK_CHARACTERS = 4 << 20
-"""Characters of an ASC file whose lines are parsed at once."""
-ASC_FRAME = re.compile(
-    r"^[ \t]*(\d+\.\d+)[ \t]+\d+[ \t]+([0-9A-Fa-f]+[xX]?)[ \t]+[RT]x[ \t]+d[ \t]+([0-8])([ 0-9A-Fa-f]*)",
-    re.MULTILINE | re.ASCII,
-)
-"""A line of a classic frame with data: time in s, identifier, number of bytes, the bytes and more."""
-ASC_DATA = re.compile(r"[ \t][RT]x[ \t]+d[ \t]")
-"""Sign of a line of a frame, whatever the rest of it has become."""
-NO_BYTES = " 00" * WORD_BYTES
+EXTENDED = 1 << 31
+"""Bit of an identifier that has 29 bits, as in BLF and DBC files."""
 TICKS_OF_10_US = 1
 """Time unit of 10 µs; others are of 1 ns."""
+PRINTED_LINE = re.compile(
+    r"^\s*(\(\d+\.\d+\))\s+(\S+)\s+([0-9A-Fa-f]+)\s+\[\d+\]((?:\s+[0-9A-Fa-f]{2})*).*$"
+)
 
 
 @dataclass(frozen=True)
@@ -56,13 +64,15 @@ class FrameBlock:
 
     Attributes:
         time_s: Their times, `(N,)`.
-        frame_id: Their identifiers, `(N,)`.
+        frame_id: Their identifiers, with `EXTENDED` for one of 29 bits, `(N,)`.
+        channel: Channels of the recorder, `(N,)`.
         length: Bytes of their data, `(N,)`.
         data: The data, zero beyond its end, `(N, B)`.
     """
 
     time_s: np.ndarray
     frame_id: np.ndarray
+    channel: np.ndarray
     length: np.ndarray
     data: np.ndarray
 
@@ -84,65 +94,18 @@ class BlfBlockReader(can.BLFReader):
         self._pos = len(frames) * BLF_FRAME.itemsize
         unit_s = np.where(frames["time_unit"] == TICKS_OF_10_US, 1e-5, 1e-9)
         time_s = frames["ticks"] * unit_s + self.start_timestamp
-        chosen = frames["flags"] & REMOTE_FLAG == 0
         length = np.minimum(frames["length"], WORD_BYTES)
         inside = np.arange(WORD_BYTES) < length[:, None]
         content = np.where(inside, frames["data"], 0).astype(np.uint8)
-        found = FrameBlock(time_s, frames["frame_id"] & ID_BITS, length, content)
-        yield select_frames(found, chosen)
-
-
-class AscBlockReader(can.ASCReader):
-    """A reader that parses lines of classic frames by blocks, and leaves others to python-can."""
-
-    def __iter__(self) -> Iterator[Any]:
-        self._extract_header()
-        file: Any = self.file
-        while lines := file.readlines(ASC_BLOCK_CHARACTERS):
-            found = ASC_FRAME.findall("".join(lines)) if self.base == "hex" else []
-            others = lines if not found else []
-            if 0 < len(found) < len(lines):
-                others = [line for line in lines if not ASC_FRAME.match(line)]
-            if found:
-                yield parse_asc_frames(found)
-            if others:
-                for line in others:
-                    if ASC_DATA.search(line) and not ASC_MESSAGE_REGEX.match(line.strip()):
-                        raise ValueError(f"the line '{line.strip()}' is no frame")
-                # python-can skips the header, whose last line this is.
-                self.file = StringIO("internal events logged\n" + "".join(others))
-                try:
-                    yield from super().__iter__()
-                finally:
-                    self.file = file
-            end = lines[-1].strip().lower()
-            if not lines[-1].endswith("\n") and not end.startswith("end triggerblock"):
-                raise ValueError(f"the last line, '{end}', is cut off")
-        self.stop()
-
-
-def parse_asc_frames(found: list[tuple[str, str, str, str]]) -> FrameBlock:
-    """Return frames as a block: time, identifier, number and text of the bytes of each."""
-    times, identifiers, lengths, texts = zip(*found, strict=True)
-    numbers = {text: int(text.rstrip("xX"), 16) for text in set(identifiers)}
-    length = np.array(list(map(int, lengths)))
-    is_short = np.array(list(map(len, texts))) < 3 * length
-    if is_short.any():
-        number = int(np.argmax(is_short))
-        raise ValueError(
-            f"the frame at {times[number]} s has {len(texts[number]) // 3} bytes of {length[number]}"
-        )
-    sizes = (3 * length).tolist()
-    content = [text[:size] + NO_BYTES[size:] for size, text in zip(sizes, texts, strict=True)]
-    data = np.frombuffer(bytes.fromhex("".join(content)), np.uint8)
-    frame_id = np.array([numbers[text] for text in identifiers])
-    time_s = np.array(list(map(float, times)))
-    return FrameBlock(time_s, frame_id, length, data.reshape(-1, WORD_BYTES))
+        frame_id = frames["frame_id"] & np.uint32(ID_BITS | EXTENDED)
+        channel = frames["channel"].astype(int) - 1  # python-can counts from 0
+        found = FrameBlock(time_s, frame_id.astype(np.int64), channel, length, content)
+        yield select_frames(found, frames["flags"] & REMOTE_FLAG == 0)
 
 
 def select_frames(block: FrameBlock, chosen: np.ndarray) -> FrameBlock:
     """Return some frames of a block."""
-    return FrameBlock(*(getattr(block, name)[chosen] for name in FrameBlock.__dataclass_fields__))
+    return FrameBlock(*(getattr(block, one.name)[chosen] for one in fields(FrameBlock)))
 
 
 def gather_frames(frames: list[can.Message]) -> FrameBlock:
@@ -150,34 +113,65 @@ def gather_frames(frames: list[can.Message]) -> FrameBlock:
     lengths = [len(frame.data) for frame in frames]
     widest = max(WORD_BYTES, *lengths)
     text = b"".join(bytes(frame.data).ljust(widest, b"\0") for frame in frames)
+    names = {name: at for at, name in enumerate(sorted({str(frame.channel) for frame in frames}))}
+    channels = []
+    for frame in frames:
+        text_of_number = re.search(r"\d+$", str(frame.channel))
+        channels.append(int(text_of_number[0]) if text_of_number else names[str(frame.channel)])
     return FrameBlock(
         np.array([frame.timestamp for frame in frames]),
-        np.array([frame.arbitration_id for frame in frames]),
+        np.array(
+            [frame.arbitration_id | (EXTENDED if frame.is_extended_id else 0) for frame in frames]
+        ),
+        np.array(channels),
         np.array(lengths),
         np.frombuffer(text, np.uint8).reshape(len(frames), widest),
     )
 
 
 class CanLog(LogFile):
-    """A log of a CAN bus."""
+    """A log of a CAN bus.
 
-    def __init__(self, path: Path, dbc: str) -> None:
+    Args:
+        path: The file.
+        dbc: Its DBC file.
+        channel: Channel of the recorder to read; `None` for all, where no message comes on two.
+    """
+
+    def __init__(self, path: Path, dbc: str, channel: int | None = None) -> None:
         super().__init__(path)
-        self._messages = {message.frame_id: message for message in load_dbc(dbc)}
+        self._channel = channel
+        self._messages = {}
+        for message in load_dbc(dbc):
+            self._messages[message.frame_id | (EXTENDED if message.is_extended_frame else 0)] = (
+                message
+            )
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the signals of the messages of the DBC that the beginning of the log has."""
-        seen: set[int] = set()
+        seen: dict[int, set[int]] = {}
         count = 0
         for block in self._iterate():
-            seen.update(np.unique(block.frame_id).tolist())
+            pairs = np.unique(np.stack([block.frame_id, block.channel], 1), axis=0)
+            for frame_id, channel in pairs.tolist():
+                seen.setdefault(frame_id, set()).add(channel)
             count += len(block.frame_id)
             if count >= HEAD_FRAMES:
                 break
         tables = {}
         for frame_id, message in self._messages.items():
-            if frame_id in seen:
+            channels = sorted(seen.get(frame_id, ()))
+            if len(channels) > 1:
+                self._refuse_channels(message.name, channels)
+            if channels:
                 tables[message.name] = [TIME, *(signal.name for signal in message.signals)]
+        if not tables:
+            ids = ", ".join(
+                f"0x{one & ID_BITS:X}{'x' if one & EXTENDED else ''}" for one in sorted(seen)[:8]
+            )
+            raise RecordingError(
+                f"{self.path}: no message of the DBC is in this log; its identifiers are {ids or 'none'}"
+            )
         return tables
 
     def read_runs(
@@ -185,35 +179,51 @@ class CanLog(LogFile):
     ) -> Iterator[LogRun]:
         """Yield the log as one run."""
         chosen = {i: m for i, m in self._messages.items() if m.name in wanted}
-        names = {i: [s.name for s in m.signals if s.name in wanted[m.name]] for i, m in chosen.items()}  # fmt: skip
-        stores = {i: StoredColumns([TIME, *several]) for i, several in names.items()}
-        counts = dict.fromkeys(chosen, 0)
-        before = 0
+        names: dict[int, list[str]] = {}
+        for at, message in chosen.items():
+            names[at] = [
+                signal.name for signal in message.signals if signal.name in wanted[message.name]
+            ]
+        parts: dict[int, list[list[np.ndarray]]] = {at: [] for at in chosen}
+        counts, before = dict.fromkeys(chosen, 0), 0
         for block in self._iterate():
             for at, message in chosen.items():
                 rows = np.flatnonzero(block.frame_id == at)
                 rows = rows[: None if max_rows is None else max_rows - counts[at]]
-                if not len(rows):
-                    continue
-                part = select_frames(block, rows)
-                values = self._decode(message, names[at], part, before + rows)
-                stores[at].add(TIME, part.time_s)
-                for name, column in values.items():
-                    stores[at].add(name, column)
-                counts[at] += len(rows)
+                if len(rows):
+                    part = select_frames(block, rows)
+                    channels = np.unique(part.channel)
+                    if len(channels) > 1:
+                        self._refuse_channels(message.name, channels.tolist())
+                    values = self._decode(message, names[at], part, before + rows)
+                    parts[at].append([part.time_s, *values])
+                    counts[at] += len(rows)
             before += len(block.frame_id)
             if max_rows is not None and all(count >= max_rows for count in counts.values()):
                 break
-        tables = {chosen[at].name: Table(store) for at, store in stores.items()}
+        tables = {}
+        for at, message in chosen.items():
+            blocks = parts[at] or [[np.empty(0)] * (1 + len(names[at]))]
+            values = [np.concatenate(column) for column in zip(*blocks, strict=True)]
+            columns = dict(zip([TIME, *names[at]], values, strict=True))
+            units = {signal.name: signal.unit for signal in message.signals if signal.unit}
+            tables[message.name] = Table(columns, units, TIME, message.is_multiplexed())
         yield LogRun(self.path.stem, str(self.path), tables)
+
+    def _refuse_channels(self, name: str, channels: list[int]) -> None:
+        listed = ", ".join(map(str, channels))
+        raise RecordingError(
+            f"{self.path}: message '{name}' comes on the channels {listed}, which are two sources; "
+            f"{advise('channel', channel=channels[0])}"
+        )
 
     def _decode(
         self, message: Any, names: list[str], block: FrameBlock, numbers: np.ndarray
-    ) -> dict[str, np.ndarray]:
+    ) -> list[np.ndarray]:
         """Return the named signals of frames of one message; `numbers` are those of the frames."""
         if is_plain(message) and (block.length >= message.length).all():
             signals = {signal.name: signal for signal in message.signals}
-            return {name: extract_signal(signals[name], block.data) for name in names}
+            return [extract_signal(signals[name], block.data) for name in names]
         rows = []
         for number, time_s, length, data in zip(
             numbers, block.time_s, block.length, block.data, strict=True
@@ -221,40 +231,40 @@ class CanLog(LogFile):
             try:
                 values: Any = message.decode(data[:length].tobytes(), decode_choices=False)
             except Exception as error:  # cantools and bitstruct raise what they stumble over
-                raise RecordingError(
-                    f"{self.path}: frame {number} at {time_s:.6f} s: is no message '{message.name}' of the DBC "
-                    f"({error})"
-                ) from error
+                text = f"frame {number} at {time_s:.6f} s: is no message '{message.name}' of the DBC ({error})"
+                self.report_damage(text, error)
+                values = {}
             rows.append([values.get(name, np.nan) for name in names])
-        return dict(zip(names, np.array(rows, dtype=float).T, strict=True))
-
-    def _check_size(self, reader: Any) -> None:
-        """Refuse a BLF file that is shorter than its header says; python-can reads it without a word."""
-        stated, there = getattr(reader, "file_size", 0), self.path.stat().st_size
-        if there < stated:
-            self.report_damage(f"cut off at byte {there} of {stated}", None)
+        return list(np.array(rows, dtype=float).reshape(len(rows), len(names)).T)
 
     def _open(self) -> Any:
         ending = self.path.suffix.lower()
         if ending == ".blf":
             return BlfBlockReader(self.path)
-        return (
-            AscBlockReader(self.path, encoding="utf-8")
-            if ending == ".asc"
-            else can.LogReader(self.path)
-        )
+        if ending in (".log", ".txt"):
+            return can.CanutilsLogReader(StringIO(read_candump(self.path)))
+        return can.LogReader(self.path)
 
     def _iterate(self) -> Iterator[FrameBlock]:
-        """Yield the frames that carry data, by blocks."""
+        """Yield the frames of the chosen channel that carry data, by blocks."""
+        for block in self._iterate_all():
+            if self._channel is None:
+                yield block
+            else:
+                yield select_frames(block, block.channel == self._channel)
+
+    def _iterate_all(self) -> Iterator[FrameBlock]:
         count, last_s = 0, 0.0
         waiting: list[can.Message] = []
         try:
             with self._open() as reader:
-                self._check_size(reader)
-                frames: Iterator[Any] = iter(reader)
-                for found in frames:
+                # python-can reads a file that is shorter than its header says without a word
+                stated, there = getattr(reader, "file_size", 0), self.path.stat().st_size
+                if there < stated:
+                    self.report_damage(f"cut off at byte {there} of {stated}", None)
+                for found in reader:
                     is_block = isinstance(found, FrameBlock)
-                    if waiting and (is_block or len(waiting) >= BLOCK_ROWS):
+                    if waiting and (is_block or len(waiting) >= BLOCK_FRAMES):
                         yield gather_frames(waiting)
                         waiting = []
                     if is_block:
@@ -267,15 +277,28 @@ class CanLog(LogFile):
                         waiting.append(found)
             if waiting:
                 yield gather_frames(waiting)
+        except RecordingError:
+            raise
         except Exception as error:  # python-can raises what its parsers stumble over
-            if isinstance(error, RecordingError):
-                raise
-            text = (
-                f"damaged after frame {count} at {last_s:.6f} s ({type(error).__name__}: {error})"
+            kind = type(error).__name__
+            self.report_damage(
+                f"damaged after frame {count} at {last_s:.6f} s ({kind}: {error})", error
             )
-            self.report_damage(text, error)
             if waiting:
                 yield gather_frames(waiting)
+
+
+def read_candump(path: Path) -> str:
+    """Return the frames of a log of candump as `candump -l` writes them."""
+    lines = []
+    for line in path.read_text(errors="replace").splitlines():
+        printed = PRINTED_LINE.match(line)
+        if printed:
+            data = "".join(printed[4].split())
+            lines.append(f"{printed[1]} {printed[2]} {printed[3]}#{data}")
+        elif line.lstrip().startswith("("):
+            lines.append(line.strip())
+    return "\n".join(lines) + "\n"
 
 
 def is_plain(message: Any) -> bool:

@@ -16,33 +16,26 @@ that an editor shows.
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from scipy.stats import theilslopes
 
-from actuators.recordings.expression import Expression
+from actuators.recordings.clocks import AlignedTime, Column, RowTime, TimeColumn, list_time_columns
 from actuators.recordings.log_files import Damaged, open_log
 from actuators.recordings.log_signals import (
     Piece,
     Places,
-    RunClocks,
     RunSignals,
     Signal,
-    compute_by_slices,
-    find_first,
-    index_columns,
     locate,
     refuse_missing,
     resolve_column,
 )
-from actuators.recordings.log_tables import LogFile, LogRun, join_names
-from actuators.recordings.text_log import CsvLayout
-from actuators.recordings.whole_rows import HOW_TO_SKIP, leave_broken_rows_out
+from actuators.recordings.log_tables import LogFile, index_columns, join_names
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
@@ -51,53 +44,16 @@ from brokk_rl.spec import NonNegative, Positive, spec
 
 log = logging.getLogger(__name__)
 
-CLOCK_POINTS = 200
-"""Points of the line that ties one clock to another; its cost grows with their square, and 200
-points of the fastest messages fix a drift of 1 ppm within minutes."""
-
-
-@spec
-class Column:
-    """A column of numbers: `scale * value + offset`.
-
-    Attributes:
-        column: Its name in the log, or arithmetic over columns.
-        scale: Unit of the recording for one of the log.
-        offset: Added after scaling, in the unit of the recording.
-    """
-
-    column: str
-    scale: float
-    offset: float
-
-
-@spec
-class AlignedTime:
-    """A clock that is tied to another one of the same table by a straight line.
-
-    Samples carry the time of the sensor's own clock, whose zero and drift are unknown, and that of
-    the recorder, which is late by the varying time of the transport. The line goes through the
-    samples that were fastest.
-
-    Attributes:
-        column: Time of the sensor's clock.
-        scale: Seconds for one of it.
-        anchor: Time of the recorder's clock, to s.
-    """
-
-    column: str
-    scale: float
-    anchor: Column
-
-    def align(self, stamp_s: np.ndarray, anchor_s: np.ndarray) -> np.ndarray:
-        """Return times of the recorder's clock without the scatter of the transport, `(T,)` s."""
-        late_s = anchor_s - stamp_s
-        blocks = np.array_split(np.arange(len(late_s)), min(CLOCK_POINTS, len(late_s)))
-        fastest = [int(rows[np.argmin(late_s[rows])]) for rows in blocks]
-        x, y = stamp_s[fastest] - stamp_s[0], late_s[fastest]
-        line: Any = theilslopes(y, x) if len(fastest) > 2 and np.ptp(x) > 0 else (0.0,)
-        slope = float(line[0])
-        return stamp_s + float(np.median(y - slope * x)) + slope * (stamp_s - stamp_s[0])
+__all__ = [
+    "AlignedTime",
+    "CanColumnMap",
+    "Column",
+    "ColumnMap",
+    "CommandColumn",
+    "JointColumns",
+    "RowTime",
+    "TargetColumn",
+]
 
 
 @spec
@@ -160,12 +116,14 @@ class TargetColumn:
             `max_speed`, for a model that integrates commands to give the target. `null` for a
             machine that is commanded by position.
         offset: Added after scaling, in the unit of the recording.
+        wraps: As of a `Column`.
     """
 
     column: str
     scale: float
     full_speed: float | None
     offset: float = 0.0  # maps from before this field have none
+    wraps: float | None = None
 
     def check(self) -> None:
         if (self.full_speed is not None and self.full_speed <= 0) or self.scale == 0:
@@ -211,9 +169,9 @@ class ColumnMap:
         damaged: `refuse` a log with damage, or `skip` its damaged rows, messages, chunks and frames.
     """
 
-    delimiter: Literal[",", ";", "\t", " "]
+    delimiter: Literal[",", ";", "\t", " ", "|"]
     decimal: Literal[".", ","]
-    time: Column | AlignedTime | dict[str, Column | AlignedTime]
+    time: Column | AlignedTime | RowTime | dict[str, Column | AlignedTime | RowTime]
     joints: dict[str, JointColumns]
     optional: dict[str, Column]
     overrun: NonNegative
@@ -227,7 +185,7 @@ class ColumnMap:
                 f"column map: '{self.decimal}' cannot be both delimiter and decimal sign"
             )
         for time in self.time.values() if isinstance(self.time, dict) else (self.time,):
-            if time.scale <= 0:
+            if not isinstance(time, RowTime) and time.scale <= 0:
                 raise ConfigError(f"column map: time.scale {time.scale:g} must be positive")
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
@@ -237,8 +195,8 @@ class ColumnMap:
             ConfigError: the map is not for this machine.
             RecordingError: the log cannot be used; names file, line, row and column.
         """
-        layout = CsvLayout(self.delimiter, self.decimal)
-        return self.read_log(open_log(path, layout, damaged=self.damaged), machine)
+        signs = (self.delimiter, self.decimal)
+        return self.read_log(open_log(path, signs, damaged=self.damaged), machine)
 
     def read_log(self, opened: LogFile, machine: Machine) -> list[Recording]:
         """Return the pieces of an opened log; see `read`."""
@@ -248,16 +206,12 @@ class ColumnMap:
                 f"{', '.join(machine.joint_names)}; choose machine=… and import=… that belong together"
             )
         self._check_interface(machine)
-        places = index_columns(opened.list_tables())
-        sources = {text: resolve_column(text, places, opened.path) for text in self._list_texts()}
-        wanted = self._list_wanted(sources, places, opened.path)
         found, num_rows = [], 0
-        for run in opened.read_runs(wanted, None):
-            if self.damaged == "skip":
-                run = self._leave_broken_rows_out(run, sources, places)
-            clocks = RunClocks(run, partial(_read_clock, run, column_map=self))
-            found += self._read_run(RunSignals(run, sources, places, clocks), clocks, machine)
-            num_rows += max(map(len, clocks.values()))
+        for signals in self.open_runs(opened, None):
+            found += self._read_run(signals, machine)
+            num_rows += max(
+                len(next(iter(one.columns.values()))) for one in signals.run.tables.values()
+            )
         if not found:
             raise RecordingError(
                 f"{opened.path}: no piece of {self.shortest_s:g} s or more without a gap of {self.longest_gap_s:g} s among its "
@@ -265,24 +219,14 @@ class ColumnMap:
             )
         return found
 
-    def _leave_broken_rows_out(
-        self, run: LogRun, sources: Mapping[str, Expression | str], places: Places
-    ) -> LogRun:
-        """Return a run without rows of which a joint's cell or the time cannot be used."""
-        needed: dict[str, set[str]] = {}
-        for joint in self.joints.values():
-            for text in (joint.command.column, joint.position.column):
-                source = sources[text]
-                for name in (source,) if isinstance(source, str) else source.names:
-                    table, column = places[name]
-                    needed.setdefault(table, set()).add(column)
-        clocks = {}
-        for table, columns in needed.items():
-            time = self.find_time(table, run.where)
-            clocks[table] = time.column
-            if isinstance(time, AlignedTime):
-                columns.add(time.anchor.column)
-        return leave_broken_rows_out(run, clocks, needed)
+    def open_runs(self, opened: LogFile, max_rows: int | None) -> Iterator[RunSignals]:
+        """Yield the signals of each run of a log, at most so many rows of each table."""
+        places = index_columns(opened.list_tables())
+        wanted = self._list_wanted(places, opened.path)
+        for run in opened.read_runs(wanted, max_rows):
+            find_time = partial(self.find_time, where=run.where)
+            skip = self.damaged == "skip"
+            yield RunSignals(run, places, find_time, skip, self.longest_gap_s)
 
     def _check_interface(self, machine: Machine) -> None:
         """Raise a `ConfigError` where targets are read as another quantity than the machine's command."""
@@ -297,7 +241,7 @@ class ColumnMap:
                     f"as {mend} in the column map"
                 )
 
-    def find_time(self, table: str, where: object) -> Column | AlignedTime:
+    def find_time(self, table: str, where: object) -> TimeColumn:
         """Return the time of a table.
 
         Raises:
@@ -311,37 +255,45 @@ class ColumnMap:
             )
         return self.time[table]
 
-    def _list_texts(self) -> list[str]:
+    def _list_wanted(self, places: Places, where: Path) -> dict[str, list[str]]:
+        """Return the columns to read by table, those of the clocks too."""
         texts = [column.column for column in self.optional.values()]
         for joint in self.joints.values():
             texts += [joint.command.column, joint.position.column]
-        return texts
-
-    def _list_wanted(
-        self, sources: Mapping[str, Expression | str], places: Places, where: Path
-    ) -> dict[str, set[str]]:
-        """Return the columns to read by table, those of the clocks too."""
-        wanted: dict[str, set[str]] = {}
-        for source in sources.values():
+        wanted: dict[str, dict[str, None]] = {}
+        for text in texts:
+            source = resolve_column(text, places, where)
             for name in (source,) if isinstance(source, str) else source.names:
                 table, column = places[name]
-                wanted.setdefault(table, set()).add(column)
+                wanted.setdefault(table, {})[column] = None
         for table, columns in wanted.items():
-            time = self.find_time(table, where)
-            texts = [time.column]
-            if isinstance(time, AlignedTime):
-                texts.append(time.anchor.column)
-            for text in texts:
-                refuse_missing(join_names(table, text), places, where)
-                columns.add(text)
-        return wanted
+            for text in list_time_columns(self.find_time(table, where)):
+                inside = {
+                    column: (table, column) for one, column in places.values() if one == table
+                }
+                source = resolve_column(text, inside, where)
+                for name in (source,) if isinstance(source, str) else source.names:
+                    refuse_missing(join_names(table, name), places, where)
+                    columns[name] = None
+        return {table: [*columns] for table, columns in wanted.items()}
 
-    def _read_run(
-        self, signals: RunSignals, clocks: Mapping[str, np.ndarray], machine: Machine
-    ) -> list[Recording]:
-        """Return the pieces of a run; one column after the other is read and resampled."""
+    def _read_run(self, signals: RunSignals, machine: Machine) -> list[Recording]:
+        """Return the pieces of a run, resampled to the rate of the machine."""
+        commands, positions = [], []
+        for j, name in enumerate(machine.joint_names):
+            middle = (machine.upper[j] + machine.lower[j]) / 2.0
+            position = read_column(signals, self.joints[name].position, middle)
+            positions.append(position)
+            commands.append(
+                self._read_command(signals, self.joints[name].command, position, machine, j)
+            )
+        optional = {}
+        for name, column in self.optional.items():
+            optional[name] = read_column(signals, column, None, empty=True)
+        # arithmetic has the clock of its first column, and gaps of the others count too
+        clocks = [signal.t_s for signal in (*commands, *positions)]
         spans_s, num_left_out = [], 0
-        for begin_s, end_s in record.split_at_gaps(clocks.values(), self.longest_gap_s):
+        for begin_s, end_s in record.split_at_gaps(clocks, self.longest_gap_s):
             if end_s - begin_s >= max(self.shortest_s, machine.period_s) - 1e-9:
                 spans_s.append((begin_s, end_s))
             else:
@@ -353,45 +305,44 @@ class ColumnMap:
                 num_left_out,
                 self.shortest_s,
             )
-        pieces = [Piece(begin_s, end_s, machine) for begin_s, end_s in spans_s]
-        for j, name in enumerate(machine.joint_names):
-            command = self._read_command(signals, self.joints[name].command, machine, j)
-            for piece in pieces:
+        found = []
+        for begin_s, end_s in spans_s:
+            piece = Piece(begin_s, end_s, machine)
+            for j, command in enumerate(commands):
                 read = command.average if machine.interface == "torque" else command.hold
                 piece.u[:, j] = read(piece.ticks_s, machine.period_s)
-            position = _scale(signals, self.joints[name].position)
-            for piece in pieces:
-                piece.q[:, j] = position.interpolate(piece.ticks_s)
-        for name, column in self.optional.items():
-            optional = _scale(signals, column, True)
-            for piece in pieces:
-                piece.extra[name] = optional.interpolate(piece.ticks_s).astype(np.float32)
-        clock_s = clocks[signals.find_table(self.joints[machine.joint_names[0]].position.column)]
-        return [piece.make_recording(signals.run, clock_s) for piece in pieces]
+                piece.q[:, j] = positions[j].interpolate(piece.ticks_s)
+            for name, signal in optional.items():
+                piece.extra[name] = signal.interpolate(piece.ticks_s).astype(np.float32)
+            found.append(piece.make_recording(signals.run, positions[0].t_s))
+        return found
 
     def _read_command(
         self,
         signals: RunSignals,
         column: CommandColumn | TargetColumn,
+        position: Signal,
         machine: Machine,
         joint: int,
     ) -> Signal:
-        signal = signals.read(column.column)
+        wraps = column.wraps if isinstance(column, TargetColumn) else None
+        signal = signals.read(column.column, wraps=wraps)
+        if isinstance(column, TargetColumn) and wraps:
+            signal = self._align_turns(signal, column, position)
         if isinstance(column, TargetColumn) and column.full_speed is None:
             low, high = machine.lower[joint], machine.upper[joint]
             middle, half = (high + low) / 2.0, (high - low) / 2.0
-            u = compute_by_slices(
-                lambda part: (column.scale * part + column.offset - middle) / half, signal.values
-            )
+            u = (column.scale * signal.values + column.offset - middle) / half
         elif isinstance(column, TargetColumn):
             u = column.command(signal.values, signal.t_s)
             # a gap between pieces is no motion of the target
             u[:-1][np.diff(signal.t_s) > self.longest_gap_s] = 0.0
         else:
-            u = compute_by_slices(column.command, signal.values)
-        row = find_first(u, lambda part: np.abs(part) <= 1.0 + self.overrun)
-        if row is not None:
-            where = locate(signals.run, signal.table, row, column.column)
+            u = column.command(signal.values)
+        is_beyond = ~(np.abs(u) <= 1.0 + self.overrun)
+        if is_beyond.any():
+            row = int(np.argmax(is_beyond))
+            where = locate(signals.run, signal, row, column.column)
             if np.isnan(u[row]):
                 raise RecordingError(
                     f"{where}: {signal.values[row]:g} lies on the side of neutral for which the column map has no full "
@@ -408,7 +359,14 @@ class ColumnMap:
                 f"{where}: command {u[row]:g} is beyond full by more than {self.overrun:g}; mend full_plus, full_minus, "
                 "neutral or full_speed of the column map, or the log"
             )
-        return Signal(signal.table, signal.t_s, np.clip(u, -1.0, 1.0, out=u), signal.text)
+        return replace(signal, values=np.clip(u, -1.0, 1.0))
+
+    def _align_turns(self, signal: Signal, column: TargetColumn, position: Signal) -> Signal:
+        """Return targets in the turn of the positions that follow them."""
+        targets = column.scale * signal.values + column.offset
+        turn = column.scale * abs(column.wraps or 0.0)
+        apart = float(np.median(position.interpolate(signal.t_s) - targets))
+        return replace(signal, values=signal.values + turn * round(apart / turn) / column.scale)
 
 
 @spec
@@ -417,54 +375,34 @@ class CanColumnMap:
 
     Attributes:
         dbc: The DBC file: a path, or `package:path` in an installed package.
+        channel: Channel of the recorder; `null` where each message comes on one.
         columns: The map; a signal is `<message>:<signal>`, the time of each message `time`.
     """
 
     dbc: str
     columns: ColumnMap
+    channel: int | None = None  # maps from before this field have none
 
     def read(self, path: Path, machine: Machine) -> list[Recording]:
         """Return the pieces of the log at `path`; see `ColumnMap.read`."""
-        # Imported here, since a desk without CAN has no python-can.
-        from actuators.recordings.can_log import CanLog
-
-        opened = CanLog(path, self.dbc)
-        opened.keep_whole = self.columns.damaged == "skip"
+        opened = open_log(path, dbc=self.dbc, damaged=self.columns.damaged, channel=self.channel)
         return self.columns.read_log(opened, machine)
 
 
-def _scale(signals: RunSignals, column: Column, empty: bool = False) -> Signal:
-    """Return a column in the unit of the recording."""
-    signal = signals.read(column.column, empty)
-    values = compute_by_slices(lambda part: column.scale * part + column.offset, signal.values)
-    return replace(signal, values=values)
+def read_column(
+    signals: RunSignals, column: Column, middle: float | None, empty: bool = False
+) -> Signal:
+    """Return a column in the unit of the recording.
 
-
-def _read_clock(run: LogRun, name: str, column_map: ColumnMap) -> np.ndarray:
-    """Return the times of a table, `(T,)` s.
-
-    Raises:
-        RecordingError: They do not increase.
+    Args:
+        signals: Signals of the run.
+        column: The column.
+        middle: Middle of the travel, next to which an unwrapped angle is put; `None` for no joint.
+        empty: Accept missing numbers.
     """
-    table, time = run.tables[name], column_map.find_time(name, run.where)
-    t_s = time.scale * np.asarray(table.columns[time.column], dtype=float)
-    if isinstance(time, Column):
-        t_s += time.offset
-    if len(t_s) < 2:
-        raise RecordingError(
-            f"{run.where}: table '{name}' has {len(t_s)} rows; a log has at least 2"
-        )
-    if (row := find_first(t_s, np.isfinite)) is not None:
-        text = table.show_cell(row, time.column)
-        raise RecordingError(
-            f"{locate(run, name, row, time.column)}: {text} is not a number; {HOW_TO_SKIP}"
-        )
-    if (row := find_first(np.diff(t_s), lambda step_s: step_s > 0)) is not None:
-        raise RecordingError(
-            f"{locate(run, name, row + 1, time.column)}: time does not increase ({t_s[row]:g} s, then {t_s[row + 1]:g} s); "
-            f"{HOW_TO_SKIP}"
-        )
-    if isinstance(time, AlignedTime):
-        anchor = np.asarray(table.columns[time.anchor.column], dtype=float)
-        t_s = time.align(t_s, time.anchor.scale * anchor + time.anchor.offset)
-    return t_s
+    signal = signals.read(column.column, empty, column.wraps)
+    values = column.scale * signal.values + column.offset
+    if column.wraps is not None and column.wraps > 0.0 and middle is not None:
+        turn = column.scale * column.wraps
+        values = values + turn * round((middle - float(np.median(values))) / turn)
+    return replace(signal, values=values)

@@ -10,67 +10,83 @@ from typing import Literal
 Role = Literal["command", "measured"]
 Quantity = Literal["position", "velocity", "effort", "unknown"]
 
-TIME_WORDS = {
-    "t",
-    "time",
-    "timestamp",
-    "stamp",
-    "clock",
-    "sec",
-    "seconds",
-    "nanosec",
-    "epoch",
-    "ts",
-    "datetime",
-    "date",
-    "zeit",
-    "zeitstempel",
-}
-COMMAND_WORDS = {
-    "u", "cmd", "cmds", "command", "commands", "commanded", "control", "ctrl", "action", "actions", "target", "targets",
-    "goal", "setpoint", "sp", "desired", "des", "ref", "reference", "demand", "request", "valve", "flow", "pwm", "duty", "soll",
-}  # fmt: skip
-MEASURED_WORDS = {
-    "q", "state", "states", "actual", "act", "meas", "measured", "ms", "feedback", "fb", "obs", "observation", "encoder",
-    "enc", "present", "status", "sensor", "ist",
-}  # fmt: skip
-TARGET_WORDS = {
-    "target",
-    "targets",
-    "goal",
-    "setpoint",
-    "sp",
-    "desired",
-    "des",
-    "ref",
-    "reference",
-    "soll",
-}
+
+def _split(text: str) -> frozenset[str]:
+    return frozenset(text.split())
+
+
+TIME_WORDS = _split("""
+    t time timestamp stamp clock sec secs seconds nanosec nanosecs nsec epoch ts tout
+    datetime date zeit zeitstempel uhrzeit datum temps tiempo elapsed millis micros
+""")
+COUNT_WORDS = _split("""
+    index idx row frame sample seq sequence step counter id no nr episode
+""")
+"""Words of numbers that count rows."""
+COMMAND_WORDS = _split("""
+    u cmd cmds command commands commanded control ctrl action actions target targets tgt
+    goal setpoint setpoints sp desired des ref reference demand request valve flow pwm duty
+    soll sollwert sollwinkel sollposition stellwert vorgabe consigne input joystick lever
+""")
+MEASURED_WORDS = _split("""
+    q state states actual act meas measured ms feedback fb obs observation encoder enc
+    present status sensor ist istwert istwinkel istposition mesure output
+""")
+TARGET_WORDS = _split("""
+    target targets tgt goal setpoint setpoints sp desired des ref reference soll sollwert
+    consigne
+""")
 """Words for commands that are positions unless another word says velocity or effort."""
-QUANTITY_WORDS: dict[Quantity, set[str]] = {
-    "position": {"q", "pos", "position", "positions", "angle", "angles", "length", "stroke", "ms", "ticks", "counts"},
-    "velocity": {"qd", "dq", "vel", "vels", "velocity", "velocities", "speed", "speeds", "rate"},
-    "effort": {
-        "tau", "torque", "torques", "effort", "efforts", "load", "loads", "current", "force", "pressure", "temp",
-        "temperature", "voltage", "kp", "kd", "stiffness", "damping",
-    },
-}  # fmt: skip
+QUANTITY_WORDS: dict[Quantity, frozenset[str]] = {
+    "position": _split("""
+        q pos position positions angle angles length stroke ms ticks counts winkel weg hub
+        lage sollwinkel istwinkel sollposition istposition
+    """),
+    "velocity": _split("""
+        qd dq vel vels velocity velocities speed speeds rate geschwindigkeit drehzahl
+        vitesse
+    """),
+    "effort": _split("""
+        tau torque torques effort efforts load loads current force pressure temp moment
+        temperature voltage kp kd stiffness damping drehmoment kraft strom druck temperatur
+    """),
+}
+ENABLE_WORDS = _split("""
+    enable enabled enabling freigabe deadman active armed servo_on powered
+""")
+"""Words of columns that say whether a drive is on."""
+DEG = 0.017453292519943295
 UNITS = {
-    "rad": ("rad", 1.0), "rads": ("rad", 1.0), "radians": ("rad", 1.0), "deg": ("rad", 0.017453292519943295),
-    "degree": ("rad", 0.017453292519943295), "degrees": ("rad", 0.017453292519943295), "rev": ("rad", 6.283185307179586),
-    "m": ("m", 1.0), "metre": ("m", 1.0), "cm": ("m", 0.01), "mm": ("m", 0.001),
-}  # fmt: skip
+    **dict.fromkeys(("rad", "rads", "radians"), ("rad", 1.0)),
+    **dict.fromkeys(("deg", "degree", "degrees", "grad", "°"), ("rad", DEG)),
+    **dict.fromkeys(("m", "metre", "meter"), ("m", 1.0)),
+    "mrad": ("rad", 0.001),
+    "rev": ("rad", 6.283185307179586),
+    "cm": ("m", 0.01),
+    "mm": ("m", 0.001),
+    "inch": ("m", 0.0254),
+}
 """Unit of the recording, and its number for one of the log."""
 TIME_UNITS = {
-    "s": 1.0, "sec": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6, "ns": 1e-9, "nsec": 1e-9,
-    "nanosec": 1e-9,
-}  # fmt: skip
+    **dict.fromkeys(("s", "sec", "secs", "seconds"), 1.0),
+    **dict.fromkeys(("ms", "msec", "millis"), 1e-3),
+    **dict.fromkeys(("us", "µs", "usec", "micros"), 1e-6),
+    **dict.fromkeys(("ns", "nsec", "nanosec"), 1e-9),
+    "min": 60.0,
+}
 """Seconds for one of a unit."""
-FILLER_WORDS = {
-    "joint", "joints", "motor", "motors", "data", "value", "values", "raw", "real", "header", "robot", "main", "percent",
-    "pct", "norm",
-}  # fmt: skip
+OTHER_UNITS = _split("""
+    % - 1 nm n a ma v mv bar pa kpa mpa hz rpm 1/min °c k w counts count ticks inc raw bool
+    l/min m/s^2 m/s² kg kn
+""")
+"""Units that say neither a position nor a time."""
+FILLER_WORDS = _split("""
+    joint joints motor motors data value values raw real header robot main percent pct norm
+    controller controllers dof forward servo servos
+""")
 """Words that name no joint."""
+UNIT_SUFFIX = re.compile(r"^(.*?)\s*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
+"""A name with a unit in brackets behind it."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +100,7 @@ class ColumnName:
         quantity: The same.
         unit: Unit of a position, a key of `UNITS`; `None` where none is named.
         joint: Remaining words joined by `_`; may be empty or a number.
+        speed_unit: rad/s or m/s for one of the column, where its name has a unit of speed.
     """
 
     table: str
@@ -92,10 +109,31 @@ class ColumnName:
     quantity: Quantity
     unit: str | None
     joint: str
+    speed_unit: float | None
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is the name of a unit, perhaps in brackets."""
+    plain = text.strip("[](){}<> ").lower()
+    numerator, _, rest = plain.partition("/")
+    is_rate = numerator in UNITS and rest in ("s", "s^2", "s²", "min")
+    return is_rate or plain in UNITS or plain in TIME_UNITS or plain in OTHER_UNITS
+
+
+def split_unit(column: str) -> tuple[str, str | None]:
+    """Return a name and the unit in brackets behind it; an index or the name of an item is none."""
+    found = UNIT_SUFFIX.fullmatch(column)
+    if found and is_unit(found[2]) and not (found[2].isdigit() and column.endswith("]")):
+        return found[1], found[2].lower()
+    return column, None
 
 
 def read_speed_unit(column: str) -> float | None:
-    """Return rad/s or m/s for one of a column whose name ends in a unit of speed, such as `rad_s`; else `None`."""
+    """Return rad/s or m/s for one of a column that names a unit of speed, `rad_s` or `[deg/s]`; else `None`."""
+    stated = split_unit(column)[1]
+    if stated is not None:
+        unit, _, second = stated.partition("/")
+        return UNITS[unit][1] if unit in UNITS and second == "s" else None
     *_, unit, second = ["", "", *split_words(column)]
     return UNITS[unit][1] if unit in UNITS and second == "s" else None
 
@@ -115,26 +153,43 @@ def read_unit(text: str) -> tuple[str, float] | None:
 
 def split_words(text: str) -> list[str]:
     """Return the words of a name in lower case: `Boom Cmd`, `boomCmd` and `boom_cmd` are the same."""
-    spaced = re.sub(r"([a-z0-9])([A-Z])", r"\1 \2", text)
-    return [word for word in re.split(r"[^a-z0-9]+", spaced.lower()) if word]
+    spaced = re.sub(r"([a-z0-9äöüß])([A-ZÄÖÜ])", r"\1 \2", text)
+    return [word for word in re.split(r"[^a-z0-9äöüßµ°]+", spaced.lower()) if word]
 
 
-def read_column_name(table: str, column: str) -> ColumnName:
-    """Return what the words of a column's name say, those of its table where it says nothing."""
-    outer, words = split_words(table), split_words(column)
+def read_column_name(table: str, column: str, unit: str | None = None) -> ColumnName:
+    """Return what the words of a column's name say, those of its table where it says nothing.
+
+    Args:
+        table: Its table.
+        column: Its name in the table.
+        unit: Unit that the log states beside the name.
+    """
+    plain, stated = split_unit(column)
+    unit = (unit or stated or "").lower() or None
+    outer, words = split_words(table), split_words(plain)
     if len(words) == 1 and (numbered := re.fullmatch(r"([a-z]+)(\d+)", words[0])):
         words = [numbered[1], numbered[2]]  # `u1` and `q1` are of joint 1
     role = _find_role(words) or _find_role(outer)
     quantity = _find_quantity(words)
     if quantity == "unknown":
         quantity = _find_quantity(outer)
-    unit = next((word for word in reversed(words) if word in UNITS), None)
-    if read_speed_unit(column) is not None:  # `rad_s` is rad/s
-        words, quantity, unit = words[:-2], "velocity", None
+    speed_unit = read_speed_unit(f"{plain} [{unit}]" if unit else column)
+    if speed_unit is not None:
+        quantity = "velocity"
+        words = words if unit else words[:-2]  # `rad_s` is rad/s
+        unit = None
+    elif unit is None:
+        unit = next((word for word in reversed(words) if word in UNITS), None)
+    elif unit not in UNITS:
+        quantity = (
+            "effort" if quantity == "unknown" and unit in ("nm", "n", "a", "v", "bar") else quantity
+        )
+        unit = None
     roles = COMMAND_WORDS | MEASURED_WORDS | set().union(*QUANTITY_WORDS.values())
     known = roles | FILLER_WORDS | set(UNITS)
     left = [word for word in words if word not in known]
-    return ColumnName(table, column, role, quantity, unit, "_".join(left))
+    return ColumnName(table, column, role, quantity, unit, "_".join(left), speed_unit)
 
 
 def _find_role(words: list[str]) -> Role | None:
@@ -153,6 +208,10 @@ def _find_quantity(words: list[str]) -> Quantity:
 
 def name_joint(text: str) -> str:
     """Return a name for a joint that a file name and a column may hold."""
-    if not text:
+    plain = re.sub(r"\W+", "_", text.translate(UMLAUTS)).strip("_")
+    if not plain:
         return "joint"
-    return f"joint_{text}" if text[0].isdigit() else text
+    return f"joint_{plain}" if plain[0].isdigit() else plain
+
+
+UMLAUTS = str.maketrans({"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss"})

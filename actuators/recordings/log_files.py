@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
-from actuators.recordings.array_log import LeRobotLog, MatlabLog, NumpyLog, ParquetLog
+from actuators.recordings.advice import advise
+from actuators.recordings.array_log import ArrayLog, LeRobotLog, ParquetLog
 from actuators.recordings.log_tables import LogFile, LogRun
-from actuators.recordings.text_log import CsvLayout, CsvLog
+from actuators.recordings.text_log import TextLog
 from brokk_rl.errors import ConfigError, RecordingError
 
-TEXT_ENDINGS = (".csv", ".tsv", ".txt")
-CAN_ENDINGS = (".blf", ".asc")
+TEXT_ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".log", ".lvm")
+CAN_ENDINGS = (".blf", ".asc", ".trc")
 BAG_ENDINGS = (".db3", ".bag")
 ENDINGS = (*TEXT_ENDINGS, *CAN_ENDINGS, *BAG_ENDINGS, ".mcap", ".parquet", ".npz", ".mat")
 """Endings of the files that are logs."""
@@ -28,6 +30,8 @@ SIGNATURES = {
     b"MATLAB 5.0": (".mat", "a MATLAB file"),
 }
 """First bytes of files, with the ending and the name of their kind."""
+CANDUMP_LINE = re.compile(rb"^\s*\(\d+\.\d+\)\s+\S+\s+[0-9A-Fa-f]+(#|\s+\[\d+\])", re.MULTILINE)
+"""A line of candump, as a file (`candump -l`) or as printed on a terminal (`candump -t a`)."""
 Damaged = Literal["refuse", "skip"]
 JOINT_LIST = "joint_list.txt"
 """File in which SAGE names the joints, one a line."""
@@ -42,7 +46,7 @@ class CsvFolderLog(LogFile):
         if (path / JOINT_LIST).is_file():
             labels = (path / JOINT_LIST).read_text(errors="replace").split()
         names = SAGE_FILES if tell_folder(path) == "sage" else _list_csv_files(path)
-        self._logs = {Path(name).stem: CsvLog(path / name, None, labels) for name in names}
+        self._logs = {Path(name).stem: TextLog(path / name, None, labels) for name in names}
 
     def list_tables(self) -> dict[str, list[str]]:
         """Return the columns of both files, items of lists by the joints where they are listed."""
@@ -61,22 +65,27 @@ class CsvFolderLog(LogFile):
 
 
 def open_log(
-    path: Path, layout: CsvLayout | None = None, dbc: str | None = None, damaged: Damaged = "refuse"
+    path: Path,
+    signs: tuple[str, str] | None = None,
+    dbc: str | None = None,
+    damaged: Damaged = "refuse",
+    channel: int | None = None,
 ) -> LogFile:
     """Open a log.
 
     Args:
         path: File or folder.
-        layout: Signs of a CSV file; `None` to tell them from its beginning.
+        signs: Delimiter and decimal sign of a text file; `None` to tell them.
         dbc: DBC file of a log of a CAN bus.
         damaged: What to do about damaged parts: `refuse` the log, or `skip` them with a warning.
+        channel: Channel of the recorder of a CAN bus; `None` for all.
 
     Raises:
         ConfigError: A log of a CAN bus without a DBC file, or a library is not installed.
         RecordingError: It is no log of a known kind, or its beginning cannot be read.
     """
     try:
-        opened = _open_folder(path) if path.is_dir() else _open_file(path, layout, dbc)
+        opened = _open_folder(path) if path.is_dir() else _open_file(path, signs, dbc, channel)
     except ModuleNotFoundError as error:
         raise ConfigError(
             f"{path}: this kind of log needs {error.name}: pip install 'brokk-rl[logs]'"
@@ -93,7 +102,7 @@ def _open_folder(path: Path) -> LogFile:
         return LeRobotLog(path)
     if kind == "bag":
         # Imported here, since a desk without logs has no rosbags.
-        from actuators.recordings.bag_log import BagLog
+        from actuators.recordings.message_log import BagLog
 
         return BagLog(path)
     if len(_list_csv_files(path)) > 1:
@@ -104,36 +113,38 @@ def _open_folder(path: Path) -> LogFile:
     )
 
 
-def _open_file(path: Path, layout: CsvLayout | None, dbc: str | None) -> LogFile:
+def _open_file(
+    path: Path, signs: tuple[str, str] | None, dbc: str | None, channel: int | None
+) -> LogFile:
     if not path.exists():
         raise RecordingError(f"{path}: no such log")
     ending = path.suffix.lower()
     _check_ending(path, ending)
     if ending == ".parquet":
         return ParquetLog(path)
-    if ending == ".npz":
-        return NumpyLog(path)
-    if ending == ".mat":
-        return MatlabLog(path)
-    if ending == ".mcap":
-        # Imported here, since a desk without logs has no mcap.
-        from actuators.recordings.mcap_log import McapLog
+    if ending in (".npz", ".mat"):
+        return ArrayLog(path)
+    if ending == ".mcap" or ending in BAG_ENDINGS:
+        # Imported here, since a desk without logs has no mcap and no rosbags.
+        from actuators.recordings.message_log import BagLog, McapLog
 
-        return McapLog(path)
-    if ending in BAG_ENDINGS:
-        from actuators.recordings.bag_log import BagLog
-
-        return BagLog(path)
-    if ending in CAN_ENDINGS:
+        return McapLog(path) if ending == ".mcap" else BagLog(path)
+    if ending in CAN_ENDINGS or (ending in (".log", ".txt") and is_candump(path)):
         # Imported here, since a desk without CAN has no python-can.
         from actuators.recordings.can_log import CanLog
 
         if dbc is None:
             raise ConfigError(
-                f"{path}: frames of a CAN bus mean nothing without their DBC file: log.dbc=<file>, or a column map that names it"
+                f"{path}: frames of a CAN bus mean nothing without their DBC file: {advise('dbc')}"
             )
-        return CanLog(path, dbc)
-    return CsvLog(path, layout)
+        return CanLog(path, dbc, channel)
+    return TextLog(path, signs)
+
+
+def is_candump(path: Path) -> bool:
+    """Return whether a text file is a log of candump: time in brackets, channel, identifier."""
+    with path.open("rb") as file:
+        return CANDUMP_LINE.search(file.read(4096)) is not None
 
 
 def _check_ending(path: Path, ending: str) -> None:

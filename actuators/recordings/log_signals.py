@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from actuators.recordings.advice import advise
+from actuators.recordings.clocks import TimeColumn, read_clock, unwrap
 from actuators.recordings.expression import Expression, parse_expression
-from actuators.recordings.log_tables import LogRun, join_names
-from actuators.recordings.whole_rows import HOW_TO_SKIP
+from actuators.recordings.log_tables import LogRun
 from brokk_rl import record
 from brokk_rl.errors import ConfigError, RecordingError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
 
+log = logging.getLogger(__name__)
+
 TICK_TOLERANCE = 1e-3
 """Part of a period by which a sample may lie after its tick and still count for it. Seconds since
 1970 are rounded to 0.2 µs, and no logger is as punctual as this."""
-
-
-SLICE = 1 << 18
-"""Samples that are computed at once: temporary arrays of a long column would fill the memory."""
-
-
-def compute_by_slices(
-    compute: Callable[[np.ndarray], np.ndarray], values: np.ndarray
-) -> np.ndarray:
-    """Return `compute(values)` for a function of each value, `(T,)`."""
-    found = np.empty(len(values))
-    for begin in range(0, len(values), SLICE):
-        found[begin : begin + SLICE] = compute(values[begin : begin + SLICE])
-    return found
+SPARSE_SHARE = 0.2
+"""Share of empty cells from which a column of a table counts as one that comes less often than the rows."""
 
 
 @dataclass(frozen=True)
@@ -43,12 +35,14 @@ class Signal:
         table: Name of the table whose rows it has.
         t_s: Times, `(T,)`.
         values: `(T,)`.
+        rows: Rows of the table that they come from, `(T,)`.
         text: Column or arithmetic that it comes from.
     """
 
     table: str
     t_s: np.ndarray
     values: np.ndarray
+    rows: np.ndarray
     text: str
 
     def hold(self, ticks_s: np.ndarray, period_s: float) -> np.ndarray:
@@ -76,95 +70,98 @@ Places = Mapping[str, tuple[str, str]]
 """Table and column of each full name."""
 
 
-class RunClocks(Mapping[str, np.ndarray]):
-    """Times of the tables of a run, one of them in memory at a time.
-
-    Args:
-        run: The run.
-        read: Returns the times of a table, `(T,)` s, by its name.
-    """
-
-    def __init__(self, run: LogRun, read: Callable[[str], np.ndarray]) -> None:
-        self._run, self._read = run, read
-        self._newest: tuple[str, np.ndarray] | None = None
-
-    def __getitem__(self, table: str) -> np.ndarray:
-        if self._newest is None or self._newest[0] != table:
-            self._newest = None  # before the next one is read
-            self._newest = (table, self._read(table))
-        return self._newest[1]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._run.tables)
-
-    def __len__(self) -> int:
-        return len(self._run.tables)
-
-
 class RunSignals:
     """The signals of a run, each on the clock of its table.
 
     Args:
         run: The run.
-        sources: Column or arithmetic of each text.
         places: Table and column of each full name.
-        clocks: Times of each table, `(T,)` s.
+        find_time: Returns the clock of a table by its name.
+        skip: Leave rows out that lack a number or whose time does not increase.
+        gap_s: Time at which a log is split.
+        quiet: Leave out without a warning.
     """
 
     def __init__(
         self,
         run: LogRun,
-        sources: Mapping[str, Expression | str],
         places: Places,
-        clocks: Mapping[str, np.ndarray],
+        find_time: Callable[[str], TimeColumn],
+        skip: bool,
+        gap_s: float,
+        quiet: bool = False,
     ) -> None:
         self.run = run
-        self._sources, self._places, self._clocks = sources, places, clocks
+        self._places, self._find_time = places, find_time
+        self._skip, self._gap_s, self._quiet = skip, gap_s, quiet
+        self._clocks: dict[str, np.ndarray] = {}
 
-    def find_table(self, text: str) -> str:
-        """Return the table whose clock a column or arithmetic has."""
-        source = self._sources[text]
-        return self._places[source if isinstance(source, str) else source.names[0]][0]
+    def read_times(self, table: str) -> np.ndarray:
+        """Return the times of a table, `(T,)` s; NaN for rows that are left out."""
+        if table not in self._clocks:
+            time = self._find_time(table)
+            self._clocks[table] = read_clock(
+                self.run, table, time, self._skip, self._gap_s, self._quiet
+            )
+        return self._clocks[table]
 
-    def read(self, text: str, empty: bool = False) -> Signal:
-        """Return a column or arithmetic over columns; NaN is refused unless `empty` allows it.
+    def read(self, text: str, empty: bool = False, wraps: float | None = None) -> Signal:
+        """Return a column or arithmetic over columns.
+
+        Rows of a sparse table that lack the column are none of it. Elsewhere an empty cell is damage, which
+        is refused unless `empty` or the request to skip allows it.
 
         Raises:
             RecordingError: It holds what is no number; names row and column.
         """
-        source = self._sources[text]
-        names = (source,) if isinstance(source, str) else source.names
-        table = self.find_table(text)
-        t_s = self._clocks[table]
-        columns: dict[str, np.ndarray] = {}
-        for name in names:
-            other, inner = self._places[name]
-            values = np.asarray(self.run.tables[other].columns[inner], dtype=float)
-            if not empty and (row := find_first(values, np.isfinite)) is not None:
-                cell = self.run.tables[other].show_cell(row, inner)
-                raise RecordingError(
-                    f"{locate(self.run, other, row, name)}: {cell} is not a number; {HOW_TO_SKIP}"
-                )
-            columns[name] = (
-                values if other == table else np.interp(t_s, self._clocks[other], values)
-            )
+        source = resolve_column(text, self._places, self.run.where)
         if isinstance(source, str):
-            return Signal(table, t_s, columns[source], text)
+            signal = self._read_column(source, empty)
+            return replace(signal, values=unwrap(signal.values, wraps))
+        parts = {name: self._read_column(name, empty) for name in source.names}
+        first = parts[source.names[0]]
+        columns = {}
+        for name, part in parts.items():
+            is_same = part.table == first.table and np.array_equal(part.rows, first.rows)
+            columns[name] = part.values if is_same else part.interpolate(first.t_s)
         values = source.evaluate(columns)
-        if not empty and (row := find_first(values, np.isfinite)) is not None:
+        bad = ~np.isfinite(values)
+        if bad.any() and not empty:
+            row = int(np.argmax(bad))
             raise RecordingError(
-                f"{locate(self.run, table, row, text)}: the value is {values[row]}, no number"
+                f"{locate(self.run, first, row, text)}: the value is {values[row]}, no number"
             )
-        return Signal(table, t_s, values, text)
+        return Signal(first.table, first.t_s, unwrap(values, wraps), first.rows, text)
 
-
-def index_columns(tables: Mapping[str, Sequence[str]]) -> dict[str, tuple[str, str]]:
-    """Return table and column of each full name."""
-    places = {}
-    for table, columns in tables.items():
-        for column in columns:
-            places[join_names(table, column)] = (table, column)
-    return places
+    def _read_column(self, name: str, empty: bool) -> Signal:
+        table, column = self._places[name]
+        content, t_s = self.run.tables[table], self.read_times(table)
+        values = np.asarray(content.columns[column], dtype=float)
+        lacking = ~np.isfinite(values)
+        is_sparse = content.is_sparse or lacking.mean() >= SPARSE_SHARE
+        if lacking.any() and not (empty or self._skip or is_sparse):
+            row = int(np.argmax(lacking))
+            cell = content.show_cell(row, column)
+            raise RecordingError(
+                f"{self.run.where}: {content.locate(row)}, column '{name}': {cell} is not a number; {advise('damaged')}"
+            )
+        is_left_out = lacking & np.isfinite(t_s)
+        if is_left_out.any() and not (self._quiet or empty or is_sparse):
+            first = content.locate(int(np.argmax(is_left_out)))
+            log.warning(
+                "%s: column '%s': %d of %d rows lack a number and are left out; the first is %s",
+                self.run.where,
+                name,
+                int(is_left_out.sum()),
+                len(values),
+                first,
+            )
+        rows = np.flatnonzero(np.isfinite(t_s) if empty else np.isfinite(t_s) & ~lacking)
+        if len(rows) < 2:
+            raise RecordingError(
+                f"{self.run.where}: column '{name}' has {len(rows)} values with a time; a log has at least 2"
+            )
+        return Signal(table, t_s[rows], values[rows], rows, name)
 
 
 def resolve_column(text: str, places: Places, where: object) -> Expression | str:
@@ -188,25 +185,22 @@ def resolve_column(text: str, places: Places, where: object) -> Expression | str
 
 def refuse_missing(name: str, places: Places, where: object) -> None:
     """Raise a `RecordingError` where a column is missing."""
+    if f"{name}#1" in places:
+        raise RecordingError(
+            f"{where}: several columns are named '{name}'; rename them, or name one: {name}#1, {name}#2"
+        )
     if name not in places:
         raise RecordingError(
             f"{where}: column '{name}' is missing or holds no numbers; {list_choices(name, places)}"
         )
 
 
-def locate(run: LogRun, table: str, row: int, column: str) -> str:
-    """Return file, row and column for a message."""
+def locate(run: LogRun, signal: Signal, row: int, column: str) -> str:
+    """Return file, row and column of a sample for a message."""
+    table = signal.table
     inside = f"table '{table}', " if table and not column.startswith(f"{table}:") else ""
-    return f"{run.where}: {run.tables[table].locate(row)}, {inside}column '{column}'"
-
-
-def find_first(values: np.ndarray, is_good: Callable[[np.ndarray], np.ndarray]) -> int | None:
-    """Return the first row whose value is not good, or `None`."""
-    for begin in range(0, len(values), SLICE):
-        rows = np.flatnonzero(~is_good(values[begin : begin + SLICE]))
-        if len(rows):
-            return begin + int(rows[0])
-    return None
+    place = run.tables[table].locate(int(signal.rows[row]))
+    return f"{run.where}: {place}, {inside}column '{column}'"
 
 
 class Piece:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
-from actuators.recordings.clock_guess import TimeGuess, read_times
-from actuators.recordings.column_guess import JointGuess
+from actuators.recordings.column_map import Column, ColumnMap, JointColumns, TargetColumn
+from actuators.recordings.column_table import JointGuess
 from actuators.recordings.log_files import Damaged, open_log
-from actuators.recordings.log_signals import index_columns
-from actuators.recordings.whole_rows import leave_broken_rows_out
+from actuators.recordings.log_signals import Signal
+from actuators.recordings.log_tables import index_columns
+from actuators.recordings.time_guess import TimeGuess
 from brokk_rl.errors import RecordingError
 
+GAP_PERIODS = 4
+"""Periods without a sample that split a log; loggers without real time skip up to two."""
 REST_SPEED = 0.02
 """Part of the top speed below which a joint counts as at rest."""
 
@@ -28,7 +32,6 @@ class JointSurvey:
         highest_command: Largest command.
         lowest: Smallest position.
         highest: Largest position.
-        top_target_speed: Fastest change of the command, per second.
         top_speed: Fastest change of the position over a tenth of a second, per second.
         rest: Most frequent command at rest; NaN where the joint never rests.
         rest_share: Share of all rows that are at rest with it, in the log with the most.
@@ -38,48 +41,82 @@ class JointSurvey:
     highest_command: float = -np.inf
     lowest: float = np.inf
     highest: float = -np.inf
-    top_target_speed: float = 0.0
     top_speed: float = 0.0
     rest: float = np.nan
     rest_share: float = 0.0
 
-    def add(self, command: np.ndarray, clock_s: np.ndarray, q: np.ndarray, t_s: np.ndarray) -> None:
-        """Add a run: commands and positions, each `(T,)` on its clock."""
-        self.lowest_command = min(self.lowest_command, float(np.nanmin(command)))
-        self.highest_command = max(self.highest_command, float(np.nanmax(command)))
-        self.lowest, self.highest = min(self.lowest, float(np.nanmin(q))), max(self.highest, float(np.nanmax(q)))  # fmt: skip
-        period_s = np.diff(clock_s)
-        steady = period_s <= 3 * np.median(period_s)
-        self.top_target_speed = max(
-            self.top_target_speed, float(np.nanmax(np.abs(np.diff(command) / period_s)[steady]))
+    def add(self, command: Signal, position: Signal, turn: float | None) -> None:
+        """Add a run; positions that begin again after a turn are put next to those before."""
+        u, q, t_s = command.values, position.values, position.t_s
+        if turn is not None and turn > 0.0:
+            middle = (
+                (self.lowest + self.highest) / 2
+                if math.isfinite(self.lowest)
+                else float(np.median(q))
+            )
+            q = q + turn * round((middle - float(np.median(q))) / turn)
+            u = u + turn * round(float(np.median(np.interp(command.t_s, t_s, q) - u)) / turn)
+        self.lowest_command = min(self.lowest_command, float(u.min()))
+        self.highest_command = max(self.highest_command, float(u.max()))
+        self.lowest, self.highest = (
+            min(self.lowest, float(q.min())),
+            max(self.highest, float(q.max())),
         )
-        step = max(1, int(0.1 / np.median(np.diff(t_s))))
+        step = max(1, int(0.1 / float(np.median(np.diff(t_s)))))
+        if len(q) <= step:
+            return
         speed = np.abs((q[step:] - q[:-step]) / (t_s[step:] - t_s[:-step]))
-        self.top_speed = max(self.top_speed, float(np.nanmax(speed, initial=0.0)))
-        at_rest = np.interp(clock_s, t_s[step:], speed) <= REST_SPEED * self.top_speed
-        values, counts = np.unique(command[at_rest], return_counts=True)
-        if len(values) and counts.max() / len(command) > self.rest_share:
+        self.top_speed = max(self.top_speed, float(speed.max()))
+        at_rest = np.interp(command.t_s, t_s[step:], speed) <= REST_SPEED * self.top_speed
+        values, counts = np.unique(u[at_rest], return_counts=True)
+        if len(values) and counts.max() / len(u) > self.rest_share:
             self.rest = float(values[counts.argmax()])
-            self.rest_share = float(counts.max() / len(command))
+            self.rest_share = float(counts.max() / len(u))
 
 
-@dataclass(frozen=True)
+@dataclass
 class LogSurvey:
     """Numbers over all logs.
 
     Attributes:
         joints: By joint.
-        period_s: Median period of the positions.
-        slowest_period_s: Median period of the slowest table.
+        periods_s: Median periods of the positions, one a run.
+        slowest_period_s: Median period of the slowest signal.
         num_runs: Number of runs.
-        minutes: Length of all runs.
+        minutes: Length of all runs without their gaps.
+        gaps: Gaps that split the logs, as text.
     """
 
-    joints: Mapping[str, JointSurvey]
-    period_s: float
-    slowest_period_s: float
-    num_runs: int
-    minutes: float
+    joints: dict[str, JointSurvey]
+    periods_s: list[float] = field(default_factory=list)
+    slowest_period_s: float = 0.0
+    num_runs: int = 0
+    minutes: float = 0.0
+    gaps: list[str] = field(default_factory=list)
+
+    @property
+    def period_s(self) -> float:
+        """Median period of the positions."""
+        return float(np.median(self.periods_s))
+
+    def add_clocks(self, where: str, signals: Sequence[Signal]) -> None:
+        """Add the clocks of a run, that of a position first."""
+        t_s = signals[0].t_s
+        periods_s = np.diff(t_s)
+        period_s = float(np.median(periods_s))
+        self.periods_s.append(period_s)
+        slowest_s = max(float(np.median(np.diff(signal.t_s))) for signal in signals)
+        self.slowest_period_s = max(self.slowest_period_s, slowest_s)
+        gaps = np.flatnonzero(periods_s > GAP_PERIODS * slowest_s)
+        if len(gaps):
+            longest = gaps[np.argmax(periods_s[gaps])]
+            self.gaps.append(
+                f"{where}: {len(gaps)} gaps, {periods_s[gaps].sum():.4g} s without samples; the longest is "
+                f"{periods_s[longest]:.4g} s "
+                f"from {t_s[longest] - t_s[0]:.2f} s on: lost rows, or a clock that was set; the log is split there"
+            )
+        self.minutes += float(t_s[-1] - t_s[0] - periods_s[gaps].sum()) / 60.0
+        self.num_runs += 1
 
 
 def measure_logs(
@@ -87,44 +124,53 @@ def measure_logs(
     times: Mapping[str, TimeGuess],
     joints: Sequence[JointGuess],
     dbc: str | None,
-    damaged: Damaged = "refuse",
+    damaged: Damaged,
+    channel: int | None,
 ) -> LogSurvey:
-    """Return the numbers of all logs; one column after the other is held in memory.
+    """Return the numbers of all logs.
 
     Raises:
         RecordingError: A log is damaged, or lacks a column that the first one has.
     """
-    found = {joint.name: JointSurvey() for joint in joints}
-    periods_s, slowest_s, num_runs, seconds = [], 0.0, 0, 0.0
+    columns = {}
+    for joint in joints:
+        command = TargetColumn(
+            column=joint.command, scale=1.0, full_speed=None, wraps=joint.target_wraps
+        )
+        position = Column(column=joint.position, scale=1.0, offset=0.0, wraps=joint.wraps)
+        columns[joint.name] = JointColumns(command=command, position=position)
+    reader = ColumnMap(
+        delimiter=",",
+        decimal=".",
+        time={table: one.time for table, one in times.items()},
+        joints=columns,
+        optional={},
+        overrun=0.0,
+        longest_gap_s=1.0,
+        shortest_s=0.0,
+        damaged=damaged,
+    )
+    if list(times) == [""]:
+        reader = ColumnMap(**{**reader.__dict__, "time": times[""].time})
+    survey = LogSurvey({joint.name: JointSurvey() for joint in joints})
     for path in paths:
-        opened = open_log(path, dbc=dbc, damaged=damaged)
-        places = index_columns(opened.list_tables())
-        wanted: dict[str, set[str]] = {}
-        for joint in joints:
-            for name in (joint.command, joint.position):
-                if name not in places:
-                    raise RecordingError(
-                        f"{path}: column '{name}' is missing, which {paths[0]} has; import logs of one kind at a time"
-                    )
-                table, column = places[name]
-                columns = wanted.setdefault(table, set())
-                columns |= {column, times[table].column, times[table].anchor or column}
-        for run in opened.read_runs(wanted, None):
-            if opened.keep_whole:
-                columns_of_time = {name: times[name].column for name in wanted}
-                run = leave_broken_rows_out(run, columns_of_time, wanted)
-            clocks = {name: read_times(table, times[name]) for name, table in run.tables.items()}
+        opened = open_log(path, None, dbc, damaged, channel)
+        missing = [
+            name
+            for joint in joints
+            for name in (joint.command, joint.position)
+            if name not in index_columns(opened.list_tables())
+        ]
+        if missing:
+            raise RecordingError(
+                f"{path}: column '{missing[0]}' is missing, which {paths[0]} has; import logs of one kind at a time"
+            )
+        for signals in reader.open_runs(opened, None):
+            clocks = []
             for joint in joints:
-                (one, command), (other, position) = places[joint.command], places[joint.position]
-                found[joint.name].add(
-                    run.tables[one].columns[command],
-                    clocks[one],
-                    run.tables[other].columns[position],
-                    clocks[other],
-                )
-            clock_s = clocks[places[joints[0].position][0]]
-            periods_s.append(float(np.median(np.diff(clock_s))))
-            slowest_s = max(slowest_s, *(float(np.median(np.diff(t_s))) for t_s in clocks.values()))
-            seconds += float(clock_s[-1] - clock_s[0])
-            num_runs += 1
-    return LogSurvey(found, float(np.median(periods_s)), slowest_s, num_runs, seconds / 60.0)
+                position = signals.read(joint.position, wraps=joint.wraps)
+                command = signals.read(joint.command, wraps=joint.target_wraps)
+                survey.joints[joint.name].add(command, position, joint.wraps)
+                clocks += [position, command]
+            survey.add_clocks(signals.run.where, clocks)
+    return survey

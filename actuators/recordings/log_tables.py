@@ -1,6 +1,6 @@
 """Contents of a log: tables of columns, each table on a clock of its own.
 
-A table is what shares a clock: a CSV file, a topic, a message of the bus. The full name of a column
+A table is what one source sends: a CSV file, a topic, a message of the bus. The full name of a column
 is `<table>:<column>`; a log with one table leaves the first part out.
 """
 
@@ -8,34 +8,34 @@ from __future__ import annotations
 
 import functools
 import logging
-import weakref
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import SpooledTemporaryFile
 
 import numpy as np
 
+from actuators.recordings.advice import advise
 from brokk_rl.errors import RecordingError
 
 log = logging.getLogger(__name__)
 
-SPOOLED_BYTES = 4 << 20
-"""Bytes of a column that stay in memory; the rest of a long log waits in a temporary file."""
-BLOCK_ROWS = 65536
-"""Rows that a reader gathers before it stores them: some megabytes for a hundred columns."""
-
 
 @dataclass(frozen=True)
 class Table:
-    """Columns of a log that share a clock.
+    """Columns of a log that come from one source.
 
     Attributes:
-        columns: Numbers by column, each `(T,)`.
+        columns: Numbers by column, each `(T,)`; NaN for an empty cell.
+        units: Units that the log itself states, by column.
+        clock: Column whose values are seconds by the reader's own making; `None` without one.
+        is_sparse: Rows need not have all columns: messages of one topic, pages of one CAN message.
     """
 
     columns: Mapping[str, np.ndarray]
+    units: Mapping[str, str] = field(default_factory=dict)
+    clock: str | None = None
+    is_sparse: bool = False
 
     def locate(self, row: int) -> str:
         """Return the place of a row in its file, for a message."""
@@ -62,7 +62,7 @@ class LogRun:
 
 
 @functools.cache
-def _warn_once(text: str) -> None:
+def warn_once(text: str) -> None:
     """Warn of a damage; a log is read several times, and each time it is met again."""
     log.warning("%s", text)
 
@@ -84,10 +84,8 @@ class LogFile(ABC):
             error: What a library raised.
         """
         if not self.keep_whole:
-            raise RecordingError(
-                f"{self.path}: {text}; log.damaged=skip, or damaged: skip in the column map, reads what is whole"
-            ) from error
-        _warn_once(f"{self.path}: {text}: left out")
+            raise RecordingError(f"{self.path}: {text}; {advise('damaged')}") from error
+        warn_once(f"{self.path}: {text}: left out")
 
     @abstractmethod
     def list_tables(self) -> dict[str, list[str]]:
@@ -112,50 +110,15 @@ class LogFile(ABC):
         """
 
 
-class StoredColumns(Mapping[str, np.ndarray]):
-    """Columns that grow by blocks and are loaded one at a time.
-
-    Long ones wait in temporary files, so that a log may be larger than the memory.
-    """
-
-    def __init__(self, names: Iterable[str]) -> None:
-        self._files = {name: SpooledTemporaryFile(SPOOLED_BYTES) for name in names}  # noqa: SIM115
-        weakref.finalize(self, _close_files, list(self._files.values()))
-        self._num_rows: int | None = None
-        self._order: np.ndarray | None = None
-
-    def add(self, name: str, values: np.ndarray) -> None:
-        """Append a block of numbers, `(T,)`, to a column."""
-        self._files[name].write(np.ascontiguousarray(values, dtype=np.float64).tobytes())
-
-    def sort(self, name: str) -> None:
-        """Bring the rows into the order of a column."""
-        values = self[name]
-        if (np.diff(values) < 0).any():
-            self._order = np.argsort(values, kind="stable")
-
-    def cut(self, num_rows: int) -> None:
-        """Leave out the rows after the first `num_rows`."""
-        self._num_rows = num_rows
-
-    def __getitem__(self, name: str) -> np.ndarray:
-        file = self._files[name]
-        file.seek(0)
-        values = np.frombuffer(file.read(), np.float64)[: self._num_rows]
-        return values if self._order is None else values[self._order]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._files)
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-
-def _close_files(files: Iterable[SpooledTemporaryFile[bytes]]) -> None:
-    for file in files:
-        file.close()
-
-
 def join_names(table: str, column: str) -> str:
     """Return the full name of a column."""
     return f"{table}:{column}" if table else column
+
+
+def index_columns(tables: Mapping[str, Collection[str]]) -> dict[str, tuple[str, str]]:
+    """Return table and column of each full name."""
+    places = {}
+    for table, columns in tables.items():
+        for column in columns:
+            places[join_names(table, column)] = (table, column)
+    return places

@@ -1,167 +1,156 @@
-"""Logs of messages: what MCAP files and ROS bags have in common.
+"""Logs of messages: MCAP files and ROS bags.
 
 Each topic is a table. Its columns are the numbers in its messages by their path; see
 `message_numbers`. `log_time` is the recorder's clock since the first message, `header.stamp` that of
-the sensor, both in s. Messages are read by blocks of one topic.
+the sensor, both in s. A topic that several programs send, each on a channel of its own, is one table
+for each: `/joint_states@2`. A message need not have all columns.
 """
 
 from __future__ import annotations
 
+import json
 import re
+import sqlite3
 import struct
 from abc import abstractmethod
+from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from contextlib import closing
+from pathlib import Path
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from actuators.recordings.log_tables import LogFile, LogRun, StoredColumns, Table
-from actuators.recordings.message_numbers import DecodingError, NumberReader
+from actuators.recordings.log_tables import LogFile, LogRun, Table
+from actuators.recordings.message_numbers import NumberReader, find_leaves
 from brokk_rl.errors import RecordingError
 
 LOG_TIME = "log_time"
-BLOCK_MESSAGES, BLOCK_BYTES = 4096, 8 << 20
-"""Messages of a topic, and bytes of them, that are decoded at once."""
+HEAD_MESSAGES = 200
+"""Messages of a topic from which its columns are listed: two sources may alternate on it."""
+HEAD_S = 5.0
+"""Time from the first message within which all sources of a topic send one."""
+MAGIC = b"\x89MCAP0\r\n"
+"""Begin of an MCAP file."""
 
 
-@dataclass(slots=True)
-class MessageBlock:
-    """Messages of one topic, in the order of the log, `N` of them.
+class LoggedMessage(NamedTuple):
+    """A message as it lies in a log.
 
     Attributes:
-        topic: Their topic.
-        reader: Reads their numbers.
-        time_ns: Times at which they were recorded, `(N,)`.
-        messages: Their bytes.
-        place: Where they are in the file, for a message; may be empty.
+        table: Its topic, with the channel where several have it.
+        time_ns: Time at which it was recorded.
+        data: Its bytes.
+        decode: Returns its content.
+        place: Where it is in the file, for a message; may be empty.
     """
 
-    topic: str
-    reader: NumberReader
-    time_ns: np.ndarray
-    messages: list[bytes]
+    table: str
+    time_ns: int
+    data: bytes
+    decode: Callable[[bytes], Any]
     place: str
-
-
-class Gatherer:
-    """Gathers messages of topics to blocks."""
-
-    def __init__(self) -> None:
-        self._waiting: dict[Any, tuple[list[int], list[bytes]]] = {}
-        self._sizes: dict[Any, int] = {}
-
-    def add(self, channel: Any, time_ns: int, data: bytes) -> bool:
-        """Add a message; return whether its block is full."""
-        times, messages = self._waiting.setdefault(channel, ([], []))
-        times.append(time_ns)
-        messages.append(data)
-        self._sizes[channel] = self._sizes.get(channel, 0) + len(data)
-        return len(times) >= BLOCK_MESSAGES or self._sizes[channel] >= BLOCK_BYTES
-
-    def take(self, channel: Any, topic: str, reader: NumberReader) -> MessageBlock:
-        """Return the messages of a channel, which begins anew."""
-        times, messages = self._waiting.pop(channel)
-        del self._sizes[channel]
-        return MessageBlock(topic, reader, np.array(times), messages, "")
-
-    def list_waiting(self) -> list[Any]:
-        """Return the channels with messages."""
-        return list(self._waiting)
 
 
 class MessageLog(LogFile):
     """A log of messages, one table a topic."""
 
     @abstractmethod
-    def _iterate(self, topics: Collection[str]) -> Iterator[MessageBlock]:
-        """Yield the messages of some topics."""
+    def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
+        """Yield the messages of some tables, or all, in the order of the log."""
 
     @abstractmethod
-    def _list_topics(self) -> list[str]:
-        """Return the topics whose messages can be decoded."""
+    def _list_known(self) -> set[str]:
+        """Return the tables that the log lists itself; empty where it lists none."""
 
     def list_tables(self) -> dict[str, list[str]]:
-        """Return the numbers in the first message of each topic."""
-        tables: dict[str, list[str]] = {}
-        for topic in sorted(set(self._guard(self._list_topics))):
-            blocks = self._iterate_safely({topic})  # its file stays open while it is held
-            block = next(blocks, None)
-            if block is None:
-                continue
-            try:
-                names = block.reader.find_numbers(block.messages[0])
-            except DecodingError as error:
-                where = self._locate(block, 0, 0, int(block.time_ns[0]))
-                self.report_damage(f"{where}: cannot be decoded ({error})", error)
-                continue
-            if names:
-                tables[topic] = [LOG_TIME, *names]
-        return tables
+        """Return the numbers in the first messages of each topic."""
+        known = self._list_known()
+        found: dict[str, dict[str, None]] = {}
+        counts = Counter[str]()
+        begin_ns = None
+        for message in self._iterate_safely(None):
+            begin_ns = message.time_ns if begin_ns is None else begin_ns
+            table = message.table
+            counts[table] += 1
+            if counts[table] <= HEAD_MESSAGES:
+                content = self._decode(message, counts[table] - 1, begin_ns)
+                names = [] if content is None else [name for name, _ in find_leaves(content)]
+                found.setdefault(table, {}).update(dict.fromkeys(names))
+            is_late = message.time_ns - begin_ns > HEAD_S * 1e9
+            if is_late and known and known <= found.keys():
+                break
+        return {
+            table: [LOG_TIME, *sorted(found[table], key=_pad_numbers)]
+            for table in sorted(found)
+            if found[table]
+        }
 
     def read_runs(
         self, wanted: Mapping[str, Collection[str]], max_rows: int | None
     ) -> Iterator[LogRun]:
-        """Yield the log as one run.
-
-        Messages without any wanted number are left out: several programs may send to one topic.
-        """
-        names = {
-            topic: sorted(set(columns) - {LOG_TIME}, key=_pad_numbers)
-            for topic, columns in wanted.items()
+        """Yield the log as one run; messages without any wanted number are left out."""
+        readers = {
+            table: NumberReader(sorted(set(names) - {LOG_TIME}, key=_pad_numbers))
+            for table, names in wanted.items()
         }
-        stores = {topic: StoredColumns([LOG_TIME, *several]) for topic, several in names.items()}
-        rows, seen = dict.fromkeys(wanted, 0), dict.fromkeys(wanted, 0)
+        times: dict[str, list[int]] = {table: [] for table in wanted}
+        rows: dict[str, list[list[Any]]] = {table: [] for table in wanted}
+        counts = Counter[str]()
         begin_ns = None
-        for block in self._iterate_safely(wanted):
-            topic = block.topic
-            # Seconds since 1970 would be rounded to 0.2 µs.
-            begin_ns = int(block.time_ns[0]) if begin_ns is None else begin_ns
-            count = len(block.messages)
-            if max_rows is not None and (count := min(count, max_rows - rows[topic])) <= 0:
-                if all(several >= max_rows for several in rows.values()):
+        for message in self._iterate_safely(wanted):
+            begin_ns = message.time_ns if begin_ns is None else begin_ns
+            table = message.table
+            if max_rows is not None and len(rows[table]) >= max_rows:
+                if all(len(several) >= max_rows for several in rows.values()):
                     break
                 continue
-            values, present = self._read_block(block, count, names[topic], seen[topic], begin_ns)
-            seen[topic] += count
-            rows[topic] += int(present.sum())
-            time_s = (block.time_ns[:count] - begin_ns) * 1e-9
-            stores[topic].add(LOG_TIME, time_s[present])
-            for at, name in enumerate(names[topic]):
-                stores[topic].add(name, values[present, at])
-        for store in stores.values():
-            store.sort(LOG_TIME)  # several programs may send to one topic
-        tables = {topic: Table(store) for topic, store in stores.items()}
+            counts[table] += 1
+            content = self._decode(message, counts[table] - 1, begin_ns)
+            values = None if content is None else readers[table].read(content)
+            if values is not None:
+                times[table].append(message.time_ns)
+                rows[table].append(values)
+        tables = {}
+        for table, reader in readers.items():
+            # seconds since 1970 would be rounded to 0.2 µs
+            time_s = (np.array(times[table], dtype=np.int64) - (begin_ns or 0)) * 1e-9
+            try:
+                numbers = np.array(rows[table], dtype=float)  # None becomes NaN
+            except (TypeError, ValueError) as error:
+                raise RecordingError(
+                    f"{self.path}: topic {table}: a value is no number ({error})"
+                ) from error
+            numbers = numbers.reshape(len(time_s), len(reader.names))
+            order = np.argsort(time_s, kind="stable")  # several programs may send to one topic
+            columns = {LOG_TIME: time_s[order]}
+            for at, name in enumerate(reader.names):
+                columns[name] = numbers[order, at]
+            tables[table] = Table(columns, {}, LOG_TIME, is_sparse=True)
         yield LogRun(self.path.resolve().stem, str(self.path), tables)
 
-    def _read_block(
-        self, block: MessageBlock, count: int, names: list[str], before: int, begin_ns: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the named numbers of the first messages of a block, and which have any."""
-        values, present = np.full((count, len(names)), np.nan), np.zeros(count, dtype=bool)
-        begin = end = 0
-        while begin < count:
-            end = end if end > begin else count
-            try:
-                found = block.reader.read(block.messages[begin:end], names)
-                values[begin:end], present[begin:end] = found
-                begin = end if end == count else end + 1  # the one between cannot be decoded
-            except DecodingError as error:
-                where = self._locate(block, begin + error.number, before, begin_ns)
-                self.report_damage(f"{where}: cannot be decoded ({error})", error)
-                end = begin + error.number
-                begin = begin + 1 if end == begin else begin
-        return values, present
+    def _decode(self, message: LoggedMessage, number: int, begin_ns: int) -> Any:
+        """Return the content of a message, `None` for a damaged one that is left out."""
+        try:
+            return message.decode(message.data)
+        except Exception as error:  # decoders raise what they stumble over
+            elapsed_s = (message.time_ns - begin_ns) * 1e-9
+            self.report_damage(
+                f"topic {message.table}, message {number}, {elapsed_s:.3f} s from the first one{message.place}: "
+                f"cannot be decoded ({describe(error)})",
+                error,
+            )
+            return None
 
-    def _iterate_safely(self, topics: Collection[str]) -> Iterator[MessageBlock]:
-        """Yield blocks; damage becomes a `RecordingError`."""
+    def _iterate_safely(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
+        """Yield messages; damage becomes a `RecordingError`."""
         count, begin_ns, last_ns = 0, None, 0
         try:
-            for block in self._iterate(topics):
-                begin_ns = int(block.time_ns[0]) if begin_ns is None else begin_ns
-                last_ns = int(block.time_ns[-1])
-                yield block
-                count += len(block.messages)
+            for message in self._iterate(tables):
+                begin_ns = message.time_ns if begin_ns is None else begin_ns
+                last_ns = message.time_ns
+                yield message
+                count += 1
         except RecordingError:
             raise
         except Exception as error:  # the libraries raise what they stumble over
@@ -169,21 +158,116 @@ class MessageLog(LogFile):
             where = f"after {count} messages, {elapsed_s:.3f} s from the first one"
             self.report_damage(f"damaged {where} ({self._explain(error)})", error)
 
-    def _locate(self, block: MessageBlock, number: int, before: int, begin_ns: int) -> str:
-        """Return the place of a message of a block; `before` of its topic came before the block."""
-        elapsed_s = (int(block.time_ns[number]) - begin_ns) * 1e-9
-        return f"topic {block.topic}, message {before + number}, {elapsed_s:.3f} s from the first one{block.place}"
-
-    def _guard(self, call: Callable[[], Any]) -> Any:
-        try:
-            return call()
-        except RecordingError:
-            raise
-        except Exception as error:
-            raise RecordingError(f"{self.path}: {self._explain(error)}") from error
-
     def _explain(self, error: Exception) -> str:
         return describe(error)
+
+
+class BagLog(MessageLog):
+    """A bag of ROS 2 (a folder, or its `.db3`) or ROS 1 (`.bag`)."""
+
+    def _open(self) -> Any:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+
+        # Bags from before 2023 have no definitions; messages of joints are the same in all versions.
+        return AnyReader([self.path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+
+    def _list_known(self) -> set[str]:
+        return set()
+
+    def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
+        from rosbags.highlevel import AnyReaderError
+
+        try:
+            with self._open() as bag:
+                names = name_tables({one.id: one.topic for one in bag.connections})
+                chosen = []
+                for one in bag.connections:
+                    is_known = one.msgtype in bag.typestore.fielddefs
+                    if is_known and (tables is None or names[one.id] in tables):
+                        chosen.append(one)
+                for connection, time_ns, data in bag.messages(connections=chosen) if chosen else ():
+                    kind = connection.msgtype
+                    decode = lambda raw, kind=kind: bag.deserialize(raw, kind)  # noqa: E731
+                    yield LoggedMessage(names[connection.id], time_ns, data, decode, "")
+        except AnyReaderError as error:
+            for file in [*sorted(self.path.glob("*.db3")), self.path]:
+                if file.suffix == ".db3" and (place := find_sqlite_damage(file)):
+                    raise RecordingError(f"{file}: damaged {place} ({error})") from error
+            raise RecordingError(f"{self.path}: {describe(error)}") from error
+
+
+class McapLog(MessageLog):
+    """An MCAP file with JSON, protobuf or ROS messages."""
+
+    def _list_known(self) -> set[str]:
+        with self.path.open("rb") as file:
+            channels = _read_channels(file)
+        return set(name_tables({key: one.topic for key, one in channels.items()}).values())
+
+    def _iterate(self, tables: Collection[str] | None) -> Iterator[LoggedMessage]:
+        from mcap.records import Channel, Message, Schema
+
+        schemas: dict[int, Any] = {}
+        decoders: dict[int, Callable[[bytes], Any] | None] = {}
+        with self.path.open("rb") as file:
+            listed = _read_channels(file)
+            names = name_tables({key: one.topic for key, one in listed.items()})
+            for place, record in self._read_records(file):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, Channel) and record.id not in decoders:
+                    names.setdefault(record.id, record.topic)
+                    if tables is None or names[record.id] in tables:
+                        schema = schemas.get(record.schema_id)
+                        decoders[record.id] = _find_decoder(record.message_encoding, schema)
+                elif isinstance(record, Message) and (decode := decoders.get(record.channel_id)):
+                    table = names[record.channel_id]
+                    yield LoggedMessage(table, record.log_time, record.data, decode, place)
+
+    def _read_records(self, file: IO[bytes]) -> Iterator[tuple[str, Any]]:
+        """Yield all records, those in chunks too, each with its place."""
+        from mcap.records import Chunk
+        from mcap.stream_reader import StreamReader, breakup_chunk
+
+        file.seek(0)
+        byte = 0
+        for record in StreamReader(file, emit_chunks=True, validate_crcs=True).records:
+            if isinstance(record, Chunk):
+                place = f", in the chunk at byte {byte}"
+                try:
+                    inside = breakup_chunk(record, validate_crc=True)
+                except Exception as error:  # decompressors raise what they stumble over
+                    self.report_damage(f"chunk at byte {byte}: {describe(error)}", error)
+                    inside = []
+                for one in inside:
+                    yield place, one
+            else:
+                yield "", record
+            byte = file.tell()
+
+    def _explain(self, error: Exception) -> str:
+        return f"{describe(error)}; {_find_damage(self.path)}"
+
+
+def name_tables(topics: Mapping[int, str]) -> dict[int, str]:
+    """Return the name of each channel's table: its topic, with the channel where several have it."""
+    counts = Counter(topics.values())
+    return {key: topic if counts[topic] == 1 else f"{topic}@{key}" for key, topic in topics.items()}
+
+
+def find_sqlite_damage(file: Path) -> str | None:
+    """Return up to where the messages of a SQLite bag can be read, `None` where all can be."""
+    count, first_ns, last_ns = 0, 0, 0
+    try:
+        with closing(sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)) as bag:
+            # The message itself comes last in a row, so that its pages are read too.
+            for time_ns, _ in bag.execute("SELECT timestamp, data FROM messages ORDER BY id"):
+                first_ns = first_ns if count else time_ns
+                last_ns, count = time_ns, count + 1
+    except sqlite3.DatabaseError:
+        return f"after {count} messages, {(last_ns - first_ns) * 1e-9:.3f} s from the first one"
+    return None
 
 
 def describe(error: Exception) -> str:
@@ -196,3 +280,62 @@ def describe(error: Exception) -> str:
 def _pad_numbers(name: str) -> str:
     """Return a key that puts `q[10]` after `q[2]`."""
     return re.sub(r"\d+", lambda number: number[0].zfill(9), name)
+
+
+def _read_channels(file: IO[bytes]) -> Mapping[int, Any]:
+    """Return the channels that the summary of an MCAP file lists, none where it is missing or damaged."""
+    from mcap.reader import make_reader
+
+    try:
+        summary = make_reader(file, validate_crcs=True).get_summary()
+    except Exception:  # the library raises what it stumbles over
+        return {}
+    return summary.channels if summary is not None else {}
+
+
+def _find_decoder(encoding: str, schema: Any) -> Callable[[bytes], Any] | None:
+    """Return the decoder of a channel, `None` for an encoding that is not known."""
+    if encoding == "json":
+        return json.loads
+    if schema is None:
+        return None
+    if encoding == "protobuf":
+        from mcap_protobuf.decoder import DecoderFactory
+
+        return DecoderFactory().decoder_for(encoding, schema)
+    if (encoding, schema.encoding) in (("cdr", "ros2msg"), ("cdr", "ros2idl"), ("ros1", "ros1msg")):
+        from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+        name = schema.name if schema.name.count("/") > 1 else schema.name.replace("/", "/msg/")
+        text = schema.data.decode()
+        own = (
+            get_types_from_idl(text)
+            if schema.encoding == "ros2idl"
+            else get_types_from_msg(text, name)
+        )
+        store = get_typestore(Stores.EMPTY)
+        # some writers leave out the definition of a time
+        store.register({**get_typestore(Stores.ROS2_HUMBLE).fielddefs, **own})
+        read = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+        return lambda data: read(data, name)
+    return None
+
+
+def _find_damage(path: Path) -> str:
+    """Return the place to which an MCAP file can be read."""
+    from mcap.stream_reader import StreamReader
+
+    with path.open("rb") as file:
+        if file.read(len(MAGIC)) != MAGIC:
+            return "it does not begin as an MCAP file does"
+        file.seek(0)
+        at = 0
+        try:
+            for _ in StreamReader(file, emit_chunks=True, validate_crcs=False).records:
+                at = file.tell()
+        except Exception:
+            pass
+        size = file.seek(0, 2)
+    if at >= size > 0:
+        return "all its records are there, so a chunk is damaged inside"
+    return f"whole up to byte {at} of {size}; `mcap recover` saves that part"

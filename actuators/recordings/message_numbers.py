@@ -1,7 +1,7 @@
 """Numbers in messages by their path: `pose.x`, `position[elbow]`, `header.stamp`.
 
 Items of a list are named by the list `name` beside it, or by their own `name`, else by their number.
-A stamp is one number, in s.
+A stamp is one number, in s. The layout of a ROS MultiArray says how its data lie, and is no number.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from operator import attrgetter, itemgetter
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,102 +20,34 @@ LABELS = ("name", "names", "joint_names", "joint_name")
 """Fields that name the items of the lists beside them."""
 TIMES = (("sec", "nanosec"), ("secs", "nsecs"), ("seconds", "nanos"), ("sec", "nsec"))
 """Fields of a time: whole seconds and nanoseconds."""
+NO_NUMBERS = ("layout",)
+"""Fields that describe their message."""
 
 Keys = tuple[str | int, ...]
 """Way from a message to a value in it: fields and numbers of items."""
 
 
-@dataclass(frozen=True)
-class Place:
-    """Stands for a number in a message that is not decoded.
-
-    Attributes:
-        byte: Place of its first byte.
-        kind: NumPy's name of its type with the order of its bytes, `<f8`.
-    """
-
-    byte: int
-    kind: str
-
-
-class DecodingError(Exception):
-    """A message of a block cannot be decoded; `number` is its place in the block."""
-
-    def __init__(self, number: int, reason: object) -> None:
-        super().__init__(str(reason))
-        self.number = number
-
-
-class NumberReader(Protocol):
-    """Reads numbers from the messages of one channel."""
-
-    def find_numbers(self, data: bytes) -> Mapping[str, Keys]:
-        """Return the numbers in a message by their names.
-
-        Raises:
-            DecodingError: It cannot be decoded.
-        """
-        ...
-
-    def read(
-        self, messages: Sequence[bytes], names: Sequence[str]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the named numbers of messages, `(N, K)`, and whether a message has any, `(N,)`.
-
-        NaN stands for a number that a message lacks.
-
-        Raises:
-            DecodingError: A message cannot be decoded.
-        """
-        ...
-
-
-class ObjectReader:
-    """Reads messages that a library decodes one by one: JSON and protobuf.
+class NumberReader:
+    """Reads named numbers from the messages of one channel.
 
     Args:
-        decode: Returns the content of a message.
+        names: Their names.
     """
 
-    def __init__(self, decode: Callable[[bytes], Any]) -> None:
-        self._decode = decode
+    def __init__(self, names: Sequence[str]) -> None:
+        self.names = [*names]
         self._label_keys: list[Keys] | None = None
         self._plans: dict[tuple[Any, ...], list[_Step]] = {}
-        self._stamps: list[int] = []
-
-    def find_numbers(self, data: bytes) -> Mapping[str, Keys]:
-        """Return the numbers in a message by their names; see `NumberReader`."""
-        try:
-            return dict(find_leaves(self._decode(data)))
-        except Exception as error:  # a decoder raises what it stumbles over
-            raise DecodingError(0, f"{type(error).__name__}: {error}") from error
-
-    def read(
-        self, messages: Sequence[bytes], names: Sequence[str]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the named numbers of messages; see `NumberReader`."""
         self._stamps = [at for at, name in enumerate(names) if name.endswith("stamp")]
-        rows: list[list[Any]] = []
-        try:
-            for data in messages:
-                rows.append(self._read_one(self._decode(data), names))
-        except Exception as error:  # a decoder raises what it stumbles over
-            raise DecodingError(len(rows), f"{type(error).__name__}: {error}") from error
-        present = np.array([row.count(None) < len(row) or not row for row in rows], dtype=bool)
-        try:
-            values = np.array(rows, dtype=float)  # None becomes NaN
-        except (TypeError, ValueError):
-            number, name = _find_no_number(rows, names)
-            raise DecodingError(number, f"'{name}' is no number") from None
-        return values.reshape(len(rows), len(names)), present
 
-    def _read_one(self, message: Any, names: Sequence[str]) -> list[Any]:
-        if self._label_keys is None:
+    def read(self, message: Any) -> list[Any] | None:
+        """Return the numbers of a message, `None` for one that it lacks, or `None` where it has none of them."""
+        if self._label_keys is None or not self._label_keys:
             self._label_keys = list(_find_labels(message, ()))
         # names of the items of lists may differ from message to message
         labels = tuple(tuple(follow(message, keys) or ()) for keys in self._label_keys)
         if labels not in self._plans:
-            self._plans[labels] = _plan_reading(message, dict(find_leaves(message)), names)
+            self._plans[labels] = _plan_reading(message, dict(find_leaves(message)), self.names)
         values: list[Any] = []
         for step in self._plans[labels]:
             try:
@@ -123,9 +55,10 @@ class ObjectReader:
             except (KeyError, IndexError, TypeError, AttributeError):
                 parent = follow(message, step.parent_keys)
                 values += [follow(parent, (key,)) for key in step.keys]
+        has_any = not values or values.count(None) < len(values)
         for at in self._stamps:
             values[at] = read_time(values[at])
-        return values
+        return values if has_any else None
 
 
 @dataclass(frozen=True)
@@ -168,15 +101,6 @@ def _apply(value: Any, getter: Callable[[Any], Any]) -> Any:
     return getter(value)
 
 
-def _find_no_number(rows: list[list[Any]], names: Sequence[str]) -> tuple[int, str]:
-    """Return number of the message and name of the first value that is no number."""
-    for number, row in enumerate(rows):
-        for name, value in zip(names, row, strict=True):
-            if value is not None and not isinstance(value, (int, float, np.number)):
-                return number, name
-    raise AssertionError("a block was refused, but none of its values")
-
-
 def find_leaves(value: Any, prefix: str = "", keys: Keys = ()) -> Iterator[tuple[str, Keys]]:
     """Yield name and way of each number in a message."""
     listed = list(_list_fields(value))
@@ -186,6 +110,8 @@ def find_leaves(value: Any, prefix: str = "", keys: Keys = ()) -> Iterator[tuple
         is_time = name.endswith("stamp") and find_time(inner) is not None
         if is_time or _is_number(inner):
             yield path, (*keys, name)
+        elif name in NO_NUMBERS:
+            continue
         elif _is_sequence(inner):
             yield from _find_items(inner, path, (*keys, name), labels)
         elif not isinstance(inner, (str, bytes)):
@@ -223,6 +149,10 @@ def _list_fields(value: Any) -> Iterator[tuple[str, Any]]:
     elif hasattr(value, "DESCRIPTOR"):
         for one in value.DESCRIPTOR.fields:
             yield one.name, getattr(value, one.name)
+    elif hasattr(value, "__dataclass_fields__"):
+        for name in value.__dataclass_fields__:
+            if not name.startswith("__"):
+                yield name, getattr(value, name)
 
 
 def follow(value: Any, keys: Keys) -> Any:
@@ -256,11 +186,15 @@ def read_time(value: Any) -> float | None:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float, np.number, Place)) and not isinstance(value, bool)
+    return isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
 
 
 def _is_sequence(value: Any) -> bool:
-    return hasattr(value, "__len__") and hasattr(value, "__getitem__") and not isinstance(value, (str, bytes, Mapping))  # fmt: skip
+    return (
+        hasattr(value, "__len__")
+        and hasattr(value, "__getitem__")
+        and not isinstance(value, (str, bytes, Mapping))
+    )
 
 
 def _is_names(value: Any) -> bool:

@@ -1,8 +1,9 @@
-"""CSV logs: numbers, ISO 8601 times and lists of numbers in their cells.
+"""Text logs: numbers, times and lists of numbers in rows, with or without a header.
 
-A list in column `positions` becomes the columns `positions[0]`, `positions[1]`, …; a time becomes
-seconds since 1970. The file is read in blocks. Only where a block is refused it is read again, line
-by line, to find the place.
+The layout is told from the numbers: the rows of data are those that one delimiter cuts into equally
+many numbers; the header is the last line of names before them, comments and a row of units aside. A
+list in column `positions` becomes the columns `positions[0]`, `positions[1]`, …; a time becomes seconds
+since 1970, a time of day seconds since midnight. pandas does the reading.
 """
 
 from __future__ import annotations
@@ -10,122 +11,142 @@ from __future__ import annotations
 import csv
 import logging
 import re
-import sys
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import pyarrow as pa
-from pyarrow import compute
-from pyarrow import csv as arrow_csv
+import pandas as pd
 
-from actuators.recordings.log_tables import LogFile, LogRun, StoredColumns, Table
+from actuators.recordings.advice import advise
+from actuators.recordings.column_names import is_unit
+from actuators.recordings.log_tables import LogFile, LogRun, Table
 from brokk_rl.errors import RecordingError
 
 log = logging.getLogger(__name__)
 
-pc: Any = compute
-"""Its functions are made when it is imported, so a type checker does not know them."""
-
-BLOCK_BYTES = 8 << 20
-"""Bytes of text that are turned into numbers at once."""
-LONGEST_LINE_BYTES = 1 << 20
-"""Bytes at the end of a file in which its last line is looked for."""
 SNIFFED_BYTES = 1 << 16
-"""Bytes from the beginning of a file by which its delimiter is told."""
+"""Bytes at both ends of a file by which its layout is told."""
+DELIMITERS = (",", ";", "\t", " ", "|")
+COMMENT_MARKS = "#%;/!*"
+"""Signs that begin a line of comment."""
+MISSING = (
+    "",
+    "nan",
+    "NaN",
+    "NAN",
+    "na",
+    "NA",
+    "N/A",
+    "n/a",
+    "null",
+    "NULL",
+    "None",
+    "none",
+    "-",
+    "--",
+)
+"""Cells without a value."""
+FLAGS = {"true": 1.0, "false": 0.0, "on": 1.0, "off": 0.0, "yes": 1.0, "no": 0.0}
 ISO_TIME = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[+-]\d\d:?\d\d)?")
+DAY_TIME = re.compile(r"\d\d?[./]\d\d?[./]\d{4}[T ]+\d\d?:\d\d(:\d\d([.,]\d+)?)?")
+"""Day, month, year and time of day."""
+CLOCK_TIME = re.compile(r"\d\d?:\d\d:\d\d([.,]\d+)?")
 ITEM = re.compile(r"(.*)\[([^\]]*)\]")
 """Name of an item of a list: column and label."""
 
 csv.field_size_limit(1 << 24)  # a cell may hold a long list
 
-CellKind = Literal["number", "time", "list", "text"]
+CellKind = Literal["number", "time", "list", "flag", "text"]
 
 
 @dataclass(frozen=True)
-class CsvLayout:
-    """Signs between and within the cells of a CSV file.
+class TextLayout:
+    """Place and form of the rows of a text log.
 
     Attributes:
-        delimiter: Between the cells of a line.
+        delimiter: Between the cells of a line; a space stands for any white space.
         decimal: Decimal sign of the numbers.
+        encoding: Encoding of the text.
+        first_line: Number of lines before the first row of data.
+        names: Names of the columns; repeated ones are told apart by `#1`, `#2`.
+        samples: Cells of some rows, those of the first row at the beginning.
     """
 
     delimiter: str
     decimal: str
+    encoding: str
+    first_line: int
+    names: tuple[str, ...]
+    samples: tuple[tuple[str, ...], ...]
+
+    def tell_kind(self, at: int) -> CellKind:
+        """Return the kind of column `at`: that of most of its cells."""
+        kinds = Counter(
+            tell_kind(row[at], self.decimal) for row in self.samples if row[at] not in MISSING
+        )
+        return kinds.most_common(1)[0][0] if kinds else "number"
 
 
 @dataclass(frozen=True)
-class CsvTable(Table):
-    """Columns of a CSV file, whose lines are found again when a message names one."""
+class TextTable(Table):
+    """Columns of a text log, whose lines are found again when a message names one."""
 
-    path: Path
-    delimiter: str
+    source: TextLog | None = None
 
     def locate(self, row: int) -> str:
         """Return line and row."""
-        return f"line {_find_row(self.path, self.delimiter, row)[0]} (row {row})"
+        assert self.source is not None
+        return f"line {self.source.find_line(row)[0]} (row {row})"
 
     def show_cell(self, row: int, column: str) -> str:
         """Return the text of a cell, two quotes for an empty one."""
-        header = _read_header(self.path, self.delimiter)
-        cells = _find_row(self.path, self.delimiter, row)[1]
-        indexed = ITEM.fullmatch(column)
-        name = column if column in header or indexed is None else indexed[1]
-        return cells[header.index(name)] or "''"
+        assert self.source is not None
+        return self.source.find_line(row)[1][self.source.find_column(column)] or "''"
 
 
-@contextmanager
-def _hide_bad_text() -> Iterator[None]:
-    """Hide the traceback of a bad line that is no text: pyarrow prints it before its own error."""
-    before = sys.unraisablehook
-
-    def hide(found: sys.UnraisableHookArgs) -> None:
-        if found.exc_type is not UnicodeDecodeError:
-            before(found)
-
-    sys.unraisablehook = hide
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
-
-
-class CsvLog(LogFile):
-    """A CSV file as a log with one table."""
+class TextLog(LogFile):
+    """A text file as a log with one table."""
 
     def __init__(
-        self, path: Path, layout: CsvLayout | None = None, labels: Sequence[str] = ()
+        self, path: Path, signs: tuple[str, str] | None = None, labels: Sequence[str] = ()
     ) -> None:
-        """Open a CSV file.
+        """Open a text file.
 
         Args:
             path: The file.
-            layout: Its signs; `None` to tell them from its beginning.
+            signs: Its delimiter and decimal sign; `None` to tell them.
             labels: Names for the items of lists of this length, instead of numbers.
         """
         super().__init__(path)
         self._labels = labels
-        self._layout = layout or detect_layout(path)
-        self._header = _read_header(path, self._layout.delimiter)
-        self._first = _find_row(path, self._layout.delimiter, 0)[1]
+        self.layout = detect_layout(path, signs)
 
-    @property
-    def layout(self) -> CsvLayout:
-        """Signs of the file, as given or as told from its beginning."""
-        return self._layout
+    def find_column(self, name: str) -> int:
+        """Return the place of a column, or of the list that an item belongs to."""
+        item = ITEM.fullmatch(name)
+        names = self.layout.names
+        return names.index(name if name in names or item is None else item[1])
+
+    def find_line(self, row: int) -> tuple[int, list[str]]:
+        """Return number, from 1, and cells of the line of a row of data."""
+        with self.path.open(encoding=self.layout.encoding, errors="replace") as file:
+            count = -1
+            for number, line in enumerate(file):
+                count += number >= self.layout.first_line and bool(line.strip())
+                if count == row:
+                    return number + 1, split_line(line, self.layout.delimiter)
+        raise RecordingError(f"{self.path}: has no row {row}")
 
     def list_tables(self) -> dict[str, list[str]]:
-        """Return the columns whose first cell is a number, a time or a list."""
+        """Return the columns whose cells are numbers, times, flags or lists."""
         found: list[str] = []
-        for name, text in zip(self._header, self._first, strict=False):
-            kind = tell_kind(text, self._layout.decimal)
+        for at, name in enumerate(self.layout.names):
+            kind = self.layout.tell_kind(at)
             if kind == "list":
-                found += [f"{name}[{label}]" for label in self._label_items(text)]
+                found += [f"{name}[{label}]" for label in self._label_items(at)]
             elif name and kind != "text":
                 found.append(name)
         return {"": found}
@@ -138,279 +159,322 @@ class CsvLog(LogFile):
         Raises:
             RecordingError: A cell cannot be read, or the file is damaged; names line and column.
         """
-        cells: dict[str, list[str]] = {}
-        for name in wanted.get("", ()):
-            if name in self._header:
-                cells.setdefault(name, []).append(name)
-            elif (indexed := ITEM.fullmatch(name)) and indexed[1] in self._header:
-                cells.setdefault(indexed[1], []).append(name)
-        for column in cells:
-            if self._header.count(column) > 1:
-                raise RecordingError(
-                    f"{self.path}: {self._header.count(column)} columns are named '{column}'; rename them"
-                )
-        columns = self._read(cells, max_rows)
-        table = CsvTable(columns, self.path, self._layout.delimiter)
-        yield LogRun(self.path.stem, str(self.path), {"": table})
+        places = {name: self.find_column(name) for name in wanted.get("", ())}
+        cells = self._read_cells(sorted(set(places.values())), max_rows)
+        columns = {}
+        for at, several in cells.items():
+            numbers = self._convert(several, at)
+            for name in (name for name, place in places.items() if place == at):
+                if numbers.ndim == 1:
+                    columns[name] = numbers
+                else:
+                    label = name.removeprefix(f"{self.layout.names[at]}[").removesuffix("]")
+                    columns[name] = numbers[:, self._label_items(at).index(label)]
+        ordered = {name: columns[name] for name in places}
+        yield LogRun(self.path.stem, str(self.path), {"": TextTable(ordered, source=self)})
 
-    @_hide_bad_text()
-    def _read(self, wanted: dict[str, list[str]], max_rows: int | None) -> StoredColumns:
-        columns = StoredColumns(name for several in wanted.values() for name in several)
-        skipped: list[int] = []
-        row = 0
+    def _read_cells(self, places: list[int], max_rows: int | None) -> dict[int, pd.Series]:
+        """Return the cells of some columns; numbers are numbers already where all of them are."""
+        layout, width = self.layout, len(self.layout.samples[0])
+        texts = {at: str for at in places if layout.tell_kind(at) != "number"}
+        options: dict[str, Any] = {
+            "sep": r"\s+" if layout.delimiter == " " else layout.delimiter,
+            "decimal": layout.decimal,
+            "header": None,
+            "names": range(width),
+            "usecols": sorted({*places, width - 1}),
+            "dtype": texts,
+            "na_values": MISSING,
+            "keep_default_na": False,
+            "encoding": layout.encoding,
+            "skiprows": layout.first_line,
+            "low_memory": False,
+            "skipinitialspace": True,
+            "nrows": max_rows,
+            "index_col": False,
+        }
         try:
-            for batch in self._open(list(wanted), skipped):
-                for at, (column, several) in enumerate(wanted.items()):
-                    numbers = self._convert(batch.column(at), column, row)
-                    for name in several:
-                        columns.add(name, self._pick(numbers, name, column))
-                row += batch.num_rows
-                if max_rows is not None and row >= max_rows:
-                    break
-        except (pa.ArrowInvalid, OSError) as error:
-            self._refuse(error)
-        if max_rows is not None and row >= max_rows:
-            return columns
-        self._drop_cut_line(columns, row, len(skipped))
-        return columns
+            frame = pd.read_csv(self.path, on_bad_lines="error", **options)
+        except pd.errors.ParserError as error:
+            self._find_bad_line(width, error)
+            frame = pd.read_csv(self.path, on_bad_lines="skip", **options)
+        except (OSError, UnicodeDecodeError, ValueError) as error:
+            raise RecordingError(
+                f"{self.path}: not a text file that can be read ({error})"
+            ) from error
+        if max_rows is None or len(frame) < max_rows:
+            frame = self._drop_cut_line(frame, width)
+        if len(frame) < 2:
+            raise RecordingError(
+                f"{self.path}: {len(frame)} rows of data below the header; a log has at least 2"
+            )
+        if frame[width - 1].isna().any() and layout.names[width - 1 : width] != ("",):
+            self._find_bad_line(width, None)
+        return {at: frame[at] for at in places}
 
-    def _open(self, columns: list[str], skipped: list[int]) -> Iterator[pa.RecordBatch]:
-        """Yield blocks of the wanted columns as text."""
-        lines = _count_header_lines(self.path, self._layout.delimiter)
-        names = [f"{at}:{name}" for at, name in enumerate(self._header)]
+    def _find_bad_line(self, width: int, error: Exception | None) -> None:
+        """Report the first line that has another number of cells than the others."""
+        with self.path.open(encoding=self.layout.encoding, errors="replace") as file:
+            row = -1
+            for number, line in enumerate(file):
+                if number < self.layout.first_line or not line.strip():
+                    continue
+                row += 1
+                count = len(split_line(line, self.layout.delimiter))
+                if count != width and line.endswith("\n"):
+                    num_names = len(self.layout.names)
+                    text = (
+                        f"line {number + 1} (row {row}): {count} cells, the header has {num_names}"
+                    )
+                    self.report_damage(text, error)
+                    return
 
-        def note_bad_row(_row: arrow_csv.InvalidRow) -> str:
-            skipped.append(1)
-            return "skip"
-
-        reader = arrow_csv.open_csv(
+    def _drop_cut_line(self, frame: pd.DataFrame, width: int) -> pd.DataFrame:
+        """Leave out a last line that a crash cut off: a number may be cut off too, and still look like one."""
+        size = self.path.stat().st_size
+        with self.path.open("rb") as file:
+            file.seek(-min(size, SNIFFED_BYTES), 2)
+            tail = file.read().decode(self.layout.encoding, errors="replace")
+        last = tail.rstrip("\r\n").rpartition("\n")[2]
+        cells = split_line(last, self.layout.delimiter)
+        is_whole = len(cells) >= width and tail.endswith(("\n", "\r"))
+        if is_whole or not len(frame):
+            return frame
+        line = self.find_line(len(frame) - 1)[0]
+        log.warning(
+            "%s: the last line, %d, is cut off or lacks its end (%d of %d cells): left out",
             self.path,
-            arrow_csv.ReadOptions(
-                use_threads=False, block_size=BLOCK_BYTES, skip_rows=lines, column_names=names
-            ),
-            arrow_csv.ParseOptions(
-                delimiter=self._layout.delimiter,
-                newlines_in_values=True,
-                invalid_row_handler=note_bad_row,
-            ),
-            arrow_csv.ConvertOptions(
-                include_columns=[names[self._header.index(name)] for name in columns],
-                column_types=dict.fromkeys(names, pa.string()),
-                strings_can_be_null=False,
-            ),
+            line,
+            len(cells),
+            width,
         )
-        yield from reader
+        return frame.iloc[:-1]
 
-    def _convert(self, cells: pa.StringArray, column: str, first_row: int) -> np.ndarray:
-        """Return the numbers of a block, `(T,)`, or `(T, K)` for lists."""
-        cells = pc.utf8_trim_whitespace(cells)
-        first = self._first[self._header.index(column)]
-        kind = tell_kind(first, self._layout.decimal)
-        try:
-            if kind == "list":
-                return _convert_lists(cells, len(_split_list(first)))
-            if kind == "time":
-                return _convert_times(cells)
-            return _convert_numbers(cells, self._layout.decimal)
-        except (pa.ArrowInvalid, ValueError):
-            row, text = self._find_bad_cell(cells, kind, first)
-        place = _find_row(self.path, self._layout.delimiter, first_row + row)[0]
-        what = {"list": f"a list of {len(_split_list(first))} numbers", "time": "an ISO time"}
-        raise RecordingError(
-            f"{self.path}: line {place} (row {first_row + row}), column '{column}': '{text}' is not "
-            f"{what.get(kind, 'a number')}"
-        )
+    def _convert(self, cells: pd.Series, at: int) -> np.ndarray:
+        """Return the numbers of a column, `(T,)`, or `(T, K)` for lists; NaN for an empty cell."""
+        kind = self.layout.tell_kind(at)
+        length = len(self._label_items(at)) if kind == "list" else 1
+        values = convert_cells(cells, kind, length, self.layout.decimal)
+        bad = np.isnan(values).reshape(len(cells), -1).any(1) & cells.notna().to_numpy()
+        if bad.any() and not self.keep_whole:
+            row = int(np.argmax(bad))
+            what = {"list": f"a list of {length} numbers", "time": "a time"}.get(kind, "a number")
+            line = self.find_line(row)[0]
+            raise RecordingError(
+                f"{self.path}: line {line} (row {row}), column '{self.layout.names[at]}': '{str(cells.iloc[row]).strip()}' is not "
+                f"{what}; {advise('damaged')}"
+            )
+        return values
 
-    def _pick(self, numbers: np.ndarray, name: str, column: str) -> np.ndarray:
-        """Return the numbers of column `name`, `(T,)`, of a block."""
-        if numbers.ndim == 1:
-            return numbers
-        labels = self._label_items(self._first[self._header.index(column)])
-        return numbers[:, labels.index(name.removeprefix(f"{column}[").removesuffix("]"))]
-
-    def _label_items(self, text: str) -> list[str]:
+    def _label_items(self, at: int) -> list[str]:
         """Return the names of the items of a list."""
-        length = len(_split_list(text))
+        length = len(split_list(self.layout.samples[0][at]))
         return [*self._labels] if len(self._labels) == length else [str(i) for i in range(length)]
 
-    def _find_bad_cell(self, cells: pa.StringArray, kind: CellKind, first: str) -> tuple[int, str]:
-        for row, cell in enumerate(cells):
-            one = cells.slice(row, 1)
-            try:
-                if kind == "list":
-                    _convert_lists(one, len(_split_list(first)))
-                elif kind == "time":
-                    _convert_times(one)
-                else:
-                    _convert_numbers(one, self._layout.decimal)
-            except (pa.ArrowInvalid, ValueError):
-                return row, cell.as_py()
-        raise AssertionError("a block was refused, but none of its cells")
 
-    def _drop_cut_line(self, columns: StoredColumns, num_rows: int, num_skipped: int) -> None:
-        """Leave out a last line that is cut off; refuse other bad lines."""
-        line, cells, is_ended = _read_last_line(self.path, self._layout.delimiter)
-        is_cut = len(cells) < len(self._header)
-        if num_skipped > int(is_cut):
-            self._refuse(None)
-        # a number may be cut off too, and still look like one
-        if is_cut or not is_ended:
-            log.warning(
-                "%s: the last line, %d, is cut off or lacks its end (%d of %d cells): left out",
-                self.path, line, len(cells), len(self._header),
-            )  # fmt: skip
-            num_rows -= int(not is_cut)  # the cut one has been skipped
-            columns.cut(num_rows)
-        if num_rows < 2:
-            raise RecordingError(
-                f"{self.path}: {num_rows} rows of data below the header; a log has at least 2"
-            )
-
-    def _refuse(self, error: Exception | None) -> None:
-        """Find the line that cannot be read, and raise."""
-        for row, (line, cells) in enumerate(_scan(self.path, self._layout.delimiter)):
-            if len(cells) != len(self._header):
-                raise RecordingError(
-                    f"{self.path}: line {line} (row {row - 1}): {len(cells)} cells, the header has "
-                    f"{len(self._header)}"
-                ) from error
-        raise RecordingError(f"{self.path}: not CSV ({error})") from error
+def convert_cells(cells: pd.Series, kind: CellKind, length: int, decimal: str) -> np.ndarray:
+    """Return cells as numbers, `(T,)`, or `(T, K)` for lists; NaN for what is none."""
+    if kind == "number":
+        if cells.dtype.kind in "fiu":
+            return cells.to_numpy(dtype=float)
+        texts = cells.astype(str).str.strip().str.replace(decimal, ".", regex=False)
+        return pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
+    texts = cells.fillna("").str.strip()
+    if kind == "flag":
+        return texts.str.lower().map(FLAGS).to_numpy(dtype=float)
+    if kind == "time":
+        return convert_times(texts)
+    found = np.full((len(texts), length), np.nan)
+    for row, text in enumerate(texts):
+        parts = split_list(text)
+        if len(parts) == length and all(_is_number(part) for part in parts):
+            found[row] = [float(part) for part in parts]
+    return found
 
 
-def detect_layout(path: Path) -> CsvLayout:
-    """Return delimiter and decimal sign, found from the beginning of a file.
+def convert_times(texts: pd.Series) -> np.ndarray:
+    """Return times as seconds since 1970, without a zone as if it were UTC, or as seconds of the day, `(T,)`."""
+    first = next((text for text in texts if text), "")
+    texts = texts.str.replace(",", ".", regex=False)
+    if CLOCK_TIME.fullmatch(first):
+        elapsed = pd.to_timedelta(texts, errors="coerce")
+        return elapsed.dt.total_seconds().to_numpy(dtype=float)
+    is_iso = ISO_TIME.fullmatch(first) is not None
+    form = {"format": "ISO8601"} if is_iso else {"dayfirst": "/" not in first, "format": "mixed"}
+    stamps: Any = pd.to_datetime(texts, utc=True, errors="coerce", **form)
+    elapsed = stamps - pd.Timestamp(0, tz="UTC")
+    return (elapsed / pd.Timedelta(seconds=1)).to_numpy(dtype=float)
 
-    The delimiter is the sign that cuts all lines into the same number of cells, the most if several
-    do.
+
+def detect_layout(path: Path, signs: tuple[str, str] | None = None) -> TextLayout:
+    """Return the layout of a text file, told from both of its ends.
 
     Raises:
-        RecordingError: The file cannot be read, or no sign does.
+        RecordingError: The file cannot be read, has no rows of numbers, or its header does not fit them.
     """
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            lines = file.read(SNIFFED_BYTES).splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: not a text file that can be read ({error})") from error
-    lines = [line for line in lines if line.strip()][:50]
-    best, most = ",", 1
-    for delimiter in (",", ";", "\t", " "):
-        counts = [len(cells) for cells in csv.reader(lines[:-1] or lines, delimiter=delimiter)]
-        if counts and len(set(counts)) == 1 and counts[0] > most:
-            best, most = delimiter, counts[0]
-    if most == 1 and any(sign in line for line in lines for sign in ";\t,"):
-        raise RecordingError(
-            f"{path}: no delimiter of , ; tab and space cuts its first lines into as many cells as its header"
+    head, tail, encoding = _read_ends(path)
+    candidates = []
+    for delimiter, decimal in [signs] if signs else _list_signs(head):
+        rows = [split_line(line, delimiter) for line in head]
+        good = [i for i, row in enumerate(rows) if _is_data(row, decimal)]
+        if not good:
+            continue
+        width = Counter(len(rows[i]) for i in good).most_common(1)[0][0]
+        samples = [rows[i] for i in good if len(rows[i]) == width]
+        for line in tail:
+            row = split_line(line, delimiter)
+            if len(row) == width and _is_data(row, decimal):
+                samples.append(row)
+        score = sum(
+            tell_kind(cell, decimal) != "text" and cell not in MISSING
+            for row in samples
+            for cell in row
         )
-    comma = re.compile(r"-?\d+,\d+")
-    cells = [cell for row in csv.reader(lines[1:], delimiter=best) for cell in row]
-    return CsvLayout(best, "," if best != "," and any(map(comma.fullmatch, cells)) else ".")
+        first = next(i for i in good if len(rows[i]) == width)
+        candidates.append((score, delimiter, decimal, first, width, samples))
+    if not candidates:
+        num_lines = sum(bool(line.strip()) for line in head)
+        if num_lines < 2:
+            raise RecordingError(f"{path}: 0 rows of data below the header; a log has at least 2")
+        text = next((line for line in head if line.strip()), "")[:60]
+        raise RecordingError(
+            f"{path}: no column of numbers can be read: expected rows of numbers between , ; tab, space or |, "
+            f"the file begins with '{text}'"
+        )
+    _, delimiter, decimal, first, width, samples = max(candidates, key=lambda one: one[0])
+    _refuse_double_comma(path, head[:first], delimiter, width, samples)
+    names = _find_names(path, head[:first], delimiter, width, samples)
+    kept = tuple(tuple(row) for row in samples)
+    return TextLayout(delimiter, decimal, encoding, first, _tell_apart(names), kept)
+
+
+def _list_signs(head: list[str]) -> list[tuple[str, str]]:
+    """Return delimiters and decimal signs to try; Excel writes the delimiter into a line of its own."""
+    stated = re.match(r'"?sep=(.)"?\s*$', head[0]) if head else None
+    delimiters = (stated[1],) if stated else DELIMITERS
+    signs = []
+    for delimiter in delimiters:
+        signs += [(delimiter, decimal) for decimal in ".," if decimal != delimiter]
+    return signs
+
+
+def _read_ends(path: Path) -> tuple[list[str], list[str], str]:
+    """Return whole lines at the beginning and at the end of a file, and its encoding."""
+    try:
+        with path.open("rb") as file:
+            head = file.read(SNIFFED_BYTES)
+            size = file.seek(0, 2)
+            file.seek(max(len(head), size - SNIFFED_BYTES) // 2 * 2)
+            tail = file.read()
+    except OSError as error:
+        raise RecordingError(f"{path}: not a text file that can be read ({error})") from error
+    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        first = head.decode(encoding, errors="strict" if size <= SNIFFED_BYTES else "ignore")
+    except UnicodeDecodeError:
+        encoding = "cp1252"
+        first = head.decode(encoding, errors="replace")
+    if "\0" in first:
+        raise RecordingError(f"{path}: not a text file that can be read (it holds bytes of 0)")
+    last = tail.decode(encoding.removesuffix("-sig"), errors="ignore")
+    lines = first.splitlines()
+    return lines if size <= SNIFFED_BYTES else lines[:-1], last.splitlines()[1:-1], encoding
+
+
+def _is_data(row: list[str], decimal: str) -> bool:
+    """Return whether most of the cells of a row are numbers, times or lists."""
+    filled = [cell for cell in row if cell not in MISSING]
+    values = [cell for cell in filled if tell_kind(cell, decimal) not in ("text", "flag")]
+    return bool(values) and 2 * len(values) > len(filled) and len(row) > 1
+
+
+def _refuse_double_comma(
+    path: Path, above: list[str], delimiter: str, width: int, samples: list[list[str]]
+) -> None:
+    """Refuse rows in which a comma is the delimiter and the decimal sign."""
+    if delimiter != "," or not above:
+        return
+    num_names = len(split_line(above[-1], delimiter))
+    fractions = [cell for row in samples for cell in row[1::2]]
+    if num_names < width <= 2 * num_names and all(cell.isdigit() for cell in fractions):
+        raise RecordingError(
+            f"{path}: the comma is both delimiter and decimal sign: a header of {num_names} cells, rows of {width}; "
+            "export again with a decimal point, or with ; or tab between the cells"
+        )
+
+
+def _find_names(
+    path: Path, above: list[str], delimiter: str, width: int, samples: list[list[str]]
+) -> list[str]:
+    """Return the names of the columns from the lines above the data, with their units."""
+    is_padded = all(row[-1] == "" for row in samples)
+    units: list[str] = []
+    filled = [line for line in above if line.strip()]
+    for line in reversed(filled):
+        mark = line.lstrip()[0]
+        is_comment = mark in COMMENT_MARKS
+        plain = line.lstrip().lstrip(COMMENT_MARKS) if is_comment else line
+        cells = split_line(plain, delimiter)
+        if len(cells) == 1 and delimiter == " ":
+            cells = split_line(plain, ",")
+        if len(cells) == width - 1 and is_padded:
+            cells.append("")
+        if len(cells) != width:
+            is_near = line is filled[-1] and not is_comment and width <= 2 * len(cells) <= 4 * width
+            if is_near and len(cells) > 1:
+                raise RecordingError(
+                    f"{path}: the header has {len(cells)} cells, the rows below it have {width}: '{line.strip()[:80]}'; "
+                    f"mend the header, or the delimiter '{delimiter}'"
+                )
+            continue
+        if not units and all(cell in MISSING or is_unit(cell) for cell in cells):
+            units = [cell.strip("[](){}") for cell in cells]
+            continue
+        if not units:
+            return cells
+        pairs = zip(cells, units, strict=True)
+        return [f"{name} [{unit}]" if unit not in MISSING else name for name, unit in pairs]
+    return [f"column_{at + 1}" for at in range(width)]
+
+
+def _tell_apart(names: list[str]) -> tuple[str, ...]:
+    """Return names of which none repeats."""
+    counts, seen, found = Counter(names), Counter[str](), []
+    for name in names:
+        seen[name] += 1
+        found.append(f"{name}#{seen[name]}" if name and counts[name] > 1 else name)
+    return tuple(found)
+
+
+def split_line(line: str, delimiter: str) -> list[str]:
+    """Return the cells of a line."""
+    if delimiter == " ":
+        return line.split()
+    cells = next(csv.reader([line.strip("\r\n")], delimiter=delimiter, skipinitialspace=True), [])
+    return [cell.strip() for cell in cells]
 
 
 def tell_kind(text: str, decimal: str) -> CellKind:
     """Return the kind of a cell; an empty cell counts as a number that is missing."""
     if text.startswith("[") and text.endswith("]"):
-        try:
-            [float(part) for part in _split_list(text)]
-        except ValueError:
-            return "text"
-        return "list"
-    if ISO_TIME.fullmatch(text):
+        return "list" if all(_is_number(part) for part in split_list(text)) else "text"
+    if any(form.fullmatch(text) for form in (ISO_TIME, DAY_TIME, CLOCK_TIME)):
         return "time"
+    if text.lower() in FLAGS:
+        return "flag"
+    is_number = text in MISSING or ("_" not in text and _is_number(text.replace(decimal, ".")))
+    return "number" if is_number else "text"
+
+
+def _is_number(text: str) -> bool:
     try:
-        float(text.replace(decimal, ".") or "nan")
+        float(text)
     except ValueError:
-        return "text"
-    return "number"
+        return False
+    return True
 
 
-def _split_list(text: str) -> list[str]:
-    inner = text.strip("[]")
-    return re.split(r"\s*,\s*|\s+", inner.strip()) if inner.strip() else []
-
-
-def _convert_numbers(cells: pa.StringArray, decimal: str) -> np.ndarray:
-    """Return the numbers of cells, `(T,)`; NaN for an empty cell."""
-    if decimal != ".":
-        cells = pc.replace_substring(cells, decimal, ".")
-    cells = pc.if_else(pc.equal(cells, ""), pa.scalar("nan"), cells)
-    return pc.cast(cells, pa.float64()).to_numpy(zero_copy_only=False)
-
-
-def _convert_times(cells: pa.StringArray) -> np.ndarray:
-    """Return seconds since 1970, `(T,)`; without a zone, as if it were UTC."""
-    cells = pc.replace_substring(pc.if_else(pc.equal(cells, ""), None, cells), ",", ".")
-    zoned = pc.any(pc.match_substring_regex(cells, r"(Z|[+-]\d\d:?\d\d)$")).as_py()
-    kind = pa.timestamp("ns", "UTC" if zoned else None)
-    nanoseconds = pc.cast(pc.cast(cells, kind), pa.int64())
-    return nanoseconds.to_numpy(zero_copy_only=False).astype(np.float64) / 1e9
-
-
-def _convert_lists(cells: pa.StringArray, length: int) -> np.ndarray:
-    """Return the numbers of lists, `(T, K)`.
-
-    Raises:
-        ValueError: A list has another length.
-    """
-    inner = pc.utf8_trim_whitespace(pc.utf8_trim(cells, "[]"))
-    parts = pc.split_pattern_regex(inner, r"\s*,\s*|\s+")
-    if not pc.all(pc.equal(pc.list_value_length(parts), length)).as_py():
-        raise ValueError("lists of different lengths")
-    numbers = pc.cast(parts.flatten(), pa.float64()).to_numpy(zero_copy_only=False)
-    return numbers.reshape(-1, length)
-
-
-def _scan(path: Path, delimiter: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield line and cells of each row, the header first."""
-    try:
-        with path.open(encoding="utf-8-sig", newline="") as file:
-            reader = csv.reader(file, delimiter=delimiter)
-            try:
-                for cells in reader:
-                    if cells:
-                        yield reader.line_num, [cell.strip() for cell in cells]
-            except csv.Error as error:
-                raise RecordingError(
-                    f"{path}: line {reader.line_num}: not CSV ({error})"
-                ) from error
-            except UnicodeDecodeError as error:  # text is decoded some lines ahead
-                raise RecordingError(
-                    f"{path}: after line {reader.line_num}: not text in UTF-8 ({error.reason})"
-                ) from error
-    except FileNotFoundError as error:
-        raise RecordingError(f"{path}: no such log") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: not a text file that can be read ({error})") from error
-
-
-def _find_row(path: Path, delimiter: str, row: int) -> tuple[int, list[str]]:
-    """Return line and cells of a row of data."""
-    found = next(islice(_scan(path, delimiter), row + 1, None), None)
-    if found is None:
-        raise RecordingError(f"{path}: 0 rows of data below the header; a log has at least 2")
-    return found
-
-
-def _read_last_line(path: Path, delimiter: str) -> tuple[int, list[str], bool]:
-    """Return number and cells of the last line that is not empty, and whether it has its end."""
-    count, size = 0, path.stat().st_size
-    with path.open("rb") as file:
-        while block := file.read(BLOCK_BYTES):
-            count += block.count(b"\n")
-        file.seek(-min(size, LONGEST_LINE_BYTES), 2)
-        tail = file.read().decode("utf-8", errors="replace")
-    is_ended = tail.endswith(("\n", "\r"))
-    lines = tail.splitlines()
-    num_empty = 0
-    while lines and not lines[-1].strip():
-        lines.pop()
-        num_empty += 1
-    cells = next(csv.reader(lines[-1:], delimiter=delimiter), [])
-    return count + int(not is_ended) - num_empty, cells, is_ended
-
-
-def _read_header(path: Path, delimiter: str) -> list[str]:
-    return next(_scan(path, delimiter), (0, [""]))[1]
-
-
-def _count_header_lines(path: Path, delimiter: str) -> int:
-    return next(_scan(path, delimiter), (0, [""]))[0]
+def split_list(text: str) -> list[str]:
+    """Return the items of a list in a cell."""
+    inner = text.strip("[]").strip()
+    return re.split(r"\s*,\s*|\s+", inner) if inner else []

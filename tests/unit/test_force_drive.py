@@ -161,7 +161,7 @@ def test_a_diagnosis_names_mass_friction_and_offset_of_a_drive(
 
 
 def test_a_force_is_averaged_over_a_period() -> None:
-    signal = Signal("", np.arange(0.0, 0.02, 0.001), np.arange(20.0), "u")
+    signal = Signal("", np.arange(0.0, 0.02, 0.001), np.arange(20.0), np.arange(20), "u")
     np.testing.assert_allclose(
         signal.average(np.array([0.0, 0.005, 0.01]), 0.005), [2.0, 7.0, 12.0]
     )

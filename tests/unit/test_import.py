@@ -90,7 +90,7 @@ def test_servo_logs_go_from_the_file_to_recordings_in_two_commands(
     assert earlier.code == 0, earlier.err
 
 
-def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
+def test_columns_that_share_no_names_are_paired_by_their_numbers(
     brokk: Callable[..., Done],
 ) -> None:
     rows = make_targets()
@@ -104,8 +104,21 @@ def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
     done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
     assert done.code == 0, done.err
     guesses = read_guesses("draft")
-    assert {guesses[f"joint_{j}: columns"]["sureness"] for j in range(3)} == {"unsure"}
-    assert "are unsure: fill in ???" in done.out
+    for j, k in enumerate((1, 2, 0)):
+        guess = guesses[f"{'abc'[j]}: columns"]
+        assert guess["value"] == f"valve{k} → angle_{'abc'[j]}_deg"
+        assert guess["sureness"] == "likely"
+
+
+def test_columns_whose_numbers_contradict_their_names_are_left_to_a_person(
+    brokk: Callable[..., Done],
+) -> None:
+    write_servo_log(Path("a.csv"), swapped=True)
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert done.code == 0, done.err
+    assert "guesses are unsure: fill in ???" in done.out
+    guesses = read_guesses("draft")
+    assert {guesses[f"{name}: columns"]["sureness"] for name in ("hip", "knee")} == {"unsure"}
     text = Path("draft/column_map.yaml").read_text()
     assert 'column: "???"' in text
     done = brokk(
@@ -138,8 +151,8 @@ def test_a_unit_that_nothing_tells_is_left_to_a_person_or_given(brokk: Callable[
     assert "kind: slide" in Path("two/machine.yaml").read_text()
     brokk("mode=import", "log.input=a.csv", "log.position_unit={joint: mm}", "session.out=by_joint")
     assert read_guesses("by_joint")["joint: unit"]["value"] == "mm"
-    done = brokk("mode=import", "log.input=a.csv", "log.position_unit=inch", "session.out=three")
-    assert done.code == 2 and "unknown unit 'inch'" in done.err
+    done = brokk("mode=import", "log.input=a.csv", "log.position_unit=furlong", "session.out=three")
+    assert done.code == 2 and "unknown unit 'furlong'" in done.err
 
 
 @pytest.mark.parametrize("sign", [1, -1])
@@ -313,15 +326,15 @@ def test_rows_that_repeat_a_time_or_lack_a_number_are_refused_or_left_out_and_co
     write_table(Path("a.csv"), columns)
     done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
     assert done.code == 2
-    assert "'t' does not increase in 1 of 1500 rows, first in line 42 (row 40); log.damaged=skip" in done.err  # fmt: skip
+    assert "'t': the time does not increase in 1 of 1500 rows, first in line 42 (row 40); log.damaged=skip" in done.err  # fmt: skip
     assert not Path("draft").exists()
     done = brokk("mode=import", "log.input=a.csv", "log.damaged=skip", "session.out=draft")
     assert done.code == 0, done.err
     options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml", "log.input=a.csv")
     done = brokk("mode=import", *options, "session.out=out")
     assert done.code == 0, done.err
-    said = "3 of 1500 rows left out: in 1 the time does not increase, 2 lack a number"
-    assert said in caplog.text
+    assert "the time does not increase in 1 of 1500 rows; 1 of 1500 rows left out" in caplog.text
+    assert "column 'hip_pos_rad': 2 of 1500 rows lack a number and are left out" in caplog.text
     assert "brokk mode=diagnose machine=@draft/machine.yaml 'diagnosis.field=out/recordings/*'" in done.out  # fmt: skip
     (path,) = Path("out/recordings").iterdir()
     np.testing.assert_allclose(read_positions(path, "hip"), delay(targets)[:, 0], atol=2e-3)

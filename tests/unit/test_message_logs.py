@@ -18,14 +18,7 @@ from carriage import check, make_carriage, make_map, make_signals
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from mcap.writer import Writer
 
-from actuators.recordings.can_log import (
-    AscBlockReader,
-    BlfBlockReader,
-    CanLog,
-    FrameBlock,
-    extract_signal,
-    gather_frames,
-)
+from actuators.recordings.can_log import BlfBlockReader, CanLog, extract_signal, gather_frames
 from actuators.recordings.column_map import AlignedTime, Column
 from actuators.recordings.log_files import open_log
 from brokk_rl.errors import ConfigError, RecordingError
@@ -324,60 +317,6 @@ def test_items_of_lists_keep_their_order(tmp_path: Path) -> None:
     assert list(run.tables["/state"].columns)[1:] == [f"q[{j}]" for j in range(12)]
 
 
-DEFINITION = """std_msgs/Header header
-bool flag
-uint8 small
-string[] name
-float64[] position
-float32[3] force
-int16[] count
-Item[] items
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: arm/Item
-int8 kind
-float64 value
-string text
-"""
-
-
-@pytest.mark.parametrize("is_ros1", [False, True])
-def test_blocks_of_ros_messages_are_what_rosbags_reads_one_by_one(is_ros1: bool) -> None:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    from actuators.recordings.ros_layout import RosReader
-
-    store = get_typestore(Stores.EMPTY)
-    humble = get_typestore(Stores.ROS2_HUMBLE).fielddefs
-    time = {"builtin_interfaces/msg/Time": humble["builtin_interfaces/msg/Time"]}
-    store.register({**time, **get_types_from_msg(DEFINITION, "arm/msg/State")})
-    types: Any = store.types
-    write = store.serialize_ros1 if is_ros1 else store.serialize_cdr
-    generator = np.random.default_rng(0)
-    messages, expected = [], []
-    names = ["header.stamp", "position[b]", "force[2]", "count[b]", "items[1].value", "small"]
-    for number in range(300):
-        stamp = types["builtin_interfaces/msg/Time"](1000 + number, 7 * number)
-        header = types["std_msgs/msg/Header"](stamp, "f" * (number % 3))
-        joints = ["a", "b"] if number % 4 else ["b", "a"]
-        items = [types["arm/msg/Item"](k, generator.normal(), "t" * (number % 5)) for k in range(3 * (number % 2))]  # fmt: skip
-        position, force = generator.normal(size=2), generator.normal(size=3).astype(np.float32)
-        count = np.array([number, -number], np.int16)
-        state = types["arm/msg/State"](header, True, number % 256, joints, position, force, count, items)  # fmt: skip
-        messages.append(bytes(write(state, "arm/msg/State")))
-        item = items[1].value if len(items) > 1 else np.nan
-        at = joints.index("b")
-        stamp_s = 1000 + number + 7e-9 * number
-        expected.append([stamp_s, position[at], force[2], count[at], item, number % 256])
-    reader = RosReader(store.fielddefs, "arm/msg/State", is_ros1)
-    values, present = reader.read(messages, names)
-    np.testing.assert_allclose(values, np.array(expected), rtol=1e-15)
-    assert present.all()
-
-
 DBC = """VERSION ""
 NS_ :
 BS_:
@@ -451,43 +390,9 @@ def test_a_block_of_classic_frames_is_what_python_can_reads(tmp_path: Path) -> N
         frames = gather_frames(list(reader))
     with BlfBlockReader(tmp_path / "a.blf") as reader:
         blocks: list[Any] = list(reader)
-    for name in ("time_s", "frame_id", "length", "data"):
+    for name in ("time_s", "frame_id", "channel", "length", "data"):
         found = np.concatenate([getattr(block, name) for block in blocks])
         np.testing.assert_allclose(found, getattr(frames, name), rtol=1e-15)
-
-
-def test_lines_of_an_asc_log_are_what_python_can_reads(tmp_path: Path) -> None:
-    frames = [
-        can.Message(timestamp=k * 0.01, arbitration_id=300 * k, is_extended_id=k > 5, data=bytes(range(k % 9)), is_fd=k == 7)
-        for k in range(1, 40)
-    ]  # fmt: skip
-    with can.Logger(tmp_path / "a.asc") as logger:
-        for frame in frames:
-            logger.on_message_received(frame)
-    text = (tmp_path / "a.asc").read_text().splitlines()
-    text[8:8] = ["// a comment", " 0.035000 1  Statistic: D 1 R 0", " 0.036000 1  ErrorFrame"]
-    text[12] += "  Length = 240000 BitCount = 124 ID = 10"
-    (tmp_path / "a.asc").write_text("\n".join(text) + "\n")
-    found: list[Any] = []
-    with AscBlockReader(tmp_path / "a.asc") as reader:
-        for one in reader:
-            found += [one] if isinstance(one, FrameBlock) else []
-            found += [gather_frames([one])] if isinstance(one, can.Message) and not one.is_error_frame else []  # fmt: skip
-    with can.ASCReader(tmp_path / "a.asc") as reader:
-        whole = gather_frames([one for one in reader if not one.is_error_frame])
-    order = np.argsort(np.concatenate([block.time_s for block in found]), kind="stable")
-    for name in ("time_s", "frame_id", "length", "data"):
-        values = np.concatenate([getattr(block, name) for block in found])[order]
-        np.testing.assert_allclose(values, getattr(whole, name), rtol=1e-15)
-    lines = text.copy()
-    for damaged, refusal in (
-        (text[11][:-3], r"the frame at \S+ s has \d bytes of \d"),
-        (text[11].replace(".", "#", 1), "the line '.*' is no frame"),
-    ):
-        lines[11] = damaged
-        (tmp_path / "a.asc").write_text("\n".join(lines) + "\n")
-        with AscBlockReader(tmp_path / "a.asc") as reader, pytest.raises(ValueError, match=refusal):
-            list(reader)
 
 
 def test_a_cut_off_blf_is_refused_by_its_frame(tmp_path: Path, carriage: Machine) -> None:

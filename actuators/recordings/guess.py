@@ -1,0 +1,106 @@
+"""Guesses about columns: evidence with a weight, a probability, and what a person gives.
+
+The weight of an observation is the logarithm of the odds that it adds; the sum gives a probability. A
+guess is `sure` from 0.97 on, `likely` from 0.8 on, `unsure` below.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+Sureness = Literal["sure", "likely", "unsure"]
+CommandKind = Literal["velocity", "position", "torque"]
+"""Quantity that commands set."""
+SURE, LIKELY = 0.97, 0.8
+"""Least probabilities of a sure and of a likely guess."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """An observation that speaks for a meaning, or against it.
+
+    Attributes:
+        text: Observation.
+        weight: Logarithm of the odds that it adds.
+    """
+
+    text: str
+    weight: float
+
+
+@dataclass(frozen=True)
+class Guess:
+    """One guess.
+
+    Attributes:
+        subject: What is guessed, `boom: command`.
+        value: The chosen value as text.
+        evidence: What speaks for it and against it.
+        others: Other candidates.
+        is_given: A person gave the value.
+    """
+
+    subject: str
+    value: str
+    evidence: tuple[Evidence, ...]
+    others: tuple[str, ...] = ()
+    is_given: bool = False
+
+    @property
+    def probability(self) -> float:
+        """Probability that the value is right."""
+        return 1.0 / (1.0 + math.exp(-sum(one.weight for one in self.evidence)))
+
+    @property
+    def sureness(self) -> Sureness:
+        """Its word."""
+        if self.probability >= SURE:
+            return "sure"
+        return "likely" if self.probability >= LIKELY else "unsure"
+
+    @property
+    def reason(self) -> str:
+        """Evidence as text."""
+        return "; ".join(one.text for one in self.evidence if one.text)
+
+    @property
+    def is_open(self) -> bool:
+        """True where a person has to fill in the value."""
+        return self.sureness == "unsure" and not self.is_given
+
+    def plain(self) -> dict[str, Any]:
+        """Return it as plain JSON data."""
+        return {
+            "subject": self.subject,
+            "value": self.value,
+            "sureness": self.sureness,
+            "probability": round(self.probability, 3),
+            "reason": self.reason,
+            "others": [*self.others],
+        }
+
+
+@dataclass(frozen=True)
+class GivenColumns:
+    """Meanings that a person gives.
+
+    Attributes:
+        joints: Columns of command and position by joint; `None` to find them.
+        command: Quantity that commands set; `None` to guess it.
+        position_unit: Unit of the positions, for all joints or by joint; `None` to guess it.
+        clock_offset_s: Seconds added to the clocks of tables.
+        time: Column of the time, or those of seconds and nanoseconds; `None` to guess it.
+        rate_hz: Rate of equally spaced rows; `None` for a log with times.
+        wraps: Value at which positions begin again, 0 for none; `None` to guess it.
+    """
+
+    joints: Mapping[str, tuple[str, str]] | None = None
+    command: CommandKind | None = None
+    position_unit: str | Mapping[str, str] | None = None
+    clock_offset_s: Mapping[str, float] | None = None
+    time: Sequence[str] | None = None
+    rate_hz: float | None = None
+    wraps: float | Mapping[str, float] | None = None

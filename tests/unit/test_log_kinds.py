@@ -1,0 +1,429 @@
+"""Logs as people have them are read right, or refused with advice that a test follows to the letter."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import can
+import cantools
+import numpy as np
+import pytest
+import scipy.io
+from conftest import Done
+from mcap.writer import Writer
+
+from actuators.recordings.signal_checks import find_jumps, find_spikes, find_wrap
+
+RATE_HZ = 50.0
+LAG = 5
+NAMES = ("time_s", "hip_target_rad", "hip_pos_rad", "knee_target_rad", "knee_pos_rad")
+
+
+def delay(values: np.ndarray) -> np.ndarray:
+    return np.concatenate([np.repeat(values[:1], LAG, 0), values[:-LAG]])
+
+
+def make_rows(num: int = 600) -> np.ndarray:
+    """Returns time, target and position of the hip, target and position of the knee, `(T, 5)`."""
+    t_s = np.arange(num) / RATE_HZ
+    hip = 0.5 * np.sin(0.9 * t_s) + 0.2 * np.sin(2.3 * t_s)
+    knee = 0.4 * np.sin(1.7 * t_s + 1.0) - 0.3 * np.sin(0.6 * t_s)
+    return np.stack([t_s, hip, delay(hip), knee, delay(knee)], 1)
+
+
+def write_text(path: str, rows: np.ndarray, names: tuple[str, ...] = NAMES) -> None:
+    lines = [",".join(f"{value:.6f}" for value in row) for row in rows]
+    Path(path).write_text("\n".join([",".join(names), *lines]) + "\n")
+
+
+def read_recordings(folder: str) -> list[dict[str, np.ndarray]]:
+    import pyarrow.parquet as pq
+
+    found = []
+    for path in sorted(Path(folder).glob("recordings/*.parquet")):
+        table = pq.read_table(path)
+        found.append({name: table[name].to_numpy() for name in table.column_names})
+    return found
+
+
+def run_both(brokk: Callable[..., Done], *options: str) -> tuple[Done, list[dict[str, Any]]]:
+    """Runs both commands of an import, the second as the first prints it."""
+    done = brokk("mode=import", "log.name=leg", "session.out=draft", *options)
+    if done.code:
+        return done, []
+    (command,) = [line for line in done.out.splitlines() if line.startswith("brokk mode=import")]
+    second = brokk(*shlex.split(command)[1:], *(one for one in options if "reader" in one))
+    assert second.code == 0, second.err
+    return done, read_recordings("draft_recordings")
+
+
+def check_joints(recordings: list[dict[str, Any]], num: int = 600, atol: float = 2e-3) -> None:
+    assert sum(len(one["t_s"]) for one in recordings) >= 0.98 * num
+    expected = make_rows(num)
+    found = recordings[0]
+    rows = len(found["t_s"])
+    np.testing.assert_allclose(found["q_hip_rad"], expected[:rows, 2], atol=atol)
+    np.testing.assert_allclose(found["q_knee_rad"], expected[:rows, 4], atol=atol)
+
+
+def follow_advice(text: str) -> str:
+    """Returns the setting that a message advises, as it is typed."""
+    found = re.search(r"'(log\.\w+=[^']+)'|(log\.\w+=[^\s,;]+)", text)
+    assert found is not None, text
+    return found[1] or found[2]
+
+
+def german(rows: np.ndarray, end: str) -> list[str]:
+    shown = rows.copy()
+    shown[:, 0] *= 1000.0
+    shown[:, 1:] = np.degrees(shown[:, 1:])
+    return [";".join(f"{v:.4f}".replace(".", ",") for v in row) + end for row in shown]
+
+
+GERMAN = "Zeit [ms];Soll Hip [°];Ist Hip [°];Soll Knee [°];Ist Knee [°]"
+COMMAS = [",".join(f"{v:.6f}" for v in row) for row in make_rows()]
+PLAIN = [" ".join(f"{v:.6f}" for v in row) for row in make_rows()]
+
+
+@pytest.mark.parametrize(
+    ("name", "lines", "encoding"),
+    [
+        ("ends.csv", [GERMAN, *german(make_rows(), ";")], "utf-8"),
+        ("ends_both.csv", [f"{GERMAN};", *german(make_rows(), ";")], "utf-8-sig"),
+        ("latin.txt", [GERMAN, *german(make_rows(), "")], "cp1252"),
+        ("wide.csv", ["sep=;", GERMAN, *german(make_rows(), "")], "utf-16"),
+        ("comments.csv", ["# operator: A. N., 2 runs", "# note", ",".join(NAMES), *COMMAS], "utf-8"),
+        ("units.csv", ["time,hip target,hip pos,knee target,knee pos", "s,rad,rad,rad,rad", *COMMAS], "utf-8"),
+        ("marked.dat", ["# " + " ".join(NAMES), *PLAIN], "utf-8"),
+    ],
+)  # fmt: skip
+def test_every_layout_of_text_gives_both_joints(
+    brokk: Callable[..., Done], name: str, lines: list[str], encoding: str
+) -> None:
+    Path(name).write_text("\r\n".join(lines) + "\r\n", encoding=encoding)
+    done, recordings = run_both(brokk, f"log.input={name}")
+    assert done.code == 0, done.err
+    assert "No guess is unsure" in done.out
+    check_joints(recordings)
+
+
+def test_text_without_a_header_is_refused_with_the_pairs_that_its_numbers_show(
+    brokk: Callable[..., Done],
+) -> None:
+    Path("a.dat").write_text("\n".join(PLAIN) + "\n")
+    done, _ = run_both(brokk, "log.input=a.dat")
+    assert done.code == 2
+    advised = follow_advice(done.err)
+    assert '["column_2", "column_3"]' in advised
+    done, recordings = run_both(brokk, "log.input=a.dat", advised)
+    assert done.code == 0, done.err
+    expected = make_rows()
+    pairs = dict(re.findall(r'(joint_\d): \["\w+", "column_(\d)"\]', advised))
+    for joint, column in pairs.items():
+        found = recordings[0][f"q_{joint}_rad"]
+        np.testing.assert_allclose(found, expected[: len(found), int(column) - 1], atol=2e-3)
+
+
+def test_a_comma_that_is_delimiter_and_decimal_sign_is_named(brokk: Callable[..., Done]) -> None:
+    lines = [",".join(f"{v:.4f}".replace(".", ",") for v in row) for row in make_rows()]
+    Path("a.csv").write_text("\n".join([",".join(NAMES), *lines]) + "\n")
+    done = brokk("mode=import", "log.input=a.csv")
+    assert done.code == 2
+    assert "the comma is both delimiter and decimal sign" in done.err
+
+
+def repeat_rows(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    return np.repeat(rows, np.tile([1, 3], len(rows) // 2), axis=0), NAMES
+
+
+def coarsen_clock(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    return np.column_stack([np.floor(rows[:, 0]), rows[:, 1:]]), NAMES
+
+
+def leave_time_out(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    return rows[:, 1:], NAMES[1:]
+
+
+def take_differences(rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    return np.column_stack([np.full(len(rows), 0.02), rows[:, 1:]]), ("dt_s", *NAMES[1:])
+
+
+@pytest.mark.parametrize("spoil", [repeat_rows, coarsen_clock, leave_time_out, take_differences])
+def test_advice_about_a_clock_reads_the_log(
+    brokk: Callable[..., Done], spoil: Callable[[np.ndarray], Any]
+) -> None:
+    write_text("a.csv", *spoil(make_rows()))
+    done, _ = run_both(brokk, "log.input=a.csv")
+    assert done.code == 2
+    done, recordings = run_both(brokk, "log.input=a.csv", follow_advice(done.err))
+    assert done.code == 0, done.err
+    check_joints(recordings)
+
+
+def test_a_clock_that_is_set_back_splits_the_log(brokk: Callable[..., Done]) -> None:
+    rows = make_rows(1200)
+    rows[600:, 0] -= 3600.0
+    write_text("a.csv", rows)
+    done, _ = run_both(brokk, "log.input=a.csv")
+    assert done.code == 2 and "the clock is set back 1 times, by 3600 s" in done.err
+    done, recordings = run_both(brokk, "log.input=a.csv", follow_advice(done.err))
+    assert done.code == 0, done.err
+    assert [len(one["t_s"]) for one in recordings] == [600, 600]
+
+
+@pytest.mark.parametrize("kind", ["pair", "counter", "epoch"])
+def test_stamps_of_several_kinds_are_read(brokk: Callable[..., Done], kind: str) -> None:
+    rows = make_rows()
+    names: tuple[str, ...] = ("sec", "nanosec", *NAMES[1:])
+    if kind == "pair":
+        ns = 1_574_946_000_350_000_000 + np.round(rows[:, 0] * 1e9).astype(np.int64)
+        clock = np.stack([ns // 10**9, ns % 10**9], 1).astype(float)
+    elif kind == "counter":  # of milliseconds in 16 bits
+        clock = (np.round(rows[:, :1] * 1000.0) + 60_000) % 65536
+        names = ("timestamp_ms", *NAMES[1:])
+    else:
+        clock = 1.7e12 + rows[:, :1] * 1000.0
+        names = ("timestamp", *NAMES[1:])
+    write_text("a.csv", np.column_stack([clock, rows[:, 1:]]), names)
+    done, recordings = run_both(brokk, "log.input=a.csv")
+    assert done.code == 0, done.err
+    assert "No guess is unsure" in done.out
+    check_joints(recordings)
+
+
+def test_a_gap_is_remarked_and_left_out_of_the_minutes(brokk: Callable[..., Done]) -> None:
+    rows = make_rows(1200)
+    rows[600:, 0] += 3600.0
+    write_text("a.csv", rows)
+    done, recordings = run_both(brokk, "log.input=a.csv")
+    assert "1 runs, 0.4 minutes" in done.out
+    assert "3600 s without samples" in done.out
+    assert len(recordings) == 2
+
+
+@pytest.mark.parametrize(("kind", "modulus"), [("angle", 2 * np.pi), ("counter", 4096.0)])
+def test_wraps_are_taken_out_and_said(
+    brokk: Callable[..., Done], kind: str, modulus: float
+) -> None:
+    rows = make_rows()
+    scale = 1.0 if kind == "angle" else 4096.0 / (2 * np.pi)
+    begin = np.pi if kind == "angle" else 0.0
+    turned = scale * (rows[:, 1:3] + begin)  # the hip passes through the end of the turn
+    half = modulus / 2 if kind == "angle" else 0.0
+    wrapped = np.mod(turned + half, modulus) - half
+    names = ("time_s", "hip_target", "hip_pos")
+    write_text("a.csv", np.column_stack([rows[:, 0], np.round(wrapped, 0 if half == 0.0 else 6)]), names)  # fmt: skip
+    unit = "rad" if kind == "angle" else "0.00153398 rad"
+    done, recordings = run_both(brokk, "log.input=a.csv", f"log.position_unit={unit}")
+    assert done.code == 0, done.err
+    assert "hip: wraps" in done.out
+    q = recordings[0]["q_hip_rad"]
+    np.testing.assert_allclose(q - q[0], rows[: len(q), 2] - rows[0, 2], atol=5e-3)
+    done = brokk("mode=import", "log.input=a.csv", f"log.position_unit={unit}", "log.wraps=0", "session.out=raw")  # fmt: skip
+    assert "No guess is unsure" not in done.out
+
+
+def test_steps_that_no_machine_makes_are_found() -> None:
+    t_s = np.arange(1000) / RATE_HZ
+    q = 300.0 * np.sin(0.5 * t_s)
+    signed = np.where(np.round(q) < 0, 32768 - np.round(q), np.round(q))
+    wrap = find_wrap(signed)
+    assert wrap is not None and wrap.modulus == -32768.0
+    assert find_wrap(q) is None
+    assert (
+        find_wrap(0.5 * np.sign(np.sin(t_s))) is None
+    )  # a square wave goes on at the same speed too
+    mixed = q.copy()
+    mixed[1::2] = 0.0
+    assert len(find_spikes(mixed)) > 500
+    assert not len(find_spikes(q))
+    reset = q.copy()
+    reset[500:] += 200.0
+    assert find_jumps(t_s, reset, np.zeros(1000), 1.5).tolist() == [499]
+    step = np.where(t_s > 5.0, 1.0, 0.0)
+    assert not len(find_jumps(t_s, delay(step), step, 1.5))
+
+
+def test_what_is_given_is_weighed_like_a_guess(brokk: Callable[..., Done]) -> None:
+    rows = make_rows()
+    rows[:, 4] = np.random.default_rng(0).normal(size=len(rows))
+    write_text("a.csv", rows)
+    given = 'log.joints={knee: ["knee_target_rad", "knee_pos_rad"]}'
+    done, _ = run_both(brokk, "log.input=a.csv", given, "log.command=position")
+    assert done.code == 0, done.err
+    assert "the numbers speak against what was given" in done.out
+    assert "No guess is unsure" not in done.out
+
+
+def test_a_drive_that_is_off_is_said_with_its_times(brokk: Callable[..., Done]) -> None:
+    rows = make_rows()
+    rows[300:450, 4] = rows[300, 4]
+    enable = np.ones(len(rows))
+    enable[300:450] = 0.0
+    write_text("a.csv", np.column_stack([rows, enable]), (*NAMES, "knee_torque_enable"))
+    done = brokk("mode=import", "log.input=a.csv", "session.out=draft")
+    assert "knee: its drive is off in 25% of the rows, first at 6.00 s, last at 8.98 s" in done.out
+
+
+def test_structures_of_simulink_are_read_by_their_labels(brokk: Callable[..., Done]) -> None:
+    rows = make_rows()
+    signals = np.array(
+        [
+            {"values": rows[:, 1:4:2], "label": "target_rad"},
+            {"values": rows[:, 2:5:2], "label": "position_rad"},
+        ]
+    )
+    scipy.io.savemat("a.mat", {"simout": {"time": rows[:, :1], "signals": signals}})
+    done, recordings = run_both(brokk, "log.input=a.mat")
+    assert done.code == 0, done.err
+    np.testing.assert_allclose(recordings[0]["q_joint_0_rad"], rows[: len(recordings[0]["t_s"]), 2], atol=2e-3)  # fmt: skip
+
+
+DBC = """VERSION ""
+BU_: PC
+BO_ 2566844672 Cmd: 8 PC
+ SG_ Page M : 0|4@1+ (1,0) [0|15] "" PC
+ SG_ hip_target m0 : 8|16@1- (0.0001,0) [-1|1] "rad" PC
+ SG_ knee_target m1 : 24|16@1- (0.0001,0) [-1|1] "rad" PC
+BO_ 257 Encoder: 8 PC
+ SG_ hip_position : 0|16@1- (0.0001,0) [-1|1] "rad" PC
+ SG_ knee_position : 16|16@1- (0.0001,0) [-1|1] "rad" PC
+"""
+
+
+def list_frames(foreign: bool) -> list[can.Message]:
+    """Returns commands as pages of one message, positions, and frames of a foreign device."""
+    database: Any = cantools.database.load_string(DBC)
+    found = []
+    for number, row in enumerate(make_rows()):
+        contents = (
+            ("Cmd", {"Page": 0, "hip_target": row[1]}),
+            ("Cmd", {"Page": 1, "knee_target": row[3]}),
+            ("Encoder", {"hip_position": row[2], "knee_position": row[4]}),
+        )
+        for place, (name, content) in enumerate(contents):
+            message = database.get_message_by_name(name)
+            found.append(
+                can.Message(
+                    timestamp=1.7e9 + number / RATE_HZ + 0.001 * place, arbitration_id=message.frame_id,
+                    is_extended_id=message.is_extended_frame, data=message.encode(content, strict=False), channel=0,
+                )
+            )  # fmt: skip
+        if foreign:
+            time_s = 1.7e9 + number / RATE_HZ + 0.007
+            data = b"\x55" * 8
+            found.append(
+                can.Message(
+                    timestamp=time_s, arbitration_id=257, is_extended_id=True, data=data, channel=0
+                )
+            )
+    return found
+
+
+@pytest.mark.parametrize("name", ["a.blf", "a.log", "printed.txt"])
+def test_pages_and_kinds_of_identifiers_are_sources_of_their_own(
+    brokk: Callable[..., Done], name: str
+) -> None:
+    Path("a.dbc").write_text(DBC)
+    frames = list_frames(foreign=True)
+    if name == "printed.txt":
+        lines = []
+        for frame in frames:
+            number = (
+                f"{frame.arbitration_id:08X}"
+                if frame.is_extended_id
+                else f"{frame.arbitration_id:03X}"
+            )
+            data = " ".join(f"{byte:02X}" for byte in frame.data)
+            lines.append(f" ({frame.timestamp:.6f})  can0  {number}   [8]  {data}")
+        Path(name).write_text("\n".join(lines) + "\n")
+    else:
+        with can.Logger(name) as logger:
+            for frame in frames:
+                logger.on_message_received(frame)
+    done, recordings = run_both(brokk, f"log.input={name}", "log.dbc=a.dbc")
+    assert done.code == 0, done.err
+    assert "No guess is unsure" in done.out
+    found = recordings[0]
+    rows = make_rows()
+    expected = np.interp(found["t_s"], rows[:, 0] - found["t_s"][0], rows[:, 4])
+    assert np.abs(found["q_knee_rad"] - expected).max() < 0.01
+
+
+def test_a_message_on_two_channels_is_refused_with_the_key_that_chooses_one(
+    brokk: Callable[..., Done],
+) -> None:
+    Path("a.dbc").write_text(DBC)
+    with can.Logger("a.blf") as logger:
+        for frame in list_frames(foreign=False):
+            logger.on_message_received(frame)
+            frame.channel = 1
+            frame.timestamp += 0.0004
+            logger.on_message_received(frame)
+    done, _ = run_both(brokk, "log.input=a.blf", "log.dbc=a.dbc")
+    assert done.code == 2 and "comes on the channels 0, 1" in done.err
+    done, recordings = run_both(brokk, "log.input=a.blf", "log.dbc=a.dbc", follow_advice(done.err))
+    assert done.code == 0, done.err
+    assert len(recordings) == 1
+
+
+def write_messages(path: str, messages: list[tuple[float, str, dict[str, Any]]]) -> None:
+    with Path(path).open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("any", "jsonschema", b"{}")
+        channels: dict[str, int] = {}
+        for t_s, topic, content in messages:
+            if topic not in channels:
+                channels[topic] = writer.register_channel(topic, "json", schema)
+            time_ns = 1_700_000_000_000_000_000 + round(t_s * 1e9)
+            writer.add_message(channels[topic], time_ns, json.dumps(content).encode(), time_ns)
+        writer.finish()
+
+
+def test_arm_and_wheels_on_one_topic_keep_their_own_rates(brokk: Callable[..., Done]) -> None:
+    messages = []
+    for number, row in enumerate(make_rows()):
+        names = ["hip", "knee"]
+        messages.append((row[0], "/joint_states", {"name": names, "position": [row[2], row[4]]}))
+        content = {"layout": {"data_offset": 0}, "name": names, "target": [row[1], row[3]]}
+        messages.append((row[0], "/command", content))
+        for part in range(4):
+            content = {"name": ["wheel"], "position": [0.1 * number + 0.02 * part]}
+            messages.append((row[0] + 0.001 + 0.004 * part, "/joint_states", content))
+    write_messages("a.mcap", messages)
+    done, recordings = run_both(brokk, "log.input=a.mcap")
+    assert done.code == 0, done.err
+    assert "2 joints at 50 Hz" in done.out
+    assert "layout" not in done.out
+    check_joints(recordings)
+
+
+def test_two_programs_on_one_topic_are_never_sure(brokk: Callable[..., Done]) -> None:
+    messages = []
+    for row in make_rows():
+        stamp = {"stamp": {"sec": 1700 + int(row[0]), "nanosec": round(1e9 * (row[0] % 1.0))}}
+        content = {"header": stamp, "name": ["hip"]}
+        messages.append((row[0], "/joint_states", {**content, "position": [row[2]]}))
+        messages.append((row[0] + 0.001, "/joint_states", {**content, "position": [0.0]}))
+        messages.append((row[0], "/command", {**content, "target": [row[1]]}))
+    write_messages("a.mcap", messages)
+    done, _ = brokk("mode=import", "log.input=a.mcap", "session.out=draft"), None
+    assert "two programs send to '/joint_states'" in done.out
+    assert "No guess is unsure" not in done.out
+
+
+def test_the_next_log_of_a_kind_fits_into_the_draft(brokk: Callable[..., Done]) -> None:
+    rows = make_rows()
+    write_text("a.csv", rows)
+    rows[:, 1:] *= 1.05
+    write_text("b.csv", rows)
+    done, _ = run_both(brokk, "log.input=a.csv")
+    options = ("machine=@draft/machine.yaml", "import=@draft/column_map.yaml")
+    done = brokk("mode=import", "log.input=b.csv", *options, "session.out=next")
+    assert done.code == 0, done.err
