@@ -25,8 +25,7 @@ from typing import ClassVar
 import torch
 
 from actuators.effects.ranges import CHANCE, EffectNumber, ParameterRanges, Value
-from actuators.models import random_draws
-from actuators.models.parameters import open_valve, select_commands_in_force
+from actuators.models.parameters import draw_normal, open_valve, select_commands_in_force
 from brokk_rl.errors import ConfigError
 from brokk_rl.follower import select_levers
 from brokk_rl.machine import Machine, mask_exclusive_joints
@@ -164,7 +163,7 @@ class HumanFollowerModel:
             counter = self._ranges.advance()
             assert counter is not None
             deflection = deflection * (
-                1.0 + value["tremor"] * random_draws.draw_normal(counter, CHANCE, proposed.shape[1])
+                1.0 + value["tremor"] * draw_normal(counter, CHANCE, proposed.shape[1])
             )
         return open_valve(deflection.clamp(-1.0, 1.0), value["dead_zone"], value["dead_zone"])
 

@@ -6,7 +6,7 @@ import torch
 
 from actuators.effects.effect import ANY_INTERFACE, EffectSpec
 from actuators.effects.ranges import CHANCE, EffectNumber, Joints, Value
-from actuators.models import random_draws
+from actuators.models.parameters import draw_normal
 from brokk_rl.spec import spec
 
 
@@ -61,7 +61,7 @@ class SensorNoise(EffectSpec):
     ) -> torch.Tensor:
         """`q + sigma N(0, 1)`."""
         assert counter is not None, "noise is stochastic"
-        return q + value["sigma_rad"] * random_draws.draw_normal(counter, CHANCE, q.shape[1])
+        return q + value["sigma_rad"] * draw_normal(counter, CHANCE, q.shape[1])
 
 
 @spec

@@ -8,8 +8,7 @@ from typing import Literal
 import numpy as np
 import torch
 
-from actuators.models import random_draws
-from actuators.models.parameters import OTHER, expand_per_joint
+from actuators.models.parameters import OTHER, expand_per_joint, hash_uniform, start_counter
 from actuators.scales import Scale, measure_scale
 from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
@@ -144,9 +143,7 @@ class ParameterRanges:
         for effect, names in idle.items():
             if effect not in active:
                 raise ConfigError(_explain_idle(machine, names, where, numbers, effect))
-        self._draw = (
-            random_draws.start_counter(num_envs, salt, device) if stochastic or drawn else None
-        )
+        self._draw = start_counter(num_envs, salt, device) if stochastic or drawn else None
         self.state = {} if self._draw is None else {"draw": self._draw}
         self._drawn = _Drawn(list(drawn.values()), shares, device) if drawn else None
         if self._drawn is not None:
@@ -211,12 +208,11 @@ class _Drawn:
         """Return fresh values, `(N, W)`, for the counter `(N,)`."""
         counter = counter[:, None] * 65_536
         value = torch.minimum(
-            self.low + (self.high - self.low) * random_draws.hash_uniform(counter + self._key),
-            self.high,
+            self.low + (self.high - self.low) * hash_uniform(counter + self._key), self.high
         )
         if not self._some:
             return value
-        there = random_draws.hash_uniform(counter + self._share_key) < self._share
+        there = hash_uniform(counter + self._share_key) < self._share
         return torch.where(there.index_select(1, self._effect), value, self._none)
 
 

@@ -6,8 +6,8 @@ from functools import cached_property
 import torch
 
 from actuators.effects.ranges import CHANCE
-from actuators.models import random_draws
 from actuators.models.joint_weight import JointWeight, build_joint_weight
+from actuators.models.parameters import draw_uniform
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -97,4 +97,4 @@ class StepInputs:
     def chance(self) -> torch.Tensor:
         """A uniform number in [0, 1) per environment, `(N, 1)`; all joints share one frame."""
         assert self.counter is not None, "only a stochastic effect has chances"
-        return random_draws.draw_uniform(self.counter, CHANCE, 1)
+        return draw_uniform(self.counter, CHANCE, 1)
