@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import quote
 
-from jinja2 import Environment, FileSystemLoader, Template
+from jinja2 import Environment, FileSystemLoader, StrictUndefined, Template
 from matplotlib.figure import Figure
 
 from brokk_rl.console_table import MISSING, is_numeric
@@ -32,7 +32,7 @@ from brokk_rl.plot import draw_png
 from brokk_rl.session import write_text
 
 Tone = Literal["good", "bad", "warn", "plain"]
-TEMPLATE_FILE = "report.html.jinja"
+TEMPLATE = Path(__file__).with_name("report.html.jinja")
 PNG = "image/png"
 PICTURE_TYPES = {".png": PNG, ".svg": "image/svg+xml", ".jpg": "image/jpeg", ".jpeg": "image/jpeg"}
 BEST_MARK = "▸ "
@@ -145,8 +145,7 @@ class Report:
         Raises:
             StorageError: The file cannot be read.
         """
-        kind, data = _read_picture(source) if isinstance(source, Path) else (PNG, draw_png(source))
-        address = f"data:{kind};base64,{base64.b64encode(data).decode()}"
+        address = embed_picture(source)
         self._add("picture", address=address, description=description or caption, caption=caption)
 
     @contextmanager
@@ -161,8 +160,7 @@ class Report:
 
     def render(self) -> str:
         """Return the whole page."""
-        made = f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"
-        return _load_template().render(title=self._title, blocks=self._blocks, made=made)
+        return render_page(TEMPLATE, {"title": self._title, "blocks": self._blocks})
 
     def write(self, path: Path) -> None:
         """Write the page in one step: readers see the old file or the whole new one.
@@ -170,22 +168,46 @@ class Report:
         Raises:
             StorageError: It could not be written.
         """
-        try:
-            write_text(path, self.render())
-        except OSError as error:
-            raise StorageError(
-                f"cannot write {path}: {error.strerror or error}; nothing was left behind"
-            ) from error
+        write_page(path, self.render())
 
     def _add(self, kind: str, **values: Any) -> None:
         """Add an element as the template takes it."""
         self._blocks.append({"kind": kind, **values})
 
 
+def render_page(template: Path, values: Mapping[str, Any]) -> str:
+    """Return a page by a template that is, or extends, `report.html.jinja`; `values` has its `title`."""
+    made = f"{datetime.now().astimezone():%Y-%m-%d %H:%M %Z}"
+    return _load_template(template).render(**values, made=made)
+
+
+def write_page(path: Path, text: str) -> None:
+    """Write a page in one step: readers see the old file or the whole new one.
+
+    Raises:
+        StorageError: It could not be written.
+    """
+    try:
+        write_text(path, text)
+    except OSError as error:
+        raise StorageError(
+            f"cannot write {path}: {error.strerror or error}; nothing was left behind"
+        ) from error
+
+
+def embed_picture(source: Figure | Path) -> str:
+    """Return a picture as an address that holds its data; see `Report.add_picture`."""
+    kind, data = _read_picture(source) if isinstance(source, Path) else (PNG, draw_png(source))
+    return f"data:{kind};base64,{base64.b64encode(data).decode()}"
+
+
 @cache
-def _load_template() -> Template:
-    environment = Environment(loader=FileSystemLoader(Path(__file__).parent), autoescape=True)
-    return environment.get_template(TEMPLATE_FILE)
+def _load_template(path: Path) -> Template:
+    folders = [path.parent, TEMPLATE.parent]
+    environment = Environment(
+        loader=FileSystemLoader(folders), autoescape=True, undefined=StrictUndefined
+    )
+    return environment.get_template(path.name)
 
 
 def _read_picture(path: Path) -> tuple[str, bytes]:

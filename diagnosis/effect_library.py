@@ -457,32 +457,32 @@ class EffectSimulator:
 
 
 class _DrivenModel:
-    """A model that knows already what the commands `u` of a run ask of it."""
+    """A model that knows already what the commands `u` of a run ask of it, `inner` for effects on its drive."""
 
     def __init__(self, model: Any, u: torch.Tensor, drive: Any) -> None:
-        self._model, self._u, self._drive = model, u, drive
+        self.inner, self._u, self._drive = model, u, drive
 
     @property
     def state(self) -> dict[str, torch.Tensor]:
         """State of the model."""
-        return self._model.state
+        return self.inner.state
 
     @property
     def delay_s(self) -> torch.Tensor:
         """Dead time of the model."""
-        return self._model.delay_s
+        return self.inner.delay_s
 
     def reset(self, mask: torch.Tensor) -> None:
         """Reset the model."""
-        self._model.reset(mask)
+        self.inner.reset(mask)
 
     def step(self, history: History) -> torch.Tensor:
         """Return the positions one control period later."""
-        return self._model.step(history)
+        return self.inner.step(history)
 
     def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> PlannedRun:
         """Return a run; an effect on commands makes other commands of `u`."""
-        return self._model.plan_run(u, first, q, drive=self._drive if u is self._u else None)
+        return self.inner.plan_run(u, first, q, drive=self._drive if u is self._u else None)
 
 
 class _SteppedRun:

@@ -4,6 +4,7 @@ They change mass, friction or torque of the simulated drive itself, which solves
 that stops a joint within a period cannot be put around a model that does not know of it.
 """
 
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import ClassVar
 
@@ -12,8 +13,20 @@ from actuators.effects.ranges import EffectNumber, Joints, Value
 from brokk_rl.spec import spec
 
 
+class DriveEffect(EffectSpec):
+    """An effect that changes numbers of a drive.
+
+    Attributes:
+        drives: Number of the drive that each of its numbers changes, where the names differ.
+    """
+
+    side = "drive"
+    interfaces = frozenset({"torque"})
+    drives: ClassVar[Mapping[str, str]] = MappingProxyType({})
+
+
 @spec
-class CoulombFriction(EffectSpec):
+class CoulombFriction(DriveEffect):
     """Dry friction of a drive: a force against the motion, the same at all speeds.
 
     Attributes:
@@ -23,9 +36,6 @@ class CoulombFriction(EffectSpec):
 
     joints: Joints
     coulomb_n: Value
-    side = "drive"
-    interfaces = frozenset({"torque"})
-    drives = MappingProxyType({"coulomb_n": "coulomb_n"})
     numbers: ClassVar = {
         # Gears and screws lose some percent of the largest force.
         "coulomb_n": EffectNumber("N", none=0.0, typical=0.05, bounds=(0.0, 0.5), scale="force")
@@ -33,7 +43,7 @@ class CoulombFriction(EffectSpec):
 
 
 @spec
-class ViscousFriction(EffectSpec):
+class ViscousFriction(DriveEffect):
     """Friction of a drive in proportion to its speed; the back EMF of a voltage-fed motor is one too.
 
     Attributes:
@@ -43,9 +53,6 @@ class ViscousFriction(EffectSpec):
 
     joints: Joints
     viscous_n_s_m: Value
-    side = "drive"
-    interfaces = frozenset({"torque"})
-    drives = MappingProxyType({"viscous_n_s_m": "viscous_n_s_m"})
     numbers: ClassVar = {
         # The same loss as dry friction, at full speed.
         "viscous_n_s_m": EffectNumber(
@@ -55,7 +62,7 @@ class ViscousFriction(EffectSpec):
 
 
 @spec
-class Inertia(EffectSpec):
+class Inertia(DriveEffect):
     """Another mass than that of the simulator: a load, or a rotor behind a gear (armature).
 
     Attributes:
@@ -65,14 +72,12 @@ class Inertia(EffectSpec):
 
     joints: Joints
     factor: Value
-    side = "drive"
-    interfaces = frozenset({"torque"})
     drives = MappingProxyType({"factor": "mass_kg"})
     numbers: ClassVar = {"factor": EffectNumber("1", none=1.0, typical=1.3, bounds=(0.2, 5.0))}
 
 
 @spec
-class ForceOffset(EffectSpec):
+class ForceOffset(DriveEffect):
     """A constant force against the positive direction: weight, or an amplifier that is off its zero.
 
     Attributes:
@@ -82,16 +87,13 @@ class ForceOffset(EffectSpec):
 
     joints: Joints
     offset_n: Value
-    side = "drive"
-    interfaces = frozenset({"torque"})
-    drives = MappingProxyType({"offset_n": "offset_n"})
     numbers: ClassVar = {
         "offset_n": EffectNumber("N", none=0.0, typical=0.02, bounds=(-0.5, 0.5), scale="force")
     }
 
 
 @spec
-class StribeckFriction(EffectSpec):
+class StribeckFriction(DriveEffect):
     """Dry friction of a drive that is larger at rest than in motion: it starts with a jerk and creeps in steps.
 
     It falls with the speed as `stribeck_m_s` of the simulated drive says.
@@ -103,9 +105,6 @@ class StribeckFriction(EffectSpec):
 
     joints: Joints
     stribeck_n: Value
-    side = "drive"
-    interfaces = frozenset({"torque"})
-    drives = MappingProxyType({"stribeck_n": "stribeck_n"})
     numbers: ClassVar = {
         # At rest 1.2 to 2 times the friction in motion, which is 5 % of the largest force.
         "stribeck_n": EffectNumber("N", none=0.0, typical=0.03, bounds=(0.0, 0.5), scale="force")
@@ -113,7 +112,7 @@ class StribeckFriction(EffectSpec):
 
 
 @spec
-class LoadFriction(EffectSpec):
+class LoadFriction(DriveEffect):
     """Dry friction of a gear that grows with the force through it.
 
     Duclusaud, Passault, Padois and Ly, ICRA 2025, models M3 and M5; see `actuators.models.friction`.
@@ -127,9 +126,6 @@ class LoadFriction(EffectSpec):
     joints: Joints
     motor_load: Value
     outside_load: Value
-    side = "drive"
-    interfaces = frozenset({"torque"})
-    drives = MappingProxyType({"motor_load": "motor_load", "outside_load": "outside_load"})
     numbers: ClassVar = {
         # Gears of servos lose 2 to 20 % of the torque; from 1 on the motor moves nothing.
         "motor_load": EffectNumber("1", none=0.0, typical=0.1, bounds=(0.0, 0.9)),
@@ -138,7 +134,7 @@ class LoadFriction(EffectSpec):
 
 
 @spec
-class PoseForce(EffectSpec):
+class PoseForce(DriveEffect):
     """Weight on a drive that changes with the position of its joint.
 
     Attributes:
@@ -151,9 +147,6 @@ class PoseForce(EffectSpec):
     joints: Joints
     pose_sin_n: Value
     pose_cos_n: Value
-    side = "drive"
-    interfaces = frozenset({"torque"})
-    drives = MappingProxyType({"pose_sin_n": "pose_sin_n", "pose_cos_n": "pose_cos_n"})
     numbers: ClassVar = {
         # A servo that bears a tenth of its largest torque in the outermost pose.
         "pose_sin_n": EffectNumber("N", none=0.0, typical=0.1, bounds=(-1.0, 1.0), scale="force"),
@@ -162,7 +155,7 @@ class PoseForce(EffectSpec):
 
 
 @spec
-class TorqueLimit(EffectSpec):
+class TorqueLimit(DriveEffect):
     """A servo that pulls no harder from some error on: a limit in its firmware, a weak motor or supply.
 
     Weight acts beside the pull: a joint comes up slower than down, and falls where the limit is below
@@ -178,9 +171,7 @@ class TorqueLimit(EffectSpec):
     joints: Joints
     shortage: Value
     firmware_damping: Value
-    side = "drive"
     interfaces = frozenset({"position"})
-    drives = MappingProxyType({"shortage": "shortage", "firmware_damping": "firmware_damping"})
     numbers: ClassVar = {
         # STS3215: 20 % of its 2.9 Nm over 24 to 40 Nm/rad are reached at 0.02 rad, 2.5 % of a travel
         # of 0.8 rad. The largest is 0.25 % of the travel, where an arm falls.

@@ -5,20 +5,23 @@ An effect of a package of your own is a spec that derives from `EffectSpec`, set
 environment, memory, resets and random draws.
 """
 
+from __future__ import annotations
+
 import re
 import zlib
 from collections.abc import Mapping
-from dataclasses import fields, replace
+from dataclasses import fields
 from types import MappingProxyType
 from typing import Any, ClassVar, Literal
 
 import torch
 
 from actuators.contracts import PlannedRun
-from actuators.effects.planned_run import ChainRun
+from actuators.effects.planned_run import ChainRun, change_run_commands
 from actuators.effects.ranges import EffectNumber, Joints, ParameterRanges, Value
-from actuators.effects.step_inputs import MachineTensors, Memory, StepInputs
+from actuators.effects.step_inputs import Memory, RunMemory, StepInputs, StepMemory, join_name
 from actuators.models.force_drive import change_drive
+from actuators.models.machine_tensors import MachineTensors
 from brokk_rl.contracts.actuator import ActuatorModel
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
@@ -51,7 +54,6 @@ class EffectSpec:
             all commands of a run can be given to it at once.
         recent: Number of newest commands that it looks at, where it changes the newest only and
             asks for no positions but in `begin`; `None`: any. See `EffectChain.plan_run`.
-        drives: Number of the drive that each of its numbers changes; drive side only.
         layer: Place among the effects of its side, from the machine outwards; a command passes the
             largest first.
         placed: Whether its `begin` asks for the positions of the joints.
@@ -76,7 +78,6 @@ class EffectSpec:
     delays: ClassVar[bool] = False
     pointwise: ClassVar[bool] = False
     recent: ClassVar[int | None] = None
-    drives: ClassVar[Mapping[str, str]] = MappingProxyType({})
     layer: ClassVar[int] = 0
     placed: ClassVar[bool] = False
     weighed: ClassVar[bool] = False
@@ -84,11 +85,11 @@ class EffectSpec:
     alike: ClassVar[bool] = True
     running: ClassVar[str | None] = None
     interfaces: ClassVar[frozenset[str]] = frozenset({"speed"})
-    variants: ClassVar[Mapping[str, "type[EffectSpec]"]] = MappingProxyType({})
+    variants: ClassVar[Mapping[str, type[EffectSpec]]] = MappingProxyType({})
     label: ClassVar[str] = ""
 
     @classmethod
-    def find_variant(cls, machine: Machine) -> "type[EffectSpec] | None":
+    def find_variant(cls, machine: Machine) -> type[EffectSpec] | None:
         """Return the class that is this effect on the machine; `None`: the machine cannot have it."""
         if machine.interface in cls.interfaces:
             return cls
@@ -101,7 +102,7 @@ class EffectSpec:
 
     def wrap(
         self, model: ActuatorModel, machine: Machine, num_envs: int, device: torch.device
-    ) -> "EffectChain":
+    ) -> EffectChain:
         """Return `model` with the effect around it.
 
         Raises:
@@ -215,8 +216,8 @@ class EffectChain:
         for name, effect in effects.items():
             values = {field.name: getattr(effect, field.name) for field in fields(effect)}  # pyright: ignore[reportArgumentType]
             joints[name] = values.pop("joints", "all")
-            given |= {_join(name, key): value for key, value in values.items()}
-            numbers |= {_join(name, key): number for key, number in effect.numbers.items()}
+            given |= {join_name(name, key): value for key, value in values.items()}
+            numbers |= {join_name(name, key): number for key, number in effect.numbers.items()}
         stochastic = any(effect.stochastic for effect in effects.values())
         salt += len(inner.state)
         self._ranges = ParameterRanges(
@@ -232,9 +233,8 @@ class EffectChain:
         self._others = {n: e for n, e in reversed(commanding.items()) if not e.delays}
         self.commands: dict[str, Any] = self._others | self._delays
         self.motions: dict[str, Any] = {name: e for name, e in effects.items() if e.side in MOTION}
-        self._drives = {name: e for name, e in effects.items() if e.side == "drive"}
-        for name, effect in self._drives.items():
-            change_drive(inner, effect.drives, self.get_values(name), where)
+        self._drives: dict[str, Any] = {n: e for n, e in effects.items() if e.side == "drive"}
+        self._change_drives(where)
         self._measured = {name: e for name, e in effects.items() if e.side == "measurement"}
         self._placed = {name: e for name, e in effects.items() if e.side == "kinematics"}
         self.is_weighed = machine.has_bodies and any(e.weighed for e in self.motions.values())
@@ -274,10 +274,10 @@ class EffectChain:
         if torch.is_grad_enabled():
             # history and `fresh` are written in place, and autograd may need what they were
             history, fresh = History(q=history.q.clone(), u=history.u.clone()), fresh.clone()
-        counter = self.advance_draws()
-        u = self._change_commands(history, fresh, counter)
+        counter, memory = self.advance_draws(), StepMemory(self._memory, fresh)
+        u = self._change_commands(history, memory, counter)
         if self.motions:
-            q = self._change_motion(history, u, fresh, counter)
+            q = self._change_motion(history, u, memory, counter)
         else:
             q = self.inner.step(History(q=history.q, u=u))
         self._fresh.fill_(False)
@@ -286,9 +286,23 @@ class EffectChain:
     def plan_run(
         self, u: torch.Tensor, first: int, q: torch.Tensor | None = None
     ) -> PlannedRun | None:
-        """See `actuators.contracts.PlannedModel`."""
+        """See `actuators.contracts.PlannedModel`.
+
+        Effects on commands are applied to the whole run before its first step, so that a step computes
+        only what depends on positions.
+        """
         self._change_drives()
-        return ChainRun.plan(self, u, first, q)
+        if not self.is_plannable:
+            return None
+        if q is None and any(effect.placed for effect in self.commands.values()):
+            return None
+        seen = u
+        for name in self.commands:
+            seen = change_run_commands(self, name, seen, first, q)
+        inner = self.inner.plan_run(seen, first, q)
+        if inner is None or not self.motions:
+            return inner
+        return ChainRun(self, inner, u, first)
 
     @property
     def is_plannable(self) -> bool:
@@ -309,11 +323,6 @@ class EffectChain:
     def advance_draws(self) -> torch.Tensor | None:
         """Advance to the next draws and return their counter, `(N,)`; `None` without draws."""
         return self._ranges.advance() if self._salts else None
-
-    def hold_in_travel(self, moved_to: torch.Tensor, predicted: torch.Tensor) -> torch.Tensor:
-        """Return positions after the effects: these never move a joint through a stop."""
-        lower = torch.minimum(self.plant.lower, predicted)
-        return moved_to.clamp(lower, torch.maximum(self.plant.upper, predicted))
 
     def measure(self, q: torch.Tensor) -> torch.Tensor:
         """Return the readings at true positions `q`, `(N, J)`; once a control period."""
@@ -358,33 +367,77 @@ class EffectChain:
         inner = getattr(self.inner, "misplacement", None)
         return torch.zeros_like(q[:, :3]) if inner is None else inner(q)
 
-    def _change_drives(self) -> None:
+    def _change_drives(self, where: str = "effect") -> None:
         """Write the numbers of effects on drives into the drive; an entry may have been replaced."""
         for name, effect in self._drives.items():
-            change_drive(self.inner, effect.drives, self.get_values(name), name)
+            values = self.get_values(name)
+            changes = {effect.drives.get(key, key): value for key, value in values.items()}
+            change_drive(self.inner, changes, where)
+
+    def move(
+        self,
+        history: History,
+        predicted: torch.Tensor,
+        counter: torch.Tensor | None,
+        memory: StepMemory | RunMemory,
+    ) -> torch.Tensor:
+        """Return the next positions with all effects on motion; these never move a joint through a stop.
+
+        Args:
+            history: Positions and commands, `(N, H, J)`.
+            predicted: Next positions without the effects, `(N, J)`.
+            counter: Of the draws.
+            memory: Of the effects.
+        """
+        q, moved_to = history.q[:, -1], predicted
+        weight = self.plant.weight(q) if self.is_weighed else None
+        for name, effect in self.motions.items():
+            now = self.describe(name, history, moved_to - q, counter, weight)
+            extra, kept = effect.extra(memory.recall(name, effect, now))
+            memory.keep(name, kept)
+            moved_to = moved_to + extra
+        lower = torch.minimum(self.plant.lower, predicted)
+        return moved_to.clamp(lower, torch.maximum(self.plant.upper, predicted))
+
+    def describe(
+        self,
+        name: str,
+        history: History,
+        moved: torch.Tensor,
+        counter: torch.Tensor | None,
+        weight: torch.Tensor | None = None,
+    ) -> StepInputs:
+        """Return the inputs of one effect, without a memory."""
+        values, draws = self.get_values(name), self.salt_counter(name, counter)
+        return StepInputs(values, {}, history, self.plant, moved, draws, weight)
 
     def _change_commands(
-        self, history: History, fresh: torch.Tensor, counter: torch.Tensor | None
+        self, history: History, memory: StepMemory, counter: torch.Tensor | None
     ) -> torch.Tensor:
         """Return the commands that the inner model gets, `(N, H, J)`."""
-        still = torch.zeros_like(history.q[:, -1])
+
+        def apply(name: str, seen: History) -> torch.Tensor:
+            effect = self.commands[name]
+            now = self.describe(name, seen, torch.zeros_like(history.q[:, -1]), counter)
+            u, kept = effect.commands(memory.recall(name, effect, now))
+            memory.keep(name, kept)
+            return u
+
         recent = slice(-(self._num_recent or history.u.shape[1]), None)
         u = history.u[:, recent]
         for name in self._others:
-            seen = History(q=history.q[:, recent], u=u)
-            u = self._apply("commands", name, seen, still, fresh, counter)
+            u = apply(name, History(q=history.q[:, recent], u=u))
         if self._num_recent is not None:
             valve = self._memory["valve"]
-            before = torch.where(fresh[:, None, None], history.u[:, :-1], valve[:, 1:])
+            before = torch.where(memory.fresh[:, None, None], history.u[:, :-1], valve[:, 1:])
             valve.copy_(torch.cat((before, u[:, -1:]), 1))
             u = valve
         for name in self._delays:
-            seen = History(q=history.q, u=u)
-            u = self._apply("commands", name, seen, still, fresh, counter)
+            u = apply(name, History(q=history.q, u=u))
         return u
 
     def _change_motion(
-        self, history: History, u: torch.Tensor, fresh: torch.Tensor, counter: torch.Tensor | None
+        self, history: History, u: torch.Tensor, memory: StepMemory, counter: torch.Tensor | None
     ) -> torch.Tensor:
         """Return the next positions, `(N, J)`, with all effects on speed.
 
@@ -392,48 +445,13 @@ class EffectChain:
         from step to step. So it sees the increments as they would be without the effects, ending
         at the true position: `shift` is added to its history.
         """
-        q, plant = history.q[:, -1], self.plant
         shift = self._memory["shift"]
-        shift = torch.where(fresh[:, None, None], torch.zeros_like(shift), shift)
-        predicted = moved_to = self.inner.step(History(q=history.q + shift, u=u))
-        weight = plant.weight(q) if self.is_weighed else None
-        for name in self.motions:
-            extra = self._apply("extra", name, history, moved_to - q, fresh, counter, weight)
-            moved_to = moved_to + extra
-        moved_to = self.hold_in_travel(moved_to, predicted)
+        shift = torch.where(memory.fresh[:, None, None], torch.zeros_like(shift), shift)
+        predicted = self.inner.step(History(q=history.q + shift, u=u))
+        moved_to = self.move(history, predicted, counter, memory)
         added = (moved_to - predicted)[:, None]
         self._memory["shift"].copy_(torch.cat((shift[:, 1:] + added, torch.zeros_like(added)), 1))
         return moved_to
-
-    def _apply(
-        self,
-        method: Literal["commands", "extra"],
-        name: str,
-        history: History,
-        moved: torch.Tensor,
-        fresh: torch.Tensor,
-        counter: torch.Tensor | None,
-        weight: torch.Tensor | None = None,
-    ) -> torch.Tensor:
-        """Return the result of one effect and store its memory."""
-        effect = self.effects[name]
-        now = StepInputs(
-            self.get_values(name),
-            {},
-            history,
-            self.plant,
-            moved,
-            self.salt_counter(name, counter),
-            weight,
-        )
-        memory = {}
-        for key, begun in effect.begin(now).items():
-            kept = self._memory[_join(name, key)]
-            memory[key] = torch.where(broadcast_rows(fresh, begun), begun, kept)
-        result, memory = getattr(effect, method)(replace(now, memory=memory))
-        for key, value in memory.items():
-            self._memory[_join(name, key)].copy_(value)
-        return result
 
     def _build_memory(self, machine: Machine, num_envs: int, device: torch.device) -> Memory:
         """Return memory of the right shapes, as it begins at rest."""
@@ -445,27 +463,20 @@ class EffectChain:
             found["valve"] = rest.clone()
         for name, effect in (self.commands | self.motions).items():
             u = rest if name in self._delays else rest[:, -(self._num_recent or len(rest[0])) :]
-            now = StepInputs(
-                self.get_values(name), {}, History(q=rest, u=u), self.plant, rest[:, -1], None
-            )
+            now = self.describe(name, History(q=rest, u=u), rest[:, -1], None)
             for key, value in effect.begin(now).items():
-                found[_join(name, key)] = value.clone()
+                found[join_name(name, key)] = value.clone()
         return found
 
     def get_values(self, name: str) -> dict[str, torch.Tensor]:
         """Return the parameters of one effect, by their own names."""
-        return {key: self.parameters[_join(name, key)] for key in self.effects[name].numbers}
+        return {key: self.parameters[join_name(name, key)] for key in self.effects[name].numbers}
 
     def salt_counter(self, name: str, counter: torch.Tensor | None) -> torch.Tensor | None:
         """Return the counter of one effect's draws; `None` for an effect that draws none."""
         if counter is None or name not in self._salts:
             return None
         return counter + self._salts[name]
-
-
-def broadcast_rows(mask: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """Return `mask`, `(N,)`, in a shape that broadcasts over the rows of `like`."""
-    return mask.reshape(-1, *[1] * (like.dim() - 1))
 
 
 def _list_variants(effects: Mapping[str, EffectSpec], machine: Machine) -> dict[str, EffectSpec]:
@@ -480,10 +491,6 @@ def _list_variants(effects: Mapping[str, EffectSpec], machine: Machine) -> dict[
             effect = variant(**values)
         found[name] = effect
     return found
-
-
-def _join(name: str, key: str) -> str:
-    return f"{name}.{key}" if name else key
 
 
 def _keep_unchanged(value: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:

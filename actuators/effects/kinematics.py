@@ -4,8 +4,9 @@ from typing import ClassVar
 
 import torch
 
-from actuators.effects.effect import ANY_INTERFACE, EffectSpec, MachineTensors
+from actuators.effects.effect import ANY_INTERFACE, EffectSpec
 from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.models.machine_tensors import MachineTensors
 from brokk_rl.spec import spec
 
 
@@ -19,8 +20,16 @@ def _describe_shift(typical_m: float) -> EffectNumber:
     )
 
 
+class GeometryEffect(EffectSpec):
+    """An effect on where the tool is, or where the camera sees a point."""
+
+    side = "kinematics"
+    stage = "kinematics"
+    interfaces = ANY_INTERFACE
+
+
 @spec
-class LinkLength(EffectSpec):
+class LinkLength(GeometryEffect):
     """Links are longer or shorter than drawn.
 
     Attributes:
@@ -31,9 +40,6 @@ class LinkLength(EffectSpec):
 
     joints: Joints
     extra_m: Value
-    side = "kinematics"
-    interfaces = ANY_INTERFACE
-    stage = "kinematics"
     numbers: ClassVar = {
         "extra_m": EffectNumber("m", none=0.0, typical=0.01, bounds=(-0.3, 0.3), scale="reach")
     }
@@ -54,7 +60,7 @@ class LinkLength(EffectSpec):
 
 
 @spec
-class BaseTilt(EffectSpec):
+class BaseTilt(GeometryEffect):
     """The machine does not stand level, as instruments and site drawings do.
 
     Camera and arm tilt together: the controller does not notice, outside instruments do. The weight
@@ -67,9 +73,6 @@ class BaseTilt(EffectSpec):
 
     roll_rad: Value
     pitch_rad: Value
-    side = "kinematics"
-    interfaces = ANY_INTERFACE
-    stage = "kinematics"
     numbers: ClassVar = {"roll_rad": _describe_angle(0.03), "pitch_rad": _describe_angle(0.03)}
 
     def tool(
@@ -93,7 +96,7 @@ class BaseTilt(EffectSpec):
 
 
 @spec
-class Extrinsics(EffectSpec):
+class Extrinsics(GeometryEffect):
     """The camera pose is wrong: seen points are rotated about the base and displaced.
 
     Attributes:
@@ -111,8 +114,6 @@ class Extrinsics(EffectSpec):
     roll_rad: Value
     pitch_rad: Value
     yaw_rad: Value
-    side = "kinematics"
-    interfaces = ANY_INTERFACE
     stage = "perception"
     numbers: ClassVar = {name: _describe_shift(0.02) for name in ("x_m", "y_m", "z_m")} | {
         name: _describe_angle(0.01) for name in ("roll_rad", "pitch_rad", "yaw_rad")

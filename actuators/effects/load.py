@@ -52,7 +52,7 @@ class LoadDependence(EffectSpec):
         if now.plant.has_masses:
             weight, sensitivity = _weight(now), now.value["sensitivity"]
         else:
-            cos, sin = now.plant.read_pose(now.history.q[:, -1])
+            sin, cos = now.plant.read_pose(now.history.q[:, -1])
             weight, sensitivity = now.value["pose_cos"] * cos + now.value["pose_sin"] * sin, 1.0
         load = now.moved.sign() * weight
         load = load * torch.where(load > 0.0, now.value["lowering"], 1.0)

@@ -10,8 +10,15 @@ from actuators.models.parameters import draw_normal
 from brokk_rl.spec import spec
 
 
+class SensorEffect(EffectSpec):
+    """An effect on the readings of a sensor at each joint."""
+
+    side = "measurement"
+    stage = "sensing"
+
+
 @spec
-class Quantisation(EffectSpec):
+class Quantisation(SensorEffect):
     """A coarse sensor: positions come in steps.
 
     Attributes:
@@ -21,8 +28,6 @@ class Quantisation(EffectSpec):
 
     joints: Joints
     step_rad: Value
-    side = "measurement"
-    stage = "sensing"
     smooth = False
     interfaces = ANY_INTERFACE
     numbers: ClassVar = {
@@ -38,7 +43,7 @@ class Quantisation(EffectSpec):
 
 
 @spec
-class SensorNoise(EffectSpec):
+class SensorNoise(SensorEffect):
     """White noise on each sample of each joint.
 
     Attributes:
@@ -48,8 +53,6 @@ class SensorNoise(EffectSpec):
 
     joints: Joints
     sigma_rad: Value
-    side = "measurement"
-    stage = "sensing"
     stochastic = True
     interfaces = ANY_INTERFACE
     numbers: ClassVar = {
@@ -65,7 +68,7 @@ class SensorNoise(EffectSpec):
 
 
 @spec
-class EncoderBias(EffectSpec):
+class EncoderBias(SensorEffect):
     """The encoder's zero is off.
 
     Attributes:
@@ -75,8 +78,6 @@ class EncoderBias(EffectSpec):
 
     joints: Joints
     bias_rad: Value
-    side = "measurement"
-    stage = "sensing"
     interfaces = frozenset({"speed", "torque"})  # a servo has its encoder within its loop
     numbers: ClassVar = {
         "bias_rad": EffectNumber("rad", none=0.0, typical=0.015, bounds=(-0.3, 0.3), scale="travel")
@@ -94,7 +95,7 @@ class EncoderBias(EffectSpec):
 
 
 @spec
-class EncoderScale(EffectSpec):
+class EncoderScale(SensorEffect):
     """The encoder's scale is off.
 
     Attributes:
@@ -104,8 +105,6 @@ class EncoderScale(EffectSpec):
 
     joints: Joints
     scale: Value
-    side = "measurement"
-    stage = "sensing"
     interfaces = frozenset({"speed", "torque"})  # a servo has its encoder within its loop
     numbers: ClassVar = {"scale": EffectNumber("1", none=1.0, typical=1.015, bounds=(0.7, 1.4))}
 

@@ -6,6 +6,7 @@ import torch
 
 from actuators.effects.effect import ANY_INTERFACE, EffectSpec, Memory, StepInputs
 from actuators.effects.ranges import EffectNumber, Joints, Value
+from actuators.models.parameters import split_run_commands
 from brokk_rl.spec import spec
 
 
@@ -174,14 +175,6 @@ def _delay_commands(u: torch.Tensor, periods: torch.Tensor, count: int) -> torch
 
     Commands are held beyond both ends.
     """
-    last = u.shape[1] - 1
-    # half a millionth of a period forgives 0.15 / 0.05 = 2.9999998
-    whole = torch.floor(periods + 5e-7)
-    part = (periods - whole).clamp(0.0, 1.0)[:, None]
-    place = (
-        torch.arange(last - count, last + 1, device=u.device)[:, None]
-        - whole.to(torch.int64)[:, None]
-    )
-    found = u.gather(1, place.clamp(0, last))
-    earlier, later = found[:, :-1], found[:, 1:]
-    return later + part * (earlier - later)
+    first = u.shape[1] - count + 1
+    earlier, later, part = split_run_commands(u.transpose(0, 1), periods, first)
+    return (later + part * (earlier - later)).transpose(0, 1)

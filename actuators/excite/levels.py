@@ -70,32 +70,22 @@ class Levels:
         starts = draw_start_poses(machine, self.stop_margin, generator)
         segments = []
         for i in range(count):
-            segments.append(
-                Segment(
-                    name=f"levels_{i:02d}",
-                    start=next(starts),
-                    u=self._program(machine, total // count, generator),
-                    stops="inward",
-                    stop_margin=self.stop_margin,
-                )
-            )
+            start, u = next(starts), self._program(machine, total // count, generator)
+            segments.append(Segment(f"levels_{i:02d}", start, u, "inward", self.stop_margin))
         return segments
 
     def _program(self, machine: Machine, steps: int, generator: np.random.Generator) -> np.ndarray:
         """Return the commands, `(T, J)`."""
-        u = np.stack(
-            [self._joint(steps, machine.period_s, generator) for _ in range(machine.num_joints)], 1
-        )
+        period_s, joints = machine.period_s, range(machine.num_joints)
+        u = np.stack([self._joint(steps, period_s, generator) for _ in joints], 1)
         exclusive = machine.is_exclusive
         if not exclusive.any() or exclusive.all():
             return u
         turn = max(1, round(self.turn_s / machine.period_s))
         num_turns = -(-steps // turn)
         # spread evenly from a random beginning, so that a short program has its part too
-        alone = (
-            np.diff(np.floor(self.exclusive_share * np.arange(num_turns + 1) + generator.random()))
-            > 0
-        )
+        turns = self.exclusive_share * np.arange(num_turns + 1) + generator.random()
+        alone = np.diff(np.floor(turns)) > 0
         return u * mask_exclusive_joints(exclusive, np.repeat(alone, turn)[:steps])
 
     def _joint(self, steps: int, period_s: float, generator: np.random.Generator) -> np.ndarray:
@@ -103,8 +93,7 @@ class Levels:
         most = -(-steps // max(1, int(self.shortest_s / period_s)))
         held_s = np.exp(generator.uniform(np.log(self.shortest_s), np.log(self.longest_s), most))
         kind = generator.random(most)
-        reach = np.where(kind < self.zero_share + self.small_share, self.small_level, 1.0) * (
-            kind >= self.zero_share
-        )
+        is_small = kind < self.zero_share + self.small_share
+        reach = np.where(is_small, self.small_level, 1.0) * (kind >= self.zero_share)
         level = reach * generator.uniform(-1.0, 1.0, most)
         return np.repeat(level, np.maximum(1, np.round(held_s / period_s).astype(int)))[:steps]

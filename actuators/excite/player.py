@@ -66,11 +66,17 @@ class ToolSpeed:
                 "collect.guards.max_tool_speed_m_s: needs torch, which is not installed; give null, or a max_command"
             ) from error
         self._kinematics, self._tensor = Kinematics(machine), torch.as_tensor
+        self._period_s = machine.period_s
 
     def of(self, q: np.ndarray, speed: np.ndarray) -> np.ndarray:
         """Return the tool speed in m/s, `(N,)`, at `q` and joint speeds `speed`, each `(N, J)`."""
         tip = self._kinematics.jacobian(self._tensor(q.astype(np.float32))).tip.numpy()
         return np.linalg.norm((tip @ speed[..., None])[..., 0], axis=-1)
+
+    def along(self, q: np.ndarray) -> np.ndarray:
+        """Return the tool speed in m/s, `(T,)`, along a path `q`, `(T, J)`."""
+        tip_m = self._kinematics.pose(self._tensor(q.astype(np.float32))).tip_in_base_m.numpy()
+        return np.linalg.norm(np.gradient(tip_m, axis=0), axis=-1) / self._period_s
 
 
 def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
@@ -78,16 +84,10 @@ def predict_tool_speed(machine: Machine, q: np.ndarray) -> np.ndarray | None:
 
     `None` where geometry or torch are missing.
     """
-    if not machine.has_bodies:
-        return None
     try:
-        import torch
-
-        from brokk_rl.kinematics import Kinematics
-    except ImportError:
+        return ToolSpeed(machine).along(q)
+    except ConfigError:
         return None
-    tip_m = Kinematics(machine).pose(torch.as_tensor(q.astype(np.float32))).tip_in_base_m.numpy()
-    return np.linalg.norm(np.gradient(tip_m, axis=0), axis=-1) / machine.period_s
 
 
 log = logging.getLogger(__name__)
@@ -145,10 +145,8 @@ class PlanPlayer:
         far = np.abs(error) > self._approach.tolerance * self._travel
         self._advance(q, far)
 
-        program, before = (
-            self._program[self._rows, self._index],
-            self._program[self._rows, np.maximum(self._index - 1, 0)],
-        )
+        program = self._program[self._rows, self._index]
+        before = self._program[self._rows, np.maximum(self._index - 1, 0)]
         program = program * (self.phase == PLAY)[:, None]
         low, high = self._low[self._rows, self.segment], self._high[self._rows, self.segment]
         # Kept until the program passes zero.
@@ -208,16 +206,11 @@ class PlanPlayer:
         moving = MOVES[phase]
         arrived = moving & (~far.any(1) | late)
         for n in np.flatnonzero(arrived & far.any(1)):
-            joints = []
-            for j in np.flatnonzero(far[n]):
-                joints.append(f"{self._machine.joint_names[j]} ({q[n, j]:.3f})")
+            names = self._machine.joint_names
+            joints = ", ".join(f"{names[j]} ({q[n, j]:.3f})" for j in np.flatnonzero(far[n]))
             name = self._plan.runs[n][self.segment[n]].name
-            log.warning(
-                "run %d: way to the start of %s given up, out of place: %s; going on from there",
-                n,
-                name,
-                ", ".join(joints),
-            )
+            text = "run %d: way to the start of %s given up, out of place: %s; going on from there"
+            log.warning(text, n, name, joints)
         phase[arrived] += 1  # rest, or wait
         rest = round(self._approach.rest_s / self._machine.period_s)
         self._left[arrived] = rest
@@ -236,16 +229,14 @@ class PlanPlayer:
         assert self._seen is not None
         period_s = self._machine.period_s
         measured = (q - self._seen[0]) / (SPEED_WINDOW * period_s)
-        return q + self._in_flight.sum(
-            1
-        ) * self._speed * period_s, q + measured * self._machine.dead_time_s
+        nominal = self._in_flight.sum(1) * self._speed * period_s
+        return q + nominal, q + measured * self._machine.dead_time_s
 
     def _toward(self, error: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Return commands toward the targets: ordinary joints first, then exclusive ones."""
         approach, exclusive = self._approach, self._machine.is_exclusive
-        size = np.clip(
-            np.abs(error) / (self._speed * approach.settle_s), approach.smallest, approach.level
-        )
+        size = np.abs(error) / (self._speed * approach.settle_s)
+        size = size.clip(approach.smallest, approach.level)
         first = far[:, ~exclusive].any(1)
         return np.sign(error) * size * far * mask_exclusive_joints(exclusive, ~first)
 
@@ -253,24 +244,18 @@ class PlanPlayer:
         """Return the commands within the guards; exclusive joints wait for the others."""
         exclusive = self._machine.is_exclusive
         together = (u[:, ~exclusive] != 0).any(1)
-        u = np.where(exclusive & together[:, None], 0.0, u).clip(
-            -self._guards.max_command, self._guards.max_command
-        )
+        most = self._guards.max_command
+        u = np.where(exclusive & together[:, None], 0.0, u).clip(-most, most)
         if self._tool_speed is None:
             return u
         speed_m_s = self._tool_speed.of(q, u * self._speed)
-        return (
-            u
-            * np.minimum(1.0, self._guards.max_tool_speed_m_s / np.maximum(speed_m_s, 1e-9))[
-                :, None
-            ]
-        )
+        scale = self._guards.max_tool_speed_m_s / np.maximum(speed_m_s, 1e-9)
+        return u * np.minimum(1.0, scale)[:, None]
 
     def _patience(self, q: np.ndarray) -> np.ndarray:
         """Return the periods after which the approach from `q` is given up, `(N,)`."""
-        needed_s = self._approach.duration_s(
-            self._machine, q, self._start[self._rows, self.segment]
-        )
+        start = self._start[self._rows, self.segment]
+        needed_s = self._approach.duration_s(self._machine, q, start)
         return np.ceil(self._approach.patience * needed_s / self._machine.period_s).astype(int)
 
     def _pack(self) -> None:
@@ -285,14 +270,9 @@ class PlanPlayer:
         self._at_zero = np.zeros((count, length), dtype=bool)
         self._start = np.tile(machine.home, (count, most, 1))
         self._low, self._high = np.zeros_like(self._start), np.zeros_like(self._start)
-        self._begin, self._end = (
-            np.zeros((count, most), dtype=int),
-            np.zeros((count, most), dtype=int),
-        )
-        self._goes_home, self._original = (
-            np.zeros((count, most), dtype=bool),
-            np.full((count, most), -1),
-        )
+        self._begin, self._end = np.zeros((2, count, most), dtype=int)
+        self._goes_home = np.zeros((count, most), dtype=bool)
+        self._original = np.full((count, most), -1)
         for n, run in enumerate(runs):
             end, names = 0, [segment.name for segment in run]
             for i, segment in enumerate(run):
@@ -377,15 +357,7 @@ def drive(
         columns = {}
         for name, value in extra().items():
             columns[name] = np.array(np.broadcast_to(value, (num_runs,)), dtype=np.float64)
-        yield Sample(
-            t_s=state.t_s,
-            q=q.copy(),
-            u=sent,
-            phase=phase,
-            segment=segment,
-            played=played,
-            extra=columns,
-        )
+        yield Sample(state.t_s, q.copy(), sent, phase, segment, played, columns)
 
 
 def _wait_for_state(link: Link, due_s: float) -> JointState:
@@ -424,11 +396,8 @@ class NominalLink:
     """
 
     def __init__(self, machine: Machine, num_runs: int, alone: bool = False) -> None:
-        self._machine, self._t_s, self._form = (
-            machine,
-            0.0,
-            (machine.num_joints,) if alone else (num_runs, machine.num_joints),
-        )
+        self._machine, self._t_s = machine, 0.0
+        self._form = (machine.num_joints,) if alone else (num_runs, machine.num_joints)
         self._q = np.tile(machine.home, (num_runs, 1))
         on_their_way = round(machine.dead_time_s / machine.period_s) + 1
         self._in_flight = np.tile(find_rest(self._q, machine), (on_their_way, 1, 1))
@@ -440,9 +409,8 @@ class NominalLink:
     def send(self, command: Command) -> Command:
         """Move on by one control period."""
         machine = self._machine
-        u = np.nan_to_num(np.asarray(command.u, dtype=float), nan=0.0, posinf=0.0, neginf=0.0).clip(
-            -1.0, 1.0
-        )
+        u = np.nan_to_num(np.asarray(command.u, dtype=float), posinf=0.0, neginf=0.0)
+        u = u.clip(-1.0, 1.0)
         self._in_flight = np.concatenate([self._in_flight[1:], u.reshape(1, *self._q.shape)])
         step = self._in_flight[0] * machine.max_speed * machine.period_s
         if machine.interface == "position":

@@ -14,8 +14,8 @@ import torch
 from scipy.optimize import least_squares
 from scipy.signal import butter, filtfilt
 
-from actuators.models.force_drive import read_pose
 from actuators.models.friction import LOADS, STRIBECK_SPEED, compute_dry_friction
+from actuators.models.machine_tensors import read_pose
 from brokk_rl.errors import RecordingError
 from brokk_rl.machine import Machine
 
@@ -189,7 +189,8 @@ class _JointRegression:
         columns, forces, folds = [np.zeros((0, len(LINEAR)))], [np.zeros(0)], [np.zeros(0, int)]
         self._poses = []
         for one in motions:
-            pose = [p.numpy() for p in read_pose(torch.from_numpy(one.q), middle, half, slides)]
+            sin, cos = read_pose(torch.from_numpy(one.q), middle, half, slides)
+            pose = [sin.numpy(), cos.numpy() - 1.0]
             self._poses.append(pose)
             ones = np.ones_like(one.q)
             own = [one.acceleration, one.speed, np.sign(one.speed), ones, *pose]

@@ -8,21 +8,19 @@ Other terms are tried beside these four, see `actuators.identify.drive_regressio
 """
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 
 from actuators.identify.drive_regression import TERMS, DriveMotion, filter_low_pass, fit_drive
+from actuators.identify.option_file import write_option
 from actuators.models.force_drive import ForceDrive
 from actuators.models.friction import STRIBECK_SPEED
-from brokk_rl.errors import ConfigError, StorageError, list_choices
+from brokk_rl.errors import ConfigError, list_choices
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from brokk_rl.session import write_json, write_text
 from brokk_rl.spec import Positive, spec
 
 EDGE_S = 0.3
@@ -107,17 +105,8 @@ class ForceFit:
                 off = float(f"{STRIBECK_SPEED * speed:.5g}") if name == "stribeck_m_s" else 0.0
                 mine.setdefault(joint, off)
         fitted = dataclasses.replace(self.actuator, **values)  # pyright: ignore[reportArgumentType]
-        facts = json.loads(json.dumps(dataclasses.asdict(fitted)))  # pyright: ignore[reportArgumentType]
-        target = f"{ForceDrive.__module__}.{ForceDrive.__name__}"
-        text = yaml.safe_dump({"_target_": target, **facts}, sort_keys=False, width=130)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            write_text(folder / f"{self.name}.yaml", f"# fitted to {machine.name}\n{text}")
-            write_json(
-                folder / f"{self.name}.json", {"schema": 1, "parameters": told, "terms": tried}
-            )
-        except OSError as error:
-            raise StorageError(f"cannot write into {folder}: {error.strerror or error}") from error
+        facts = {"schema": 1, "parameters": told, "terms": tried}
+        write_option(folder, self.name, fitted, f"fitted to {machine.name}", facts)
         return fitted
 
     def _read_motion(

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import json
 import logging
 import time
 from collections.abc import Sequence
@@ -12,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from scipy.stats import qmc
 
 from actuators import open_loop
@@ -23,14 +21,15 @@ from actuators.identify.gauss_newton import (
     get_parameters,
     take_step,
 )
-from actuators.identify.training_data import COMMANDED
+from actuators.identify.option_file import round_by_joint, write_option
+from actuators.models.checkpoint import ResumeFile
+from actuators.recordings.split import COMMANDED
 from brokk_rl import record
 from brokk_rl.contracts.actuator import Actuator
-from brokk_rl.errors import ConfigError, RecordingError, StorageError
+from brokk_rl.errors import ConfigError, RecordingError
 from brokk_rl.machine import Machine
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
-from brokk_rl.session import write_json, write_text
 from brokk_rl.spec import Count, Positive, spec
 
 log = logging.getLogger(__name__)
@@ -88,33 +87,25 @@ def find_correlated_pairs(
     return correlated
 
 
-def format_option(fitted: Any, facts: dict[str, Any]) -> str:
-    """Return the text of a config option of the group `actuator`."""
-    kind = type(fitted)
-    node = {"_target_": f"{kind.__module__}.{kind.__qualname__}", **dataclasses.asdict(fitted)}
+def describe_option(fitted: Any, facts: dict[str, Any]) -> str:
+    """Return the comment of a fitted option: data, errors of free runs and intervals."""
+    errors = []
+    for joint, value in facts["validation_rmse"].items():
+        errors.append(f"{joint} {'-' if value is None else f'{value:.4f}'}")
     lines = [
-        f"# {kind.__name__} fitted to {facts['recordings']} recordings ({facts['runs']} runs, {facts['minutes']:g} min) of machine "
-        f"'{facts['machine']}', {facts['created']}.",
-        "# Use: actuator=@<this file>. A number that the recordings do not tell has its whole range as interval.",
-        f"# Error of free runs of {facts['horizon_s']:g} s on the validation recordings, at their end, rad or m: "
-        + ", ".join(
-            f"{joint} {'-' if value is None else f'{value:.4f}'}"
-            for joint, value in facts["validation_rmse"].items()
-        ),
-        "# 95 % intervals:",
+        f"{type(fitted).__name__} fitted to {facts['recordings']} recordings ({facts['runs']} runs, {facts['minutes']:g} min) of "
+        f"machine '{facts['machine']}', {facts['created']}.",
+        "Use: actuator=@<this file>. A number that the recordings do not tell has its whole range as interval.",
+        f"Error of free runs of {facts['horizon_s']:g} s on the validation recordings, at their end, rad or m: {', '.join(errors)}",
+        "95 % intervals:",
     ]
     for name, row in facts["parameters"].items():
         cells = []
         for joint, cell in row.items():
-            cells.append(
-                f"{joint} {cell['ci95'][0]:.4g} to {cell['ci95'][1]:.4g}{'' if cell['told'] else ' (not told)'}"
-            )
-        lines.append(f"#   {name}: {', '.join(cells)}")
-    return (
-        "\n".join(lines)
-        + "\n"
-        + yaml.safe_dump(node, sort_keys=False, default_flow_style=None, width=132)
-    )
+            low, high = cell["ci95"]
+            cells.append(f"{joint} {low:.4g} to {high:.4g}{'' if cell['told'] else ' (not told)'}")
+        lines.append(f"  {name}: {', '.join(cells)}")
+    return "\n".join(lines)
 
 
 def log_undetermined(facts: dict[str, Any]) -> None:
@@ -234,9 +225,11 @@ class GreyBoxFit:
             )
         judged = validation or train  # a fit to all recordings has none left to choose a start by
         held = self._free_runs(machine, judged, self.validation_windows, random, device)
-        place = folder / f"{self.name}.progress.json"
-        search = _Search(self, runs, place, _hash_fit(self, machine, runs, held, seed))
-        x = search.choose(search.run(nominal, seed), held)
+        left = ResumeFile(
+            folder / f"{self.name}.partial.safetensors", self._stamp(machine, runs, held, seed)
+        )
+        search = _Search(self, runs)
+        x = search.choose(search.run(nominal, seed, left), held)
         sure = estimate_uncertainty(runs, x, self.robust)
         found = self._rounded(machine, runs, x)
         fitted: Any = dataclasses.replace(self.actuator, **found)  # pyright: ignore[reportArgumentType, reportCallIssue]
@@ -247,15 +240,8 @@ class GreyBoxFit:
             "parameters": tabulate_parameters(found, runs, x, sure),
             "tangled": find_correlated_pairs(machine, runs, sure),
         }
-        try:
-            write_json(folder / f"{self.name}.json", facts)
-            write_text(folder / f"{self.name}.yaml", format_option(fitted, facts))
-            # the state of the search is of no use once the result is on disk
-            place.unlink(missing_ok=True)
-        except OSError as failure:
-            raise StorageError(
-                f"cannot write into {folder}: {failure.strerror or failure}"
-            ) from failure
+        write_option(folder, self.name, fitted, describe_option(fitted, facts), facts)
+        left.remove()
         log_undetermined(facts)
         return fitted
 
@@ -333,57 +319,62 @@ class GreyBoxFit:
     def _rounded(
         self, machine: Machine, runs: CandidateRuns, x: np.ndarray
     ) -> dict[str, dict[str, float]]:
-        rounded = {}
-        for name, row in zip(runs.names, runs.values(x), strict=True):
-            rounded[name] = {
-                joint: float(f"{value:.5g}")
-                for joint, value in zip(machine.joint_names, row, strict=True)
-            }
-        return rounded
+        rows = zip(runs.names, runs.values(x), strict=True)
+        return {name: round_by_joint(machine, row) for name, row in rows}
+
+    def _stamp(
+        self, machine: Machine, runs: CandidateRuns, held: CandidateRuns, seed: int
+    ) -> dict[str, Any]:
+        """Return all that the result depends on."""
+        data = hashlib.sha256()
+        for part in (runs.cut, held.cut):
+            data.update(part.u.tobytes() + part.q.tobytes())
+        return {
+            "fit": dataclasses.asdict(self),  # pyright: ignore[reportArgumentType]
+            "machine": machine.fingerprint(),
+            "max_speed": machine.max_speed.tolist(),
+            "seed": seed,
+            "windows": data.hexdigest(),
+        }
 
 
 @dataclass
 class _Search:
-    """The running search; each step is saved in `place`, from which an interrupted fit resumes."""
+    """The search; each step is saved, and an interrupted fit goes on from there."""
 
     config: GreyBoxFit
     runs: CandidateRuns
-    place: Path
-    digest: str
     before_s: float = 0.0
 
-    def run(self, nominal: np.ndarray, seed: int) -> list[np.ndarray]:
-        """Return where each start leads, each `(P, J)`."""
+    def run(self, nominal: np.ndarray, seed: int, left: ResumeFile) -> np.ndarray:
+        """Return where each start leads, `(S, P, J)`."""
         config, began = self.config, time.monotonic()
+        found = torch.zeros((config.starts, *nominal.shape), dtype=torch.float64)
+        place = left.load({"x": found})
+        if place is None:
+            found.copy_(torch.from_numpy(self._starts(nominal, seed)))
+            place = {"start": 0, "iteration": 0, "seconds": 0.0}
+        self.before_s = place["seconds"]
         total = config.starts * config.iterations
         with ItemProgress(f"{config.name}: search", total) as progress:
-            state = self._left() or {
-                "done": [],
-                "iteration": 0,
-                "waiting": self._starts(nominal, seed).tolist(),
-            }
-            self.before_s = state.get("seconds", 0.0)
-            done, iteration = [np.array(x) for x in state["done"]], state["iteration"]
-            waiting = [np.array(x) for x in state["waiting"]]
-            while waiting:
+            while place["start"] < config.starts:
+                start, iteration = place["start"], place["iteration"] + 1
                 progress.reach(
-                    len(done) * config.iterations + iteration,
-                    f"{config.name}: start {len(done) + 1} of {config.starts}, step {iteration + 1}",
+                    start * config.iterations + iteration - 1,
+                    f"{config.name}: start {start + 1} of {config.starts}, step {iteration}",
                 )
-                waiting[0], gain = take_step(self.runs, waiting[0], config.robust)
-                iteration += 1
+                x, gain = take_step(self.runs, found[start].numpy(), config.robust)
+                found[start] = torch.from_numpy(x)
+                place["iteration"] = iteration
                 if gain < config.tolerance or iteration >= config.iterations:
-                    log.info(
-                        "%s: start %d ended after %d steps", config.name, len(done) + 1, iteration
-                    )
-                    done.append(waiting.pop(0))
-                    iteration = 0
-                self._keep(done, iteration, waiting, self.before_s + time.monotonic() - began)
-        return done
+                    log.info("%s: start %d ended after %d steps", config.name, start + 1, iteration)
+                    place |= {"start": start + 1, "iteration": 0}
+                place["seconds"] = self.before_s + time.monotonic() - began
+                left.save({"x": found}, place)
+        return found.numpy()
 
-    def choose(self, found: list[np.ndarray], held: CandidateRuns) -> np.ndarray:
-        """Return the parameters with the best validation runs, per joint if uncoupled."""
-        stacked = np.stack(found)
+    def choose(self, stacked: np.ndarray, held: CandidateRuns) -> np.ndarray:
+        """Return the parameters `(P, J)` with the best validation runs, per joint if uncoupled."""
         score, fallback = (
             _average_rmse(runs.squares(stacked), runs.active) for runs in (held, self.runs)
         )
@@ -405,31 +396,6 @@ class _Search:
             0
         )[: self.config.starts]  # (S, J)
         return np.stack([candidates[order[:, j], :, j] for j in range(joints)], 2)
-
-    def _left(self) -> dict[str, Any] | None:
-        """Return the state of an interrupted fit with the same settings, if any."""
-        try:
-            state = json.loads(self.place.read_text())
-        except (OSError, ValueError):
-            return None
-        if state.get("digest") != self.digest:
-            log.warning(
-                "%s is of a fit with other settings or recordings; this one begins anew", self.place
-            )
-            return None
-        log.info("going on from %s", self.place)
-        return state
-
-    def _keep(
-        self, done: list[np.ndarray], iteration: int, waiting: list[np.ndarray], seconds: float
-    ) -> None:
-        state = {"digest": self.digest, "seconds": seconds, "iteration": iteration}
-        state |= {"done": [x.tolist() for x in done], "waiting": [x.tolist() for x in waiting]}
-        try:
-            self.place.parent.mkdir(parents=True, exist_ok=True)
-            write_json(self.place, state)
-        except OSError as error:
-            raise StorageError(f"cannot write {self.place}: {error.strerror or error}") from error
 
 
 def _select_windows(
@@ -453,15 +419,3 @@ def _average_rmse(squares: np.ndarray, active: np.ndarray) -> np.ndarray:
     """Return mean RMS errors over active windows, `(C, J)`; NaN for an inactive joint."""
     count = np.where(active.any(0), active.sum(0), np.nan)
     return np.sqrt(squares).sum(1) / count
-
-
-def _hash_fit(
-    config: GreyBoxFit, machine: Machine, runs: CandidateRuns, held: CandidateRuns, seed: int
-) -> str:
-    """Return a hash of all that the result depends on."""
-    told = hashlib.sha256(
-        repr((config, machine.fingerprint(), machine.max_speed.tolist(), seed)).encode()
-    )
-    for part in (runs.cut, held.cut):
-        told.update(part.u.tobytes() + part.q.tobytes())
-    return told.hexdigest()

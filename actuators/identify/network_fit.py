@@ -13,15 +13,16 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 
 from actuators.identify import training_data
-from actuators.identify.training_data import TrainingWindows
+from actuators.identify.training_data import TrainingWindows, list_sources
 from actuators.models import checkpoint
 from actuators.models.checkpoint import ResumeFile, hash_recordings
+from actuators.models.machine_tensors import MachineTensors
 from actuators.models.network import Coupled, JointNetworks, Mlp
 from actuators.recordings.split import COMMANDED
 from brokk_rl.errors import BrokkError, ConfigError
@@ -52,18 +53,22 @@ class FreeRunOptimizer:
     def __init__(self, networks: JointNetworks, machine: Machine, seed: int) -> None:
         self.networks, self.averaged = networks, copy.deepcopy(networks).requires_grad_(False)
         self._device = networks.quiet.device
-        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=self._device)
-        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=self._device)
+        self._plant = MachineTensors(machine, self._device)
         self._seed = seed % 2**31
         self._key = torch.zeros((), dtype=torch.int64, device=self._device)
         self._rate = torch.zeros((), device=self._device)
         self._share_of_new = torch.zeros((), device=self._device)
         self._parameters = list(networks.parameters())
-        on_gpu = self._device.type == "cuda"
         self._adam = torch.optim.Adam(
-            self._parameters, lr=self._rate, fused=True, capturable=on_gpu
+            self._parameters, lr=self._rate, fused=True, capturable=self._device.type == "cuda"
         )
-        self._begin_adam()
+        # Adam's state at fixed addresses before capture: a step with zero rate.
+        for parameter in self._parameters:
+            parameter.grad = torch.zeros_like(parameter)
+        self._adam.step()
+        for parameter in self._parameters:
+            for value in self._adam.state[parameter].values():
+                value.zero_()
 
     def state(self) -> dict[str, torch.Tensor]:
         """Return the tensors that an update changes, by name, to be copied from and into."""
@@ -72,10 +77,8 @@ class FreeRunOptimizer:
             found[f"networks.{name}"] = value.detach()
         found |= {f"averaged.{name}": value for name, value in self.averaged.named_parameters()}
         for number, parameter in enumerate(self._parameters):
-            found |= {
-                f"adam.{number}.{name}": value
-                for name, value in self._adam.state[parameter].items()
-            }
+            for name, value in self._adam.state[parameter].items():
+                found[f"adam.{number}.{name}"] = value
         return found
 
     def updater(
@@ -87,11 +90,8 @@ class FreeRunOptimizer:
         """
 
         def update() -> None:
-            self._update(
-                *windows.draw(
-                    batch, still_share, busy_share, self._key, together=self.networks.coupled
-                )
-            )
+            shares, together = (still_share, busy_share), self.networks.coupled
+            self._update(*windows.draw(batch, *shares, self._key, together=together))
 
         if self._device.type != "cuda":
             return update
@@ -114,7 +114,7 @@ class FreeRunOptimizer:
     def run(self, u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Return free runs of the averaged networks through windows, `(J, B, K)`."""
         return self.averaged.roll_out(
-            u[..., :-1], q[..., : self.averaged.num_history], self._lower, self._upper
+            u[..., :-1], q[..., : self.averaged.num_history], self._plant.lower, self._plant.upper
         )
 
     def _update(self, u: torch.Tensor, q: torch.Tensor) -> None:
@@ -124,11 +124,12 @@ class FreeRunOptimizer:
         if horizon == 1:
             # before the dead zone, whose gradient is zero where it acts
             output = networks(networks.inputs(u[..., :size], q[..., :size]))
-            loss = (
-                (output - (q[..., size] - q[..., size - 1]) / scale[..., 0]).square().mean(1).sum()
-            )
+            moved = (q[..., size] - q[..., size - 1]) / scale[..., 0]
+            loss = (output - moved).square().mean(1).sum()
         else:
-            path = networks.roll_out(u[..., :-1], q[..., :size], self._lower, self._upper)
+            path = networks.roll_out(
+                u[..., :-1], q[..., :size], self._plant.lower, self._plant.upper
+            )
             ahead = torch.arange(1, horizon + 1, device=q.device)
             # an error that grows with the square root of time counts the same early and late
             loss = (((path - q[..., size:]) / scale).square() / ahead).mean((1, 2)).sum()
@@ -141,15 +142,6 @@ class FreeRunOptimizer:
         with torch.no_grad():
             for mean, value in zip(self.averaged.parameters(), self._parameters, strict=True):
                 mean.lerp_(value, self._share_of_new)
-
-    def _begin_adam(self) -> None:
-        """Create Adam's state at fixed addresses before capture: a step with zero rate."""
-        for parameter in self._parameters:
-            parameter.grad = torch.zeros_like(parameter)
-        self._adam.step()
-        for parameter in self._parameters:
-            for value in self._adam.state[parameter].values():
-                value.zero_()
 
 
 log = logging.getLogger(__name__)
@@ -247,30 +239,22 @@ class NetworkFit:
         fitting = _NetworkFitting(self, machine, train, validation, seed, device)
         seconds = fitting.run(interruption)
         tensors, errors = fitting.result
+        names = machine.joint_names
+        commanded = training_data.measure_commanded_each_way_s(train).sum(0) / 60.0
         facts = {
             "width": self.width,
             "data": {
                 "recordings": len(train),
                 "minutes": round(sum(recording.duration_s for recording in train) / 60.0, 1),
-                "commanded_minutes": dict(
-                    zip(
-                        machine.joint_names,
-                        (training_data.measure_commanded_each_way_s(train).sum(0) / 60.0)
-                        .round(1)
-                        .tolist(),
-                        strict=True,
-                    )
-                ),
-                "sources": sorted(
-                    {recording.metadata.get("source", "unknown") for recording in train}
-                ),
+                "commanded_minutes": dict(zip(names, commanded.round(1).tolist(), strict=True)),
+                "sources": list_sources(train),
             },
             "fit": {
                 "loss": self.loss,
                 "seed": seed,
                 "device": device.type,
                 "seconds": round(seconds, 1),
-                "validation_rmse": dict(zip(machine.joint_names, errors, strict=True)),
+                "validation_rmse": dict(zip(names, errors, strict=True)),
                 "validation_s": self.validation_s,
             },
         }
@@ -290,8 +274,7 @@ class _FitProgress:
     seconds: float = 0.0
 
 
-@dataclasses.dataclass(frozen=True)
-class _HorizonStage:
+class _HorizonStage(NamedTuple):
     """Updates with one horizon."""
 
     horizon_s: float
@@ -317,31 +300,17 @@ class _NetworkFitting:
         networks = JointNetworks(joints, machine.num_history, config.width, coupled, generator)
         self._normalise(networks)
         self._descent = FreeRunOptimizer(networks.to(device), machine, seed)
-        self._kept = {
-            name: value.clone() for name, value in self._descent.averaged.named_parameters()
-        }
+        averaged = self._descent.averaged.named_parameters()
+        self._kept = {name: value.clone() for name, value in averaged}
         self._best = torch.full((joints,), math.inf, device=device)
-        held = TrainingWindows(
-            validation,
-            machine,
-            self._steps(config.validation_s),
-            device,
-            "held out to stop the fit by",
-        )
+        steps, purpose = self._steps(config.validation_s), "held out to stop the fit by"
+        held = TrainingWindows(validation, machine, steps, device, purpose)
         batch = max(1, VALIDATED // joints) if coupled else VALIDATED
-        self._held = held.draw(
-            batch,
-            0.2,
-            config.busy_share,
-            torch.zeros((), dtype=torch.int64, device=device),
-            together=coupled,
-        )
+        key = torch.zeros((), dtype=torch.int64, device=device)
+        self._held = held.draw(batch, 0.2, config.busy_share, key, together=coupled)
         self._stages = [_HorizonStage(0.0, config.one_step_updates, config.one_step_batch)]
-        if config.loss == "rollout":
-            self._stages += [
-                _HorizonStage(horizon_s, config.updates, config.batch)
-                for horizon_s in config.horizons_s
-            ]
+        for horizon_s in config.horizons_s if config.loss == "rollout" else ():
+            self._stages.append(_HorizonStage(horizon_s, config.updates, config.batch))
 
     def run(self, interruption: ResumeFile) -> float:
         """Fit, going on from `interruption` if there is one; returns the time it took in all, s."""
@@ -365,9 +334,8 @@ class _NetworkFitting:
     ) -> None:
         """Run the rest of the stage at `place`."""
         config, stage = self._config, self._stages[place.stage]
-        windows = TrainingWindows(
-            self._train, self._machine, max(1, self._steps(stage.horizon_s)), self._device
-        )
+        steps = max(1, self._steps(stage.horizon_s))
+        windows = TrainingWindows(self._train, self._machine, steps, self._device)
         update = self._descent.updater(windows, stage.batch, config.still_share, config.busy_share)
         before = sum(earlier.updates for earlier in self._stages[: place.stage])
         total = sum(one.updates for one in self._stages)
@@ -375,10 +343,9 @@ class _NetworkFitting:
         spent_s = place.seconds
         while place.update < stage.updates and place.stale < config.patience:
             number = before + place.update
-            rate = config.learning_rate * (
-                0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total))
-            )
-            self._descent.steer(number, rate, min(config.average, (number + 1.0) / (number + 11.0)))
+            fall = 0.02 + 0.98 * 0.5 * (1.0 + math.cos(math.pi * number / total))
+            average = min(config.average, (number + 1.0) / (number + 11.0))
+            self._descent.steer(number, config.learning_rate * fall, average)
             update()
             place.update += 1
             if place.update % config.validate_every == 0 or place.update == stage.updates:
@@ -403,10 +370,8 @@ class _NetworkFitting:
             raise BrokkError("the fit diverged (NaN in the validation); lower fit.learning_rate")
         better = error < self._best
         if averaged.coupled:
-            mean, best = (
-                (value / averaged.increment_scale).mean() for value in (error, self._best)
-            )
-            better = (mean < best).expand_as(error)
+            scale = averaged.increment_scale
+            better = ((error / scale).mean() < (self._best / scale).mean()).expand_as(error)
         self._best.copy_(torch.where(better, error, self._best))
         for name, value in averaged.named_parameters():
             rows = better[: len(value)].view(-1, 1, 1)  # the joints, or one for all
@@ -414,11 +379,8 @@ class _NetworkFitting:
         return bool(better.any())
 
     def _state(self) -> dict[str, torch.Tensor]:
-        return {
-            **self._descent.state(),
-            **{f"kept.{name}": value for name, value in self._kept.items()},
-            "best": self._best,
-        }
+        kept = {f"kept.{name}": value for name, value in self._kept.items()}
+        return self._descent.state() | kept | {"best": self._best}
 
     def _normalise(self, networks: JointNetworks) -> None:
         """Set the normalisation from training data and machine limits."""
@@ -426,25 +388,19 @@ class _NetworkFitting:
             commands = np.concatenate([r.u[1:, joint] for r in self._train])
             moved = np.concatenate([np.diff(r.q[:, joint]) for r in self._train])
             moved = moved[np.abs(commands) > min(BEYOND_DEAD_BAND, 0.5 * np.abs(commands).max())]
-            networks.increment_scale[joint] = max(
-                1e-6, float(np.sqrt(np.mean(np.square(moved, dtype=np.float64))))
-            )
-            commands = commands[np.abs(commands) > COMMANDED]
-            networks.command_scale[joint] = float(
-                np.sqrt(np.mean(np.square(commands, dtype=np.float64)))
-            )
-        lower, upper = (
-            torch.as_tensor(bound, dtype=torch.float32)
-            for bound in (self._machine.lower, self._machine.upper)
-        )
-        networks.position_center.copy_((lower + upper) / 2.0)
-        networks.position_scale.copy_((upper - lower) / 2.0)
-        if self._config.quiet is None:
-            networks.quiet.copy_(
-                torch.as_tensor(training_data.estimate_resting_noise(self._train, self._machine))
-            )
-        else:
-            networks.quiet.fill_(self._config.quiet)
+            networks.increment_scale[joint] = max(1e-6, _measure_rms(moved))
+            networks.command_scale[joint] = _measure_rms(commands[np.abs(commands) > COMMANDED])
+        plant = MachineTensors(self._machine, networks.quiet.device)
+        networks.position_center.copy_(plant.middle)
+        networks.position_scale.copy_(plant.half_travel)
+        quiet = self._config.quiet
+        if quiet is None:
+            quiet = training_data.estimate_resting_noise(self._train, self._machine)
+        networks.quiet.copy_(torch.as_tensor(quiet))
 
     def _steps(self, horizon_s: float) -> int:
         return round(horizon_s / self._machine.period_s)
+
+
+def _measure_rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))

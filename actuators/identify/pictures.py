@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,7 +14,17 @@ from actuators.identify.dead_time import DeadTimeEstimate
 from actuators.identify.scores import REGIMES, TAILS, FreeRunScores
 from actuators.recordings.split import COMMANDED
 from brokk_rl.machine import Machine
-from brokk_rl.plot import BLUE, GREY, ORANGE, OTHERS, add_legend, make_joint_panels, remove_frame
+from brokk_rl.plot import (
+    BLUE,
+    GREY,
+    ORANGE,
+    OTHERS,
+    RED,
+    add_legend,
+    draw_grid,
+    make_joint_panels,
+    remove_frame,
+)
 
 COLOURS = {"hold": GREY, "arx": ORANGE}
 
@@ -32,68 +42,58 @@ def draw_prediction(scores: FreeRunScores, model: str) -> Figure:
     the longest way; worst: of the largest error of the model (the paper's figure 2).
     """
     cut, machine = scores.cut, scores.machine
-    steps = cut.measured.shape[1]
-    t_s = machine.period_s * np.arange(1, steps + 1)
+    t_s = machine.period_s * np.arange(1, cut.measured.shape[1] + 1)
     # Inches. Laid out by hand, which is much faster than any layout engine with so many axes.
     height = 2.75 * machine.num_joints + 0.5
     figure = Figure(figsize=(12.0, height))
     rows = figure.add_gridspec(
-        machine.num_joints,
-        3,
-        left=0.075,
-        right=0.99,
-        bottom=0.45 / height,
-        top=1.0 - 0.6 / height,
-        wspace=0.17,
-        hspace=0.28,
-    )
-    colour = assign_colours(list(scores.predicted), model)
+        machine.num_joints, 3, left=0.075, right=0.99, bottom=0.45 / height, top=1.0 - 0.6 / height,
+        wspace=0.17, hspace=0.28,
+    )  # fmt: skip
     for j, joint in enumerate(machine.joints):
-        chosen = _select_windows(scores, model, j)
-        for column, (title, window) in enumerate(chosen.items()):
+        for column, (title, window) in enumerate(_select_windows(scores, model, j).items()):
             grid = rows[j, column].subgridspec(2, 1, height_ratios=[3.2, 1.0], hspace=0.12)
             above = figure.add_subplot(grid[0])
             below = figure.add_subplot(grid[1], sharex=above)
-            measured = cut.measured[window, :, j]
-            for name, path in scores.predicted.items():
-                if name != model:
-                    above.plot(
-                        t_s,
-                        np.where(np.isfinite(measured), path[window, :, j], np.nan),
-                        color=colour[name],
-                        lw=1.0,
-                        ls="--",
-                        label=name,
-                    )
-            above.plot(t_s, measured, color="black", lw=1.8, label="measured")
-            above.plot(
-                t_s,
-                np.where(np.isfinite(measured), scores.predicted[model][window, :, j], np.nan),
-                color=BLUE,
-                lw=1.6,
-                label=model,
-            )
-            _frame_axis(above, measured, scores.predicted[model][window, :, j], machine, j)
-            above.tick_params(labelbottom=False)
+            _draw_paths(above, scores, model, window, j)
             run = str(cut.run[window]).rsplit("/", 1)[-1].removesuffix(".parquet")
             above.set_title(f"{title}: {run}", fontsize=8.5, loc="left")
+            above.tick_params(labelbottom=False)
             u = cut.u[window, cut.num_before - 1 :, j]
-            below.fill_between(
-                t_s - machine.period_s, u, step="post", color="#555555", alpha=0.35, lw=0
-            )
-            below.set_ylim(-1.05, 1.05)
-            below.set_yticks([-1, 0, 1])
-            below.axhline(0.0, color="#555555", lw=0.5)
-            below.set_xlim(0.0, t_s[-1])
+            below.fill_between(t_s - machine.period_s, u, step="post", color=GREY, alpha=0.5, lw=0)
+            below.axhline(0.0, color=GREY, lw=0.5)
+            below.set(ylim=(-1.05, 1.05), yticks=[-1, 0, 1], xlim=(0.0, t_s[-1]))
             if column == 0:
                 above.set_ylabel(f"{joint.name} [{joint.unit}]")
                 below.set_ylabel("u", rotation=0, va="center")
             if j == machine.num_joints - 1:
                 below.set_xlabel("time of the free run [s]")
-            for axis in (above, below):
-                remove_frame(axis)
+            remove_frame(above)
+            remove_frame(below)
     add_legend(figure, figure.axes[0])
     return figure
+
+
+def _draw_paths(axis: Axes, scores: FreeRunScores, model: str, window: int, joint: int) -> None:
+    """Draw the paths of a window; the axis is bound by measurement and model, whatever rivals do."""
+    machine, measured = scores.machine, scores.cut.measured[window, :, joint]
+    t_s = machine.period_s * np.arange(1, len(measured) + 1)
+    given = np.isfinite(measured)
+    colour = assign_colours(list(scores.predicted), model)
+    axis.plot(t_s, measured, color="black", lw=1.8, label="measured", zorder=3)
+    for name, path in scores.predicted.items():
+        shown = np.where(given, path[window, :, joint], np.nan)
+        is_mine = name == model
+        style = {"lw": 1.6, "zorder": 4} if is_mine else {"lw": 1.0, "ls": "--"}
+        axis.plot(t_s, shown, color=colour[name], label=name, **style)
+    shown = np.concatenate([measured[given], scores.predicted[model][window, : given.sum(), joint]])
+    lower, upper = float(machine.lower[joint]), float(machine.upper[joint])
+    middle = (shown.max() + shown.min()) / 2.0
+    half = max(float(np.ptp(shown)) * 0.62, 0.01 * (upper - lower))
+    axis.set_ylim(middle - half, middle + half)
+    for limit in (lower, upper):
+        if abs(limit - middle) < half:
+            axis.axhline(limit, color=RED, lw=1.0, ls=":")
 
 
 def draw_error_over_horizon(scores: FreeRunScores, model: str) -> Figure:
@@ -104,27 +104,18 @@ def draw_error_over_horizon(scores: FreeRunScores, model: str) -> Figure:
     t_s = machine.period_s * np.arange(1, scores.cut.measured.shape[1] + 1)
     for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
         for name in sorted(scores.predicted, key=lambda name: name == model):
-            rmse, again = (
-                100.0 * values[..., j] / scores.travel[j] for values in scores.rmse(name)
-            )
+            rmse, again = (100.0 * one[..., j] / scores.travel[j] for one in scores.rmse(name))
             axis.plot(t_s, rmse, color=colour[name], lw=2.0 if name == model else 1.3, label=name)
-            if np.isfinite(again).any():
-                with np.errstate(invalid="ignore"):
-                    low, high = np.nanpercentile(again[:, np.isfinite(again).any(0)], TAILS, axis=0)
-                axis.fill_between(
-                    t_s[np.isfinite(again).any(0)], low, high, color=colour[name], alpha=0.2, lw=0
-                )
-        axis.set_xscale("log")
-        axis.set_yscale("log")
+            told = np.isfinite(again).any(0)
+            if told.any():
+                low, high = np.nanpercentile(again[:, told], TAILS, axis=0)
+                axis.fill_between(t_s[told], low, high, color=colour[name], alpha=0.2, lw=0)
         axis.set_title(joint.name, loc="left", fontsize=10)
+        _set_log_scale(axis, "x")
+        _set_log_scale(axis, "y")
         axis.set_xticks([t for t in (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0) if t <= t_s[-1]])
-        axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter(NullFormatter())
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
         axis.set_xlim(t_s[0], t_s[-1])
-        axis.grid(which="major", alpha=0.3)
-        remove_frame(axis)
+        draw_grid(axis)
     figure.supxlabel("time of the free run [s]; the left end is the one-step error", fontsize=10)
     figure.supylabel("RMSE [% of travel]", fontsize=10)
     add_legend(figure, axes[0])
@@ -137,49 +128,36 @@ def draw_regimes(
     """Draw how fast each model drifts in each regime, one panel a joint."""
     figure, axes = make_joint_panels(machine, "x")
     colour = assign_colours(names, model)
-    travel = machine.upper - machine.lower
-    for j, (axis, joint) in enumerate(zip(axes, machine.joints, strict=True)):
+    for axis, joint, travel in zip(
+        axes, machine.joints, machine.upper - machine.lower, strict=True
+    ):
         rows = table[joint.name]
+        labels = []
         for y, regime in enumerate(REGIMES):
-            if regime not in rows:
-                continue
+            labels.append(
+                f"{regime} ({100 * rows[regime]['time']:.0f} %)"
+                if regime in rows
+                else f"{regime} (0 %)"
+            )
             for number, name in enumerate(sorted(names, key=lambda name: name == model)):
-                cell = rows[regime]["models"][name]
-                value = 100.0 * cell["drift_per_s"] / travel[j]
-                shift = 0.5 * ((number + 0.5) / len(names) - 0.5)
-                if value <= 0:
+                if regime not in rows or rows[regime]["models"][name]["drift_per_s"] <= 0:
                     continue
+                cell = rows[regime]["models"][name]
+                place = y + 0.5 * ((number + 0.5) / len(names) - 0.5)
+                low, high = cell["ci95"] or [cell["drift_per_s"]] * 2
+                ends = np.maximum(100.0 * np.array([low, high]) / travel, 1e-4)
+                axis.plot(ends, [place] * 2, color=colour[name], lw=1.4)
+                drift = 100.0 * cell["drift_per_s"] / travel
+                label = name if regime == next(iter(rows)) else None
                 size = 6.5 if name == model else 4.5
-                axis.plot(
-                    value,
-                    y + shift,
-                    "o",
-                    color=colour[name],
-                    ms=size,
-                    label=name if regime == _find_first_regime(rows) else None,
-                )
-                if cell["ci95"]:
-                    low, high = (max(100.0 * bound / travel[j], 1e-4) for bound in cell["ci95"])
-                    axis.plot([low, high], [y + shift] * 2, color=colour[name], lw=1.4)
-        axis.set_xscale("log")
-        axis.xaxis.set_major_formatter("{x:g}")
-        axis.xaxis.set_minor_formatter(NullFormatter())
-        axis.set_yticks(
-            range(len(REGIMES)),
-            [
-                f"{name} ({100 * rows[name]['time']:.0f} %)" if name in rows else f"{name} (0 %)"
-                for name in REGIMES
-            ],
-        )
-        axis.tick_params(axis="y", labelsize=8)
+                axis.plot(drift, place, "o", color=colour[name], ms=size, label=label)
+        _set_log_scale(axis, "x")
+        axis.set_yticks(range(len(REGIMES)), labels, fontsize=8)
         axis.set_ylim(len(REGIMES) - 0.5, -0.5)
-        axis.grid(axis="x", which="major", alpha=0.3)
         axis.set_title(joint.name, loc="left", fontsize=10)
-        remove_frame(axis)
-    figure.supxlabel(
-        "drift: RMS of the error added within a second [% of travel]; in brackets the part of the time",
-        fontsize=10,
-    )
+        draw_grid(axis, "x")
+    text = "drift: RMS of the error added within a second [% of travel]; in brackets the part of the time"
+    figure.supxlabel(text, fontsize=10)
     add_legend(figure, axes[0])
     return figure
 
@@ -188,46 +166,45 @@ def draw_dead_times(delays: Mapping[str, DeadTimeEstimate | None], machine: Mach
     """Draw the unexplained variance over the delay, one panel a joint, with intervals."""
     figure, axes = make_joint_panels(machine, "xy")
     history_s = machine.num_history * machine.period_s
+    drawn = None
     for axis, (joint, delay) in zip(axes, delays.items(), strict=True):
-        axis.set_title(joint, loc="left", fontsize=10)
-        remove_frame(axis)
+        draw_grid(axis)
         if delay is None:
+            axis.set_title(joint, loc="left", fontsize=10)
             axis.text(0.5, 0.5, "hardly commanded", transform=axis.transAxes, ha="center")
             continue
-        axis.plot(delay.tried_s, 100.0 * delay.left, color=BLUE, lw=1.8)
-        axis.axvspan(*delay.ci95_s, color=BLUE, alpha=0.25, lw=0, label="95 % interval")
-        axis.axvline(
-            machine.dead_time_s, color="black", lw=1.0, ls="--", label="the machine's dead_time_s"
-        )
-        if history_s < delay.tried_s[-1]:
-            axis.axvspan(
-                history_s,
-                delay.tried_s[-1],
-                color="#999999",
-                alpha=0.25,
-                lw=0,
-                label="beyond the history",
-            )
-        axis.set_yscale("log")
-        axis.yaxis.set_major_formatter("{x:g}")
-        axis.yaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.0, 0.4)))
-        axis.set_xlim(0.0, delay.tried_s[-1])
-        axis.grid(alpha=0.3)
+        drawn = drawn or axis
         text = f"{delay.value_s:.2f} s" if delay.is_found else "not found"
         axis.set_title(f"{joint}: {text}", loc="left", fontsize=10)
+        axis.plot(delay.tried_s, 100.0 * delay.left, color=BLUE, lw=1.8)
+        axis.axvspan(*delay.ci95_s, color=BLUE, alpha=0.25, lw=0, label="95 % interval")
+        given = "the machine's dead_time_s"
+        axis.axvline(machine.dead_time_s, color="black", lw=1.0, ls="--", label=given)
+        last_s = delay.tried_s[-1]
+        if history_s < last_s:
+            beyond = "beyond the history"
+            axis.axvspan(history_s, last_s, color=GREY, alpha=0.25, lw=0, label=beyond)
+        _set_log_scale(axis, "y")
+        axis.set_xlim(0.0, last_s)
     figure.supxlabel("delay [s]", fontsize=10)
     figure.supylabel("variance of the motion left unexplained [%]", fontsize=10)
-    drawn = [axis for axis, delay in zip(axes, delays.values(), strict=True) if delay is not None]
     if drawn:
-        add_legend(figure, drawn[0])
+        add_legend(figure, drawn)
     return figure
 
 
+def _set_log_scale(axis: Axes, direction: Literal["x", "y"]) -> None:
+    """Make an axis logarithmic, with plain numbers at its ticks."""
+    scale = axis.xaxis if direction == "x" else axis.yaxis
+    axis.set(**{f"{direction}scale": "log"})
+    scale.set_major_formatter("{x:g}")
+    minor = NullFormatter() if direction == "x" else LogFormatter(minor_thresholds=(1.0, 0.4))
+    scale.set_minor_formatter(minor)
+
+
 def _select_windows(scores: FreeRunScores, model: str, joint: int) -> dict[str, int]:
-    measured, u = (
-        scores.cut.measured[..., joint],
-        scores.cut.u[:, scores.cut.num_before - 1 :, joint],
-    )
+    measured = scores.cut.measured[..., joint]
+    u = scores.cut.u[:, scores.cut.num_before - 1 :, joint]
     length = np.isfinite(measured).sum(1)
     whole = length == length.max()
     moving = whole & (np.abs(u) > COMMANDED).any(1)
@@ -240,25 +217,3 @@ def _select_windows(scores: FreeRunScores, model: str, joint: int) -> dict[str, 
         "liveliest": int(among[way.argmax()]),
         "worst": int(among[error.argmax()]),
     }
-
-
-def _frame_axis(
-    axis: Axes, measured: np.ndarray, predicted: np.ndarray, machine: Machine, joint: int
-) -> None:
-    """Bound the axis by measurement and model: a diverging rival does not flatten them."""
-    shown = np.concatenate(
-        [measured[np.isfinite(measured)], predicted[: np.isfinite(measured).sum()]]
-    )
-    travel = float(machine.upper[joint] - machine.lower[joint])
-    middle, half = (
-        (shown.max() + shown.min()) / 2.0,
-        max(float(np.ptp(shown)) * 0.62, 0.01 * travel),
-    )
-    axis.set_ylim(middle - half, middle + half)
-    for limit in (machine.lower[joint], machine.upper[joint]):
-        if abs(limit - middle) < half:
-            axis.axhline(limit, color="#b3261e", lw=1.0, ls=":")
-
-
-def _find_first_regime(rows: Mapping[str, Any]) -> str:
-    return next(name for name in REGIMES if name in rows)

@@ -13,6 +13,7 @@ from actuators.identify import dead_time, pictures
 from actuators.identify.dead_time import RESOLUTION_S
 from actuators.identify.scores import FreeRunScores, average_joints, bound_interval, score_regimes
 from actuators.identify.stages import FitStage, FittedModel, list_recordings
+from actuators.identify.training_data import list_sources
 from actuators.recordings.split import measure_commanded_s
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -34,6 +35,12 @@ THIN_COMMAND = 0.5
 """… or no command larger than this both ways."""
 FEW_RUNS = 6
 """Runs to judge by below which an interval from resampling them is coarse."""
+PHRASES = {
+    "at rest": "when it should rest",
+    "alone": "when it moves alone",
+    "with others": "when it moves with others",
+}
+"""Regimes as a sentence names them."""
 DELAY_TOLERANCE_S = 0.05
 """The machine's dead time may differ from that of its joints by this much, s: a control period at
 20 Hz."""
@@ -54,60 +61,49 @@ class VerdictSentence:
 
 def write_verdict(result: Mapping[str, Any], machine: Machine) -> list[VerdictSentence]:
     """Return the sentences of the verdict on an `identification.json`, the answer first."""
-    given = [
-        horizon
-        for horizon, value in result["overall"][result["model"]].items()
-        if value is not None
-    ]
+    overall = result["overall"][result["model"]]
+    given = [horizon for horizon, value in overall.items() if value is not None]
     horizon = f"{HEADLINE_S:g}" if f"{HEADLINE_S:g}" in given else given[-1]
-    findings = [_judge_comparison(result, horizon), _judge_worst_joint(result, given[-1], machine)]
-    findings += (
-        _judge_dead_time(result, machine) + _judge_excitation(result) + _judge_test_data(result)
-    )
-    return findings
+    return [
+        _judge_comparison(result, horizon),
+        _judge_worst_joint(result, given[-1], machine),
+        *_judge_dead_time(result, machine),
+        *_judge_excitation(result),
+        *_judge_test_data(result),
+    ]
 
 
 def _judge_comparison(result: Mapping[str, Any], horizon: str) -> VerdictSentence:
     model, joints = result["model"], list(result["joints"])
     overall = {name: rows[horizon]["percent"] for name, rows in result["overall"].items()}
     mine = f"{model}: {overall[model]:.2f} % of travel after {horizon} s in a free run, mean over joints"
-    rival = LINEAR if model != LINEAR else HOLD
     if model == HOLD:
-        return VerdictSentence(
-            "plain", f"{mine}; this is the error of a machine that stands still, and no model."
-        )
+        text = f"{mine}; this is the error of a machine that stands still, and no model."
+        return VerdictSentence("plain", text)
+    rival = LINEAR if model != LINEAR else HOLD
     against = result["against"][rival]
-    total, rows = against["overall"][horizon], [against[joint][horizon] for joint in joints]
-    better, worse = [], []
-    for joint, row in zip(joints, rows, strict=True):
-        # an interval that excludes 0 leaves no doubt
-        if row["ci95"] and row["ci95"][1] < 0:
-            better.append(joint)
-        elif row["ci95"] and row["ci95"][0] > 0:
-            worse.append(joint)
-    change = total["reduction_percent"]
-    text = f"{mine}, against {overall[rival]:.2f} % of {rival}: {abs(change):.0f} % {'less' if change >= 0 else 'more'}"
+    total, change = against["overall"][horizon], against["overall"][horizon]["reduction_percent"]
+    word = "less" if change >= 0 else "more"
+    text = f"{mine}, against {overall[rival]:.2f} % of {rival}: {abs(change):.0f} % {word}"
     if total["reduction_ci95"]:
         low, high = total["reduction_ci95"]
         text += f" (95 %: {low:.0f} to {high:.0f} % less)"
     if total["ci95"] is None:
-        return VerdictSentence(
-            "warn",
-            f"{text}. Judged by one run only, so there is no saying whether that holds for others.",
-        )
+        text += ". Judged by one run only, so there is no saying whether that holds for others."
+        return VerdictSentence("warn", text)
+    # an interval that excludes 0 leaves no doubt
+    intervals = {joint: against[joint][horizon]["ci95"] or (-np.inf, np.inf) for joint in joints}
+    better = [joint for joint, (_, high) in intervals.items() if high < 0]
+    worse = [joint for joint, (low, _) in intervals.items() if low > 0]
     text += f". Better beyond doubt on {_name_joints(better, joints)}"
     text += f", worse on {_name_joints(worse, joints)}." if worse else "."
     strongest = min(overall, key=lambda name: overall[name])
     if strongest not in (model, rival):
         text += f" The best of those compared is {strongest} with {overall[strongest]:.2f} %."
-    tone = (
-        "good"
-        if total["ci95"][1] < 0 and not worse
-        else "bad"
-        if total["ci95"][0] > 0 or len(worse) > len(better)
-        else "warn"
-    )
-    return VerdictSentence(tone, text)
+    if total["ci95"][1] < 0 and not worse:
+        return VerdictSentence("good", text)
+    is_bad = total["ci95"][0] > 0 or len(worse) > len(better)
+    return VerdictSentence("bad" if is_bad else "warn", text)
 
 
 def _judge_worst_joint(
@@ -117,41 +113,31 @@ def _judge_worst_joint(
     rows = {joint: models[model][horizon] for joint, models in result["joints"].items()}
     joint = max(rows, key=lambda name: rows[name]["percent"])
     unit = machine.joints[machine.joint_names.index(joint)].unit
-    row = rows[joint]
-    text = (
-        f"Worst joint: {joint}, {row['percent']:.2f} % of its travel"
-        f" ({row['rmse']:.2g} {unit}) after {horizon} s."
-    )
-    shares = {
-        name: cell["models"][model]["share"] / cell["time"]
-        for name, cell in result["regimes"][joint].items()
-    }
-    if shares:
-        regime = max(shares, key=lambda name: shares[name])
-        cell = result["regimes"][joint][regime]
+    percent, rmse = rows[joint]["percent"], rows[joint]["rmse"]
+    text = f"Worst joint: {joint}, {percent:.2f} % of its travel ({rmse:.2g} {unit}) after {horizon} s."
+    cells = result["regimes"][joint]
+    if cells:
+        regime = max(
+            cells, key=lambda name: cells[name]["models"][model]["share"] / cells[name]["time"]
+        )
+        time, share = cells[regime]["time"], cells[regime]["models"][model]["share"]
         text += (
-            f" It drifts most {_phrase_regime(regime)}: {100 * cell['time']:.0f} % of the time, "
-            f"{100 * cell['models'][model]['share']:.0f} % of the squared drift."
+            f" It drifts most {_phrase_regime(regime)}: {100 * time:.0f} % of the time, "
+            f"{100 * share:.0f} % of the squared drift."
         )
     return VerdictSentence("plain", text)
 
 
 def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[VerdictSentence]:
-    known = {}
-    for joint, delay in result["delay_s"].items():
-        if delay is not None:
-            known[joint] = delay
+    known = {joint: delay for joint, delay in result["delay_s"].items() if delay is not None}
     if not known:
         return []
     history_s = machine.num_history * machine.period_s
     values = [delay["value"] for delay in known.values()]
-    span = (
-        f"{min(values):.2f} s"
-        if max(values) - min(values) < RESOLUTION_S / 2
-        else f"{min(values):.2f} to {max(values):.2f} s"
-    )
+    span = f"{min(values):.2f} s"
+    if max(values) - min(values) >= RESOLUTION_S / 2:
+        span = f"{min(values):.2f} to {max(values):.2f} s"
     stated = f"machine '{machine.name}' says {machine.dead_time_s:g} s"
-    found: list[VerdictSentence] = []
     lost, long, off = [], [], []
     for joint, delay in known.items():
         if not delay["found"]:
@@ -160,22 +146,17 @@ def _judge_dead_time(result: Mapping[str, Any], machine: Machine) -> list[Verdic
             long.append(joint)
         if abs(delay["value"] - machine.dead_time_s) > DELAY_TOLERANCE_S:
             off.append(joint)
+    found: list[VerdictSentence] = []
     if lost:
-        found.append(
-            VerdictSentence(
-                "warn",
-                f"The dead time of {', '.join(lost)} is not found: the motion does not follow the command.",
-            )
-        )
+        text = f"The dead time of {', '.join(lost)} is not found: the motion does not follow the command."
+        found.append(VerdictSentence("warn", text))
     if long:
         count = int(np.ceil(max(known[joint]["ci95"][1] for joint in long) / machine.period_s)) + 2
-        text = f"The dead time of {', '.join(long)} may exceed the history of {history_s:.2f} s: models miss the command that acts."
-        found.append(
-            VerdictSentence(
-                "bad",
-                f"{text} Set num_history of machine '{machine.name}' to {count} or more and fit again.",
-            )
+        text = (
+            f"The dead time of {', '.join(long)} may exceed the history of {history_s:.2f} s: models miss the command that acts. "
+            f"Set num_history of machine '{machine.name}' to {count} or more and fit again."
         )
+        found.append(VerdictSentence("bad", text))
     if off:
         text = f"Dead time {span}, but {stated}: correct dead_time_s ({', '.join(off)})."
         found.append(VerdictSentence("warn", text))
@@ -193,65 +174,46 @@ def _judge_excitation(result: Mapping[str, Any]) -> list[VerdictSentence]:
             lacks.append(f"commanded for {facts['commanded_s']:.0f} s only")
         if facts["travel"] < THIN_TRAVEL:
             lacks.append(f"seen over {100 * facts['travel']:.0f} % of its travel")
-        for sign, value in (
-            ("+", facts["largest_command"][1]),
-            ("-", -facts["largest_command"][0]),
-        ):
-            if value < THIN_COMMAND:
-                lacks.append(f"no command beyond {sign}{value:.2g}")
+        low, high = facts["largest_command"]
+        if high < THIN_COMMAND:
+            lacks.append(f"no command beyond +{high:.2g}")
+        if -low < THIN_COMMAND:
+            lacks.append(f"no command beyond -{-low:.2g}")
         if lacks:
-            found.append(
-                VerdictSentence(
-                    "warn",
-                    f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model.",
-                )
-            )
+            text = f"{joint} is too little excited: {'; '.join(lacks)}. Record more of it before trusting its model."
+            found.append(VerdictSentence("warn", text))
     return found
 
 
 def _judge_test_data(result: Mapping[str, Any]) -> list[VerdictSentence]:
-    found, data = [], result["data"]
-    idle = []
-    for joint, facts in data["excitation"].items():
-        if facts["judged_s"] <= 0:
-            idle.append(joint)
+    texts, data = [], result["data"]
+    idle = [joint for joint, facts in data["excitation"].items() if facts["judged_s"] <= 0]
     if idle:
-        found.append(
-            VerdictSentence(
-                "warn",
-                f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing.",
-            )
+        texts.append(
+            f"{', '.join(idle)} never moves by command in the runs judged by: its errors there say nothing."
         )
-    if data["test"]["runs"] < FEW_RUNS:
-        found.append(
-            VerdictSentence(
-                "warn",
-                f"Judged by {data['test']['runs']} runs: intervals from so few are coarse, most likely too narrow.",
-            )
+    runs = data["test"]["runs"]
+    if runs < FEW_RUNS:
+        texts.append(
+            f"Judged by {runs} runs: intervals from so few are coarse, most likely too narrow."
         )
-    found += [
-        VerdictSentence("warn", f"No figure at {horizon} s: {reason}.")
-        for horizon, reason in result["missing"].items()
-    ]
-    return found
+    for horizon, reason in result["missing"].items():
+        texts.append(f"No figure at {horizon} s: {reason}.")
+    return [VerdictSentence("warn", text) for text in texts]
 
 
 def _name_joints(some: list[str], every: list[str]) -> str:
     if not some:
         return "no joint"
-    return (
-        f"all {len(every)} joints"
-        if len(some) == len(every)
-        else f"{len(some)} of {len(every)} joints ({', '.join(some)})"
-    )
+    if len(some) == len(every):
+        return f"all {len(every)} joints"
+    return f"{len(some)} of {len(every)} joints ({', '.join(some)})"
 
 
 def _phrase_regime(regime: str) -> str:
-    return {
-        "at rest": "when it should rest",
-        "alone": "when it moves alone",
-        "with others": "when it moves with others",
-    }.get(regime, regime if regime.startswith(("after", "near")) else f"at {regime}")
+    if regime in PHRASES:
+        return PHRASES[regime]
+    return regime if regime.startswith(("after", "near")) else f"at {regime}"
 
 
 @dataclass(frozen=True)
@@ -299,14 +261,13 @@ def build_results(
     acting = []
     for delay in delays.values():
         acting.append(delay.value_s if delay and delay.is_found else machine.dead_time_s)
-    acting_s = np.array(acting)
     result: dict[str, Any] = {
         "schema": 1, "machine": machine.name, "model": model, "fit_seconds": round(kept.seconds, 2), "use": kept.use,
         "fold_seconds": [round(done[model].seconds, 2) for done in identified.done[:-1]],
     }  # fmt: skip
     result |= _tabulate_errors(scores, identified)
     result["delay_s"] = {joint: _tabulate_delay(delay) for joint, delay in delays.items()}
-    result["regimes"] = score_regimes(scores, acting_s)
+    result["regimes"] = score_regimes(scores, np.array(acting))
     result["data"] = _describe_data(identified, fitted_to, scores)
     findings = write_verdict(result, machine)
     result["verdict"] = [{"tone": finding.tone, "text": finding.text} for finding in findings]
@@ -347,87 +308,75 @@ def _tabulate_errors(scores: FreeRunScores, identified: IdentificationRun) -> di
     """Return `joints`, `overall`, `one_step`, `against` and `missing`."""
     machine, model = identified.machine, identified.model
     names, units = machine.joint_names, [joint.unit for joint in machine.joints]
-    found: dict[str, Any] = {
-        "joints": {joint: {} for joint in names},
-        "overall": {},
-        "one_step": {joint: {} for joint in names},
-    }
-    keys = {horizon_s: f"{horizon_s:g}" for horizon_s in identified.wanted_s}
+    horizons = {f"{horizon_s:g}": horizon_s for horizon_s in identified.wanted_s}
+    fitting = {key: h for key, h in horizons.items() if h in identified.horizons_s}
+    absent = dict.fromkeys(horizons)
+    joints: dict[str, Any] = {joint: {} for joint in names}
+    one_step: dict[str, Any] = {joint: {} for joint in names}
+    overall, against = {}, {}
     for name in scores.predicted:
-        rows = {key: scores.at(name, h) for h, key in keys.items() if h in identified.horizons_s}
+        rows = {key: scores.at(name, h) for key, h in fitting.items()}
+        overall[name] = absent | {key: average_joints(row, units) for key, row in rows.items()}
+        first, again = scores.rmse(name)
         for j, joint in enumerate(names):
-            found["joints"][joint][name] = {
-                key: rows[key][j] if key in rows else None for key in keys.values()
+            joints[joint][name] = absent | {key: row[j] for key, row in rows.items()}
+            one_step[joint][name] = {
+                "rmse": float(first[0, j]),
+                "ci95": bound_interval(again[:, 0, j]),
+                "percent": float(100 * first[0, j] / scores.travel[j]),
             }
-        found["overall"][name] = {
-            key: average_joints(rows[key], units) if key in rows else None for key in keys.values()
-        }
-        rmse, again = scores.rmse(name)
-        for j, joint in enumerate(names):
-            first = float(rmse[0, j])
-            found["one_step"][joint][name] = {
-                "rmse": first, "ci95": bound_interval(again[:, 0, j]), "percent": float(100 * first / scores.travel[j])
-            }  # fmt: skip
-    found["against"] = {
-        rival: {joint: {} for joint in (*names, "overall")}
-        for rival in scores.predicted
-        if rival != model
+        if name != model:
+            compared = {key: scores.against(model, name, h) for key, h in fitting.items()}
+            against[name] = {}
+            for j, joint in enumerate((*names, "overall")):
+                against[name][joint] = absent | {key: row[j] for key, row in compared.items()}
+    longest_s = open_loop.find_longest_horizon_s(_list_judged(identified), machine)
+    before_s = open_loop.count_samples_before(machine) * machine.period_s
+    reason = f"the longest recording judged by leaves {longest_s:.1f} s after the {before_s:.2f} s before a free run"
+    return {
+        "joints": joints,
+        "overall": overall,
+        "one_step": one_step,
+        "against": against,
+        "missing": {key: reason for key in horizons if key not in fitting},
     }
-    for rival, table in found["against"].items():
-        for h, key in keys.items():
-            rows = (
-                scores.against(model, rival, h)
-                if h in identified.horizons_s
-                else [None] * (len(names) + 1)
-            )
-            for joint, row in zip(table, rows, strict=True):
-                table[joint][key] = row
+
+
+def _list_judged(identified: IdentificationRun) -> list[Recording]:
     judged = []
     for stage in identified.stages:
         judged.extend(list_recordings(stage.test))
-    longest_s, before_s = (
-        open_loop.find_longest_horizon_s(judged, machine),
-        open_loop.count_samples_before(machine) * machine.period_s,
-    )
-    reason = f"the longest recording judged by leaves {longest_s:.1f} s after the {before_s:.2f} s before a free run"
-    found["missing"] = {key: reason for h, key in keys.items() if h not in identified.horizons_s}
-    return found
+    return judged
 
 
 def _describe_data(
     identified: IdentificationRun, fitted_to: Sequence[Recording], scores: FreeRunScores
 ) -> dict[str, Any]:
     """Return facts on the data: amount, runs of each part, excitation of each joint."""
-    machine, last = identified.machine, identified.stages[-1]
-    judged = []
-    for stage in identified.stages:
-        judged.extend(list_recordings(stage.test))
-    u, q = (
-        np.concatenate([getattr(recording, name) for recording in fitted_to]) for name in ("u", "q")
-    )
+    last, judged = identified.stages[-1], _list_judged(identified)
+    u = np.concatenate([recording.u for recording in fitted_to])
+    q = np.concatenate([recording.q for recording in fitted_to])
     moved_s, judged_s = measure_commanded_s(fitted_to), measure_commanded_s(judged)
-    tested = set()
+    tested, runs = set(), []
     for stage in identified.stages:
         tested.update(stage.test)
+        parts = {part: list(getattr(stage, part)) for part in ("train", "validation", "test")}
+        runs.append({"stage": stage.name or "fit"} | parts)
+    excitation = {}
+    for j, joint in enumerate(identified.machine.joint_names):
+        excitation[joint] = {
+            "commanded_s": float(moved_s[j]),
+            "judged_s": float(judged_s[j]),
+            "travel": float(np.ptp(q[:, j]) / scores.travel[j]),
+            "largest_command": [float(min(0.0, u[:, j].min())), float(max(0.0, u[:, j].max()))],
+        }
     return {
         "train": _count_recordings(list_recordings(last.train), len(last.train)),
         "validation": _count_recordings(list_recordings(last.validation), len(last.validation)),
         "test": _count_recordings(judged, len(tested)),
         "windows": len(scores.cut.q),
-        "runs": [
-            {"stage": stage.name or "fit"}
-            | {part: list(getattr(stage, part)) for part in ("train", "validation", "test")}
-            for stage in identified.stages
-        ],
-        "excitation": {
-            joint: {
-                "commanded_s": float(moved_s[j]),
-                "judged_s": float(judged_s[j]),
-                "travel": float(np.ptp(q[:, j]) / scores.travel[j]),
-                "largest_command": [float(min(0.0, u[:, j].min())), float(max(0.0, u[:, j].max()))],
-            }
-            for j, joint in enumerate(machine.joint_names)
-        },
+        "runs": runs,
+        "excitation": excitation,
     }
 
 
@@ -436,7 +385,5 @@ def _count_recordings(recordings: Sequence[Recording], num_runs: int) -> dict[st
         "runs": num_runs,
         "recordings": len(recordings),
         "minutes": round(sum(recording.duration_s for recording in recordings) / 60.0, 1),
-        "sources": sorted(
-            {recording.metadata.get("source", "unknown") for recording in recordings}
-        ),
+        "sources": list_sources(recordings),
     }

@@ -44,13 +44,10 @@ class FreeRunScores:
 
     def __post_init__(self) -> None:
         self._runs, self._number = np.unique(self.cut.run, return_inverse=True)
-        count = len(self._runs)
-        self.weights = self.generator.multinomial(
-            count, np.full(count, 1.0 / count), size=RESAMPLED
-        ).astype(float)
-        self.error = {
-            name: path.astype(float) - self.cut.measured for name, path in self.predicted.items()
-        }
+        count, measured = len(self._runs), self.cut.measured
+        drawn = self.generator.multinomial(count, np.full(count, 1.0 / count), size=RESAMPLED)
+        self.weights = drawn.astype(float)
+        self.error = {name: path.astype(float) - measured for name, path in self.predicted.items()}
         self.travel = np.asarray(self.machine.upper - self.machine.lower, dtype=float)
         self._mean_squares = {name: self.mean(error**2) for name, error in self.error.items()}
 
@@ -76,9 +73,8 @@ class FreeRunScores:
         nothing about other runs.
         """
         shape = totals.shape[1:]
-        total, count = (
-            self._by_run(values).reshape(self.num_runs, -1) for values in (totals, counts)
-        )
+        total = self._by_run(totals).reshape(self.num_runs, -1)
+        count = self._by_run(counts).reshape(self.num_runs, -1)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = total.sum(0) / count.sum(0)
             resampled = (self.weights @ total) / (self.weights @ count)
@@ -106,16 +102,15 @@ class FreeRunScores:
         path, (rmse, resampled) = error[:, : step + 1], self.rmse(name)
         rows = []
         for j in range(len(self.travel)):
-            rows.append(
-                {
-                    "rmse": float(rmse[step, j]),
-                    "ci95": bound_interval(resampled[:, step, j]),
-                    "percent": float(100.0 * rmse[step, j] / self.travel[j]),
-                    "path_rmse": float(np.sqrt(np.mean(path[..., j] ** 2))),
-                    "path_mean": float(np.abs(path[..., j]).mean()),
-                    "end_mean": float(np.abs(error[:, step, j]).mean()),
-                }
-            )
+            row = {
+                "rmse": float(rmse[step, j]),
+                "ci95": bound_interval(resampled[:, step, j]),
+                "percent": float(100.0 * rmse[step, j] / self.travel[j]),
+                "path_rmse": float(np.sqrt(np.mean(path[..., j] ** 2))),
+                "path_mean": float(np.abs(path[..., j]).mean()),
+                "end_mean": float(np.abs(error[:, step, j]).mean()),
+            }
+            rows.append(row)
         return rows
 
     def against(self, name: str, rival: str, horizon_s: float) -> list[dict[str, Any]]:
@@ -126,18 +121,9 @@ class FreeRunScores:
         resampling the same runs for both.
         """
         step = self.step(horizon_s)
-        (mine, mine_again), (other, other_again) = (
-            [part[..., step, :] for part in self.rmse(key)] for key in (name, rival)
-        )
-        rows = []
-        for j in range(len(self.travel)):
-            rows.append([values[..., j] for values in (mine, other, mine_again, other_again)])
-        rows.append(
-            [
-                (100.0 * values / self.travel).mean(-1)
-                for values in (mine, other, mine_again, other_again)
-            ]
-        )
+        both = [part[..., step, :] for key in (name, rival) for part in self.rmse(key)]
+        rows = [[values[..., j] for values in both] for j in range(len(self.travel))]
+        rows.append([(100.0 * values / self.travel).mean(-1) for values in both])
         return [_compare_errors(*row) for row in rows]
 
     def _by_run(self, values: np.ndarray) -> np.ndarray:
@@ -157,28 +143,23 @@ def bound_interval(resampled: np.ndarray) -> list[float] | None:
 
 def average_joints(rows: Sequence[dict[str, Any]], units: Sequence[str]) -> dict[str, float]:
     """Return means over joints; those in rad or m only where all joints have the same unit."""
-    keys = (
-        ("rmse", "percent", "path_rmse", "path_mean", "end_mean")
-        if len(set(units)) == 1
-        else ("percent",)
-    )
-    means = {}
-    for key in keys:
-        means[key] = float(np.mean([row[key] for row in rows]))
-    return means
+    keys = ["percent"]
+    if len(set(units)) == 1:
+        keys = ["rmse", "percent", "path_rmse", "path_mean", "end_mean"]
+    return {key: float(np.mean([row[key] for row in rows])) for key in keys}
 
 
 def _compare_errors(
-    mine: np.ndarray, other: np.ndarray, mine_again: np.ndarray, other_again: np.ndarray
+    mine: np.ndarray, mine_again: np.ndarray, other: np.ndarray, other_again: np.ndarray
 ) -> dict[str, Any]:
     floor = np.finfo(float).tiny  # a rival without any error cannot be bettered
+    reduced = 100.0 * (1.0 - mine / np.maximum(other, floor))
+    reduced_again = 100.0 * (1.0 - mine_again / np.maximum(other_again, floor))
     return {
         "difference": float(mine - other),
         "ci95": bound_interval(mine_again - other_again),
-        "reduction_percent": float(100.0 * (1.0 - mine / np.maximum(other, floor))),
-        "reduction_ci95": bound_interval(
-            100.0 * (1.0 - mine_again / np.maximum(other_again, floor))
-        ),
+        "reduction_percent": float(reduced),
+        "reduction_ci95": bound_interval(reduced_again),
     }
 
 
@@ -215,11 +196,9 @@ def classify_seconds(scores: FreeRunScores, delay_s: np.ndarray) -> dict[str, np
     for j in range(machine.num_joints):
         back = min(round(delay_s[j] / machine.period_s), cut.num_before - 2)
         begin = cut.num_before - 1 - back
-        u = cut.u[..., j]
-        acting[..., j] = u[:, begin : begin + num_seconds * steps].reshape(shape[:-1])
-        turned[..., j] = _find_reversals(u)[:, begin : begin + num_seconds * steps].reshape(
-            shape[:-1]
-        )
+        u, rows = cut.u[..., j], slice(begin, begin + num_seconds * steps)
+        acting[..., j] = u[:, rows].reshape(shape[:-1])
+        turned[..., j] = _find_reversals(u)[:, rows].reshape(shape[:-1])
     size = np.abs(acting).max(2)
     q = cut.measured[:, : num_seconds * steps].reshape(shape)
     margin = NEAR_STOP * scores.travel
@@ -262,17 +241,15 @@ def score_regimes(
         for j, joint in enumerate(scores.machine.joint_names):
             if not inside[..., j].any():
                 continue
-            table[joint][regime] = {
-                "time": float(inside[..., j].sum() / whole[..., j].sum()),
-                "models": {
-                    name: {
-                        "drift_per_s": float(np.sqrt(mean[j])),
-                        "ci95": bound_interval(np.sqrt(again[:, j])),
-                        "share": float(share[j]),
-                    }
-                    for name, ((mean, again), share) in drift.items()
-                },
-            }
+            models = {}
+            for name, ((mean, again), share) in drift.items():
+                models[name] = {
+                    "drift_per_s": float(np.sqrt(mean[j])),
+                    "ci95": bound_interval(np.sqrt(again[:, j])),
+                    "share": float(share[j]),
+                }
+            time = float(inside[..., j].sum() / whole[..., j].sum())
+            table[joint][regime] = {"time": time, "models": models}
     return table
 
 

@@ -56,11 +56,45 @@ class StaticFit:
     demand: np.ndarray
 
 
+class DrivenRecording:
+    """Commands and poses of a recording, and what the model makes of them.
+
+    Args:
+        recording: The recording.
+        pose: Features of the pose.
+        period_s: Control period.
+    """
+
+    def __init__(self, recording: Recording, pose: PoseFeatures, period_s: float) -> None:
+        self._period_s = period_s
+        self._played = _apply_plays(recording.u.astype(np.float64))
+        self.pose = pose.features(torch.as_tensor(recording.q)).numpy().astype(np.float64)
+
+    def spools(self, dynamics: np.ndarray) -> np.ndarray:
+        """Return the spool strokes of all joints, `(T, J)`, for dynamics `(J, 4)`."""
+        return np.stack([self.spool(j, row) for j, row in enumerate(dynamics)], 1)
+
+    def spool(self, j: int, dynamics: np.ndarray) -> np.ndarray:
+        """Return the spool strokes of joint `j`, `(T,)`, for dynamics `(4,)`."""
+        dead_time_s, play, spool_s, _ = dynamics
+        low = int(np.clip(np.searchsorted(PLAYS, play, side="right") - 1, 0, len(PLAYS) - 2))
+        part = (play - PLAYS[low]) / (PLAYS[low + 1] - PLAYS[low])
+        played = (1.0 - part) * self._played[low, :, j] + part * self._played[low + 1, :, j]
+        delayed = delay_signal(played, dead_time_s / self._period_s)
+        return lag_signal(delayed, spool_s, self._period_s)
+
+    def factor(self, j: int, extends: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Return the factor of the pose on the speed of joint `j`, `(T,)`, for slopes `(J, 2, M)`."""
+        sides = self.pose[:, j] @ pose[j].T
+        return np.maximum(1.0 + np.where(extends, sides[:, 0], sides[:, 1]), 0.0)
+
+
 class SpeedData:
     """Recordings as increments, and the model on them.
 
     Attributes:
         way: Increments, `(J, I)`.
+        num_increments: Number of increments of each used recording.
         known: Increments that count, `(I,)` bool.
         scale: Mean square of the increments, `(J,)`.
     """
@@ -79,10 +113,9 @@ class SpeedData:
             raise RecordingError(
                 f"too little data: none of the {len(self.recordings)} recordings lasts long enough to fit to"
             )
-        self._u = [r.u.astype(np.float64) for r in used]
-        self._played = [_apply_plays(u) for u in self._u]
         pose = PoseFeatures(machine, torch.device("cpu"))
-        self._pose = [pose.features(torch.as_tensor(r.q)).numpy().astype(np.float64) for r in used]
+        self._used = [DrivenRecording(recording, pose, self._period_s) for recording in used]
+        self.num_increments = [len(self._increments(recording.u)) for recording in used]
         self.num_pose = pose.size
         q = [r.q.astype(np.float64) for r in used]
         way = [self._increments(np.diff(part, axis=0, append=part[-1:])) for part in q]
@@ -106,14 +139,9 @@ class SpeedData:
         """1 for increments away from both stops, else 0, `(J, I)`."""
         return self._free
 
-    @property
-    def num_increments(self) -> list[int]:
-        """Number of increments of each used recording."""
-        return [len(self._increments(u)) for u in self._u]
-
     def strokes(self, j: int, dynamics: np.ndarray) -> np.ndarray:
         """Return the mean stroke of the valve of joint `j` over each increment, `(I,)`."""
-        parts = [self._increments(self._spool(n, j, dynamics)) for n in range(len(self._u))]
+        parts = [self._increments(one.spool(j, dynamics)) for one in self._used]
         return np.concatenate(parts) / WIDTH
 
     def pull(self, noise: float, size: int) -> np.ndarray:
@@ -128,7 +156,7 @@ class SpeedData:
         if (still := np.flatnonzero(~self.moves)).size:
             names = ", ".join(self.machine.joint_names[j] for j in still)
             raise RecordingError(
-                f"too little data: {names} never moves in the {len(self._u)} recordings to fit to"
+                f"too little data: {names} never moves in the {len(self._used)} recordings to fit to"
             )
 
     def replace_motion(self, steps: Sequence[np.ndarray]) -> "SpeedData":
@@ -153,40 +181,33 @@ class SpeedData:
 
         `known`: factors on the speed, or none.
         """
-        parts = []
-        for n in range(len(self._u)):
-            basis = self._basis(self._spool(n, j, dynamics), j)
-            basis = basis if known is None else basis * known[n][:, None]
-            parts.append(self._increments(lag_signal(basis, dynamics[3], self._period_s)))
-        return np.concatenate(parts)
+        bases = []
+        for n, one in enumerate(self._used):
+            basis = self._basis(one.spool(j, dynamics), j)
+            bases.append(basis if known is None else basis * known[n][:, None])
+        return self._collect(bases, dynamics[3])
 
     def factors(self, found: StaticFit, dynamics: np.ndarray) -> list[list[np.ndarray]]:
         """Return the speed factor from pose and pump, by joint and recording, each `(T,)`."""
-        joints, half = range(self.machine.num_joints), len(self._knots) - 1
+        joints = range(self.machine.num_joints)
+        factors: list[list[np.ndarray]] = [[] for _ in joints]
+        for one in self._used:
+            spool = one.spools(dynamics)
+            plain = [self._basis(spool[:, j], j) @ found.curve[j] for j in joints]
+            opening = self._measure_opening(np.stack(plain, 1), spool, found)
+            share = _compute_pump_share(found.demand, opening)
+            for j in joints:
+                factors[j].append(one.factor(j, spool[:, j] > 0, found.pose) * share)
+        return factors
+
+    def _measure_opening(
+        self, plain: np.ndarray, spool: np.ndarray, found: StaticFit
+    ) -> np.ndarray:
+        """Return steps without pose and pump over those at full command, `(T, J)`."""
+        half = len(self._knots) - 1
         full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
         unit = self.machine.max_speed * self._period_s
-        spool = self._stack_spools(dynamics)
-        plain = []
-        for s in spool:
-            plain.append(
-                np.stack([self._basis(s[:, j], j) @ found.curve[j] for j in joints], 1) / unit
-            )
-        share = []
-        for p, s in zip(plain, spool, strict=True):
-            share.append(
-                _compute_pump_share(
-                    found.demand, np.abs(p) / np.where(s > 0, full[:, 0], full[:, 1])
-                )
-            )
-        factors = []
-        for j in joints:
-            factors.append(
-                [
-                    self._factor(n, j, spool[n][:, j] > 0, found.pose) * share[n]
-                    for n in range(len(self._u))
-                ]
-            )
-        return factors
+        return np.abs(plain) / unit / np.where(spool > 0, full[:, 0], full[:, 1])
 
     def curve(
         self,
@@ -209,36 +230,29 @@ class SpeedData:
 
         `demand`: where to begin, if known.
         """
-        joints, count, half = self.machine.num_joints, len(self._u), len(self._knots) - 1
-        spool = self._stack_spools(dynamics)
-        bases = []
-        for n in range(count):
-            bases.append([self._basis(spool[n][:, j], j) for j in range(joints)])
+        joints, half = range(self.machine.num_joints), len(self._knots) - 1
+        spools = [one.spools(dynamics) for one in self._used]
+        bases = [[self._basis(spool[:, j], j) for spool in spools] for j in joints]
         found = StaticFit(
-            np.zeros((joints, 2 * half)),
-            np.zeros((joints, 2, self.num_pose)),
-            np.full(joints, FIRST_DEMAND) if demand is None else demand,
+            np.zeros((len(joints), 2 * half)),
+            np.zeros((len(joints), 2, self.num_pose)),
+            np.full(len(joints), FIRST_DEMAND) if demand is None else demand,
         )
-        opening = [np.abs(s) for s in spool]
+        opening = [np.abs(spool) for spool in spools]
         noise, free = self._noise.copy(), self._free.copy()
         # curve, pose and pump are each linear or small given the other two: they take turns
         for _ in range(sweeps):
-            share = [_compute_pump_share(found.demand, o) for o in opening]
+            share = [_compute_pump_share(found.demand, one) for one in opening]
             flow: list[list[np.ndarray]] = []
-            for j in range(joints):
-                basis = [by_joint[j] for by_joint in bases]
-                out = [s[:, j] > 0 for s in spool]
-                flow.append(
-                    self._fit_joint(j, basis, out, share, dynamics[j, 3], found, noise, free)
-                )
-            full = np.maximum(np.abs(found.curve[:, [half - 1, 2 * half - 1]]), 1e-3)
-            unit = self.machine.max_speed * self._period_s
-            plain, opening, posed = [], [], []
-            for n, s in enumerate(spool):
-                plain.append(np.stack([by_joint[n] for by_joint in flow], 1))
-                opening.append(np.abs(plain[n]) / unit / np.where(s > 0, full[:, 0], full[:, 1]))
-                factor = [self._factor(n, j, s[:, j] > 0, found.pose) for j in range(joints)]
-                posed.append(plain[n] * np.stack(factor, 1))
+            for j in joints:
+                out, speed_s = [spool[:, j] > 0 for spool in spools], dynamics[j, 3]
+                flow.append(self._fit_joint(j, bases[j], out, share, speed_s, found, noise, free))
+            opening, posed = [], []
+            for n, (one, spool) in enumerate(zip(self._used, spools, strict=True)):
+                plain = np.stack([by_joint[n] for by_joint in flow], 1)
+                opening.append(self._measure_opening(plain, spool, found))
+                factor = [one.factor(j, spool[:, j] > 0, found.pose) for j in joints]
+                posed.append(plain * np.stack(factor, 1))
             found.demand = self._demand(found.demand, posed, opening, dynamics, noise, free)
         return found
 
@@ -268,18 +282,16 @@ class SpeedData:
         Returns:
             Its steps without pose and pump, of each recording, `(T,)`.
         """
-        count = len(basis)
         scaled = []
-        for n in range(count):
-            factor = self._factor(n, j, out[n], found.pose)
-            scaled.append(basis[n] * (factor * share[n])[:, None])
+        for n, one in enumerate(self._used):
+            scaled.append(basis[n] * (one.factor(j, out[n], found.pose) * share[n])[:, None])
         features = self._collect(scaled, speed_s)
         found.curve[j] = self.curve(features, self.way[j], noise[j], free[j])
         plain, moved, sides = [], [], []
-        for n in range(count):
+        for n, one in enumerate(self._used):
             plain.append(basis[n] @ found.curve[j])
             moved.append((plain[n] * share[n])[:, None])
-            part = moved[n] * self._pose[n][:, j]
+            part = moved[n] * one.pose[:, j]
             sides.append(np.hstack([part * out[n][:, None], part * ~out[n][:, None]]))
         slopes = self._collect(sides, speed_s)
         level = self._collect(moved, speed_s)[:, 0]
@@ -292,18 +304,15 @@ class SpeedData:
         moves = np.abs(self.way[j]) > 0.1 * np.sqrt(self.scale[j])
         typical = SIGMA_OVER_MEDIAN * np.median(np.abs(left[moves]))
         # Huber's weights: beyond `OUTLIER` typical errors an increment counts with its size
-        free[j] = self._free[j] * np.minimum(
-            1.0, OUTLIER * typical / np.maximum(np.abs(left), 1e-9)
-        )
+        huber = OUTLIER * typical / np.maximum(np.abs(left), 1e-9)
+        free[j] = self._free[j] * np.minimum(1.0, huber)
         noise[j] = TOGETHER * max(typical**2, 1e-6 * self.scale[j])
         return plain
 
     def _collect(self, parts: Sequence[np.ndarray], speed_s: float) -> np.ndarray:
         """Return the increments of steps `(T, …)` of all recordings after the lag of the speed."""
-        increments = []
-        for part in parts:
-            increments.append(self._increments(lag_signal(part, speed_s, self._period_s)))
-        return np.concatenate(increments)
+        later = [lag_signal(part, speed_s, self._period_s) for part in parts]
+        return np.concatenate([self._increments(part) for part in later])
 
     def _demand(
         self,
@@ -329,39 +338,13 @@ class SpeedData:
                 parts.append(self._increments(moved))
             return ((self.way - np.concatenate(parts).T) * weight).ravel()
 
-        starts = [
-            start,
-            *(np.full(joints, level) for level in (0.3, 0.55, 0.8) if (start == start[0]).all()),
-        ]
+        starts = [start]
+        if (start == start[0]).all():
+            starts += [np.full(joints, level) for level in (0.3, 0.55, 0.8)]
         best = min(starts, key=lambda demand: float(np.square(compute_residual(demand)).sum()))
-        return least_squares(
-            compute_residual,
-            np.clip(best, 0.0, 1.99),
-            bounds=(0.0, 2.0),
-            diff_step=1e-3,
-            max_nfev=12,
-        ).x
-
-    def _factor(self, n: int, j: int, out: np.ndarray, pose: np.ndarray) -> np.ndarray:
-        features = self._pose[n][:, j]
-        return np.maximum(1.0 + np.where(out, features @ pose[j, 0], features @ pose[j, 1]), 0.0)
-
-    def _spool(self, n: int, j: int, dynamics: np.ndarray) -> np.ndarray:
-        dead_time_s, play, spool_s, _ = dynamics
-        low = int(np.clip(np.searchsorted(PLAYS, play, side="right") - 1, 0, len(PLAYS) - 2))
-        part = (play - PLAYS[low]) / (PLAYS[low + 1] - PLAYS[low])
-        played = (1.0 - part) * self._played[n][low, :, j] + part * self._played[n][low + 1, :, j]
-        return lag_signal(
-            delay_signal(played, dead_time_s / self._period_s), spool_s, self._period_s
-        )
-
-    def _stack_spools(self, dynamics: np.ndarray) -> list[np.ndarray]:
-        """Return the spool strokes of each recording, `(T, J)`, for dynamics `(J, 4)`."""
-        joints = range(self.machine.num_joints)
-        spools = []
-        for n in range(len(self._u)):
-            spools.append(np.stack([self._spool(n, j, dynamics[j]) for j in joints], 1))
-        return spools
+        best = np.clip(best, 0.0, 1.99)
+        limits = {"bounds": (0.0, 2.0), "diff_step": 1e-3, "max_nfev": 12}
+        return least_squares(compute_residual, best, **limits).x
 
     def _basis(self, spool: np.ndarray, j: int) -> np.ndarray:
         """Return signed hat functions of the spool times full step, `(T, 2 (K - 1))`."""
@@ -405,11 +388,8 @@ def lag_signal(u: np.ndarray, time_constant_s: float, period_s: float) -> np.nda
 
 def _apply_plays(u: np.ndarray) -> np.ndarray:
     """Return the play operator of each of `PLAYS` on `u` `(T, J)`, `(P, T, J)`."""
-    out, now, half = (
-        np.empty((len(PLAYS), *u.shape)),
-        np.repeat(u[:1], len(PLAYS), 0),
-        PLAYS[:, None] / 2,
-    )
+    out, now = np.empty((len(PLAYS), *u.shape)), np.repeat(u[:1], len(PLAYS), 0)
+    half = PLAYS[:, None] / 2
     for t in range(len(u)):
         now = np.minimum(np.maximum(now, u[t] - half), u[t] + half)
         out[:, t] = now

@@ -105,30 +105,20 @@ def fit_or_restore(
     """
     path = folder / FREE_RUNS / f"{name}.npz"
     shape = () if cut is None else cut.q.shape
-    key = hashlib.sha256(
-        repr((fit, machine.fingerprint(), stage.digest, shape)).encode()
-    ).hexdigest()
+    stamp = repr((fit, machine.fingerprint(), stage.digest, shape))
+    key = hashlib.sha256(stamp.encode()).hexdigest()
     if path.exists():
         return _restore(path, key)
-    log.info(
-        "%sfitting %s to %d runs", f"{stage.name}: " if stage.name else "", name, len(stage.train)
-    )
+    where = f"{stage.name}: " if stage.name else ""
+    log.info("%sfitting %s to %d runs", where, name, len(stage.train))
     folder.mkdir(parents=True, exist_ok=True)
     began = time.monotonic()
-    actuator = fit.fit(
-        machine,
-        list_recordings(stage.train),
-        list_recordings(stage.validation),
-        folder,
-        stage.seed,
-        device,
-    )
+    train, validation = list_recordings(stage.train), list_recordings(stage.validation)
+    actuator = fit.fit(machine, train, validation, folder, stage.seed, device)
     seconds = time.monotonic() - began
-    predicted = (
-        np.zeros((0, 0, machine.num_joints))
-        if cut is None
-        else open_loop.roll_out(actuator, machine, cut, device)
-    )
+    predicted = np.zeros((0, 0, machine.num_joints))
+    if cut is not None:
+        predicted = open_loop.roll_out(actuator, machine, cut, device)
     found = FittedModel(predicted, seconds, find_overrides(actuator, folder, name))
     part = path.with_name(f".{path.name}.{os.getpid()}.npz")
     try:
@@ -153,10 +143,9 @@ def find_overrides(actuator: Actuator, folder: Path, name: str) -> str:
     if checkpoint is None:
         return ""
     for option in registry.list_options():
-        if (
-            option.group == "actuator"
-            and (yaml.safe_load(option.path.read_text()) or {}).get("_target_") == target
-        ):
+        if option.group != "actuator":
+            continue
+        if (yaml.safe_load(option.path.read_text()) or {}).get("_target_") == target:
             return f"actuator={option.name} actuator.checkpoint={checkpoint}"
     return ""
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+from torch import nn
 from torch.nn.utils.rnn import pad_sequence
 
 from actuators.models.parameters import hash_uniform
@@ -42,23 +43,17 @@ class TrainingWindows:
         device: torch.device,
         purpose: str = "to fit to",
     ) -> None:
-        self.u = (
-            torch.cat([torch.as_tensor(recording.u) for recording in recordings])
-            .T.contiguous()
-            .to(device)
-        )
-        self.q = (
-            torch.cat([torch.as_tensor(recording.q) for recording in recordings])
-            .T.contiguous()
-            .to(device)
-        )
+        def join(parts: Sequence[np.ndarray]) -> torch.Tensor:
+            return torch.cat([torch.as_tensor(part) for part in parts]).T.contiguous().to(device)
+
+        self.u = join([recording.u for recording in recordings])
+        self.q = join([recording.q for recording in recordings])
         self.num_history, self.horizon = machine.num_history, horizon
         self._length = machine.num_history + horizon
         starts, begin = [], 0
         for recording in recordings:
-            starts.append(
-                torch.arange(begin, begin + max(0, recording.num_samples - self._length + 1))
-            )
+            count = max(0, recording.num_samples - self._length + 1)
+            starts.append(torch.arange(begin, begin + count))
             begin += recording.num_samples
         self.starts = torch.cat(starts).to(device)
         if not len(self.starts):
@@ -103,10 +98,8 @@ class TrainingWindows:
         """
         index = self._index(batch, still_share, busy_share, key)
         index = index.flatten()[None] if together else index
-        return (
-            self.u.unfold(1, self._length, 1)[self._joint, index],
-            self.q.unfold(1, self._length, 1)[self._joint, index],
-        )
+        u, q = (one.unfold(1, self._length, 1)[self._joint, index] for one in (self.u, self.q))
+        return u, q
 
     def _index(
         self, batch: int, still_share: float, busy_share: float, key: torch.Tensor
@@ -127,9 +120,7 @@ class TrainingWindows:
 
     def _within(self, condition: torch.Tensor) -> torch.Tensor:
         """Return the starts of windows in which `condition`, `(T,)` bool, holds at some time."""
-        count = torch.cat(
-            [torch.zeros(1, dtype=torch.int64, device=condition.device), condition.cumsum(0)]
-        )
+        count = nn.functional.pad(condition.cumsum(0), (1, 0))
         return self.starts[count[self.starts + self._length] > count[self.starts]]
 
     def _busiest(self) -> torch.Tensor:
@@ -152,6 +143,11 @@ SETTLED = 3
 has died away."""
 
 
+def list_sources(recordings: Sequence[Recording]) -> list[str]:
+    """Return where recordings come from, each source once."""
+    return sorted({recording.metadata.get("source", "unknown") for recording in recordings})
+
+
 def measure_commanded_each_way_s(recordings: Sequence[Recording]) -> np.ndarray:
     """Return for how long each joint is commanded forth and back, s, shape `(2, J)`."""
     both = []
@@ -167,34 +163,30 @@ def check_enough(recordings: Sequence[Recording], machine: Machine) -> None:
         RecordingError: a joint is hardly commanded, in figures.
     """
     found = measure_commanded_each_way_s(recordings)
-    for needed_s, fatal in ((NEEDED_S, True), (AMPLE_S, False)):
-        lacking = "; ".join(
-            f"{name} {forth_s / 60:.1f} min forth and {back_s / 60:.1f} min back"
-            for name, (forth_s, back_s) in zip(machine.joint_names, found.T.tolist(), strict=True)
-            if min(forth_s, back_s) < needed_s
-        )
+    for needed_s, is_fatal in ((NEEDED_S, True), (AMPLE_S, False)):
+        lacking = []
+        for name, (forth_s, back_s) in zip(machine.joint_names, found.T.tolist(), strict=True):
+            if min(forth_s, back_s) < needed_s:
+                lacking.append(
+                    f"{name} {forth_s / 60:.1f} min forth and {back_s / 60:.1f} min back"
+                )
         if not lacking:
             continue
-        found_text = f"{lacking} commanded (|u| > {COMMANDED:g}) in the {len(recordings)} recordings to fit to"
+        text = f"{'; '.join(lacking)} commanded (|u| > {COMMANDED:g}) in the {len(recordings)} recordings to fit to"
         advice = "Record more of these joints: small and large commands both ways over their whole travel (mode=collect)."
-        if fatal:
-            raise RecordingError(
-                f"too little data: {found_text}, needed are {needed_s / 60:.2g} min each way. {advice}"
-            )
-        log.warning(
-            "thin data: %s; errors hardly fall beyond %.2g min each way. %s",
-            found_text,
-            needed_s / 60,
-            advice,
-        )
-        break
+        minutes = f"{needed_s / 60:.2g} min each way"
+        if is_fatal:
+            raise RecordingError(f"too little data: {text}, needed are {minutes}. {advice}")
+        log.warning("thin data: %s; errors hardly fall beyond %s. %s", text, minutes, advice)
+        return
 
 
 def check_together(recordings: Sequence[Recording]) -> None:
     """Warn where joints hardly move at the same time: their coupling cannot be learned."""
-    together_s = float(
-        sum(((np.abs(r.u) > COMMANDED).sum(1) > 1).sum() / r.rate_hz for r in recordings)
-    )
+    together_s = 0.0
+    for recording in recordings:
+        several = (np.abs(recording.u) > COMMANDED).sum(1) > 1
+        together_s += float(several.sum()) / recording.rate_hz
     if together_s < AMPLE_S:
         log.warning(
             "thin data: several joints are commanded at once for %.1f min; how they share the pump shows in %.2g min or more. "
@@ -225,14 +217,12 @@ def estimate_resting_noise(recordings: Sequence[Recording], machine: Machine) ->
             still.append(np.diff(q)[quiet[:-1]])
             moving.append(q[~quiet])
         still, step = np.concatenate(still), _estimate_sensor_step(np.concatenate(moving))
-        if not len(still):
-            log.warning(
-                "%s is never at rest in the recordings to fit to: its drift at rest will not be learned",
-                name,
-            )
-        noise[joint] = max(
-            float(np.quantile(np.abs(still), 0.68)) if len(still) else 0.0, step / np.sqrt(6.0)
-        )
+        noise[joint] = step / np.sqrt(6.0)
+        if len(still):
+            noise[joint] = max(noise[joint], float(np.quantile(np.abs(still), 0.68)))
+        else:
+            text = "%s is never at rest in the recordings to fit to: its drift at rest will not be learned"
+            log.warning(text, name)
     return noise
 
 

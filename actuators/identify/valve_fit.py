@@ -5,24 +5,21 @@ joint by joint.
 """
 
 import dataclasses
-import json
 import logging
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 from scipy.optimize import least_squares
 
+from actuators.identify.option_file import round_by_joint, write_option
 from actuators.identify.speed_data import PLAYS, SpeedData
 from actuators.models.valve import ValveActuator
-from brokk_rl.errors import StorageError
 from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel
 from brokk_rl.progress import ItemProgress
 from brokk_rl.record import Recording
-from brokk_rl.session import write_text
 from brokk_rl.spec import Count, Positive, spec
 
 log = logging.getLogger(__name__)
@@ -79,21 +76,8 @@ class ValveFit:
                 dynamics = fit_all_dynamics(data, known, dynamics if turn else None, *limits)
                 progress.advance()
         fitted = self._spec(data, dynamics)
-        # through JSON, which makes lists of tuples as YAML wants them
-        facts = json.loads(json.dumps(dataclasses.asdict(fitted)))  # pyright: ignore[reportArgumentType]
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            text = yaml.safe_dump(
-                {"_target_": f"{ValveActuator.__module__}.{ValveActuator.__name__}", **facts},
-                sort_keys=False,
-                width=130,
-            )
-            write_text(
-                folder / f"{self.name}.yaml",
-                f"# fitted to {len(data.recordings)} recordings of {machine.name}\n{text}",
-            )
-        except OSError as error:
-            raise StorageError(f"cannot write into {folder}: {error.strerror or error}") from error
+        comment = f"fitted to {len(data.recordings)} recordings of {machine.name}"
+        write_option(folder, self.name, fitted, comment)
         return fitted
 
     def refit(
@@ -117,30 +101,21 @@ class ValveFit:
         found = data.statics(
             dynamics, self.sweeps if demand is None else max(1, self.sweeps // 2), demand
         )
-        names, half = data.machine.joint_names, len(self.actuator.knots) - 1
-
-        def table(values: np.ndarray) -> dict[str, float]:
-            return {name: float(f"{value:.5g}") for name, value in zip(names, values, strict=True)}
-
-        def rows(values: np.ndarray) -> dict[str, tuple[float, ...]]:
-            rounded = {}
-            for name, row in zip(names, values, strict=True):
-                rounded[name] = tuple(float(f"{v:.5g}") for v in row)
-            return rounded
-
-        zero = np.zeros((len(names), 1))
-        return dataclasses.replace(  # pyright: ignore[reportArgumentType]
-            self.actuator,  # pyright: ignore[reportArgumentType]
-            dead_time_s=table(dynamics[:, 0]),
-            play=table(dynamics[:, 1]),
-            spool_s=table(dynamics[:, 2]),
-            speed_s=table(dynamics[:, 3]),
-            demand=table(found.demand),
-            curve_extend=rows(np.hstack([zero, np.maximum(found.curve[:, :half], 0.0)])),
-            curve_retract=rows(np.hstack([zero, np.maximum(found.curve[:, half:], 0.0)])),
-            pose_extend=rows(found.pose[:, 0]),
-            pose_retract=rows(found.pose[:, 1]),
-        )
+        machine, half = data.machine, len(self.actuator.knots) - 1
+        curve = np.insert(np.maximum(found.curve, 0.0), [0, half], 0.0, axis=1)
+        columns = {
+            "dead_time_s": dynamics[:, 0],
+            "play": dynamics[:, 1],
+            "spool_s": dynamics[:, 2],
+            "speed_s": dynamics[:, 3],
+            "demand": found.demand,
+            "curve_extend": curve[:, : half + 1],
+            "curve_retract": curve[:, half + 1 :],
+            "pose_extend": found.pose[:, 0],
+            "pose_retract": found.pose[:, 1],
+        }
+        numbers = {name: round_by_joint(machine, column) for name, column in columns.items()}
+        return dataclasses.replace(self.actuator, **numbers)  # pyright: ignore[reportArgumentType]
 
 
 def fit_all_dynamics(

@@ -68,16 +68,7 @@ def write_checkpoint(
         "num_history": machine.num_history,
         **facts,
     }
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-        part.write_bytes(save(tensors, metadata={"brokk": json.dumps(header)}))
-        part.replace(path)
-    except OSError as error:
-        raise StorageError(f"cannot write checkpoint {path}: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
+    _write(path, tensors, header, f"cannot write checkpoint {path}")
 
 
 def read_checkpoint(
@@ -90,9 +81,7 @@ def read_checkpoint(
             that are not finite.
     """
     try:
-        with safe_open(path, framework="pt") as file:
-            header = json.loads((file.metadata() or {})["brokk"])
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        tensors, header = _read(path)
     except (SafetensorError, OSError) as error:
         raise CheckpointError(
             f"{path}: corrupt or truncated ({error}); copy it again or make a new one with `brokk mode=identify`"
@@ -151,9 +140,7 @@ class ResumeFile:
         if not self._path.is_file():
             return None
         try:
-            with safe_open(self._path, framework="pt") as file:
-                header = json.loads((file.metadata() or {})["brokk"])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+            tensors, header = _read(self._path)
             stamp, place = header["stamp"], header["place"]
         except (SafetensorError, OSError, KeyError, ValueError) as error:
             raise CheckpointError(
@@ -178,21 +165,8 @@ class ResumeFile:
         Raises:
             StorageError: the file could not be written; the one before it is untouched.
         """
-        part = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")
-        content = save(
-            {name: value.detach().cpu().clone() for name, value in state.items()},
-            metadata={"brokk": json.dumps({"stamp": self._stamp, "place": dict(place)})},
-        )
-        try:
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            part.write_bytes(content)
-            part.replace(self._path)
-        except OSError as error:
-            raise StorageError(
-                f"cannot write {self._path}: {error.strerror or error}; the one before it is untouched"
-            ) from error
-        finally:
-            part.unlink(missing_ok=True)
+        header = {"stamp": self._stamp, "place": dict(place)}
+        _write(self._path, state, header, f"cannot write {self._path}")
 
     def remove(self) -> None:
         """Remove the file: the fit is done."""
@@ -209,3 +183,28 @@ def _list_differences(then: Any, now: Any, name: str = "") -> list[str]:
             differences.extend(_list_differences(then.get(key), now.get(key), inner))
         return differences
     return [] if then == now else [f"{name} (was {then}, is {now})"]
+
+
+def _read(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
+    """Return the tensors and the header of a file of ours."""
+    with safe_open(path, framework="pt") as file:
+        header = json.loads((file.metadata() or {})["brokk"])
+        return {name: file.get_tensor(name) for name in file.keys()}, header  # noqa: SIM118 (not a dict)
+
+
+def _write(
+    path: Path, tensors: Mapping[str, torch.Tensor], header: Mapping[str, Any], failure: str
+) -> None:
+    """Write a file in one step: it is the old or the new one."""
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    copies = {name: value.detach().cpu().clone().contiguous() for name, value in tensors.items()}
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        part.write_bytes(save(copies, metadata={"brokk": json.dumps(header)}))
+        part.replace(path)
+    except OSError as error:
+        raise StorageError(
+            f"{failure}: {error.strerror or error}; the one before it is untouched"
+        ) from error
+    finally:
+        part.unlink(missing_ok=True)

@@ -38,23 +38,13 @@ contact force does not tilt the machine (the actuator does not know it).
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, get_type_hints
+from typing import Annotated, Literal
 
-import numpy as np
 import torch
 from annotated_types import Ge, Interval
 
-from actuators.models.parameters import (
-    PerJoint,
-    SpreadParameters,
-    check_dead_time,
-    check_interface,
-    expand_per_joint,
-    open_valve,
-    select_commands_in_force,
-)
-from brokk_rl.errors import ConfigError
-from brokk_rl.gravity import Gravity
+from actuators.models.hydraulic import OilModel
+from actuators.models.parameters import PerJoint, open_valve
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
@@ -162,61 +152,42 @@ class HydraulicCircuit:
         return CircuitModel(self, machine, num_envs, device)
 
 
-PER_JOINT = tuple(
-    name for name, hint in get_type_hints(HydraulicCircuit).items() if hint == PerJoint
-)
-STATES = ("pilot", "spool", "spool_rate", "speed", "bore", "rod", "poppet", "promised", "pressed")
-"""State of each joint: `speed` over full speed, pressures over relief, `poppet` opening of the
-counterbalance valve, `promised` motion of the last step and `pressed` deflection of the drive, rad
-or m."""
+BOUNDS: dict[str, tuple[float, float]] = dict.fromkeys(
+    (
+        "spool_hz", "spool_damping", "speed_scale", "flow_share", "supply_ratio", "mode_hz", "outlet",
+        "counterbalance_range", "counterbalance_s", "stribeck_speed",
+    ),
+    (1e-6, math.inf),
+)  # fmt: skip
+BOUNDS |= dict.fromkeys(("rod_area", "linkage_sides"), (0.05, 1.0))
+BOUNDS |= dict.fromkeys(("hysteresis", "notch"), (0.0, 1.0))
+BOUNDS |= dict.fromkeys(("overlap_extend", "overlap_retract"), (0.0, 0.9))
+# at 0 and pi the cylinder has no lever arm
+BOUNDS |= dict.fromkeys(("linkage_lower_rad", "linkage_upper_rad"), (0.15, math.pi - 0.15))
+"""Range of numbers in which the equations mean something."""
 
 
-class CircuitModel:
+class CircuitModel(OilModel):
     """The circuit at work in `N` environments; see the module for its equations.
 
-    Attributes:
-        parameters: Numbers by name, `(N, J)`.
+    State of each joint: `speed` over full speed, pressures over relief, `poppet` opening of the
+    counterbalance valve, `promised` motion of the last step and `pressed` deflection of the drive, rad
+    or m; `supply` `(N, 1)`, of relief pressure.
     """
+
+    STATES = (
+        "pilot", "spool", "spool_rate", "speed", "bore", "rod", "poppet", "promised", "pressed",
+    )  # fmt: skip
 
     def __init__(
         self, config: HydraulicCircuit, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        check_interface(machine, "speed", "hydraulics set speeds")
-        nominal = {}
-        for name in PER_JOINT:
-            nominal[name] = expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
-        _check(nominal)
-        longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
-        check_dead_time(float(longest_s), machine, "actuator.transport_s")
-        self._parameters = SpreadParameters(
-            nominal, config.spread, num_envs, device, "actuator.spread"
-        )
-        self.parameters = self._parameters.value
-        self._config = config
-        self._period_s = machine.period_s
-        self._num_substeps = max(1, round(machine.period_s / config.substep_s))
-        self._gravity = Gravity(machine, device)
-
-        def tensor(values: object) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
-        self._full_speed = tensor(machine.max_speed)
-        self._stiffness = tensor(np.array([body.stiffness.value for body in machine.bodies]))
-        self._yield_force = tensor(np.array([body.yield_force.value for body in machine.bodies]))
-        shape = (num_envs, machine.num_joints)
-        self._state = {name: torch.zeros(shape, device=device) for name in STATES}
+        super().__init__(config, machine, num_envs, device, BOUNDS)
         self._state["supply"] = torch.zeros(num_envs, 1, device=device)
-        self._state["fresh"] = torch.ones(num_envs, dtype=torch.bool, device=device)
         self._kinematics = Kinematics(machine, device) if config.outrigger_nm_rad else None
-        home = tensor(machine.home)[None]
-        self._home_moment_nm = self._gravity.overturn(home)
-        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """State of each joint, `STATES`, `(N, J)`; `supply` `(N, 1)`, of relief pressure."""
-        return {**self._state, **self._parameters.state}
+        home = torch.as_tensor(machine.home, dtype=torch.float32, device=device)
+        self._home_moment_nm = self._gravity.overturn(home[None])
+        self.reset(self._fresh.clone())
 
     @property
     def sides(self) -> frozenset[str]:
@@ -225,11 +196,8 @@ class CircuitModel:
 
     def reset(self, mask: torch.Tensor) -> None:
         """Let the environments of `mask`, `(N,)` bool, start from their history."""
-        for name in STATES:
-            self._state[name].masked_fill_(mask[:, None], 0.0)
         self._state["supply"].masked_fill_(mask[:, None], self._config.standby)
-        self._state["fresh"].logical_or_(mask)
-        self._parameters.redraw(mask)
+        super().reset(mask)
 
     def tool(self, point_m: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
         """Return the true place of the tool that the drawing has at `point_m`, `(N, 3)`."""
@@ -248,23 +216,20 @@ class CircuitModel:
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
         state, p, config = self._state, self.parameters, self._config
-        q, dt = history.q[:, -1], self._period_s / self._num_substeps
-        earlier, later, part = select_commands_in_force(
-            history.u, p["transport_s"] / self._period_s
-        )
+        q, dt = history.q[:, -1], self._dt_s
+        earlier, later, part = self._read_commands(history.u)
         torque = p["supply_ratio"] * self._yield_force
         lever, stroke = self._follow_linkage(q)
         inertia = self._stiffness / (2.0 * math.pi * p["mode_hz"]) ** 2
-        push = dt * torque / (inertia * self._full_speed)
+        push = dt * torque / (inertia * self.plant.max_speed)
         alpha = p["rod_area"]
-        column = self._stiffness * self._full_speed / (torque * (1.0 + alpha))
+        column = self._stiffness * self.plant.max_speed / (torque * (1.0 + alpha))
         soft_bore = column * (DEAD_VOLUME + 0.5) / (DEAD_VOLUME + stroke)
         soft_rod = column / alpha * (DEAD_VOLUME + 0.5) / (DEAD_VOLUME + 1.0 - stroke)
 
         moved = q - history.q[:, -2]
-        begun = self._begin(history, moved, lever, torque)
-        fresh = state["fresh"][:, None]
-        now = {name: torch.where(fresh, begun[name], state[name]) for name in begun}
+        fresh = self._fresh.clone()[:, None]
+        now = self.recall(self._begin(history, moved, lever, torque))
         pilot, spool, spool_rate, speed = (
             now[name] for name in ("pilot", "spool", "spool_rate", "speed")
         )
@@ -275,10 +240,10 @@ class CircuitModel:
         # the drive lets go at its yield force, an obstacle does not
         yielding = self._yield_force / self._stiffness
         most = torch.where(blocked > 0.5, 2.0 * torque / self._stiffness, yielding)
-        pressed = (now["pressed"] + missed).maximum(-most).minimum(most)
+        pressed = (now["pressed"] + missed).clamp(-most, most)
         blocked = blocked * (pressed.abs() / yielding / LOOSE - 1.0).clamp(0.0, 1.0)
         speed = speed * (1.0 - blocked)
-        shift = lever * missed / self._full_speed
+        shift = lever * missed / self.plant.max_speed
         bore = (now["bore"] - soft_bore * shift).clamp(0.0, 1.0)
         rod = (now["rod"] + soft_rod * alpha * shift).clamp(0.0, 1.0)
         weight = self._gravity.load(q)
@@ -292,7 +257,7 @@ class CircuitModel:
         begin_q = q
         for i in range(self._num_substeps):
             u = torch.lerp(later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0))
-            pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
+            pilot = pilot.clamp(u - play, u + play)
             spool_rate = spool_rate + dt * omega * (
                 omega * (pilot - spool) - 2.0 * p["spool_damping"] * spool_rate
             )
@@ -333,7 +298,7 @@ class CircuitModel:
             k_rod = k_rod / (1.0 + k_rod * (torch.where(extends, out_slope, in_slope)))
             bore = bore + k_bore * (torch.where(extends, flow, -out_flow) - p["leak"] * bore)
             rod = rod + k_rod * (torch.where(extends, -out_flow, flow) - p["leak"] * rod)
-            bent = (pressed - blocked * (q - begin_q)).maximum(-most).minimum(most)
+            bent = (pressed - blocked * (q - begin_q)).clamp(-most, most)
             load = (weight + self._stiffness * bent) / torque
             momentum = speed + push * (lever * (bore - alpha * rod) + load)
             rub = push * (p["coulomb"] + excess * torch.exp(-speed.abs() / p["stribeck_speed"]))
@@ -345,17 +310,14 @@ class CircuitModel:
             )
             bore = (bore - k_bore * lever * speed).clamp(0.0, 1.0)
             rod = (rod + k_rod * alpha * lever * speed).clamp(0.0, 1.0)
-            went = q + dt * self._full_speed * speed
-            q = went.clamp(self._lower, self._upper)
+            went = q + dt * self.plant.max_speed * speed
+            q = self.plant.hold(went)
             speed = speed.masked_fill(q != went, 0.0)
             supply = self._feed(supply, highest, flow, slope, spool, dt)
 
         promised = q - begin_q
         values = (pilot, spool, spool_rate, speed, bore, rod, poppet, promised, pressed)
-        for name, value in zip(STATES, values, strict=True):
-            state[name].copy_(value)
-        state["supply"].copy_(supply)
-        state["fresh"].fill_(False)
+        self.keep({**dict(zip(self.STATES, values, strict=True)), "supply": supply})
         return q
 
     def _feed(
@@ -388,7 +350,7 @@ class CircuitModel:
         """Return lever arm over that in mid-travel and stroke from 0 to 1, each `(N, J)`."""
         p = self.parameters
         low, high, sides = p["linkage_lower_rad"], p["linkage_upper_rad"], p["linkage_sides"]
-        share = (q - self._lower) / (self._upper - self._lower)
+        share = (q - self.plant.lower) / (self.plant.upper - self.plant.lower)
         length = compute_cylinder_length(low + share * (high - low), sides)
         lever = torch.sin(low + share * (high - low)) / length
         middle = 0.5 * (low + high)
@@ -407,13 +369,9 @@ class CircuitModel:
     ) -> dict[str, torch.Tensor]:
         """Return the state of a free run that begins in the middle of a motion."""
         p, config = self.parameters, self._config
-        in_force, _, _ = select_commands_in_force(history.u, p["transport_s"] / self._period_s)
-        # the spool trails its command by 2 damping / omega
-        trail_s = p["spool_damping"] / (math.pi * p["spool_hz"])
-        trailing, _, _ = select_commands_in_force(
-            history.u, (p["transport_s"] + trail_s) / self._period_s
-        )
-        speed = moved / (self._period_s * self._full_speed)
+        in_force, _, _ = self._read_commands(history.u)
+        trailing = self._read_trailing(history.u)
+        speed = moved / (self.plant.period_s * self.plant.max_speed)
         needed = p["coulomb"] * (speed / 0.01).clamp(-1.0, 1.0) + p["viscous"] * speed
         needed = (needed - self._gravity.load(history.q[:, -1]) / torque) / lever
         bore = (needed.clamp(min=0.0) + PRELOAD).clamp(max=1.0)
@@ -445,27 +403,3 @@ def compute_cylinder_length(angle_rad: torch.Tensor, sides: torch.Tensor) -> tor
         sides: Their ratio, shorter over longer.
     """
     return torch.sqrt(1.0 + sides * sides - 2.0 * sides * torch.cos(angle_rad))
-
-
-def _check(nominal: dict[str, np.ndarray]) -> None:
-    """Raise a `ConfigError` for numbers outside the range in which the equations mean something."""
-    bounds = dict.fromkeys(nominal, (0.0, math.inf))
-    positive = ("spool_hz", "spool_damping", "speed_scale", "flow_share", "supply_ratio", "mode_hz")
-    positive += ("outlet", "counterbalance_range", "counterbalance_s", "stribeck_speed")
-    bounds |= dict.fromkeys(positive, (1e-6, math.inf))
-    bounds |= dict.fromkeys(("rod_area", "linkage_sides"), (0.05, 1.0))
-    bounds |= dict.fromkeys(("hysteresis", "notch"), (0.0, 1.0))
-    bounds |= dict.fromkeys(("overlap_extend", "overlap_retract"), (0.0, 0.9))
-    # at 0 and pi the cylinder has no lever arm
-    bounds |= dict.fromkeys(("linkage_lower_rad", "linkage_upper_rad"), (0.15, math.pi - 0.15))
-    for name, value in nominal.items():
-        low, high = bounds[name]
-        if not ((value >= low) & (value <= high)).all():
-            raise ConfigError(
-                f"actuator.{name}: expected {low:g} to {high:g}, got {value.tolist()}"
-            )
-    if (nominal["breakaway"] < nominal["coulomb"]).any():
-        raise ConfigError(
-            "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no "
-            "smaller than in motion)"
-        )

@@ -15,9 +15,9 @@ from typing import Any, ClassVar, Protocol
 import torch
 
 from actuators.models.friction import LOADS, STRIBECK_SPEED, compute_dry_friction
+from actuators.models.joint_model import ParametricModel
 from actuators.models.parameters import (
     PerJoint,
-    SpreadParameters,
     check_interface,
     read_parameters,
     select_commands_in_force,
@@ -112,16 +112,16 @@ class Motor(Protocol):
         ...
 
 
-class ForceDriveModel:
+class ForceDriveModel(ParametricModel):
     """Implicit solution over a control period.
 
     Attributes:
-        parameters: Numbers by name, `(N, J)`. Write in place or replace an entry to simulate `N`
-            candidates side by side.
-        drive_changes: Changes of them by effects, `(N, J)` by name: a factor on the mass, force added to
-            the others.
+        drive_changes: Changes of the numbers by effects, `(N, J)` by name: a factor on the mass, force
+            added to the others.
         motor: Circuit of motors that are commanded by their duty; `None`: a command is a force.
     """
+
+    STATES = ("speed",)
 
     def __init__(
         self, config: ForceDrive, machine: Machine, num_envs: int, device: torch.device
@@ -135,61 +135,35 @@ class ForceDriveModel:
             not_negative=("viscous_n_s_m", "coulomb_n", "stribeck_n", *LOADS),
             absent={"stribeck_m_s": STRIBECK_SPEED * machine.max_speed},
         )
-        self._parameters = SpreadParameters(
-            nominal, config.spread, num_envs, device, "actuator.spread"
-        )
-        self.parameters = self._parameters.value
+        super().__init__(config, nominal, machine, num_envs, device)
         self.drive_changes: dict[str, torch.Tensor] = {}
         self.motor: Motor | None = None
-        self._period_s = machine.period_s
-
-        def tensor(values: object) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
-        self._middle, self._half = (self._lower + self._upper) / 2, (self._upper - self._lower) / 2
-        self._slides = torch.tensor([j.kind == "slide" for j in machine.joints], device=device)
-        self._max_force = tensor(machine.max_force)
+        self._max_force = torch.as_tensor(machine.max_force, dtype=torch.float32, device=device)
         count = min(SPEED_SAMPLES, machine.num_history)
-        times_s = self._period_s * torch.arange(1 - count, 1, dtype=torch.float64)
+        times_s = machine.period_s * torch.arange(1 - count, 1, dtype=torch.float64)
         powers = torch.stack([times_s**power for power in range(3)], 1)
         # Slope at the newest sample of the parabola through the last positions.
-        self._slope = tensor(torch.linalg.pinv(powers)[1].numpy())
-        self._speed = torch.zeros(num_envs, machine.num_joints, device=device)
-        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
+        self._slope = torch.linalg.pinv(powers)[1].to(device, torch.float32)
         self.reset(self._fresh.clone())
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """`speed` `(N, J)` in rad/s or m/s, `fresh`, and the drawn parameters."""
-        return {"speed": self._speed, "fresh": self._fresh, **self._parameters.state}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Let the environments of `mask`, `(N,)` bool, start from their history; redraw."""
-        self._speed.masked_fill_(mask[:, None], 0.0)
-        self._fresh.logical_or_(mask)
-        self._parameters.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        value, period_s = self._change_numbers(), self._period_s
+        value, period_s = self._change_numbers(), self.plant.period_s
         earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / period_s)
         command = torch.lerp(later, earlier, part)
         q = history.q[:, -1]
         weight = self._weigh(value, q)
         recent = history.q[:, -len(self._slope) :]
         begun = torch.einsum("h,nhj->nj", self._slope, recent)
-        before = torch.where(self._fresh[:, None], begun, self._speed)
+        before = self.recall({"speed": begun})["speed"]
         mass = value["mass_kg"]
         motor, speed = self._solve(value, command, weight, before)
         states = (before, motor, weight, self._max_force)
         friction = period_s * compute_dry_friction(value, *states) / mass
         speed = speed.sign() * (speed.abs() - friction).clamp(min=0.0)
         moved = q + 0.5 * period_s * (before + speed)
-        low, high = torch.minimum(self._lower, q), torch.maximum(self._upper, q)
-        held = torch.minimum(torch.maximum(moved, low), high)
-        self._speed.copy_(speed.masked_fill(held != moved, 0.0))
-        self._fresh.fill_(False)
+        held = self.plant.hold_from(q, moved)
+        self.keep({"speed": speed.masked_fill(held != moved, 0.0)})
         return held
 
     def _solve(
@@ -200,7 +174,7 @@ class ForceDriveModel:
         before: torch.Tensor,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the force of the motor and the speed at the end of the period, without dry friction."""
-        step, viscous = self._period_s / value["mass_kg"], value["viscous_n_s_m"]
+        step, viscous = self.plant.period_s / value["mass_kg"], value["viscous_n_s_m"]
         if self.motor is None:
             force = command * self._max_force
             return force, (before + step * (force - weight)) / (1.0 + step * viscous)
@@ -208,13 +182,13 @@ class ForceDriveModel:
         speed = (before + step * (stall - weight)) / (1.0 + step * (viscous + back_emf))
         # The force falls with the speed: beyond the limit at this one, it is at the limit.
         limit = self.motor.limit
-        force = torch.minimum(torch.maximum(stall - back_emf * speed, -limit), limit)
+        force = (stall - back_emf * speed).clamp(-limit, limit)
         return force, (before + step * (force - weight)) / (1.0 + step * viscous)
 
     def _weigh(self, value: dict[str, torch.Tensor], q: torch.Tensor) -> torch.Tensor:
         """Return the force from outside against the positive direction, `(N, J)`."""
-        sin, cos = read_pose(q, self._middle, self._half, self._slides)
-        return value["offset_n"] + value["pose_sin_n"] * sin + value["pose_cos_n"] * cos
+        sin, cos = self.plant.read_pose(q)
+        return value["offset_n"] + value["pose_sin_n"] * sin + value["pose_cos_n"] * (cos - 1.0)
 
     def _change_numbers(self) -> dict[str, torch.Tensor]:
         """Return the numbers with the changes by effects, `(N, J)`."""
@@ -224,30 +198,13 @@ class ForceDriveModel:
             value[name] = own * change if name == "mass_kg" else own + change
         return value
 
-    @property
-    def delay_s(self) -> torch.Tensor:
-        """Dead time, `(N, J)`."""
-        return self.parameters["dead_time_s"]
 
-
-def read_pose(
-    q: torch.Tensor, middle: torch.Tensor, half: torch.Tensor, slides: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what `pose_sin_n` and `pose_cos_n` are multiplied by at positions `q`, each like `q`."""
-    away = q - middle
-    sin = torch.where(slides, away / half, torch.sin(away))
-    return sin, torch.where(slides, torch.zeros_like(q), torch.cos(away) - 1.0)
-
-
-def change_drive(
-    model: Any, drives: Mapping[str, str], value: Mapping[str, torch.Tensor], where: str
-) -> None:
+def change_drive(model: Any, changes: Mapping[str, torch.Tensor], where: str) -> None:
     """Write numbers of an effect into the `drive_changes` of the drive within `model`.
 
     Args:
         model: The drive, or effects around it.
-        drives: Number of the drive that each number of the effect changes.
-        value: Numbers of the effect, `(N, J)` by name.
+        changes: By number of the drive, `(N, J)`.
         where: Config node named in messages.
 
     Raises:
@@ -260,5 +217,4 @@ def change_drive(
             f"{where}: it changes numbers of a drive, and {type(model).__name__} has none; choose actuator=force (joints "
             "commanded by torque) or actuator=servo (by position)"
         )
-    for name, changed in drives.items():
-        model.drive_changes[changed] = value[name]
+    model.drive_changes.update(changes)

@@ -22,15 +22,15 @@ pushing, and the simulator's drive yields.
 """
 
 import math
-from typing import Annotated, get_type_hints
+from collections.abc import Mapping
+from typing import Annotated, Any, get_type_hints
 
-import numpy as np
 import torch
 from annotated_types import Interval
 
+from actuators.models.joint_model import ParametricModel
 from actuators.models.parameters import (
     PerJoint,
-    SpreadParameters,
     check_dead_time,
     check_interface,
     expand_per_joint,
@@ -120,89 +120,119 @@ class Hydraulic:
         return HydraulicModel(self, machine, num_envs, device)
 
 
-PER_JOINT = tuple(name for name, hint in get_type_hints(Hydraulic).items() if hint == PerJoint)
+class OilModel(ParametricModel):
+    """Base of hydraulic plants: numbers within bounds, weight, stiffness, substeps.
+
+    Args:
+        config: The spec, with `substep_s` and `spread`.
+        machine: A machine with known masses.
+        num_envs: Number of environments, `N`.
+        device: Where the tensors live.
+        bounds: Smallest and largest value of numbers by name; 0 and more for the others.
+    """
+
+    DELAY = "transport_s"
+
+    def __init__(
+        self,
+        config: Any,
+        machine: Machine,
+        num_envs: int,
+        device: torch.device,
+        bounds: Mapping[str, tuple[float, float]],
+    ) -> None:
+        check_interface(machine, "speed", "hydraulics set speeds")
+        nominal = {}
+        for name, hint in get_type_hints(type(config)).items():
+            if hint == PerJoint:
+                nominal[name] = expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
+        for name, value in nominal.items():
+            low, high = bounds.get(name, (0.0, math.inf))
+            if not ((value >= low) & (value <= high)).all():
+                raise ConfigError(
+                    f"actuator.{name}: expected {low:g} to {high:g}, got {value.tolist()}"
+                )
+        if (nominal["breakaway"] < nominal["coulomb"]).any():
+            raise ConfigError(
+                "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)"
+            )
+        longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
+        check_dead_time(float(longest_s), machine, "actuator.transport_s")
+        super().__init__(config, nominal, machine, num_envs, device)
+        self._config = config
+        self._num_substeps = max(1, round(machine.period_s / config.substep_s))
+        self._dt_s = machine.period_s / self._num_substeps
+        self._gravity = Gravity(machine, device)
+        stiffness = [body.stiffness.value for body in machine.bodies]
+        yield_force = [body.yield_force.value for body in machine.bodies]
+        self._stiffness = torch.tensor(stiffness, dtype=torch.float32, device=device)
+        self._yield_force = torch.tensor(yield_force, dtype=torch.float32, device=device)
+
+    def _read_commands(self, u: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the two commands of the coming period, and the part of it in which the first acts."""
+        return select_commands_in_force(u, self.delay_s / self.plant.period_s)
+
+    def _read_trailing(self, u: torch.Tensor) -> torch.Tensor:
+        """Return where spools are that follow commands `u`: they trail by 2 damping / omega."""
+        p = self.parameters
+        trail_s = p["spool_damping"] / (math.pi * p["spool_hz"])
+        trailing, _, _ = select_commands_in_force(u, (self.delay_s + trail_s) / self.plant.period_s)
+        return trailing
 
 
-class HydraulicModel:
+BOUNDS: dict[str, tuple[float, float]] = dict.fromkeys(
+    (
+        "spool_hz", "spool_damping", "speed_scale", "retract_ratio", "flow_share", "supply_ratio", "mode_hz",
+        "stribeck_speed",
+    ),
+    (1e-6, math.inf),
+)  # fmt: skip
+BOUNDS |= dict.fromkeys(("hysteresis", "notch", "load_sensitivity"), (0.0, 1.0))
+BOUNDS |= dict.fromkeys(("overlap_extend", "overlap_retract"), (0.0, 0.9))
+"""Range of numbers in which the equations mean something."""
+
+
+class HydraulicModel(OilModel):
     """The plant at work in `N` environments; see the module for its equations.
 
-    Attributes:
-        parameters: Numbers by name, `(N, J)`; write in place to simulate `N` candidates side by
-            side.
+    Spool is of full stroke, speed in rad/s, force in Nm, each `(N, J)`; `oil_c` `(N,)`.
     """
+
+    STATES = ("pilot", "spool", "spool_rate", "speed", "force")
 
     def __init__(
         self, config: Hydraulic, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
-        check_interface(machine, "speed", "hydraulics set speeds")
-        nominal = {}
-        for name in PER_JOINT:
-            nominal[name] = expand_per_joint(getattr(config, name), machine, f"actuator.{name}")
-        _check(nominal)
-        longest_s = nominal["transport_s"].max() * (1.0 + config.spread.get("transport_s", 0.0))
-        check_dead_time(float(longest_s), machine, "actuator.transport_s")
-        self._parameters = SpreadParameters(
-            nominal, config.spread, num_envs, device, "actuator.spread"
-        )
-        self.parameters = self._parameters.value
-        self._config = config
-        self._period_s = machine.period_s
-        self._num_substeps = max(1, round(machine.period_s / config.substep_s))
-        self._gravity = Gravity(machine, device)
-
-        def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
-        self._full_speed = tensor(machine.max_speed)
-        self._stiffness = tensor(np.array([body.stiffness.value for body in machine.bodies]))
-        self._yield_force = tensor(np.array([body.yield_force.value for body in machine.bodies]))
-        shape = (num_envs, machine.num_joints)
-        self._state = {
-            name: torch.zeros(shape, device=device)
-            for name in ("pilot", "spool", "spool_rate", "speed", "force")
-        }
+        super().__init__(config, machine, num_envs, device, BOUNDS)
         self._state["oil_c"] = torch.zeros(num_envs, device=device)
-        self._state["fresh"] = torch.ones(num_envs, dtype=torch.bool, device=device)
-        self.reset(torch.ones(num_envs, dtype=torch.bool, device=device))
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """Spool (of full stroke), speed (rad/s), force (Nm), each `(N, J)`; `oil_c` `(N,)`."""
-        return {**self._state, **self._parameters.state}
+        self.reset(self._fresh.clone())
 
     def reset(self, mask: torch.Tensor) -> None:
         """Let the environments of `mask`, `(N,)` bool, start from their history."""
-        for name in ("pilot", "spool", "spool_rate", "speed", "force"):
-            self._state[name].masked_fill_(mask[:, None], 0.0)
         self._state["oil_c"].masked_fill_(mask, self._config.oil_start_c)
-        self._state["fresh"].logical_or_(mask)
-        self._parameters.redraw(mask)
+        super().reset(mask)
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
         state, p, config = self._state, self.parameters, self._config
-        q, dt = history.q[:, -1], self._period_s / self._num_substeps
+        q, dt = history.q[:, -1], self._dt_s
         weight = self._gravity.load(q)
         warm = 1.0 + config.thermal_gain * (state["oil_c"] - config.oil_reference_c)[:, None]
-        earlier, later, part = select_commands_in_force(
-            history.u, p["transport_s"] / self._period_s
-        )
-
+        earlier, later, part = self._read_commands(history.u)
         supply = p["supply_ratio"] * self._yield_force
         inertia = self._stiffness / (2.0 * math.pi * p["mode_hz"]) ** 2
         pull = (
             dt * (2.0 * math.pi * p["spool_hz"] * warm) ** 2,
             dt * 2.0 * p["spool_damping"] * 2.0 * math.pi * p["spool_hz"] * warm,
         )
-        extend_speed = p["speed_scale"] * self._full_speed * warm
+        extend_speed = p["speed_scale"] * self.plant.max_speed * warm
         retract_speed = extend_speed * p["retract_ratio"]
         play = 0.5 * p["hysteresis"]
         excess = p["breakaway"] - p["coulomb"]
-        knee = p["stribeck_speed"] * self._full_speed
-        viscous = p["viscous"] / self._full_speed
+        knee = p["stribeck_speed"] * self.plant.max_speed
+        viscous = p["viscous"] / self.plant.max_speed
         # Below 1 % of full speed friction grows with speed: no stick-slip chatter at this time step.
-        still = 0.01 * self._full_speed
+        still = 0.01 * self.plant.max_speed
         rub = dt * supply / inertia
 
         def rubbing(speed: torch.Tensor) -> torch.Tensor:
@@ -210,29 +240,21 @@ class HydraulicModel:
             fast = speed.abs()
             return (p["coulomb"] + excess * torch.exp(-fast / knee)) / (fast + still) + viscous
 
-        # a free run may begin in the middle of a motion, which the history shows; the spool trails
-        # its command by 2 damping / omega
-        trail_s = p["spool_damping"] / (math.pi * p["spool_hz"])
-        trailing, _, _ = select_commands_in_force(
-            history.u, (p["transport_s"] + trail_s) / self._period_s
-        )
-        measured = (q - history.q[:, -2]) / self._period_s
+        # a free run may begin in the middle of a motion, which the history shows
+        measured = (q - history.q[:, -2]) / self.plant.period_s
         begun = {
             "pilot": earlier,
-            "spool": trailing,
+            "spool": self._read_trailing(history.u),
             "spool_rate": torch.zeros_like(q),
             "speed": measured,
+            "force": supply * rubbing(measured) * measured - weight,
         }
-        begun["force"] = supply * rubbing(measured) * measured - weight
-        pilot, spool, spool_rate, speed, force = (
-            torch.where(state["fresh"][:, None], begun[name], state[name])
-            for name in ("pilot", "spool", "spool_rate", "speed", "force")
-        )
+        pilot, spool, spool_rate, speed, force = self.recall(begun).values()
         demand = torch.zeros_like(q)
         for i in range(self._num_substeps):
             # Smooth in the delay.
             u = torch.lerp(later, earlier, (part * self._num_substeps - i).clamp(0.0, 1.0))
-            pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
+            pilot = pilot.clamp(u - play, u + play)
             spool_rate = spool_rate + pull[0] * (pilot - spool) - pull[1] * spool_rate
             spool = (spool + dt * spool_rate).clamp(-1.0, 1.0)
             opening = open_valve(spool, p["overlap_extend"], p["overlap_retract"])
@@ -246,53 +268,18 @@ class HydraulicModel:
             )
             flow_speed = opening * head * torch.where(opening > 0, extend_speed, retract_speed)
             force = force + dt * (self._stiffness * (flow_speed - speed) - p["leak_hz"] * force)
-            force = torch.minimum(torch.maximum(force, -supply), supply)  # relief valves
+            force = force.clamp(-supply, supply)  # relief valves
             speed = (speed + dt * (force + weight) / inertia) / (1.0 + rub * rubbing(speed))
             moved = q + dt * speed
-            q = moved.clamp(self._lower, self._upper)
+            q = self.plant.hold(moved)
             speed = speed.masked_fill(q != moved, 0.0)
 
-        for name, value in (
-            ("pilot", pilot),
-            ("spool", spool),
-            ("spool_rate", spool_rate),
-            ("speed", speed),
-            ("force", force),
-        ):
-            state[name].copy_(value)
-        state["fresh"].fill_(False)
+        values = (pilot, spool, spool_rate, speed, force)
+        self.keep(dict(zip(self.STATES, values, strict=True)))
         work = demand.sum(1).clamp(max=1.0)
         settled_c = config.oil_ambient_c + config.oil_rise_c * work
         state["oil_c"].add_(
-            (settled_c - state["oil_c"]) * (1.0 - math.exp(-self._period_s / config.oil_time_s))
+            (settled_c - state["oil_c"])
+            * (1.0 - math.exp(-self.plant.period_s / config.oil_time_s))
         )
         return q
-
-
-def _check(nominal: dict[str, np.ndarray]) -> None:
-    """Raise a `ConfigError` for numbers outside the range in which the equations mean something."""
-    positive = (
-        "spool_hz",
-        "spool_damping",
-        "speed_scale",
-        "retract_ratio",
-        "flow_share",
-        "supply_ratio",
-        "mode_hz",
-        "stribeck_speed",
-    )
-    for name, value in nominal.items():
-        low = 1e-6 if name in positive else 0.0
-        if (value < low).any():
-            raise ConfigError(
-                f"actuator.{name}: expected {'more than 0' if low else '0 or more'}, got {value.tolist()}"
-            )
-    for name in ("overlap_extend", "overlap_retract", "hysteresis", "notch", "load_sensitivity"):
-        if (nominal[name] > (0.9 if name.startswith("overlap") else 1.0)).any():
-            raise ConfigError(
-                f"actuator.{name}: expected at most {0.9 if name.startswith('overlap') else 1.0}, got {nominal[name].tolist()}"
-            )
-    if (nominal["breakaway"] < nominal["coulomb"]).any():
-        raise ConfigError(
-            "actuator.breakaway: expected at least actuator.coulomb (friction at rest is no smaller than in motion)"
-        )

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 
 from actuators.models import checkpoint
+from actuators.models.joint_model import MemorylessModel
+from actuators.models.machine_tensors import MachineTensors
 from brokk_rl.errors import CheckpointError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -23,16 +25,8 @@ class Hold:
         return HoldModel()
 
 
-class HoldModel:
+class HoldModel(MemorylessModel):
     """`q' = q`."""
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """Nothing."""
-        return {}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Do nothing."""
 
     def step(self, history: History) -> torch.Tensor:
         """Return the newest position, shape `(N, J)`."""
@@ -92,7 +86,7 @@ def build_arx_features(u: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
     return torch.cat([u, u.abs() * u, q[:, 1:] - q[:, :-1]], 1)
 
 
-class ArxModel:
+class ArxModel(MemorylessModel):
     """`q' = q + weight . features`, each joint from its own history.
 
     Args:
@@ -102,23 +96,13 @@ class ArxModel:
     """
 
     def __init__(self, weight: torch.Tensor, machine: Machine, device: torch.device) -> None:
-        self._weight = weight
-        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
-        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """Nothing."""
-        return {}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Do nothing."""
+        self._weight, self._plant = weight, MachineTensors(machine, device)
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
         inputs = build_arx_features(history.u, history.q)
         moved = torch.einsum("nij,ji->nj", inputs, self._weight)
-        return (history.q[:, -1] + moved).clamp(self._lower, self._upper)
+        return self._plant.hold(history.q[:, -1] + moved)
 
 
 @spec

@@ -15,6 +15,8 @@ import torch
 from torch import nn
 
 from actuators.models import checkpoint
+from actuators.models.joint_model import MemorylessModel
+from actuators.models.machine_tensors import MachineTensors
 from brokk_rl.errors import CheckpointError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
@@ -279,27 +281,18 @@ class Mlp:
         )
 
 
-class NetworkModel:
+class NetworkModel(MemorylessModel):
     """Actuator networks at work, separate or coupled. Has no memory beyond the history."""
 
     def __init__(self, networks: JointNetworks, machine: Machine, device: torch.device) -> None:
         self._networks = networks.requires_grad_(False)
-        self._lower = torch.as_tensor(machine.lower, dtype=torch.float32, device=device)
-        self._upper = torch.as_tensor(machine.upper, dtype=torch.float32, device=device)
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """Nothing."""
-        return {}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Do nothing."""
+        self._plant = MachineTensors(machine, device)
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
         networks = self._networks
         output = networks(networks.inputs(history.u.permute(2, 0, 1), history.q.permute(2, 0, 1)))
-        return (history.q[:, -1] + networks.increment(output).T).clamp(self._lower, self._upper)
+        return self._plant.hold(history.q[:, -1] + networks.increment(output).T)
 
 
 def load_networks(name: str, kind: str, machine: Machine) -> JointNetworks:

@@ -256,14 +256,8 @@ def select_commands_in_force(
         The earlier command, the later command, and the part of the period in which the earlier one
         acts, each `(N, J)`.
     """
-    last = u.shape[1] - 1
-    # half a millionth of a period forgives 0.55 / 0.05 = 11.000000000000002
-    whole = torch.floor(delay_periods + 5e-7)
-    part = (delay_periods - whole).clamp(0.0, 1.0)
-    newest = last - whole.to(torch.int64)
-    later = u.gather(1, newest.clamp(0, last)[:, None]).squeeze(1)
-    earlier = u.gather(1, (newest - 1).clamp(0, last)[:, None]).squeeze(1)
-    return earlier, later, part
+    earlier, later, part = split_run_commands(u.transpose(0, 1), delay_periods, u.shape[1])
+    return earlier[0], later[0], part
 
 
 def split_run_commands(
@@ -276,7 +270,8 @@ def split_run_commands(
         delay_periods: Dead time in control periods, `(N, J)`.
         first: Length of the history at the first step.
     """
-    whole = torch.floor(delay_periods + 5e-7)  # see `select_commands_in_force`
+    # half a millionth of a period forgives 0.55 / 0.05 = 11.000000000000002
+    whole = torch.floor(delay_periods + 5e-7)
     part = (delay_periods - whole).clamp(0.0, 1.0)
     steps = torch.arange(first - 2, len(u), device=u.device)[:, None, None]
     found = u.gather(0, (steps - whole.to(torch.int64)).clamp(0, len(u) - 1))

@@ -17,20 +17,15 @@ Once a control period, joint by joint:
 With `response_s`, play and sag of 0 the joint is at its target after one period: the ideal servo.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
 import torch
 
-from actuators.models.parameters import (
-    PerJoint,
-    SpreadParameters,
-    check_interface,
-    read_parameters,
-    select_commands_in_force,
-    split_run_commands,
-)
-from brokk_rl.history import History
+from actuators.models.joint_model import CommandParts, JointMemory, PlannableModel
+from actuators.models.parameters import PerJoint, check_interface, read_parameters
 from brokk_rl.machine import Machine
 from brokk_rl.spec import spec
 
@@ -93,7 +88,7 @@ class Servo:
     limit_rad: PerJoint | None = None
     firmware_damping: PerJoint = 0.5
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ServoModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ServoModel:
         """Return a model for `num_envs` environments on `device`.
 
         Raises:
@@ -102,15 +97,16 @@ class Servo:
         return ServoModel(self, machine, num_envs, device)
 
 
-class ServoModel:
+class ServoModel(PlannableModel):
     """Exact solution of the loop over each part of a period with one command.
 
     Attributes:
         parameters: Numbers by name, `(N, J)`, those of `LIMIT_NUMBERS` only where there is a limit.
-            Write in place or replace an entry to simulate `N` candidates side by side.
         drive_changes: Changes by effects, `(N, J)` by name: `shortage`, the error of 5 % of the travel
             over another limit, 0 for none, and its `firmware_damping`. The lower limit counts.
     """
+
+    STATES = ("held", "speed")
 
     def __init__(
         self, config: Servo, machine: Machine, num_envs: int, device: torch.device
@@ -123,136 +119,80 @@ class ServoModel:
             positive=("damping", "top_speed", "limit_rad"),
             not_negative=("response_s", "play_rad", "firmware_damping"),
         )
-        self._parameters = SpreadParameters(
-            nominal, config.spread, num_envs, device, "actuator.spread"
-        )
-        self.parameters = self._parameters.value
+        super().__init__(config, nominal, machine, num_envs, device)
         self.drive_changes: dict[str, torch.Tensor] = {}
-        self._period_s = machine.period_s
-
-        def tensor(values: object) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=torch.float32, device=device)
-
-        self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
-        self._middle = (self._lower + self._upper) / 2
-        self._half = (self._upper - self._lower) / 2
-        self._max_speed = tensor(machine.max_speed)
-        shape = (num_envs, machine.num_joints)
-        self._state = {name: torch.zeros(shape, device=device) for name in ("held", "speed")}
-        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
         self.reset(self._fresh.clone())
 
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """`held` target (rad or m), `speed`, each `(N, J)`; `fresh`, and the drawn parameters."""
-        return {**self._state, "fresh": self._fresh, **self._parameters.state}
+    def ask(self, commands: torch.Tensor) -> torch.Tensor:
+        """Return the targets of commands, rad or m."""
+        return self.plant.middle + self.plant.half_travel * commands
 
-    def reset(self, mask: torch.Tensor) -> None:
-        """Let the environments of `mask`, `(N,)` bool, start from their history; redraw."""
-        for value in self._state.values():
-            value.masked_fill_(mask[:, None], 0.0)
-        self._fresh.logical_or_(mask)
-        self._parameters.redraw(mask)
+    def solve(self, drive: CommandParts) -> tuple[PartSolution, PartSolution]:
+        """Return the motion over the two parts of a period."""
+        value, limit = self.parameters, self.read_limit()
+        found = []
+        for share in (drive.part, 1.0 - drive.part):
+            loop = value["response_s"], value["damping"], share * self.plant.period_s
+            limited = None if limit is None else LimitedSolution.build(*loop, limit)
+            found.append(PartSolution(LoopSolution.build(*loop), limited))
+        first, second = found
+        return first, second
 
-    def step(self, history: History) -> torch.Tensor:
-        """Return the joint positions one control period later, shape `(N, J)`."""
-        earlier, later, part = select_commands_in_force(
-            history.u, self.parameters["dead_time_s"] / self._period_s
-        )
-        earlier, later = self.read_target(earlier), self.read_target(later)
-        q, fresh = history.q[:, -1], self._fresh[:, None]
-        speed = (q - history.q[:, -2]) / self._period_s
-        held = torch.where(fresh, self.begin_held(earlier, q), self._state["held"])
-        speed = torch.where(fresh, speed, self._state["speed"])
-        first = self.hold(held, earlier)
-        second = self.hold(first, later)
-        moved, speed = self.move(q, speed, first, second, self.solve(part, self.read_limit()))
-        self._state["held"].copy_(second)
-        self._state["speed"].copy_(speed)
-        self._fresh.fill_(False)
-        return moved
+    def begin(self, drive: CommandParts, q: torch.Tensor, before: torch.Tensor) -> JointMemory:
+        """Return speed and held target of joints at `q`, as near to it as the play allows."""
+        bent = q + self._sag(q)
+        speed = (q - before) / self.plant.period_s
+        return {"held": self.hold(bent, drive.earlier[0]), "speed": speed}
 
-    @property
-    def delay_s(self) -> torch.Tensor:
-        """Dead time, `(N, J)`."""
-        return self.parameters["dead_time_s"]
-
-    def plan_run(self, u: torch.Tensor, first: int, q: torch.Tensor | None = None) -> "ServoRun":
-        """See `actuators.contracts.PlannedModel`."""
-        return ServoRun(self, u, first)
-
-    @property
-    def period_s(self) -> float:
-        """Control period, s."""
-        return self._period_s
-
-    def read_target(self, u: torch.Tensor) -> torch.Tensor:
-        """Return the targets of commands `(…, J)`, rad or m."""
-        return self._middle + self._half * u
-
-    def begin_held(self, target: torch.Tensor, q: torch.Tensor) -> torch.Tensor:
-        """Return the held target of a joint that is at `q`, as near to it as the play allows, `(N, J)`."""
-        value = self.parameters
-        return self.hold(q + value["sag_rad"] + value["sag_slope"] * (q - self._middle), target)
+    def advance(
+        self,
+        k: int,
+        q: torch.Tensor,
+        drive: CommandParts,
+        solution: tuple[PartSolution, PartSolution],
+        memory: JointMemory,
+    ) -> tuple[torch.Tensor, JointMemory]:
+        """Return positions, speeds and held targets after step `k`."""
+        begin, held, speed = q, memory["held"], memory["speed"]
+        for target, part in zip((drive.earlier[k], drive.later[k]), solution, strict=True):
+            held = self.hold(held, target)
+            reached = held - self._sag(held)
+            error, free_speed = part.loop.advance(q - reached, speed)
+            free = error + reached, free_speed
+            if part.limited is not None:
+                free = part.limited.advance(q, speed, held, reached, self._sag(q), free)
+            q, speed = free
+        most = self.parameters["top_speed"] * self.plant.max_speed
+        way = most * self.plant.period_s
+        limited = q.clamp(begin - way, begin + way)
+        speed = speed.clamp(-most, most)
+        stopped = self.plant.hold_from(begin, limited)
+        return stopped, {"held": held, "speed": speed.masked_fill(stopped != limited, 0.0)}
 
     def hold(self, held: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
         """Return the target behind the play, `(N, J)`."""
         half = 0.5 * self.parameters["play_rad"]
-        return torch.minimum(torch.maximum(held, target - half), target + half)
+        return held.clamp(target - half, target + half)
 
-    def read_limit(self) -> "PullLimit | None":
+    def _sag(self, at: torch.Tensor) -> torch.Tensor:
+        """Return how far joints stay below targets `at`, `(N, J)`, rad or m."""
+        value = self.parameters
+        return value["sag_rad"] + value["sag_slope"] * (at - self.plant.middle)
+
+    def read_limit(self) -> PullLimit | None:
         """Return the limit of the torque; `None` where there can be none."""
         own, changes = self.parameters, self.drive_changes
         if "shortage" not in changes:
             if "limit_rad" not in own:
                 return None
             return PullLimit(own["limit_rad"], own["firmware_damping"])
-        full = 2.0 * FULL_TORQUE_TRAVEL * self._half
+        full = 2.0 * FULL_TORQUE_TRAVEL * self.plant.half_travel
         limit_rad = full / torch.maximum(changes["shortage"], full / NO_LIMIT_RAD)
         inside = changes["firmware_damping"]
         if "limit_rad" not in own:
             return PullLimit(limit_rad, inside)
         inside = torch.where(own["limit_rad"] < limit_rad, own["firmware_damping"], inside)
         return PullLimit(torch.minimum(own["limit_rad"], limit_rad), inside)
-
-    def solve(
-        self, part: torch.Tensor, limit: "PullLimit | None"
-    ) -> "tuple[PartSolution, PartSolution]":
-        """Return the motion over the two parts of a period; `limit`: see `read_limit`."""
-        value = self.parameters
-        found = []
-        for share in (part, 1.0 - part):
-            loop = value["response_s"], value["damping"], share * self._period_s
-            limited = None if limit is None else LimitedSolution.build(*loop, limit)
-            found.append(PartSolution(LoopSolution.build(*loop), limited))
-        first, second = found
-        return first, second
-
-    def move(
-        self,
-        q: torch.Tensor,
-        speed: torch.Tensor,
-        first: torch.Tensor,
-        second: torch.Tensor,
-        solutions: "tuple[PartSolution, PartSolution]",
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return positions and speeds after a period with two held targets, each `(N, J)`."""
-        value, begin = self.parameters, q
-        for held, solution in zip((first, second), solutions, strict=True):
-            reached = held - value["sag_rad"] - value["sag_slope"] * (held - self._middle)
-            error, free_speed = solution.loop.advance(q - reached, speed)
-            free = error + reached, free_speed
-            if solution.limited is not None:
-                weight = value["sag_rad"] + value["sag_slope"] * (q - self._middle)
-                free = solution.limited.advance(q, speed, held, reached, weight, free)
-            q, speed = free
-        most = value["top_speed"] * self._max_speed
-        way = most * self._period_s
-        limited = torch.minimum(torch.maximum(q, begin - way), begin + way)
-        speed = torch.minimum(torch.maximum(speed, -most), most)
-        low, high = torch.minimum(self._lower, begin), torch.maximum(self._upper, begin)
-        held = torch.minimum(torch.maximum(limited, low), high)
-        return held, speed.masked_fill(held != limited, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,7 +214,7 @@ class LoopSolution:
     @classmethod
     def build(
         cls, response_s: torch.Tensor, damping: torch.Tensor, time_s: torch.Tensor
-    ) -> "LoopSolution":
+    ) -> LoopSolution:
         """Return the map over `time_s`, `(N, J)`."""
         w = 1.0 / response_s.clamp(min=SHORTEST_RESPONSE_S)
         bend = damping.square() - 1.0
@@ -330,7 +270,7 @@ class LimitedSolution:
     @classmethod
     def build(
         cls, response_s: torch.Tensor, damping: torch.Tensor, time_s: torch.Tensor, limit: PullLimit
-    ) -> "LimitedSolution":
+    ) -> LimitedSolution:
         """Return the motion over `time_s`, `(N, J)`, with a limit."""
         step_s, response_s = time_s / SUBSTEPS, response_s.clamp(min=SHORTEST_RESPONSE_S)
         outside = damping * (1.0 - limit.inside).clamp(min=LEAST_OUTSIDE)
@@ -399,34 +339,3 @@ class PartSolution:
 
     loop: LoopSolution
     limited: LimitedSolution | None
-
-
-class ServoRun:
-    """A run of a `ServoModel`; see `actuators.contracts.PlannedRun`.
-
-    Targets behind the play depend on commands alone: they are computed beforehand.
-    """
-
-    def __init__(self, model: ServoModel, u: torch.Tensor, first: int) -> None:
-        self._model, self._first = model, first
-        earlier, later, part = split_run_commands(
-            u, model.parameters["dead_time_s"] / model.period_s, first
-        )
-        self._earlier, self._later = model.read_target(earlier), model.read_target(later)
-        limit = model.read_limit()
-        if limit is not None and not bool((limit.limit_rad < NO_LIMIT_RAD).any()):
-            limit = None
-        self._solutions = model.solve(part, limit)
-        self._held: torch.Tensor | None = None
-        self._speed: torch.Tensor | None = None
-
-    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
-        """Return positions `k`, `(N, J)`."""
-        model, place = self._model, k - self._first
-        if self._speed is None or self._held is None:
-            self._speed = (q[k - 1] - q[k - 2]) / model.period_s
-            self._held = model.begin_held(self._earlier[place], q[k - 1])
-        first = model.hold(self._held, self._earlier[place])
-        self._held = model.hold(first, self._later[place])
-        moved, self._speed = model.move(q[k - 1], self._speed, first, self._held, self._solutions)
-        return moved

@@ -15,16 +15,18 @@ The curve takes in dead bands, gain, asymmetry, notches and saturation; load and
 cylinder are in the pose.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
+from actuators.models.joint_model import JointMemory, PlannableModel
 from actuators.models.joint_weight import build_joint_weight
 from actuators.models.parameters import (
     PerJoint,
-    SpreadParameters,
     check_interface,
     read_parameters,
     select_commands_in_force,
@@ -93,7 +95,7 @@ class ValveActuator:
                 f"actuator.knots: expected strokes that rise from 0 to 1, got {list(self.knots)}"
             )
 
-    def build(self, machine: Machine, num_envs: int, device: torch.device) -> "ValveModel":
+    def build(self, machine: Machine, num_envs: int, device: torch.device) -> ValveModel:
         """Return a model for `num_envs` environments on `device`.
 
         Raises:
@@ -210,30 +212,24 @@ class PoseFactor:
         return factor.clamp(min=0.0)
 
 
-class ValveModel:
+class ValveModel(PlannableModel):
     """The grey box at work in `N` environments; see the module for its equations.
 
-    Attributes:
-        parameters: Numbers by name, `(N, J)`; write in place to simulate `N` candidates side by
-            side.
+    `pilot` and `spool` are of full stroke, `step` is the motion in a period.
     """
+
+    STATES = ("pilot", "spool", "step")
 
     def __init__(
         self, config: ValveActuator, machine: Machine, num_envs: int, device: torch.device
     ) -> None:
         check_interface(machine, "speed", "a valve sets speeds")
         nominal = read_parameters(config, NUMBERS, machine, not_negative=NUMBERS)
-        self._parameters = SpreadParameters(
-            nominal, config.spread, num_envs, device, "actuator.spread"
-        )
-        self.parameters = self._parameters.value
-        self._period_s = machine.period_s
+        super().__init__(config, nominal, machine, num_envs, device)
 
         def tensor(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=device)
 
-        self._full_step = tensor(machine.max_speed * machine.period_s)
-        self._lower, self._upper = tensor(machine.lower), tensor(machine.upper)
         curves = [
             _expand_rows(value, machine, len(config.knots), f"actuator.{name}")
             for name, value in _list_curves(config)
@@ -249,107 +245,80 @@ class ValveModel:
                 rows = getattr(config, name) or {}
                 sides.append(_expand_rows(rows, machine, pose.size, f"actuator.{name}"))
             self._pose = PoseFactor(pose, tensor(np.stack(sides)))
-        shape = (num_envs, machine.num_joints)
-        self._state = {
-            name: torch.zeros(shape, device=device) for name in ("pilot", "spool", "step")
-        }
-        self._fresh = torch.ones(num_envs, dtype=torch.bool, device=device)
-
-    @property
-    def state(self) -> dict[str, torch.Tensor]:
-        """`pilot`, `spool` (of full stroke), `step` (motion in a period), each `(N, J)`; draws."""
-        return {**self._state, "fresh": self._fresh, **self._parameters.state}
-
-    def reset(self, mask: torch.Tensor) -> None:
-        """Let the environments of `mask`, `(N,)` bool, start from their history."""
-        for value in self._state.values():
-            value.masked_fill_(mask[:, None], 0.0)
-        self._fresh.logical_or_(mask)
-        self._parameters.redraw(mask)
 
     def step(self, history: History) -> torch.Tensor:
         """Return the joint positions one control period later, shape `(N, J)`."""
-        value, state, dt = self.parameters, self._state, self._period_s
-        earlier, later, part = select_commands_in_force(history.u, value["dead_time_s"] / dt)
-        q, fresh = history.q[:, -1], self._fresh[:, None]
-        u = torch.lerp(later, earlier, part)
-        play = 0.5 * value["play"]
-        pilot = torch.where(fresh, earlier, state["pilot"])
-        pilot = torch.minimum(torch.maximum(pilot, u - play), u + play)
-        spool = torch.lerp(
-            pilot, torch.where(fresh, earlier, state["spool"]), _compute_decay(dt, value["spool_s"])
+        q = history.q[:, -1]
+        earlier, later, part = select_commands_in_force(
+            history.u, self.delay_s / self.plant.period_s
         )
-        before = torch.where(fresh, q - history.q[:, -2], state["step"])
-        kept = _compute_decay(dt, value["speed_s"])
-        held, step = self.move(q, self._want(spool), spool > 0, before, kept)
-        for name, now in (("pilot", pilot), ("spool", spool), ("step", step)):
-            state[name].copy_(now)
-        self._fresh.fill_(False)
+        begun = {"pilot": earlier, "spool": earlier, "step": q - history.q[:, -2]}
+        memory = self.recall(begun)
+        commands = torch.lerp(later, earlier, part)[None]
+        pilot, spool = self._follow(commands, memory["pilot"], memory["spool"])
+        drive = ValveDrive(self._want(spool), spool > 0)
+        held, after = self.advance(0, q, drive, self.solve(drive), memory)
+        self.keep(after | {"pilot": pilot, "spool": spool[-1]})
         return held
 
-    @property
-    def delay_s(self) -> torch.Tensor:
-        """Dead time, `(N, J)`."""
-        return self.parameters["dead_time_s"]
-
-    def plan_run(
-        self,
-        u: torch.Tensor,
-        first: int,
-        q: torch.Tensor | None = None,
-        drive: "ValveDrive | None" = None,
-    ) -> "ValveRun":
-        """See `actuators.contracts.PlannedModel`; `drive`: that of the commands, if known."""
-        kept = _compute_decay(self._period_s, self.parameters["speed_s"])
-        return ValveRun(self, self.drive(u, first) if drive is None else drive, kept, first)
-
-    def drive(self, u: torch.Tensor, first: int) -> "ValveDrive":
+    def drive(self, u: torch.Tensor, first: int) -> ValveDrive:
         """Return the demand of the commands of a run `(T, N, J)`, whatever the positions are."""
-        value = self.parameters
-        earlier, later, part = split_run_commands(u, value["dead_time_s"] / self._period_s, first)
-        commands, before = torch.lerp(later, earlier, part), earlier[0]
-        play, kept = 0.5 * value["play"], _compute_decay(self._period_s, value["spool_s"])
-        low, high = commands - play, commands + play
-        spool, pilot, now = torch.empty_like(commands), before, before
-        for k in range(len(commands)):
-            pilot = pilot.clamp(low[k], high[k])
-            now = torch.lerp(pilot, now, kept, out=spool[k])
+        delay_periods = self.delay_s / self.plant.period_s
+        earlier, later, part = split_run_commands(u, delay_periods, first)
+        _, spool = self._follow(torch.lerp(later, earlier, part), earlier[0], earlier[0])
         wanted = torch.empty_like(spool)
-        for part in range(0, len(spool), STEPS_AT_ONCE):
-            rows = slice(part, part + STEPS_AT_ONCE)
+        for k in range(0, len(spool), STEPS_AT_ONCE):
+            rows = slice(k, k + STEPS_AT_ONCE)
             wanted[rows] = self._want(spool[rows])
         return ValveDrive(wanted, spool > 0)
 
-    def move(
-        self,
-        q: torch.Tensor,
-        wanted: torch.Tensor,
-        extends: torch.Tensor,
-        before: torch.Tensor,
-        kept: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the next positions, and the motion that the next period begins with, each `(N, J)`.
+    def solve(self, drive: ValveDrive) -> torch.Tensor:
+        """Return the part of the speed that is left after a period."""
+        return self._compute_decay("speed_s")
 
-        Args:
-            q: Positions.
-            wanted: Motion in a period that the valve asks for in the mean pose.
-            extends: Whether it opens to the positive side.
-            before: Motion in the period before.
-            kept: Part of it that is left after a period.
-        """
+    def begin(self, drive: ValveDrive, q: torch.Tensor, before: torch.Tensor) -> JointMemory:
+        """Return the motion that the history shows."""
+        return {"step": q - before}
+
+    def advance(
+        self,
+        k: int,
+        q: torch.Tensor,
+        drive: ValveDrive,
+        solution: torch.Tensor,
+        memory: JointMemory,
+    ) -> tuple[torch.Tensor, JointMemory]:
+        """Return positions after step `k`, and the motion that the next one begins with."""
+        wanted = drive.wanted[k]
         if self._pose:
-            wanted = wanted * self._pose.at(q, extends)
-        step = torch.lerp(wanted, before, kept)
+            wanted = wanted * self._pose.at(q, drive.extends[k])
+        step = torch.lerp(wanted, memory["step"], solution)
         moved = q + step
-        held = moved.clamp(torch.minimum(self._lower, q), torch.maximum(self._upper, q))
-        return held, step.masked_fill(held != moved, 0.0)
+        held = self.plant.hold_from(q, moved)
+        return held, {"step": step.masked_fill(held != moved, 0.0)}
+
+    def _follow(
+        self, commands: torch.Tensor, pilot: torch.Tensor, spool: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the last pilot, and the strokes of the spools after commands `(K, N, J)`."""
+        play, kept = 0.5 * self.parameters["play"], self._compute_decay("spool_s")
+        low, high = commands - play, commands + play
+        found = torch.empty_like(commands)
+        for k in range(len(commands)):
+            pilot = pilot.clamp(low[k], high[k])
+            spool = torch.lerp(pilot, spool, kept, out=found[k])
+        return pilot, found
+
+    def _compute_decay(self, name: str) -> torch.Tensor:
+        """Return the part of a first-order lag's state that is left after a period."""
+        return torch.exp(-self.plant.period_s / self.parameters[name].clamp(min=1e-6))
 
     def _want(self, spool: torch.Tensor) -> torch.Tensor:
         """Return the motion in a period that spools `(…, N, J)` ask for in the mean pose."""
         flow = self._flow(spool)
         full = torch.where(spool > 0, self._full_extend, self._full_retract)
         asked = (self.parameters["demand"] * (flow / full).abs()).sum(-1, keepdim=True)
-        return flow * self._full_step / asked.clamp(min=1.0)
+        return flow * self.plant.full_step / asked.clamp(min=1.0)
 
     def _flow(self, spool: torch.Tensor) -> torch.Tensor:
         place = (spool.clamp(-1.0, 1.0) + 1.0) * (CELLS / 2)
@@ -370,27 +339,9 @@ class ValveDrive:
     wanted: torch.Tensor
     extends: torch.Tensor
 
-    def repeat(self, count: int) -> "ValveDrive":
+    def repeat(self, count: int) -> ValveDrive:
         """Return that of all environments, `count` times one after the other."""
         return ValveDrive(self.wanted.repeat(1, count, 1), self.extends.repeat(1, count, 1))
-
-
-class ValveRun:
-    """A run of a `ValveModel`; see `actuators.contracts.PlannedRun`."""
-
-    def __init__(
-        self, model: ValveModel, drive: ValveDrive, kept: torch.Tensor, first: int
-    ) -> None:
-        self._model, self._drive, self._kept, self._first = model, drive, kept, first
-        self._before: torch.Tensor | None = None
-
-    def step(self, k: int, q: torch.Tensor) -> torch.Tensor:
-        """Return positions `k`, `(N, J)`."""
-        place = k - self._first
-        before = q[k - 1] - q[k - 2] if self._before is None else self._before
-        wanted, extends = self._drive.wanted[place], self._drive.extends[place]
-        held, self._before = self._model.move(q[k - 1], wanted, extends, before, self._kept)
-        return held
 
 
 def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) -> np.ndarray:
@@ -402,11 +353,6 @@ def tabulate_curves(knots: np.ndarray, extend: np.ndarray, retract: np.ndarray) 
             np.concatenate([-np.interp(half[:0:-1], knots, back), np.interp(half, knots, out)])
         )
     return np.stack(rows)
-
-
-def _compute_decay(period_s: float, time_constant_s: torch.Tensor) -> torch.Tensor:
-    """Return the part of a first-order lag's state that is left after a period."""
-    return torch.exp(-period_s / time_constant_s.clamp(min=1e-6))
 
 
 def _list_curves(config: ValveActuator) -> tuple[tuple[str, object], tuple[str, object]]:

@@ -114,7 +114,7 @@ class Identify:
         result |= {"device": str(device), "seed": self.session.seed, "folds": self.identify.folds}
         folder = self.session.folder
         write_json(folder / "identification.json", result)
-        page.write_page(folder, result, findings, drawings, self.machine)
+        page.write_page(folder, result, drawings, self.machine)
         _print_results(result, findings, folder)
         return result["overall"][self.fit.name][f"{horizons_s[-1]:g}"]["percent"]
 

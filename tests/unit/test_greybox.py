@@ -18,8 +18,9 @@ from actuators import open_loop
 from actuators.identify import greybox
 from actuators.identify.gauss_newton import CandidateRuns, estimate_uncertainty
 from actuators.identify.greybox import GreyBoxFit
+from actuators.models.checkpoint import ResumeFile
 from actuators.models.lag import FirstOrderLag
-from brokk_rl.errors import ConfigError, RecordingError
+from brokk_rl.errors import CheckpointError, ConfigError, RecordingError
 from brokk_rl.history import History
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
@@ -181,11 +182,16 @@ def test_an_interrupted_fit_goes_on_exactly(
 
 
 def test_what_was_left_by_other_settings_is_not_gone_on_from(
-    machine: Machine, runs: list[Recording], tmp_path: Path, caplog: pytest.LogCaptureFixture
+    machine: Machine, runs: list[Recording], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "lag.progress.json").write_text('{"digest": "of another fit", "done": []}')
-    quick("lag", iterations=1, starts=1).fit(machine, runs[:4], runs[4:], tmp_path, 0, CPU)
-    assert "other settings or recordings" in caplog.text
+    def interrupt(*given: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ResumeFile, "remove", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        quick("lag", iterations=1, starts=1).fit(machine, runs[:4], runs[4:], tmp_path, 0, CPU)
+    with pytest.raises(CheckpointError, match=r"fit\.iterations \(was 1, is 2\)"):
+        quick("lag", iterations=2, starts=1).fit(machine, runs[:4], runs[4:], tmp_path, 0, CPU)
 
 
 def test_what_the_recordings_do_not_show_is_said(
