@@ -7,9 +7,7 @@ behaviour. A value that the caller typed and that contradicts the policy is refu
 
 from __future__ import annotations
 
-import copy
 import logging
-import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -55,11 +53,11 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     folder, or from a checkpoint, takes up the overrides of its run.
 
     Raises:
-        ConfigError: A key has another name now; the message ends with the command that works.
+        ConfigError: A key has another name now.
     """
     words = [word for word in arguments if "=" in word and not word.startswith("-")]
     given = {one.key_or_group: one for one in OverridesParser.create().parse_overrides(words)}
-    _refuse_old_keys(arguments, given)
+    _refuse_old_keys(given)
     prepared = list(arguments)
     is_whole = any(word.startswith(WHOLE) for word in arguments)
     for override in given.values():
@@ -109,32 +107,16 @@ def is_going_on(cfg: DictConfig, folder: Path) -> bool:
     return path is not None and _find_run(path).resolve() == folder.resolve()
 
 
-def apply_behaviour(node: Mapping[str, Any], behaviour: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the node of a task with the values of a behaviour, given by dotted names."""
-    changed = copy.deepcopy(dict(node))
-    for path, value in behaviour.items():
-        *parents, last = path.split(".")
-        place = changed
-        for part in parents:
-            place = place.setdefault(part, {})
-        place[last] = value
-    return changed
-
-
-def _refuse_old_keys(arguments: Sequence[str], given: Mapping[str, Override]) -> None:
+def _refuse_old_keys(given: Mapping[str, Override]) -> None:
     is_training = _read_value(given, "mode") == "train" or not {"mode", "experiment"} & {*given}
     for key in OLD_KEYS:
-        if key not in given or (key == "resume" and not is_training):
-            continue
-        line, value = str(given[key].input_line), _read_value(given, key)
-        works = [word for word in arguments if word != line]
-        works.append(f"policy={value}")
-        if key == "resume" and "session.out" not in given:
-            works.append(f"session.out={value}")
-        raise ConfigError(
-            f"{line}: '{key}' is now 'policy', in every mode. This works: "
-            f"{shlex.join(['brokk', *works])}"
-        )
+        if key in given and (key != "resume" or is_training):
+            value = _read_value(given, key)
+            out = f" session.out={value}" if key == "resume" and "session.out" not in given else ""
+            raise ConfigError(
+                f"{given[key].input_line}: '{key}' is now 'policy', in every mode: give "
+                f"policy={value}{out}"
+            )
 
 
 def _read_value(given: Mapping[str, Override], key: str) -> str | None:
@@ -272,7 +254,7 @@ def _insert_behaviour(
     those of an earlier version, which are no honest opponent.
     """
     before: Any = OmegaConf.to_container(cfg.task, resolve=True)
-    after = apply_behaviour(before, own.behaviour)
+    after = own.apply_to(before)
     changes = dict(list_differences(drop_targets(before), drop_targets(after), "task"))
     refused = []
     for key, (here, there) in changes.items():
@@ -299,7 +281,7 @@ def _insert_task(cfg: DictConfig, node: DictConfig) -> None:
     before: Any = OmegaConf.to_container(cfg.task, resolve=True)
     if own is None or node.task is not None or name_target(before[TARGET]) != own.name:
         return
-    after = apply_behaviour(before, own.behaviour)
+    after = own.apply_to(before)
     if drop_targets(after) != drop_targets(before):
         node.task = after
 

@@ -14,6 +14,7 @@ caller's.
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 from collections.abc import Collection, Iterator, Mapping
@@ -92,6 +93,17 @@ class TaskDescription:
                 "again (mode=export)"
             )
         return found
+
+    def apply_to(self, node: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the node of a task with the values of this behaviour."""
+        changed = copy.deepcopy(dict(node))
+        for path, value in self.behaviour.items():
+            *parents, last = path.split(".")
+            place = changed
+            for part in parents:
+                place = place.setdefault(part, {})
+            place[last] = value
+        return changed
 
     def require_same(self, other: TaskDescription, who: str, advice: str) -> None:
         """Refuse a task `other` that is not the one of the policy or checkpoint `who`.

@@ -8,7 +8,6 @@ import pytest
 
 from brokk_rl import extensions, registry
 from brokk_rl.build import build_node
-from brokk_rl.policy_choice import apply_behaviour
 from brokk_rl.policy_folder import describe_spec, find_policy
 
 extensions.register_options([])  # the exam's options are those of an extension
@@ -23,7 +22,7 @@ def own_task(task: Any, policy: object) -> Any:
     """Returns a task's spec with the behaviour of the policy at a path."""
     own = find_policy(str(policy)).task
     assert own is not None
-    return build_node(apply_behaviour(describe_spec(task), own.behaviour), "task")
+    return build_node(own.apply_to(describe_spec(task)), "task")
 
 
 def names(group: str) -> list[str]:

@@ -19,7 +19,6 @@ import torch
 from brokk_rl import extensions
 from brokk_rl.build import build_node
 from brokk_rl.observation import measure_ranges, restore_encoder
-from brokk_rl.policy_choice import apply_behaviour
 from brokk_rl.policy_folder import describe_spec, find_policy
 from brokk_rl.rl.loop import ControlLoopConfig
 from brokk_rl.rl.policy import TrainedPolicy
@@ -36,7 +35,7 @@ def measure(folder: Path) -> dict[str, object]:
     policy = TrainedPolicy(path=str(folder), task=None)
     follower = "person" if contract["task"]["behaviour"]["advice"] else "none"
     sim = replace(extensions.load_option("sim", "native"), num_worlds=NUM_ENVS, num_threads=2)
-    node = apply_behaviour(describe_spec(task), find_policy(str(folder)).task.behaviour)
+    node = find_policy(str(folder)).task.apply_to(describe_spec(task))
     config = ControlLoopConfig(
         machine=machine, sim=sim, task=build_node(node, "task"), actuator=extensions.load_option("actuator", "mlp"),
         effects={"library": extensions.load_option("effect", "library")}, follower=extensions.load_option("follower", follower),

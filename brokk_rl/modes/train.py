@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, ClassVar
 
+import pandas as pd
 import torch
 from scipy import stats
 
@@ -115,7 +116,8 @@ class Train(PlantMode):
             _log_success(logger)
             results = self._finish(config, runner)
             files = [path for name in TRACKED for path in sorted(folder.glob(name))]
-            logger.writer.report(flatten_figures(results["policies"], "evaluation"), files)
+            figures = pd.json_normalize(results["policies"], sep="/").select_dtypes("number")
+            logger.writer.report(figures.add_prefix("evaluation/").iloc[0].to_dict(), files)
         log.info("policy, curves and evaluation are in %s", folder)
         return float(results["success_strict"]["mean"])
 
@@ -231,17 +233,6 @@ class Train(PlantMode):
             name, text = type(self.task).__name__, "cannot be deployed, so there is no policy.onnx"
             log.warning("the task (%s) %s; %s", name, text, NOT_DEPLOYABLE)
         return results
-
-
-def flatten_figures(node: Mapping[str, Any], name: str) -> dict[str, float]:
-    """Return the numbers of nested tables by their path: `evaluation/trained/success_strict/mean`."""
-    found: dict[str, float] = {}
-    for key, value in node.items():
-        if isinstance(value, Mapping):
-            found |= flatten_figures(value, f"{name}/{key}")
-        elif isinstance(value, (int, float)):
-            found[f"{name}/{key}"] = float(value)
-    return found
 
 
 def _log_success(logger: TrainingLogger) -> None:

@@ -23,7 +23,6 @@ from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.observation import restore_encoder
-from brokk_rl.policy_choice import apply_behaviour
 from brokk_rl.policy_folder import describe_spec, describe_task
 from brokk_rl.rl.policy import ClassicalPolicy
 from brokk_rl.rl.settings import Evaluation
@@ -241,7 +240,7 @@ def test_its_description_gives_the_same_terms_back() -> None:
         observation={"error": term("tasks.terms:commands")},
         action=JointAction(scale=1.0, mask=False),
     )
-    node = apply_behaviour(describe_spec(other), describe_task(task).behaviour)
+    node = describe_task(task).apply_to(describe_spec(other))
     assert build_node(node, "task") == task
 
 

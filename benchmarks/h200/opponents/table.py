@@ -23,7 +23,6 @@ from hydra.utils import instantiate
 
 from brokk_rl.build import build_node
 from brokk_rl.contracts.task import Policy
-from brokk_rl.policy_choice import apply_behaviour
 from brokk_rl.policy_folder import describe_spec, find_policy
 from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
@@ -109,10 +108,7 @@ class PlantCases:
         self._cases: dict[str, Any] = {
             "trained": (
                 trained,
-                build_node(
-                    apply_behaviour(describe_spec(task), find_policy(trained.path).task.behaviour),
-                    "task",
-                ),
+                build_node(find_policy(trained.path).task.apply_to(describe_spec(task)), "task"),
             ),
             "classical": (ClassicalPolicy(task=None), task),
             "classical before": (

@@ -22,7 +22,6 @@ from matplotlib.figure import Figure
 from brokk_rl.build import build_node
 from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import Kinematics
-from brokk_rl.policy_choice import apply_behaviour
 from brokk_rl.policy_folder import describe_spec, find_policy
 from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
 from brokk_rl.rl.loop import ControlLoopConfig
@@ -89,10 +88,7 @@ def draw_trajectories(words: list[str], bundle: Path, picture: Path) -> None:
     config = ControlLoopConfig(
         machine=spec.machine,
         sim=spec.sim,
-        task=build_node(
-            apply_behaviour(describe_spec(spec.task), find_policy(trained.path).task.behaviour),
-            "task",
-        ),
+        task=build_node(find_policy(trained.path).task.apply_to(describe_spec(spec.task)), "task"),
         actuator=spec.actuator,
         effects=spec.effect,
         follower=spec.follower,
