@@ -13,7 +13,7 @@ from composed import option
 from kinematic import Kinematic
 
 from brokk_rl.machine import Machine
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import TrainingBudget, TrainingConfig
 
@@ -25,14 +25,15 @@ TIMES = ("seconds", "rate/env_steps_per_s", "rate/collect_s", "rate/learn_s")
 
 def plant(
     machine: Machine, task: Any = None, sim: Any = None, follower: Any = None
-) -> ControlLoopConfig:
+) -> SimulatedPlant:
     """Returns what a small control loop is made of."""
-    return ControlLoopConfig(
+    return SimulatedPlant(
         machine=machine,
         sim=sim or Kinematic(),
         task=task or option("task", "borehole_insertion"),
         actuator=option("actuator", "lag"),
-        effects={},
+        effect={},
+        event={},
         follower=follower or option("follower", "none"),
     )
 

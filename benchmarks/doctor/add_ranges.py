@@ -20,7 +20,7 @@ from brokk_rl import extensions
 from brokk_rl.build import build_node
 from brokk_rl.observation import measure_ranges, restore_encoder
 from brokk_rl.policy_folder import describe_spec, find_policy
-from brokk_rl.rl.loop import ControlLoopConfig
+from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import TrainedPolicy
 
 NUM_ENVS, NUM_MOMENTS, APART = 256, 8, 40
@@ -36,9 +36,10 @@ def measure(folder: Path) -> dict[str, object]:
     follower = "person" if contract["task"]["behaviour"]["advice"] else "none"
     sim = replace(extensions.load_option("sim", "native"), num_worlds=NUM_ENVS, num_threads=2)
     node = find_policy(str(folder)).task.apply_to(describe_spec(task))
-    config = ControlLoopConfig(
+    config = SimulatedPlant(
         machine=machine, sim=sim, task=build_node(node, "task"), actuator=extensions.load_option("actuator", "mlp"),
-        effects={"library": extensions.load_option("effect", "library")}, follower=extensions.load_option("follower", follower),
+        effect={"library": extensions.load_option("effect", "library")}, event={},
+        follower=extensions.load_option("follower", follower),
     )  # fmt: skip
     torch.manual_seed(0)
     loop = config.build(cpu, NUM_ENVS, 4 * NUM_ENVS, 0)

@@ -40,7 +40,7 @@ from brokk_rl.policy_folder import describe_policy, write_policy
 from brokk_rl.rl.evaluation import evaluate_policy
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import PROGRESS
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, NetworkPolicy
 from brokk_rl.rl.runner import TrainingRunner
 
@@ -193,14 +193,14 @@ def evaluate(spec: Train, actor: Any, options: argparse.Namespace) -> dict[str, 
 
 def build(spec: Train, num_envs: int | None, pool: int, seed: int, folder: Path) -> ControlLoop:
     """Return the control loop of a training, with starts that are drawn once for all of a task."""
-    config = ControlLoopConfig(
+    config = SimulatedPlant(
         machine=spec.machine,
         sim=spec.sim,
         task=spec.task,
         actuator=spec.actuator,
-        effects=spec.effect,
+        effect=spec.effect,
         follower=spec.follower,
-        events=spec.event,
+        event=spec.event,
     )
     starts = draw_starts(spec, pool, seed, folder)
     device = spec.session.torch_device()

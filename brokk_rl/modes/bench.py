@@ -12,10 +12,9 @@ from typing import Any, ClassVar
 import torch
 
 from brokk_rl.console_table import print_table
-from brokk_rl.modes.evaluate import PlantMode
 from brokk_rl.rl.execution import capture_graph
 from brokk_rl.rl.group import TrainingGroup
-from brokk_rl.rl.loop import ControlLoop
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
 from brokk_rl.rl.runner import TrainingRunner
 from brokk_rl.rl.settings import BenchmarkSizes, TrainingConfig
 from brokk_rl.session import Session, read_versions, write_json
@@ -36,7 +35,7 @@ contacts, the control step, training."""
 
 
 @spec
-class Benchmark(PlantMode):
+class Benchmark(SimulatedPlant):
     """Measures rates of physics, control step and training.
 
     Attributes:
@@ -66,13 +65,12 @@ class Benchmark(PlantMode):
             The training rate of the last row, that of all processes together.
         """
         device = self.session.torch_device()
-        plant = self.compose_loop()
         rows = []
         with TrainingGroup(device) as group:
             for num_envs in self.bench.num_envs:
                 self.session.seed_all()
                 starts = self.session.stream("starts")
-                loop = plant.build(device, num_envs, self.rl.num_starts, starts)
+                loop = self.build(device, num_envs, self.rl.num_starts, starts)
                 rows.append(_sum_over_ranks(group.gather(self._measure(loop, device, group))))
                 rates = [f"{name} {rows[-1][name]:,.0f}" for name in RATES if name in rows[-1]]
                 log.info("%d environments: %s", num_envs, ", ".join(rates))

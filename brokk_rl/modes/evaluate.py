@@ -9,20 +9,16 @@ from typing import Any
 import torch
 
 from brokk_rl.console_table import print_table
-from brokk_rl.contracts.actuator import Actuator, Effect, Follower
 from brokk_rl.contracts.target import TargetSensorSpec
-from brokk_rl.contracts.task import SUCCESS, Figure, Task
-from brokk_rl.contracts.world import Simulator
+from brokk_rl.contracts.task import SUCCESS, Figure
 from brokk_rl.errors import ConfigError
-from brokk_rl.machine import Machine
 from brokk_rl.policy_folder import describe_task
 from brokk_rl.progress import ItemProgress
 from brokk_rl.rl.evaluation import PolicyEvaluation, evaluate_policy
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec
 from brokk_rl.rl.settings import Evaluation
 from brokk_rl.session import Session, write_json
-from brokk_rl.sim.events import Event
 from brokk_rl.sim.scene import find_site
 from brokk_rl.sim.video import render_video
 from brokk_rl.spec import name_spec, spec
@@ -31,43 +27,7 @@ log = logging.getLogger(__name__)
 
 
 @spec
-class PlantMode:
-    """Parts of the control loop that the modes of a simulated plant share.
-
-    Attributes:
-        machine: The machine.
-        sim: Physics.
-        task: The task.
-        actuator: How commands become motion.
-        effect: Effects around the actuator model, by name.
-        event: Changes of the simulated machine, by name.
-        follower: Who stands between policy and machine.
-    """
-
-    machine: Machine
-    sim: Simulator
-    task: Task
-    actuator: Actuator
-    effect: dict[str, Effect]
-    event: dict[str, Event]
-    follower: Follower
-
-    def compose_loop(self, target: TargetSensorSpec | None = None) -> ControlLoopConfig:
-        """Return the parts of the control loop, and a sensor of the target where there is one."""
-        return ControlLoopConfig(
-            machine=self.machine,
-            sim=self.sim,
-            task=self.task,
-            actuator=self.actuator,
-            effects=self.effect,
-            events=self.event,
-            follower=self.follower,
-            target=target,
-        )
-
-
-@spec
-class Evaluate(PlantMode):
+class Evaluate(SimulatedPlant):
     """Evaluates a policy and its rivals on the same starts.
 
     Attributes:
@@ -100,35 +60,36 @@ class Evaluate(PlantMode):
 
     def run(self) -> float:
         """Evaluate; return the strict success of the policy."""
-        config = self.compose_loop(self.target)
         policies = {name_spec(self.policy): self.policy} | self.rivals
-        results = evaluate_policies(config, self.evaluation, self.session, policies)
+        results = evaluate_policies(self, self.evaluation, self.session, policies, self.target)
         return float(results["success_strict"]["mean"])
 
 
 def evaluate_policies(
-    config: ControlLoopConfig,
+    plant: SimulatedPlant,
     evaluation: Evaluation,
     session: Session,
     policies: dict[str, PolicySpec],
+    target: TargetSensorSpec | None = None,
 ) -> dict[str, Any]:
     """Evaluate policies from the same starts with the same noise.
 
-    A policy that has a task of its own acts by it, the others by `config.task`. Writes
+    A policy that has a task of its own acts by it, the others by `plant.task`. Writes
     `evaluation.json` and `episode.mp4`.
 
     Args:
-        config: The control loop.
+        plant: Machine, physics, actuator and task.
         evaluation: How to evaluate.
         session: Where to write, and on which device.
         policies: By name; the first is the one in question and stands at the top of
             `evaluation.json`.
+        target: How the loops come to know their targets; `None`: the task draws errors.
 
     Returns:
         The content of `evaluation.json`.
     """
     device = session.torch_device()
-    tasks = {name: getattr(one, "task", None) or config.task for name, one in policies.items()}
+    tasks = {name: getattr(one, "task", None) or plant.task for name, one in policies.items()}
     descriptions = {name: describe_task(task) for name, task in tasks.items()}
     loops: dict[str, tuple[ControlLoop, dict[str, Any]]] = {}
     starts: Starts | None = None
@@ -139,8 +100,8 @@ def evaluate_policies(
         if key not in loops:
             # effects and followers draw from it, too
             torch.manual_seed(evaluation.seed)
-            num, own = evaluation.episodes, replace(config, task=tasks[name])
-            loop = own.build(device, num, num, evaluation.seed, starts)
+            num, own = evaluation.episodes, replace(plant, task=tasks[name])
+            loop = own.build(device, num, num, evaluation.seed, starts, target)
             loop.capture()
             loops[key] = loop, loop.state_dict()
         loop, fresh = loops[key]
@@ -164,8 +125,8 @@ def evaluate_policies(
     results = {
         **table[first],
         "seed": evaluation.seed,
-        "actuator": name_spec(config.actuator),
-        "follower": name_spec(config.follower),
+        "actuator": name_spec(plant.actuator),
+        "follower": name_spec(plant.follower),
         "policy": first,
         "task": descriptions[first].to_json(),
         "tasks": {name: descriptions[name].fingerprint() for name in evaluated},
@@ -177,8 +138,8 @@ def evaluate_policies(
     if evaluation.video:
         recorded = evaluated[first].episodes
         shown = next((episode for episode in recorded if episode.success), recorded[0])
-        site = find_site(getattr(config.task, "scene", None), config.sim)
-        path = render_video(config.machine, shown, session.folder / "episode.mp4", site)
+        site = find_site(getattr(plant.task, "scene", None), plant.sim)
+        path = render_video(plant.machine, shown, session.folder / "episode.mp4", site)
         if path:
             log.info("video of one episode: %s", path)
     return results

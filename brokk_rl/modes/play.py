@@ -11,12 +11,12 @@ import torch
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.gamepad import Gamepad
-from brokk_rl.modes.evaluate import PlantMode
 from brokk_rl.play.checkpoint_watch import CheckpointWatch
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import PlaySession
 from brokk_rl.play.settings import PlaySettings
 from brokk_rl.policy_folder import find_policy
+from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import ClassicalPolicy, PolicySpec, TrainedPolicy
 from brokk_rl.session import Session
 from brokk_rl.spec import name_spec, spec
@@ -37,7 +37,7 @@ RATE_S = 30.0
 
 
 @spec
-class Play(PlantMode):
+class Play(SimulatedPlant):
     """Shows a policy at work, live, and lets a person touch it.
 
     Attributes:
@@ -97,9 +97,8 @@ class Play(PlantMode):
         session = Session(out=".", seed=settings.seed, device=settings.device)
         device = session.torch_device()
         session.seed_all()
-        config = self.compose_loop()
         pool = max(NUM_STARTS, settings.worlds)
-        loop = config.build(device, settings.worlds, pool, session.stream("starts"))
+        loop = self.build(device, settings.worlds, pool, session.stream("starts"))
         watch, policies = None, {}
         if not isinstance(self.policy, ClassicalPolicy):
             policies[POLICY] = self.policy.build(loop, settings.seed)

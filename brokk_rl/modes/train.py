@@ -14,7 +14,7 @@ from scipy import stats
 
 from brokk_rl import distributed
 from brokk_rl.contracts.task import SUCCESS
-from brokk_rl.modes.evaluate import PlantMode, evaluate_policies
+from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.policy_folder import (
     CONTRACT,
     describe_policy,
@@ -26,7 +26,7 @@ from brokk_rl.policy_folder import (
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.group import TrainingGroup
 from brokk_rl.rl.logger import LEVELS, PROGRESS, Tracking, TrainingLogger, draw_curves, find_passing
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
 from brokk_rl.rl.policy import (
     ClassicalPolicy,
     PolicySpec,
@@ -49,7 +49,7 @@ TRACKED = ("*.png", "*.mp4", "policy.*", "evaluation.json", "resolved.yaml")
 
 
 @spec
-class Train(PlantMode):
+class Train(SimulatedPlant):
     """Trains a policy for a task through an actuator model, then evaluates and exports it.
 
     A training goes on from the newest checkpoint in its own folder, if there is one.
@@ -88,9 +88,8 @@ class Train(PlantMode):
         device = self.session.torch_device()
         log.info("training on %s: %s of %s", device, name_spec(self.task), self.machine.name)
         self.session.seed_all()
-        config = self.compose_loop()
         stream = self.session.stream("starts")
-        loop = config.build(device, self.rl.num_envs, self.rl.num_starts, stream)
+        loop = self.build(device, self.rl.num_envs, self.rl.num_starts, stream)
         if self.rl.near_starts:
             loop.bring_near(self.rl.near_starts, stream)
         folder = self.session.folder
@@ -114,7 +113,7 @@ class Train(PlantMode):
                 return None
             logger = runner.logger
             _log_success(logger)
-            results = self._finish(config, runner)
+            results = self._finish(runner)
             files = [path for name in TRACKED for path in sorted(folder.glob(name))]
             figures = pd.json_normalize(results["policies"], sep="/").select_dtypes("number")
             logger.writer.report(figures.add_prefix("evaluation/").iloc[0].to_dict(), files)
@@ -206,7 +205,7 @@ class Train(PlantMode):
         }
         return contract
 
-    def _finish(self, config: ControlLoopConfig, runner: TrainingRunner) -> dict[str, Any]:
+    def _finish(self, runner: TrainingRunner) -> dict[str, Any]:
         """Write policy and curves, evaluate, export; return the content of `evaluation.json`."""
         folder, loop, actor = self.session.folder, runner.env, runner.alg.get_policy()
         contract = self._describe_policy(loop)
@@ -219,14 +218,14 @@ class Train(PlantMode):
             "classical": ClassicalPolicy(task=None),
             "untrained": UntrainedPolicy(training=self.rl),
         }
-        results = evaluate_policies(config, self.evaluation, self.session, policies)
+        results = evaluate_policies(self, self.evaluation, self.session, policies)
         line = None
         if controller := results["policies"].get("classical"):
             line = controller[SUCCESS]["mean"]
             log.info("%s", describe_gain(results["policies"]["trained"], controller))
         picture, words = folder / "learning_curves.png", loop.task.figures
         draw_curves(folder / PROGRESS, picture, words, book.first_episodes, line)
-        task = config.task.build(self.machine, 1, torch.device("cpu"))
+        task = self.task.build(self.machine, 1, torch.device("cpu"))
         if "deployable" in task.offers:
             export_onnx(folder, actor, task, self.machine, contract, answers)
         else:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -42,6 +41,7 @@ from brokk_rl.rl.settings import NearStarts
 from brokk_rl.sim.events import Event, build_varied_world
 from brokk_rl.sim.faults import FaultRecorder
 from brokk_rl.sim.scene import find_site
+from brokk_rl.spec import spec
 
 Starts = dict[str, torch.Tensor]
 
@@ -51,29 +51,27 @@ MAX_FAULT_FILES = 8
 """Faults that one process writes, 100 kB each. Chosen by hand: later ones tell little more."""
 
 
-@dataclass(frozen=True)
-class ControlLoopConfig:
-    """Parts of a control loop: specs, not yet built.
+@spec
+class SimulatedPlant:
+    """Parts of a control loop: a simulated machine and the task that is done with it.
 
     Attributes:
         machine: The machine.
-        sim: Builds the world.
-        task: Builds the task.
-        actuator: Builds the actuator model.
-        effects: Effects around the actuator model, by name.
+        sim: Physics.
+        task: The task.
+        actuator: How commands become motion.
+        effect: Effects around the actuator model, by name.
+        event: Changes of the simulated machine, by name.
         follower: Who stands between policy and machine.
-        events: Changes of the simulated machine, by name.
-        target: How the loop comes to know its target; `None`: the task draws errors.
     """
 
     machine: Machine
     sim: Simulator
     task: Task
     actuator: Actuator
-    effects: dict[str, Effect]
+    effect: dict[str, Effect]
+    event: dict[str, Event]
     follower: Follower
-    events: dict[str, Event] = field(default_factory=dict)
-    target: TargetSensorSpec | None = None
 
     def build(
         self,
@@ -82,6 +80,7 @@ class ControlLoopConfig:
         pool: int,
         seed: int,
         starts: Starts | None = None,
+        target: TargetSensorSpec | None = None,
     ) -> ControlLoop:
         """Return the control loop on `device`.
 
@@ -91,16 +90,17 @@ class ControlLoopConfig:
             pool: Number of valid starts from which resets draw.
             seed: Seed of the starts.
             starts: Starts of another control loop, in the place of drawn ones.
+            target: How the loop comes to know its target; `None`: the task draws errors.
         """
         site = find_site(getattr(self.task, "scene", None), self.sim)
         more: dict[str, Any] = {"site": site} if site else {}
         build_world = self.sim.build
-        if self.events:
-            build_world = partial(build_varied_world, self.sim, self.events)
+        if self.event:
+            build_world = partial(build_varied_world, self.sim, self.event)
         world: World = build_world(self.machine, device, num_envs, **more)
         num = world.num_worlds
         model = self.actuator.build(self.machine, num, device)
-        for effect in self.effects.values():
+        for effect in self.effect.values():
             model = effect.wrap(model, self.machine, num, device)
         model = accept_speeds(model, self.machine, num, device)
         follower = self.follower.build(self.machine, num, device)
@@ -112,7 +112,7 @@ class ControlLoopConfig:
                 drawn = process.starts(pool, seed)
             starts = {key: value.to(device) for key, value in drawn.items()}
         description = describe_task(self.task)
-        sensor = self.target.sense(self.machine, num, seed) if self.target else None
+        sensor = target.sense(self.machine, num, seed) if target else None
         return ControlLoop(
             self.machine, world, model, follower, process, starts, description, sensor
         )

@@ -19,7 +19,7 @@ from brokk_rl.modes.evaluate import evaluate_policies
 from brokk_rl.modes.train import Train
 from brokk_rl.policy_folder import CONTRACT
 from brokk_rl.rl.logger import Tracking
-from brokk_rl.rl.loop import ControlLoopConfig
+from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import PolicySpec, TrainedPolicy
 from brokk_rl.rl.settings import Evaluation, TrainingConfig
 from brokk_rl.session import Session, write_json
@@ -142,26 +142,25 @@ class CloseGap:
         _show(found, folder)
         return float(found["achieved"]["mean"])
 
-    def _plants(self) -> dict[str, ControlLoopConfig]:
-        known = ControlLoopConfig(
+    def _plants(self) -> dict[str, SimulatedPlant]:
+        known = SimulatedPlant(
             machine=self.machine,
             sim=self.sim,
             task=self.task,
             actuator=self.actuator,
-            effects=self.effect,
+            effect=self.effect,
+            event={},
             follower=self.follower,
         )
         return {
             "simulator": known,
-            "repaired": replace(known, effects=self.effect | self.found),
-            "machine": replace(
-                known, actuator=self.stand_in.actuator, effects=self.stand_in.effect
-            ),
+            "repaired": replace(known, effect=self.effect | self.found),
+            "machine": replace(known, actuator=self.stand_in.actuator, effect=self.stand_in.effect),
         }
 
-    def _training_plant(self) -> ControlLoopConfig:
+    def _training_plant(self) -> SimulatedPlant:
         known = self._plants()["repaired"]
-        return replace(known, effects=self.effect | self.randomisation | self.found)
+        return replace(known, effect=self.effect | self.randomisation | self.found)
 
     def _retrained(self) -> Path:
         """Return the folder of the retrained policy; train it unless that is done."""
@@ -173,13 +172,13 @@ class CloseGap:
         log.info("retraining with %s", ", ".join(self.found))
         Train(
             session=replace(self.session, out=str(place)), machine=self.machine, sim=self.sim, task=plant.task,
-            actuator=plant.actuator, effect=plant.effects, event={}, follower=self.follower, rl=self.rl, tracking=self.tracking,
+            actuator=plant.actuator, effect=plant.effect, event={}, follower=self.follower, rl=self.rl, tracking=self.tracking,
             evaluation=self.evaluation, policy=self.policy if self.warm else None,
         ).run()  # fmt: skip
         return place
 
     def _evaluated(
-        self, name: str, plant: ControlLoopConfig, policies: dict[str, PolicySpec]
+        self, name: str, plant: SimulatedPlant, policies: dict[str, PolicySpec]
     ) -> dict[str, Any]:
         """Return `evaluation.json` on a plant; one that an interrupted run has written is kept."""
         place = self.session.folder / name
@@ -192,8 +191,8 @@ class CloseGap:
         )
 
 
-def _describe_plant(plant: ControlLoopConfig) -> str:
-    return " + ".join([name_spec(plant.actuator), *plant.effects])
+def _describe_plant(plant: SimulatedPlant) -> str:
+    return " + ".join([name_spec(plant.actuator), *plant.effect])
 
 
 def _show(found: dict[str, Any], folder: Path) -> None:

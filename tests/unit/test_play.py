@@ -17,7 +17,7 @@ from brokk_rl.gamepad import Gamepad
 from brokk_rl.play.levers import GamepadLevers
 from brokk_rl.play.session import DISTANCE_M, PERSON, PlaySession
 from brokk_rl.play.settings import PlaySettings
-from brokk_rl.rl.loop import ControlLoopConfig
+from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import ClassicalPolicy
 
 NUM = 2
@@ -28,12 +28,13 @@ PERIOD_S = 0.05
 def made() -> Callable[..., PlaySession]:
     """Makes sessions of two quiet machines, on which the classical controller drives."""
     task = option("task", "borehole_insertion")
-    config = ControlLoopConfig(
+    config = SimulatedPlant(
         machine=option("machine", "brokk170"),
         sim=option("sim", "native"),
         task=replace(task, noise=replace(task.noise, filter="mean")),
         actuator=option("actuator", "ideal"),
-        effects={"library": option("effect", "library")},
+        effect={"library": option("effect", "library")},
+        event={},
         follower=option("follower", "none"),
     )
 

@@ -331,7 +331,7 @@ def test_a_policy_goes_where_a_sensor_sees_the_hole_and_rests_where_it_sees_none
     spec: Any = SimpleNamespace(sense=lambda machine, num_envs, seed: sensor)
     task = replace(option("task", "borehole_insertion"), episode_s=60.0)
     torch.manual_seed(0)
-    loop = replace(runs.plant(machine, task), target=spec).build(CPU, 2, 2, 5)
+    loop = runs.plant(machine, task).build(CPU, 2, 2, 5, target=spec)
     policy, groups = ClassicalPolicy(task=None).build(loop, 0), loop.get_observations()
     begun = loop.history.q[:, -1].clone()
     for _ in range(150):

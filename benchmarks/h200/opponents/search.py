@@ -24,7 +24,7 @@ import hydra
 import torch
 from hydra.utils import instantiate
 
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant
 from tasks.control import ClassicalController
 from tasks.settings import ControllerGuidance
 from tasks.tool_pose import ToolPoseProcess
@@ -126,9 +126,10 @@ class Trial:
         device = torch.device("cuda")
         parts = {name: instantiate(cfg[name], _convert_="all") for name in ("machine", "sim")}
         parts |= {name: instantiate(cfg[name], _convert_="all") for name in ("task", "actuator")}
-        config = ControlLoopConfig(
+        config = SimulatedPlant(
             **parts,
-            effects=instantiate(cfg.effect, _convert_="all"),
+            effect=instantiate(cfg.effect, _convert_="all"),
+            event={},
             follower=instantiate(cfg.follower, _convert_="all"),
         )
         self.config = parts["task"].classical

@@ -24,7 +24,7 @@ from hydra.utils import instantiate
 from brokk_rl.build import build_node
 from brokk_rl.contracts.task import Policy
 from brokk_rl.policy_folder import describe_spec, find_policy
-from brokk_rl.rl.loop import ControlLoop, ControlLoopConfig, Starts
+from brokk_rl.rl.loop import ControlLoop, SimulatedPlant, Starts
 from brokk_rl.rl.policy import ClassicalPolicy, TrainedPolicy
 from brokk_rl.statistics import compute_wilson_interval
 
@@ -101,7 +101,9 @@ class PlantCases:
             name: instantiate(cfg[name], _convert_="all")
             for name in ("machine", "sim", "task", "actuator", "follower")
         }
-        self._config = ControlLoopConfig(**parts, effects=instantiate(cfg.effect, _convert_="all"))
+        self._config = SimulatedPlant(
+            **parts, effect=instantiate(cfg.effect, _convert_="all"), event={}
+        )
         task: Any = self._config.task
         trained = TrainedPolicy(path="tasks:policies/borehole_insertion", task=None)
         numbers = dataclasses.replace(task.classical, **before)

@@ -24,7 +24,7 @@ from brokk_rl.extensions import load_mode
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.policy_folder import describe_spec, find_policy
 from brokk_rl.rl.evaluation import RecordedEpisode, evaluate_policy
-from brokk_rl.rl.loop import ControlLoopConfig
+from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import TrainedPolicy
 
 NUM_PATHS = 8
@@ -85,14 +85,14 @@ def draw_trajectories(words: list[str], bundle: Path, picture: Path) -> None:
     """Draw paths of the chisel's tip from above and from the side, and one episode's commands."""
     spec = compose([*words, *CPU])
     trained = TrainedPolicy(path=str(bundle), task=None)
-    config = ControlLoopConfig(
+    config = SimulatedPlant(
         machine=spec.machine,
         sim=spec.sim,
         task=build_node(find_policy(trained.path).task.apply_to(describe_spec(spec.task)), "task"),
         actuator=spec.actuator,
-        effects=spec.effect,
+        effect=spec.effect,
         follower=spec.follower,
-        events=spec.event,
+        event=spec.event,
     )
     torch.manual_seed(spec.evaluation.seed)
     loop = config.build(torch.device("cpu"), NUM_PATHS, NUM_PATHS, spec.evaluation.seed)

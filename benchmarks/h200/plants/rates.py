@@ -15,7 +15,7 @@ import torch
 from hydra.utils import instantiate
 
 from brokk_rl.rl.evaluation import evaluate_policy
-from brokk_rl.rl.loop import ControlLoopConfig
+from brokk_rl.rl.loop import SimulatedPlant
 from brokk_rl.rl.policy import TrainedPolicy
 
 ACTUATORS = ("mlp", "hydraulic", "load_sensing", "post_compensated", "open_center")
@@ -35,7 +35,9 @@ def main(folder: Path, counts: list[int]) -> None:
                 name: instantiate(cfg[name], _convert_="all")
                 for name in ("machine", "sim", "task", "actuator", "follower")
             }
-            config = ControlLoopConfig(**parts, effects=instantiate(cfg.effect, _convert_="all"))
+            config = SimulatedPlant(
+                **parts, effect=instantiate(cfg.effect, _convert_="all"), event={}
+            )
             torch.manual_seed(1024)
             loop = config.build(torch.device("cuda"), num, 1024, 1024, starts)
             starts = loop.starts
