@@ -1,4 +1,4 @@
-"""Contracts of the parts of the shipped finder: segmenters, ellipse detectors, proposers, pose estimators.
+"""Contracts of the parts of the shipped finder: segmenters, ellipse detectors, pose estimators.
 
 Each is an option of `conf/perception/<part>`: a spec whose `build()` returns the part. Pictures and
 camera coordinates are those of `brokk_rl.contracts.vision`.
@@ -6,6 +6,7 @@ camera coordinates are those of `brokk_rl.contracts.vision`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -64,22 +65,6 @@ class EllipseDetectorSpec(Protocol):
         ...
 
 
-class HoleProposer(Protocol):
-    """Proposes places that may be holes by other signs than the edges of a rim."""
-
-    def propose(self, frame: Frame, masks: Masks) -> list[Ellipse]:
-        """Return ellipses of about the place and size of a rim, the likeliest first."""
-        ...
-
-
-class HoleProposerSpec(Protocol):
-    """A spec in `conf/perception/proposer`."""
-
-    def build(self) -> HoleProposer:
-        """Return a proposer."""
-        ...
-
-
 class PoseEstimator(Protocol):
     """Turns an ellipse of a picture into a hole in space."""
 
@@ -123,4 +108,18 @@ class RejectionExplainer(Protocol):
 
     def explain(self, rejection: Rejection) -> str:
         """Return a sentence: the refused candidate, the reason, and a remedy."""
+        ...
+
+
+@runtime_checkable
+class HoleFollower(Protocol):
+    """Optional ability of a finder: to look at known holes alone, in a fraction of the time."""
+
+    @property
+    def search_every(self) -> int:
+        """Frames of which one is to be searched as a whole."""
+        ...
+
+    def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
+        """Return those of some holes, seen before, that are still where they were."""
         ...

@@ -14,17 +14,14 @@ import numpy as np
 
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
-from brokk_rl.spec import NonNegative, Positive, spec
+from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception import pair_check, search
-from perception.contracts import (
-    EllipseDetectorSpec,
-    HoleProposerSpec,
-    PoseEstimatorSpec,
-    SegmenterSpec,
-)
-from perception.face_depth import FaceDepth, FaceMatcher
+from perception.contracts import EllipseDetectorSpec, PoseEstimatorSpec, SegmenterSpec
 from perception.pair_check import PairCheck
+from perception.pair_depth import FaceMatcher, PairDepth
+from perception.pose import consistency
 from perception.pose.plane_conic import convert_to_gray
+from perception.pose.rim import build_chart
 from perception.pose.wall_light import IN_DUST
 
 SAME_ELLIPSE = 0.15
@@ -59,6 +56,22 @@ EXPLANATIONS = {
     "depth noise on the face, 1/m": (
         "the face around it is no plane",
         "Is it on the block's edge, or is the depth that noisy?",
+    ),
+    consistency.RING_KNOWN: (
+        "the ring around it has hardly any depth, so that its face is not known",
+        "Too dark, too near, or no texture to match.",
+    ),
+    consistency.RING_ON_FACE: (
+        "the ring around it does not lie on the plane that was taken for its face",
+        "Its surroundings are larger than the face: is the block in the mask?",
+    ),
+    consistency.NEARER: (
+        "its inside is nearer than the face",
+        "Something stands there, or its surroundings were taken for the face.",
+    ),
+    consistency.STRETCH: (
+        "its rim is round only with another focal length",
+        "K is that of another resolution or lens: K over this factor would do.",
     ),
     "tilt of the face, rad": (
         "the camera sees the face at too flat an angle",
@@ -127,9 +140,6 @@ class StagedPerception:
     Attributes:
         segmenter: Marks the block.
         ellipse: Finds ellipses on it.
-        proposer: Proposes further places, by other signs than edges; `null` for none.
-        regions_first: Judge the proposer's places first, and search ellipses only in frames where
-            none of them is a hole: faster, but a frame with several holes may show fewer of them.
         pose: Turns ellipses into holes.
         radius_m: Radius of the holes; limits the size of the ellipses.
         size_slack: Allowed relative error of that size.
@@ -139,14 +149,15 @@ class StagedPerception:
         block_probability: Probability from which a pixel counts as block.
         roi: Search region: the `mask` of the block, or its bounding `box`.
         apart: Holes nearer to each other than this many radii are one; the outer rim wins.
-        faces: Matches candidates again where depth is coarse (`stereo.shrink`); `null` for never.
+        depth: Matches pairs of frames that come without depth, and candidates again where depth is
+            coarse; `null` for never.
+        search_every: Frames of which one is searched as a whole; in the others `follow` looks at
+            known holes alone.
         pair: Check of the camera pair before anything else; `null` for none.
     """
 
     segmenter: SegmenterSpec
     ellipse: EllipseDetectorSpec
-    proposer: HoleProposerSpec | None
-    regions_first: bool
     pose: PoseEstimatorSpec
     radius_m: Positive
     size_slack: NonNegative
@@ -155,7 +166,8 @@ class StagedPerception:
     block_probability: float
     roi: Literal["mask", "box"]
     apart: float
-    faces: FaceDepth | None
+    depth: PairDepth | None
+    search_every: Count
     pair: PairCheck | None
 
     def build(self) -> StagedFinder:
@@ -184,7 +196,6 @@ class StagedFinder:
     def __init__(self, settings: StagedPerception) -> None:
         self.settings = settings
         self._segmenter, self._detector = settings.segmenter.build(), settings.ellipse.build()
-        self._proposer = settings.proposer.build() if settings.proposer else None
         self._pose = settings.pose.build()
         self._pair = settings.pair.build() if settings.pair else None
 
@@ -196,13 +207,12 @@ class StagedFinder:
         """
         s = self.settings
         ms: dict[str, float] = {}
-        with _time_stage(ms, "frame"):
-            frame = rectify(frame)
-        if self._pair is not None:
-            with _time_stage(ms, "pair"):
-                fault = self._pair.find_fault(frame)
-            if fault is not None:
-                return FrameDetections([], [fault], [], None, ms)
+        frame, fault = self._prepare(frame, ms)
+        if fault is not None:
+            return FrameDetections([], [fault], [], None, ms)
+        if s.depth is not None:
+            with _time_stage(ms, "stereo"):
+                frame = s.depth.match_whole(frame)
         with _time_stage(ms, "segment"):
             masks = self._segmenter.segment(frame)
         # The share decides before the dear search begins.
@@ -213,20 +223,64 @@ class StagedFinder:
             rejection = Rejection("segment", reason, share, s.smallest_block)
             return FrameDetections([], [rejection], [], masks, ms)
         judged = _Judged([], [], [])
-        finer = s.faces.build(frame, on_block) if s.faces else None
-        # Regions take a third of the time of arcs: searched first, they may make arcs needless.
-        stages = ("regions", "ellipse") if s.regions_first else ("ellipse", "regions")
-        for stage in stages:
-            if s.regions_first and judged.found:
-                break
-            with _time_stage(ms, stage):
-                if stage == "ellipse":
-                    candidates, wrong_size = self._detect_ellipses(frame, on_block)
-                    judged.rejected.extend(wrong_size)
-                else:
-                    candidates = self._proposer.propose(frame, masks) if self._proposer else []
+        finer = s.depth.build(frame, on_block) if s.depth else None
+        with _time_stage(ms, "ellipse"):
+            candidates, wrong_size = self._detect_ellipses(frame, on_block)
+        judged.rejected.extend(wrong_size)
+        with _time_stage(ms, "pose"):
+            self._judge(frame, masks, candidates, judged, finer)
+        return self._conclude(judged, masks, frame, ms)
+
+    @property
+    def search_every(self) -> int:
+        """Frames of which one is to be searched as a whole; see `HoleFollower`."""
+        return self.settings.search_every
+
+    def follow(self, frame: Frame, holes: Sequence[HolePose]) -> FrameDetections:
+        """Return the holes that are still where they were; see `HoleFollower.follow`."""
+        s = self.settings
+        ms: dict[str, float] = {}
+        frame, fault = self._prepare(frame, ms)
+        if fault is not None:
+            return FrameDetections([], [fault], [], None, ms)
+        places = [one for one in (expect_rim(hole, frame) for hole in holes) if one is not None]
+        if s.depth is None or frame.right is None or frame.baseline_m is None or not places:
+            return self.find(frame)
+        with _time_stage(ms, "stereo"):
+            frame, face = s.depth.match_near(frame, places)
+        masks = Masks(face, None)
+        judged = _Judged([], [], [])
+        gray = convert_to_gray(frame)
+        for place, _ in places:
+            with _time_stage(ms, "ellipse"):
+                level = search.plan_level_around(place, gray.shape, s.size_slack, s.comfortable_px)
+                candidates = _remove_duplicates(level.detect(self._detector, gray))
+            near = [one for one in candidates if np.hypot(one.x - place.x, one.y - place.y) < one.a]
             with _time_stage(ms, "pose"):
-                self._judge(frame, masks, candidates, judged, finer)
+                self._judge(frame, masks, near, judged, None)
+        return self._conclude(judged, masks, frame, ms)
+
+    def find_ellipses(self, frame: Frame) -> list[Ellipse]:
+        """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
+        return self._detector.detect(convert_to_gray(rectify(frame)), None, None)
+
+    def explain(self, rejection: Rejection) -> str:
+        """Return a sentence: the refused candidate, the reason, and a remedy."""
+        return explain_rejection(rejection)
+
+    def _prepare(self, frame: Frame, ms: dict[str, float]) -> tuple[Frame, Rejection | None]:
+        """Return a frame without distortion, and what is wrong with its pair."""
+        with _time_stage(ms, "frame"):
+            frame = rectify(frame)
+        if self._pair is None:
+            return frame, None
+        with _time_stage(ms, "pair"):
+            return frame, self._pair.find_fault(frame)
+
+    def _conclude(
+        self, judged: _Judged, masks: Masks, frame: Frame, ms: dict[str, float]
+    ) -> FrameDetections:
+        """Return the detections of a frame: each hole once, in the base frame where that is known."""
         found, doubles = self._remove_inner_rims(judged.found)
         rejected = judged.rejected
         if not found and not rejected:
@@ -240,14 +294,6 @@ class StagedFinder:
         ms["total"] = sum(ms.values())
         detections = FrameDetections([pose for _, pose in found], rejected, shown, masks, ms)
         return detections.in_base_frame(frame)
-
-    def find_ellipses(self, frame: Frame) -> list[Ellipse]:
-        """Return the ellipses of the whole picture, of any size, the best first; needs no depth."""
-        return self._detector.detect(convert_to_gray(rectify(frame)), None, None)
-
-    def explain(self, rejection: Rejection) -> str:
-        """Return a sentence: the refused candidate, the reason, and a remedy."""
-        return explain_rejection(rejection)
 
     def _judge(
         self,
@@ -327,6 +373,29 @@ class StagedFinder:
             else:
                 kept.append((ellipse, pose))
         return sorted(kept, key=lambda one: -one[1].score), doubles
+
+
+def expect_rim(hole: HolePose, frame: Frame) -> tuple[Ellipse, np.ndarray] | None:
+    """Return the ellipse of a known hole's rim in a frame, and its face, the plane `m · P = 1`.
+
+    Returns:
+        `None` where its centre is not in the picture.
+    """
+    rotation, shift = np.eye(3), np.zeros(3)
+    if hole.frame == "base":
+        if frame.base_from_camera is None:
+            return None
+        rotation = frame.base_from_camera[:3, :3].T
+        shift = -rotation @ frame.base_from_camera[:3, 3]
+    center_m, axis = rotation @ hole.center_m + shift, rotation @ hole.axis
+    height, width = frame.color.shape[:2]
+    if center_m[2] <= 0 or float(axis @ center_m) >= 0:
+        return None
+    m = axis / float(axis @ center_m)
+    row = build_chart(center_m, m, frame.camera_matrix).seen(np.array([0.0, 0.0, hole.radius_m]))
+    if not np.isfinite(row).all() or not (0 <= row[0] < width and 0 <= row[1] < height):
+        return None
+    return Ellipse(*map(float, row), rms_px=0.0, coverage=1.0, score=hole.score), m
 
 
 def rectify(frame: Frame) -> Frame:

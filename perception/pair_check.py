@@ -62,17 +62,20 @@ class PairMatches:
     Attributes:
         left: `(n, 2)`.
         right: `(n, 2)`.
+        texture: Least eigenvalue of the gradient around each, `(n,)`: the variance of its place
+            is proportional to the inverse.
     """
 
     left: np.ndarray
     right: np.ndarray
+    texture: np.ndarray
 
     def select_common_shift(self, reach_px: float) -> PairMatches:
         """Return the matches whose vertical shift is near the commonest one."""
         shift_px = (self.right - self.left)[:, 1]
         near = np.abs(shift_px[:, None] - shift_px[None, :]) < reach_px
         chosen = near[np.argmax(np.count_nonzero(near, axis=1))]
-        return PairMatches(self.left[chosen], self.right[chosen])
+        return PairMatches(self.left[chosen], self.right[chosen], self.texture[chosen])
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class PairAlignment:
         pitch_px: By a turn about the x axis, or a shift of the picture; focal length times angle.
         roll_px: By a turn about the optical axis, likewise.
         focal_px: By another focal length.
-        rms_px: Root mean square over the whole picture, less what noise alone gives.
+        rms_px: Root mean square over the matched features, less what noise alone gives.
         std_px: Standard deviation of `rms_px`.
     """
 
@@ -114,7 +117,7 @@ class PairCheck:
             pair was found good before.
         least_ahead: Least part of the features that lie farther right in the left picture.
         most_turn: Largest quotient of vertical and horizontal distance of matched features.
-        limit_px: Largest root mean square of the vertical disparity over the picture.
+        limit_px: Largest root mean square of the vertical disparity over the features.
         num_sigma: Standard deviations by which it must exceed the limit.
         most_std_px: Standard deviation of that, from which nothing can be told.
         scale: Largest departure from 1 of depth by disparity over a depth that was measured.
@@ -187,7 +190,7 @@ class PairCheck:
         detector = cv2.ORB.create(self.num_features, fastThreshold=self.corner)
         mine, my_words = detector.detectAndCompute(pictures[0], None)
         theirs, their_words = detector.detectAndCompute(pictures[1], None)
-        nothing = PairMatches(np.zeros((0, 2)), np.zeros((0, 2)))
+        nothing = PairMatches(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0))
         if not mine or not theirs:
             return nothing
         pairs = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True).match(my_words, their_words)
@@ -199,23 +202,27 @@ class PairCheck:
         cell = np.floor(start / self.cell_px)
         first = np.unique(cell[:, 0] * 10_000 + cell[:, 1], return_index=True)[1]
         start, end = start[first], end[first]
-        there = self._register(pictures[0], pictures[1], start, end)
-        back = self._register(pictures[1], pictures[0], there, start)
+        there, texture = self._register(pictures[0], pictures[1], start, end)
+        back, _ = self._register(pictures[1], pictures[0], there, start)
         good = np.linalg.norm(back - start, axis=1) < self.return_px
         # Pixel centres: a shrunk pixel's centre lies between those it covers.
         left_px = (start[good].astype(float) + 0.5) * shrink - 0.5
         right_px = (there[good].astype(float) + 0.5) * shrink - 0.5
-        return PairMatches(left_px, right_px)
+        return PairMatches(left_px, right_px, texture[good])
 
     def _register(
         self, one: np.ndarray, other: np.ndarray, start: np.ndarray, guess: np.ndarray
-    ) -> np.ndarray:
-        """Return the places in another picture of features at `start`, near `guess`, `(n, 2)`."""
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the places in another picture of features at `start`, near `guess`, `(n, 2)`.
+
+        Also return the least eigenvalue of the gradient around each, `(n,)`.
+        """
         window = (self.window_px, self.window_px)
-        return cv2.calcOpticalFlowPyrLK(
-            one, other, start, guess.copy(), winSize=window, maxLevel=1,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
-        )[0]  # fmt: skip
+        flags = cv2.OPTFLOW_USE_INITIAL_FLOW | cv2.OPTFLOW_LK_GET_MIN_EIGENVALS
+        places, _, texture = cv2.calcOpticalFlowPyrLK(
+            one, other, start, guess.copy(), winSize=window, maxLevel=1, flags=flags
+        )
+        return places, texture.ravel().astype(float)
 
 
 class PairWatch:
@@ -247,15 +254,14 @@ class PairWatch:
 
 
 def fit_alignment(matches: PairMatches, frame: Frame) -> PairAlignment:
-    """Return the vertical disparity over the picture: three numbers, fitted robustly."""
+    """Return the vertical disparity of a pair: three numbers, fitted robustly."""
     shift_px = (matches.right - matches.left)[:, 1]
     design = _build_design(frame, matches.right[:, 0], matches.right[:, 1])
     # A hundredth of a pixel: pictures drawn without noise would leave no scale.
-    solution, cov = fit_linear(design, shift_px, 0.01)
-    height, width = frame.color.shape[:2]
-    across, down = np.meshgrid(np.linspace(0, width - 1, 15), np.linspace(0, height - 1, 9))
-    everywhere = _build_design(frame, across.ravel(), down.ravel())
-    gram = everywhere.T @ everywhere / len(everywhere)
+    precision = np.sqrt(matches.texture / np.median(matches.texture))
+    solution, cov = fit_linear(design * precision[:, None], shift_px * precision, 0.01)
+    # Where something was matched: beyond, three numbers of few features say anything.
+    gram = design.T @ design / len(design)
     noise = float(np.trace(gram @ cov))
     rms_px = float(np.sqrt(max(float(solution @ gram @ solution) - noise, 0.0)))
     pitch, roll, focal = (float(value) for value in solution)

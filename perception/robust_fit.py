@@ -46,4 +46,9 @@ def fit_linear(
         root = np.sqrt(weight)
         solution = np.linalg.lstsq(design * root[:, None], values * root, rcond=None)[0]
         away = values - design @ solution
-    return solution, scale**2 * np.linalg.pinv(design.T @ (design * weight[:, None]))
+    # Residuals of unlike spread: the sandwich of White (1980) with leverages (HC3).
+    normal = np.linalg.pinv(design.T @ (design * weight[:, None]))
+    heavy = design * weight[:, None]
+    leverage = np.einsum("ni,ij,nj->n", design, normal, heavy)
+    moved = heavy * (away / np.maximum(1.0 - leverage, 0.1))[:, None]
+    return solution, normal @ (moved.T @ moved) @ normal

@@ -25,7 +25,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.parallel import map_parallel, use_workers
 from brokk_rl.spec import Count, NonNegative, Positive, spec
 from perception.calibrate import transforms
-from perception.mount.mounts import CameraMount, CameraMountSpec
+from perception.mount.mounts import AxesMount, CameraMount
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
 from perception.mount.occlusion import ArmShape
 from perception.render.stereo_camera import StereoRig, place_rig
@@ -57,7 +57,7 @@ class PerceivedTarget:
     camera: SimulatedCamera
     finder: FinderSpec
     tracker: TrackerSpec
-    mount: CameraMountSpec
+    mount: AxesMount
     next_view: ExpectedCovariance
     arm: ArmShape
     rate_hz: Positive

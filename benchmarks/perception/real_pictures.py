@@ -30,11 +30,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from ellipses import build
 from speed import configured
 
+from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
-from perception.benchmark.calibration_patterns import count_matches
 from perception.pose import alignment, plane
 from perception.pose.plane import FacePlane
 from perception.pose.plane_conic import PlaneConic, convert_to_gray
@@ -349,12 +348,18 @@ def count_targets(finder: Any, frame: Frame) -> dict[str, Any]:
 
 def judge_ellipses(folders: dict[str, Path]) -> Iterator[dict[str, Any]]:
     """Yield how many round things of each picture are found."""
-    detector = build("contour_arcs")
+    detector = configured("perception", "mode=perceive").ellipse.build()
     for name, (folder, file, true) in ROUND.items():
         gray = cv2.cvtColor(read_color(folders[folder] / file), cv2.COLOR_RGB2GRAY)
         seen = detector.detect(gray, None, None)
-        hits = count_matches(seen, np.array(true))
+        hits = sum(any(is_alike(one, row) for one in seen) for row in true)
         yield {"picture": name, "true": len(true), "found": hits, "others": len(seen) - hits}
+
+
+def is_alike(one: Ellipse, row: Sequence[float]) -> bool:
+    """Return whether an ellipse has the place and size of a true one, x, y, a, b, to a tenth."""
+    away = np.abs(np.array([one.x, one.y, one.a, one.b]) - np.array(row[:4]))
+    return bool(away.max() < 0.1 * row[2])
 
 
 if __name__ == "__main__":

@@ -34,6 +34,7 @@ from brokk_rl.session import Session, write_json, write_text
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, spec
 from perception.contracts import Overlay, RejectionExplainer, WholePictureFinder
+from perception.tracking.steered_search import SteeredSearch
 
 log = logging.getLogger(__name__)
 
@@ -157,18 +158,18 @@ class Perceive:
         self, finder: BoreholeFinder, tracker: HoleTracker
     ) -> Iterator[tuple[FrameEntry, Frame | None]]:
         """Yield the result of each frame of the source."""
+        search = SteeredSearch(finder, tracker)
         for name, frame, refused in self._read_frames(self.source):
             if frame is None:
                 yield FrameEntry(name, None, None, refused), None
                 continue
             try:
-                found = finder.find(frame).in_base_frame(frame)
+                found, tracked = search.update(frame)
             except FrameError as error:
                 log.warning("%s", error)
                 yield FrameEntry(name, None, None, str(error)), frame
                 continue
-            # Holes of a refused frame are unknown, not absent: the tracker is not told.
-            target = _choose_target(tracker.update(found.holes, frame.t_s), frame.t_s)
+            target = _choose_target(tracked, frame.t_s)
             yield FrameEntry(name, found, target, None), frame
 
     def _list_ellipses(
@@ -244,7 +245,8 @@ class Perceive:
             target = next((entry.target for entry in reversed(entries) if entry.target), None)
             if target is not None:
                 rows.append(("target", _format_target(target[0])))
-        for stage in used[0].ms if used else ():
+        stages = dict.fromkeys(stage for one in used for stage in one.ms)
+        for stage in stages:
             rows.append((f"ms, {stage}", f"{median(one.ms.get(stage, 0.0) for one in used):.0f}"))
         print_table((), rows)
 

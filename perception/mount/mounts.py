@@ -1,8 +1,8 @@
-"""Camera mounts: fixed, on driven axes, on a link of the machine, or put into places by hand.
+"""Camera mounts: fixed, or on driven axes on the base or a link of the machine.
 
-A mount has a position, `(A,)`: one number for each axis, or the place itself. `locate` turns it
-into the camera's pose. Frames of machine and mount have x forward, y left and z up; the camera's
-own follow the optical convention.
+A mount has a position, `(A,)`: one number for each axis. `locate` turns it into the camera's pose.
+Frames of machine and mount have x forward, y left and z up; the camera's own follow the optical
+convention.
 
 Axes: `A` numbers of a position, `V` views, `J` joints; anything may stand before `A` and `J`.
 """
@@ -10,8 +10,7 @@ Axes: `A` numbers of a position, `V` views, `J` joints; anything may stand befor
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
@@ -51,54 +50,6 @@ class MountError:
         """Return a small motion of the camera in its own coordinates, `(6,)`, m and rad."""
         shift, turn = getattr(self, f"{kind}_m"), getattr(self, f"{kind}_rad")
         return generator.standard_normal(6) * [shift, shift, shift, turn, turn, turn]
-
-
-class CameraMount(Protocol):
-    """A mount of a machine, built from an option of `conf/perception/mount`."""
-
-    @property
-    def error(self) -> MountError:
-        """Error of the camera's believed pose."""
-        ...
-
-    @property
-    def start(self) -> np.ndarray:
-        """First position, `(A,)`."""
-        ...
-
-    @property
-    def views(self) -> np.ndarray:
-        """Positions between which is chosen, `(V, A)`, at least one."""
-        ...
-
-    def locate(self, position: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return the camera's pose in the base frame, `(…, 4, 4)`.
-
-        Args:
-            position: Positions, `(…, A)`.
-            q: Joint positions of the machine, `(…, J)`.
-        """
-        ...
-
-    def compute_travel_s(self, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the time from `start`, `(A,)`, to each of `goals`, `(V, A)`, until it stands still."""
-        ...
-
-    def describe(self, position: np.ndarray) -> str:
-        """Return a position in words."""
-        ...
-
-
-class CameraMountSpec(Protocol):
-    """A spec in `conf/perception/mount`."""
-
-    def build(self, machine: Machine) -> CameraMount:
-        """Return the mount on a machine.
-
-        Raises:
-            ConfigError: the machine has no such link.
-        """
-        ...
 
 
 @spec
@@ -170,15 +121,21 @@ class AxesMount:
     settle_s: NonNegative
     error: MountError
 
-    def build(self, machine: Machine) -> AxesMountModel:
+    def build(self, machine: Machine) -> CameraMount:
         """Return the mount on a machine."""
         if self.link != BASE:
             compute_link_pose(machine, machine.home, self.link)  # refuses an unknown link
-        return AxesMountModel(self, machine)
+        return CameraMount(self, machine)
 
 
-class AxesMountModel:
-    """Mount with driven axes at work, with the settings `AxesMount`; a `CameraMount`."""
+class CameraMount:
+    """Mount of a machine, with the settings `AxesMount`.
+
+    Attributes:
+        error: Error of the camera's believed pose.
+        start: First position, `(A,)`.
+        views: Positions between which is chosen, `(V, A)`, at least one.
+    """
 
     def __init__(self, settings: AxesMount, machine: Machine) -> None:
         self._settings, self._machine = settings, machine
@@ -193,7 +150,12 @@ class AxesMountModel:
         self.views = np.array(views, float).reshape(len(views), len(self._axes))
 
     def locate(self, position: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return the camera's pose in the base frame; see `CameraMount.locate`."""
+        """Return the camera's pose in the base frame, `(…, 4, 4)`.
+
+        Args:
+            position: Positions, `(…, A)`.
+            q: Joint positions of the machine, `(…, J)`.
+        """
         pose = np.eye(4)
         if self._settings.link != BASE:
             pose = compute_link_pose(self._machine, q, self._settings.link)
@@ -202,7 +164,7 @@ class AxesMountModel:
         return pose @ self._camera
 
     def compute_travel_s(self, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the time from `start` to each of `goals`; the slowest axis counts."""
+        """Return the time from `start`, `(A,)`, to each of `goals`, `(V, A)`; the slowest axis counts."""
         if not self._axes:
             return np.zeros(len(goals))
         speed = np.array([axis.max_speed for axis in self._axes])
@@ -217,71 +179,3 @@ class AxesMountModel:
         for name, axis, value in zip(self._settings.axes, self._axes, position, strict=True):
             parts.append(f"{name} {value:.2f} {'rad' if axis.kind == 'hinge' else 'm'}")
         return ", ".join(parts)
-
-
-@spec
-class CameraPlace:
-    """A place of a tripod and the direction of its camera in the base frame.
-
-    Attributes:
-        position_m: The camera.
-        yaw_rad: Turn of the view about the vertical, from x towards y.
-        pitch_rad: How far it looks down.
-    """
-
-    position_m: tuple[float, float, float]
-    yaw_rad: float
-    pitch_rad: float
-
-
-@spec
-class PlacesMount:
-    """Let a person put the camera into one of several places; a board gives its pose there.
-
-    Attributes:
-        places: Places by name; it begins in the first.
-        move_s: Time until a person has moved it and its pose is known.
-        error: Error of the believed pose.
-    """
-
-    places: dict[str, CameraPlace]
-    move_s: NonNegative
-    error: MountError
-
-    def check(self) -> None:
-        if not self.places:
-            raise ConfigError("places: expected one place or more")
-
-    def build(self, machine: Machine) -> PlacesMountModel:
-        """Return the mount."""
-        return PlacesMountModel(self)
-
-
-class PlacesMountModel:
-    """Mount that a person carries between places; a position is the number of a place, `(1,)`."""
-
-    def __init__(self, settings: PlacesMount) -> None:
-        self._settings = settings
-        self._names: Sequence[str] = list(settings.places)
-        self._poses = np.stack(
-            [
-                build_camera_pose(place.position_m, place.yaw_rad, place.pitch_rad)
-                for place in settings.places.values()
-            ]
-        )
-        self.error = settings.error
-        self.start = np.zeros(1)
-        self.views = np.arange(len(self._names), dtype=float)[:, None]
-
-    def locate(self, position: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Return the camera's pose in the base frame; see `CameraMount.locate`."""
-        poses = self._poses[np.round(np.asarray(position)[..., 0]).astype(int)]
-        return np.broadcast_to(poses, (*np.broadcast_shapes(poses.shape[:-2], q.shape[:-1]), 4, 4))
-
-    def compute_travel_s(self, start: np.ndarray, goals: np.ndarray) -> np.ndarray:
-        """Return the time until the mount stands in each of `goals`."""
-        return np.where((goals == start).all(-1), 0.0, self._settings.move_s)
-
-    def describe(self, position: np.ndarray) -> str:
-        """Return the name of the place."""
-        return self._names[round(float(position[0]))]

@@ -36,6 +36,7 @@ class Interior:
             negative in a hole, about zero on a disc.
         deeper: Part of the known depth inside that lies clearly behind the face.
         unknown: Part of the inside without depth.
+        nearer: Part of the inside whose depth is known and before the face.
         around: Brightness of the darkest hundredth of the surroundings over that of the face;
             occluders are left out, since there is less dust before them.
         contrast: Difference between the darker part of the face and the darkest quarter, in
@@ -46,6 +47,7 @@ class Interior:
     slope: float
     deeper: float
     unknown: float
+    nearer: float
     around: float
     contrast: float
 
@@ -67,7 +69,7 @@ def measure_interior(
     radii = conic.measure_radii(ellipse, columns, rows)
     inside, ring = radii < INSIDE, (radii > RING[0]) & (radii < RING[1])
     if inside.sum() < 8 or ring.sum() < 8:
-        return Interior(*[np.nan] * 6)
+        return Interior(*[np.nan] * 7)
     face = max(float(np.median(part[ring])), 1.0)
     smooth = cv2.GaussianBlur(
         part, (0, 0), max(0.15 * float(np.sqrt(ellipse[2] * ellipse[3])), 0.6)
@@ -76,15 +78,17 @@ def measure_interior(
     inside &= smooth < face
     depth = depth_m[top:bottom, left:right]
     known = np.isfinite(depth)
+    nearer = 0.0
     if plane is not None:
         behind = plane.inverse_depth(camera_matrix, columns, rows) - 1.0 / np.where(
             known, depth, np.inf
         )
         # An occluder hides a part of the inside.
         before = (known & (behind < -4 * plane.sigma)).astype(np.uint8)
+        nearer = float(np.mean(before[inside]))
         inside &= cv2.dilate(before, np.ones((5, 5), np.uint8)) == 0
     if inside.sum() < 8:
-        return Interior(*[np.nan] * 6)
+        return Interior(*[np.nan] * 4, nearer, *[np.nan] * 2)
     values = smooth[inside]
     darkness = float(np.percentile(values, 25.0)) / face
     unknown = float(np.mean(~known[inside]))
@@ -106,7 +110,13 @@ def measure_interior(
         slope /= max(contrast, FAINTEST)
     around = _measure_darkest_around(gray, depth_m, ellipse, camera_matrix, plane) / face
     return Interior(
-        darkness, slope, deeper, unknown, around, _measure_contrast(smooth[ring], face * darkness)
+        darkness,
+        slope,
+        deeper,
+        unknown,
+        nearer,
+        around,
+        _measure_contrast(smooth[ring], face * darkness),
     )
 
 

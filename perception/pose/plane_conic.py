@@ -7,17 +7,17 @@ from typing import Annotated
 
 import cv2
 import numpy as np
-from annotated_types import Interval
+from annotated_types import Ge, Interval
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks, Rejection
 from brokk_rl.errors import ConfigError
 from brokk_rl.signals import Frame
-from brokk_rl.spec import Positive, spec
+from brokk_rl.spec import Positive, Share, spec
 from perception.contracts import PoseEstimator, PoseEstimatorSpec
 from perception.ellipse import conic
-from perception.pose import alignment, appearance, broken_rim, plane, rim
+from perception.pose import alignment, appearance, broken_rim, consistency, plane, rim
 from perception.pose.appearance import Interior
-from perception.pose.plane import FacePlane
+from perception.pose.plane import FacePlane, FaceSupport
 from perception.pose.rim import RimCircle
 from perception.pose.wall_light import IN_DUST, WallLight, measure_wall_light
 
@@ -34,8 +34,6 @@ FORGIVEN, AT_FIRST = 0.55, 1.4
 for an ellipse, which may follow the shade within a rim where that is the steeper edge."""
 BROKEN_SEEN = 0.6
 """Least part of a broken rim with edges: its pieces may lie at any depth, so texture has some too."""
-BESIDE = (1.15, 1.45)
-"""Radii of an ellipse at which occluders of its rim are searched."""
 
 
 @spec
@@ -87,6 +85,10 @@ class PlaneConic:
         coverage: Least visible part of the circle.
         broken: Part of a rim that is missing though nothing hides it, from which its pieces count
             as broken off; 1 for never.
+        on_face: Least part of the innermost ring with depth that lies on the face.
+        agree: Least part of the circle that is seen, over that of the ellipse: both are one rim.
+        stretch: Factor on the focal length from which another one explains that they are not.
+        nearer: Largest part of the inside with depth that is nearer than the face.
         tilt_rad: Largest angle between the face's normal and the line of sight.
         inner: Inner limit of the face's support in radii of the ellipse; leaves out the bleeding of
             the rim.
@@ -102,9 +104,8 @@ class PlaneConic:
             depth, 1/m; with a right picture the face is aligned directly.
         bias_per_m: Standard deviation of the remaining bias that no residual shows, 1/m.
         rig_px: `Frame.disparity_std_px` of a pair that was not calibrated.
-        center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
-        shape_px: Standard deviation of each of the first waves of a rim, px; they move the centre
-            of an incomplete one.
+        center_px: Least standard deviation of the centre of a whole rim that no residual shows, px;
+            what its waves show comes on top.
         looks: Gates on the appearance.
         without_depth: Estimator where the face has no depth; `null` for none.
         blind: Part of the face around a hole with known depth below which `without_depth` serves.
@@ -115,6 +116,10 @@ class PlaneConic:
     axis_ratio: float
     coverage: float
     broken: float
+    on_face: Share
+    agree: Share
+    stretch: Annotated[float, Ge(1)]
+    nearer: Share
     tilt_rad: float
     inner: float
     rings: tuple[float, ...]
@@ -127,7 +132,6 @@ class PlaneConic:
     bias_per_m: float
     rig_px: float
     center_px: float
-    shape_px: float
     looks: AppearanceGates
     without_depth: PoseEstimatorSpec | None
     blind: float
@@ -157,7 +161,8 @@ class PlaneConicEstimator:
         """Return the hole in camera coordinates, or why it is none; see `PoseEstimator`."""
         s, row = self.settings, as_row(ellipse)
         gray, light, allowed = self._prepare(frame, masks)
-        face = self._fit_face(frame, allowed, row, ellipse)
+        points = self._collect_support(frame, allowed, row)
+        face = self._fit_face(frame, points, ellipse)
         if face is None:
             assert self._without_depth is not None
             return self._without_depth.estimate(frame, masks, ellipse)
@@ -185,22 +190,29 @@ class PlaneConicEstimator:
             shape = self._check_shape(face, row, frame, ellipse)
             if isinstance(shape, Rejection):
                 return shape
+        aside = consistency.check_ring(
+            points, face, (s.rings[0], s.on_face), both is not None, ellipse
+        )
+        if aside is not None:
+            return aside
         circle = self._fit_circle(light, frame, face, both, ellipse, has_good_shape=shape)
         if isinstance(circle, Rejection):
             return circle
         return self._describe_hole(light, frame, masks, face, circle, both, ellipse)
 
+    def _collect_support(self, frame: Frame, allowed: np.ndarray, row: np.ndarray) -> FaceSupport:
+        """Return the depth around an ellipse `(5,)`: inside the hole it shows no face."""
+        s = self.settings
+        reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
+        return plane.collect_support(
+            frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
+        )
+
     def _fit_face(
-        self, frame: Frame, allowed: np.ndarray, row: np.ndarray, ellipse: Ellipse
+        self, frame: Frame, points: FaceSupport, ellipse: Ellipse
     ) -> FacePlane | Rejection | None:
         """Return the plane of the face from depth; `None` where `without_depth` serves in its place."""
         s = self.settings
-        # Depth for the plane comes from a ring around the ellipse: inside the hole it shows no
-        # face.
-        reach = (s.radius_m, s.inner, s.rings[0], s.rings[-1])
-        points = plane.collect_support(
-            frame.depth_m, allowed, frame.camera_matrix, row, *reach, s.max_pixels, s.cell_px
-        )
         # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
         face = plane.fit_plane(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
         if face is None:
@@ -239,14 +251,21 @@ class PlaneConicEstimator:
             s.radius_m,
             s.radius_tolerance,
             s.center_px,
-            s.shape_px,
         )
         # What is missing of a rim is hidden, or broken off.
         seen = 0.0 if circle is None else circle.coverage
         row = as_row(ellipse) if circle is None else circle.ellipse
         ray = np.linalg.solve(frame.camera_matrix, [ellipse.x, ellipse.y, 1.0])
         chart = rim.build_chart(face.point(ray), face.m, frame.camera_matrix)
-        is_broken = 1.0 - seen - measure_hidden_part(face, row, frame) > s.broken
+        if ellipse.coverage > consistency.WHOLE and seen < s.agree * ellipse.coverage:
+            limits = (s.radius_m, s.radius_tolerance, s.center_px)
+            least = max(seen + 0.2, s.agree)
+            stretch = consistency.find_stretch(
+                light, frame.camera_matrix, face, as_row(ellipse), limits, least
+            )
+            if abs(np.log(stretch)) > np.log(s.stretch):
+                return Rejection("pose", consistency.STRETCH, stretch, 1.0, ellipse)
+        is_broken = 1.0 - seen - consistency.measure_hidden_part(face, row, frame) > s.broken
         if (
             s.broken < 1.0
             and both is not None
@@ -265,6 +284,9 @@ class PlaneConicEstimator:
         # then most of the circle must be seen.
         is_sure = has_good_shape and ellipse.coverage >= s.coverage
         least = s.coverage if is_sure else max(s.coverage, FORGIVEN)
+        if ellipse.coverage > consistency.WHOLE:
+            # Ellipse and circle are one rim: of a whole one most must be seen as either.
+            least = max(least, consistency.ONE_RIM * ellipse.coverage)
         if circle is None or circle.coverage < least:
             reason = "part of a circle on the face with a rim"
             seen = 0.0 if circle is None else circle.coverage
@@ -370,7 +392,7 @@ class PlaneConicEstimator:
             return Rejection("pose", "axis ratio on the face", 0.0, s.axis_ratio, ellipse)
         radius, ratio = float(np.sqrt(axes[0] * axes[1])), float(axes[1] / axes[0])
         # The less of a rim is visible, the less precise is its ellipse.
-        seen = max(1.0 - measure_hidden_part(face, row, frame), s.coverage)
+        seen = max(1.0 - consistency.measure_hidden_part(face, row, frame), s.coverage)
         tolerance = AT_FIRST * s.radius_tolerance / seen * s.radius_m
         if abs(radius - s.radius_m) > tolerance:
             limit = s.radius_m + np.sign(radius - s.radius_m) * tolerance
@@ -396,6 +418,8 @@ class PlaneConicEstimator:
         def refuse(reason: str, value: float, limit: float) -> Rejection:
             return Rejection("pose", reason, value, limit, ellipse)
 
+        if inside.nearer > self.settings.nearer:
+            return refuse(consistency.NEARER, inside.nearer, self.settings.nearer)
         # Written as a negation so that NaN, an inside without pixels, is refused too.
         if not inside.darkness <= looks.darkness:
             return refuse("brightness inside over outside", inside.darkness, looks.darkness)
@@ -442,32 +466,6 @@ def compute_center_covariance(face: FacePlane, circle: RimCircle, bias_per_m: fl
     ray = center / center[2]
     depth_var = center[2] ** 4 * (float(ray @ face.cov @ ray) + bias_per_m**2)
     return np.outer(ray, ray) * depth_var + circle.cov_m2
-
-
-def measure_hidden_part(face: FacePlane, row: np.ndarray, frame: Frame) -> float:
-    """Return the part of a rim on a face, near an ellipse `(5,)`, that an occluder hides.
-
-    Searched at two radii: the ellipse may be smaller than the rim, and depth is often unknown at
-    the edge of an occluder.
-    """
-    height, width = frame.depth_m.shape
-    # A step of 5 degrees. Chosen by hand; not searched.
-    nearer = np.zeros(72, bool)
-    for scale in BESIDE:
-        points = conic.sample_ellipses(
-            (row * [1.0, 1.0, scale, scale, 1.0])[None],
-            np.linspace(0.0, 2 * np.pi, 72, endpoint=False),
-        )[0][0]
-        column, line = np.rint(points).astype(int).T
-        on = (column >= 0) & (column < width) & (line >= 0) & (line < height)
-        depth = frame.depth_m[line.clip(0, height - 1), column.clip(0, width - 1)]
-        rays = (
-            np.column_stack([points, np.ones(len(points))]) @ np.linalg.inv(frame.camera_matrix).T
-        )
-        # Four standard deviations: of 72 points none is nearer by chance.
-        # False where depth is unknown.
-        nearer |= on & (1.0 / depth - rays @ face.m > 4 * face.sigma)
-    return float(nearer.mean())
 
 
 def as_row(ellipse: Ellipse) -> np.ndarray:

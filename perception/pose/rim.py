@@ -131,7 +131,6 @@ def fit_rim_circle(
     radius_m: float,
     tolerance: float,
     center_px: float,
-    shape_px: float,
 ) -> RimCircle | None:
     """Fit the circle on the plane `m · P = 1` along which most edges run from dark to bright.
 
@@ -144,8 +143,8 @@ def fit_rim_circle(
         m: Plane, `(3,)`.
         radius_m: Expected radius.
         tolerance: Allowed relative error of it.
-        center_px: Standard deviation of the centre of a whole rim that no residual shows, px.
-        shape_px: Standard deviation of each of the `WAVES` of a rim, px.
+        center_px: Least standard deviation of each wave of a rim, px: of the first one, which no
+            residual shows, and of the `WAVES` beyond what the residuals show.
     """
     ray = np.linalg.solve(camera_matrix, np.array([ellipse[0], ellipse[1], 1.0]))
     chart = build_chart(ray / (m @ ray), m, camera_matrix)
@@ -165,7 +164,7 @@ def fit_rim_circle(
         )
         if profiles is None:
             return None
-        fit = _fit_circle(found, profiles.edges, profiles.pixel_m, center_px, shape_px)
+        fit = _fit_circle(found, profiles.edges, profiles.pixel_m, center_px)
         found = None if fit is None else fit.circle
         # Half as much more than the final limit, which the caller checks.
         if found is not None and abs(found[2] - radius_m) > 1.5 * tolerance * radius_m:
@@ -297,7 +296,7 @@ def _vote_for_circle(
 
 
 def _fit_circle(
-    start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float, shape_px: float
+    start: np.ndarray, edges: np.ndarray, pixel_m: np.ndarray, center_px: float
 ) -> _CircleFit | None:
     """Fit a circle to the edges nearest to one; `None` where too few determine it."""
     found = start
@@ -328,12 +327,32 @@ def _fit_circle(
     alike = max((ALIKE_PX * float(np.median(pixel_m)) + ALIKE_M) / spacing_m, 1.0)
     angle = np.arctan2(away[on, 1], away[on, 0])
     # Systematic errors: the first wave moves the centre itself, the others deform the rim.
-    moves = [center_px * np.cos(angle), center_px * np.sin(angle)]
-    for number in WAVES:
-        moves += [shape_px * np.cos(number * angle), shape_px * np.sin(number * angle)]
+    wave_px = float(np.hypot(_measure_waves(off[on], angle, weight[on], alike), center_px))
+    moves = []
+    for number in (1, *WAVES):
+        moves += [wave_px * np.cos(number * angle), wave_px * np.sin(number * angle)]
     moved = np.linalg.solve(normal, heavy.T @ np.column_stack(moves))[:2]
     cov = np.linalg.inv(normal)[:2, :2] * rms_px**2 * alike + moved @ moved.T
     return _CircleFit(found, cov, rms_px, coverage)
+
+
+def _measure_waves(
+    off_px: np.ndarray, angle: np.ndarray, weight: np.ndarray, alike: float
+) -> float:
+    """Return the standard deviation of a coefficient of the `WAVES` of a rim, px, beyond its noise.
+
+    No residual shows the first wave, which is a shift of the circle. Light, chips and lens make it
+    about as large as the next ones.
+    """
+    columns = []
+    for number in WAVES:
+        columns += [np.cos(number * angle), np.sin(number * angle)]
+    design = np.column_stack(columns)
+    root = np.sqrt(weight)
+    waves, *_ = np.linalg.lstsq(design * root[:, None], off_px * root, rcond=1e-3)
+    rest = off_px - design @ waves
+    noise = float(np.average(rest**2, weights=weight)) * alike * 2.0 / len(off_px)
+    return float(np.sqrt(max(float(np.mean(waves**2)) - noise, 0.0)))
 
 
 def _find_profiles_beside_gaps(on: np.ndarray) -> np.ndarray:

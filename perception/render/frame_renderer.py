@@ -15,7 +15,6 @@ from perception import dataset
 from perception.dataset import FrameLabel, SceneTruth, TrueCircle
 from perception.render.board_on_arm import BoardOnArm
 from perception.render.camera_sensor import draw_dust, take_picture
-from perception.render.footage import Footage
 from perception.render.photographed_surfaces import PhotographedSurfaces
 from perception.render.ray_tracer import Tracer
 from perception.render.scene_ranges import Scene, SceneRanges
@@ -61,7 +60,7 @@ class FrameRenderer:
     """
 
     rig: StereoRig
-    scene: SceneRanges | Footage | BoardOnArm
+    scene: SceneRanges | BoardOnArm
     surfaces: PhotographedSurfaces
     stereo: Stereo
     depth: Literal["matched", "exact", "none"]

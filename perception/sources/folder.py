@@ -32,8 +32,8 @@ class FrameFolder:
         folder: The folder.
         rate_hz: Frame rate; gives frame `k` the time k / rate_hz.
         least_known: Least part of the picture with known depth.
-        needs: Required files of a frame. `depth`: all. `camera`: `camera.yaml`, but no depth: for
-            boards and networks. `nothing`: any photographs, grey ones too, for ellipses alone.
+        needs: Required files of a frame. `depth`: depth, or a pair that is matched here. `pair`: the
+            same, but a pair is left to the finder. `camera`: a picture alone, for boards.
         base_from_camera: Pose of the camera in the base frame: `calibration.yaml` of
             `mode=calibrate`, or `(4, 4)`; `null` takes `T_base_cam` of `camera.yaml`.
         stereo: Computes the depth of a frame that has a right picture and no depth.
@@ -43,7 +43,7 @@ class FrameFolder:
     folder: str
     rate_hz: Positive
     least_known: Share
-    needs: Literal["depth", "camera", "nothing"]
+    needs: Literal["depth", "pair", "camera"]
     base_from_camera: CameraPlacement
     stereo: Stereo
     pair: PairCheck
@@ -143,20 +143,17 @@ class FolderSource:
     def __enter__(self) -> FolderSource:
         self._stems, self._next = dataset.list_stems(self._place), 0
         path = self._place / dataset.CAMERA
-        self._camera = (
-            None if self._settings.needs == "nothing" and not path.exists() else read_camera(path)
-        )
+        camera = read_camera(path)
         place = load_extrinsics(self._settings.base_from_camera, "source.base_from_camera")
-        if self._camera is not None and place.base_from_camera is not None:
-            self._camera = replace(
-                self._camera, base_from_camera=place.base_from_camera, cov=place.cov
-            )
-        if self._camera is not None and place.disparity_std_px is not None:
-            self._camera = replace(
-                self._camera,
+        if place.base_from_camera is not None:
+            camera = replace(camera, base_from_camera=place.base_from_camera, cov=place.cov)
+        if place.disparity_std_px is not None:
+            camera = replace(
+                camera,
                 disparity_std_px=place.disparity_std_px,
                 disparity_error_px=place.disparity_error_px,
             )
+        self._camera = camera
         return self
 
     def __exit__(self, *exc: Any) -> None:
@@ -179,11 +176,11 @@ class FolderSource:
         for ending in (dataset.COLOR, dataset.RIGHT):
             paths[ending] = stem.with_name(stem.name + ending)
         picture = read_picture(paths[dataset.COLOR])
-        if self._settings.needs == "nothing" and picture.ndim == 2:
-            picture = np.repeat(picture[..., None], 3, 2)
         color = validation.convert_color(picture, str(paths[dataset.COLOR]))
         height, width = color.shape[:2]
-        camera = self._camera or CameraModel(_guess_camera_matrix(height, width), None, None, None)
+        camera = self._camera
+        if camera is None:
+            raise FrameError(f"{self._place}: not open; use it in a `with` block")
         where = str(self._place / dataset.CAMERA)
         validation.check_size(camera.size_px, height, width, where, str(paths[dataset.COLOR]))
         validation.check_matrix_fits(camera.matrix, height, width, where)
@@ -221,7 +218,7 @@ class FolderSource:
             found = validation.check_depth(values, str(where), least)
             validation.check_same_size(color, found, str(where), "depth")
             return found, 1
-        if self._settings.needs != "depth":
+        if self._settings.needs == "camera":
             return np.full(color.shape[:2], np.nan, np.float32), 1
         if right is None:
             raise FrameError(
@@ -233,6 +230,8 @@ class FolderSource:
                 f"{stem}: depth of a pair needs baseline_m and a rectified camera (dist 0) in "
                 f"{dataset.CAMERA}"
             )
+        if self._settings.needs == "pair":
+            return np.full(color.shape[:2], np.nan, np.float32), 1
         matched = self._settings.stereo.depth_m(
             color, right, float(camera.matrix[0, 0]), camera.baseline_m
         )
@@ -253,13 +252,6 @@ def _load_array(path: Path) -> np.ndarray:
         return np.load(path, allow_pickle=False)
     except (OSError, ValueError, EOFError) as error:
         raise FrameError(f"{path}: truncated or no array ({error})") from error
-
-
-def _guess_camera_matrix(height: int, width: int) -> np.ndarray:
-    """Return the camera matrix of a lens of 53 degrees, for pictures of unknown cameras."""
-    return np.array(
-        [[width, 0.0, (width - 1) / 2], [0.0, width, (height - 1) / 2], [0.0, 0.0, 1.0]]
-    )
 
 
 def _is_whole_png(data: bytes) -> bool:

@@ -12,7 +12,7 @@ from brokk_rl.machine import Machine
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Positive, spec
 from perception.mount.approach import plan_approach_motion
-from perception.mount.mounts import CameraMountSpec
+from perception.mount.mounts import AxesMount
 from perception.mount.next_view import ExpectedCovariance, HoleBelief, ViewChoice
 from perception.mount.occlusion import ArmShape
 from perception.render.stereo_camera import place_rig
@@ -33,7 +33,7 @@ class MovingCamera:
     """
 
     camera: SimulatedCamera
-    mount: CameraMountSpec
+    mount: AxesMount
     next_view: ExpectedCovariance
     arm: ArmShape
     machine: Machine

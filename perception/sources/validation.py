@@ -175,11 +175,26 @@ def check_disparity_error(value: Any, where: str) -> tuple[float, float, float]:
 
 
 def convert_color(picture: np.ndarray, where: str) -> np.ndarray:
-    """Return a picture as RGB, `(h, w, 3)` uint8; it comes as OpenCV reads it, blue first."""
-    if picture.ndim != 3 or picture.shape[2] not in (3, 4):
-        raise FrameError(f"{where}: a grey picture, expected colour (3 channels of 8 bits)")
+    """Return a picture as RGB, `(h, w, 3)` uint8; it comes as OpenCV reads it, blue first.
+
+    Infrared and industrial cameras give one channel, of 8 bits or of more in 16: three alike are
+    made of it, and of 16 bits the brightest value decides the scale.
+    """
+    if picture.ndim == 3 and picture.shape[2] == 1:
+        picture = picture[..., 0]
+    if picture.ndim == 2 and picture.dtype == np.uint16:
+        bits = max(int(picture.max(initial=0)).bit_length(), 8)
+        picture = (picture >> (bits - 8)).astype(np.uint8)
     if picture.dtype != np.uint8:
-        raise FrameError(f"{where}: {picture.dtype} in each channel, expected 8 bits")
+        raise FrameError(
+            f"{where}: {picture.dtype} in each channel, expected 8 bits, or 16 bits of a grey picture"
+        )
+    if picture.ndim == 2:
+        return np.ascontiguousarray(np.repeat(picture[..., None], 3, 2))
+    if picture.ndim != 3 or picture.shape[2] not in (3, 4):
+        raise FrameError(
+            f"{where}: a picture of shape {picture.shape}, expected 1, 3 or 4 channels"
+        )
     return np.ascontiguousarray(picture[..., 2::-1])
 
 

@@ -7,7 +7,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from composed import option
 from drawn import AXIS, CENTER, K, both_views, drawn
 
 from perception.pose import alignment, broken_rim, rim
@@ -70,20 +69,3 @@ def test_the_depth_of_a_break_is_read_from_both_pictures() -> None:
     assert both is not None and profiles is not None
     odds = broken_rim.compare_depths(both, chart, profiles, float(np.sqrt(row[2] * row[3])))
     assert broken_rim.DEPTHS_M[int(np.argmax(odds.sum(0)))] == pytest.approx(0.016, abs=2e-3)
-
-
-def test_a_hole_half_in_a_shadow_is_proposed_and_texture_is_not() -> None:
-    frame, masks, ellipse = drawn()
-    gray = convert_to_gray(frame).astype(float)
-    # the shadow's edge crosses the middle of the hole
-    gray[:, int(ellipse.x) :] *= 0.35
-    color = np.repeat(gray.astype(np.uint8)[..., None], 3, 2)
-    proposer = option("perception/proposer", "face_regions").build()
-    found = proposer.propose(replace(frame, color=color), masks)
-    near = [one for one in found if np.hypot(one.x - ellipse.x, one.y - ellipse.y) < 0.2 * one.a]
-    assert len(near) == 1
-    assert near[0].a == pytest.approx(ellipse.a, rel=0.05)
-    assert near[0] is found[0], "it is the likeliest one"
-    flat, masks, _ = drawn(depth_m=0.0)
-    without = replace(flat, color=np.full_like(flat.color, 150))
-    assert proposer.propose(without, masks) == []

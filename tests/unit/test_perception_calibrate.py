@@ -297,7 +297,7 @@ def test_the_command_finds_the_camera_and_sources_take_its_file(
     assert "corners of the board" in lost["left_out"]
     folder = FrameFolder(
         folder=str(footage), rate_hz=1.0, least_known=0.0, needs="camera", base_from_camera="run/calibration.yaml",
-        stereo=load_part("stereo"), pair=option("perception/pair", "matched_features"),
+        stereo=load_part("stereo"), pair=load_part("pair_check"),
     )  # fmt: skip
     with folder.build() as source:
         frame = source.read_latest()
@@ -447,7 +447,7 @@ def test_a_given_point_is_as_exact_as_a_click_of_the_camera_that_is_known(
             source=FrameFolder(
                 folder=str(tmp_path),
                 stereo=load_part("stereo"),
-                pair=option("perception/pair", "matched_features"),
+                pair=load_part("pair_check"),
                 rate_hz=10.0,
                 least_known=0.01,
                 needs="depth",

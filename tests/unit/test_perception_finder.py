@@ -29,16 +29,7 @@ def test_a_hole_is_found_from_picture_and_depth_alone() -> None:
     assert len(found.holes) == 1
     assert found.holes[0].center_m == pytest.approx(CENTER, abs=1e-3)
     assert float(found.holes[0].axis @ AXIS) > np.cos(np.radians(0.3))
-    assert {"segment", "regions", "pose", "total"} <= set(found.ms)
-    assert "ellipse" not in found.ms, "a region is a hole, so no arcs are searched"
-
-
-def test_without_a_region_the_arcs_are_searched() -> None:
-    frame, masks, _ = drawn(noise=0.001)
-    spec = replace(option("perception", "plane_conic"), proposer=None)
-    segmenter = SimpleNamespace(build=lambda: SimpleNamespace(segment=lambda frame: masks))
-    found = replace(spec, segmenter=segmenter).build().find(frame)
-    assert len(found.holes) == 1 and "ellipse" in found.ms
+    assert {"segment", "ellipse", "pose", "total"} <= set(found.ms)
 
 
 def test_the_base_frame_is_where_the_camera_is_said_to_be() -> None:

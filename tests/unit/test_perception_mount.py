@@ -90,20 +90,20 @@ def test_a_rod_hides_exactly_the_part_of_the_rim_behind_it() -> None:
 
 
 def test_the_next_view_sees_a_hole_that_the_arm_will_hide(machine: Machine) -> None:
-    mount, planner = plan(machine, "hand_placed", move_s=1.0)
-    # the arm comes to rest between the first place and the hole
+    mount, planner = plan(machine, "mast")
+    # the arm comes to rest between the camera and the hole
     q = np.array([0.0, -0.6, 1.2, 0.8, 0.3])
     between = (mount.locate(mount.start, q)[:3, 3] + 3 * HOLE_M) / 4
     planner._arm = _Wall(between)
     view = planner.choose(believe(), mount.start, np.stack([q] * 7)).view
-    assert view.is_moving and view.name in ("right", "beyond")
+    assert view.is_moving
     assert view.seen_before_s == 0.0 and view.seen_s > 3.0
     assert view.std_m < view.std_before_m
     assert "Camera moves" in view.explain() and view.name in view.explain()
 
 
 class _Wall:
-    """A ball before the first place, in the place of an arm."""
+    """A ball before the camera, in the place of an arm."""
 
     def __init__(self, center_m: np.ndarray) -> None:
         self._center_m = center_m
@@ -114,7 +114,7 @@ class _Wall:
 
 
 def test_a_camera_that_sees_the_hole_as_well_as_any_stays(machine: Machine) -> None:
-    mount, planner = plan(machine, "hand_placed")
+    mount, planner = plan(machine, "mast")
     q = np.stack([machine.home] * 7)
     view = planner.choose(believe(), mount.start, q).view
     assert not view.is_moving and view.travel_s == 0.0
@@ -169,12 +169,12 @@ def test_a_scene_seen_from_elsewhere_is_the_same_scene() -> None:
 def test_a_view_that_showed_nothing_is_left_for_another_one_and_not_for_itself(
     machine: Machine,
 ) -> None:
-    mount, planner = plan(machine, "hand_placed", move_s=1.0)
+    mount, planner = plan(machine, "mast")
     q = np.stack([machine.home] * 7)
     before = planner.choose(believe(), mount.start, q, num_missed=0)
     after = planner.choose(believe(), mount.start, q, num_missed=8)
     assert not before.view.is_moving
-    assert after.view.is_moving and after.position[0] != mount.start[0]
+    assert after.view.is_moving and not np.array_equal(after.position, mount.start)
 
 
 def test_the_mast_turns_to_the_hole_wherever_the_arm_points(machine: Machine) -> None:

@@ -11,6 +11,7 @@ from composed import option
 from drawn import K, drawn
 
 from brokk_rl.contracts.vision import HolePose
+from brokk_rl.extensions import load_part
 from brokk_rl.signals import Frame
 from perception import pair_check
 from perception.finder import explain_rejection
@@ -85,13 +86,13 @@ def pair(down_px: float, roll_rad: float, seed: int = 0) -> Frame:
 
 
 def fault(frame: Frame) -> str | None:
-    found = option("perception/pair", "matched_features").find_fault(frame)
+    found = load_part("pair_check").find_fault(frame)
     return None if found is None else found.reason
 
 
 def test_pitch_and_roll_of_a_pair_are_measured() -> None:
     roll_rad = np.radians(0.05)
-    check = option("perception/pair", "matched_features")
+    check = load_part("pair_check")
 
     def measure(frame: Frame) -> pair_check.PairAlignment:
         assert frame.right is not None
@@ -149,7 +150,7 @@ def test_a_pair_that_is_not_rectified_is_refused_and_calibration_is_asked_for() 
 
 
 def test_a_pair_once_found_good_stays_good_where_nothing_can_be_told() -> None:
-    watch = option("perception/pair", "matched_features", every=1).build()
+    watch = replace(load_part("pair_check"), every=1).build()
     good = pair(0.0, 0.0)
     blank = replace(good, color=np.full_like(good.color, 128), right=np.full_like(good.color, 128))
     assert watch.find_fault(blank) is not None

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,21 +12,17 @@ import yaml
 from composed import option
 
 from brokk_rl import record
-from brokk_rl.errors import ConfigError
 from brokk_rl.extensions import load_part
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
-from perception import dataset
 from perception.benchmark.session_score import score_holes
 from perception.calibrate.arm import compute_link_poses
 from perception.label.camera_pose import Charuco
 from perception.render.board_on_arm import BoardOnArm
-from perception.render.footage import Footage
 from perception.render.frame_renderer import FrameRenderer
 from perception.render.photographed_surfaces import NO_PHOTOGRAPHS
 from perception.render.stereo_camera import StereoRig
 
-SMALL = ("rig.width=640", "rig.height=360", "rig.focal_px=264.0")
 SESSION = Session(out=".", seed=4, device="cpu")
 
 
@@ -84,42 +78,6 @@ def test_a_board_on_the_arm_is_where_the_recording_says(rig: StereoRig, tmp_path
     away_px = expected - corners_px
     assert np.median(np.linalg.norm(away_px, axis=1)) < 0.15
     assert np.abs(away_px.mean(0)).max() < 0.05
-
-
-def test_footage_is_of_one_block_in_one_place(
-    brokk: Callable[..., Any], rig: StereoRig, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    done = brokk(
-        "mode=render", "scene=footage", "render.count=2", "studio.depth=none", "studio.pair=false", *SMALL,
-        f"session.out={out}",
-    )  # fmt: skip
-    assert done.code == 0, done.err
-    cameras = yaml.safe_load((out / "cameras.yaml").read_text())
-    placing = yaml.safe_load((out / "placing.yaml").read_text())
-    assert "T_base_cam" not in yaml.safe_load((out / "frames/camera.yaml").read_text())
-    centers, corners = [], []
-    for name, pose in cameras.items():
-        truth = dataset.read_truth(out / "frames" / name)
-        pose = np.array(pose)
-        centers.append([hole.center_in_base_m for hole in truth.holes])
-        local = np.array(truth.block["rotation"]) @ (np.array([-1, -1, 1]) * truth.block["half_m"])
-        corner = local + truth.block["center_m"]
-        corners.append(pose[:3, :3] @ corner + pose[:3, 3])
-        if name == placing["frame"]:
-            matrix = np.array(yaml.safe_load((out / "frames/camera.yaml").read_text())["K"])
-            seen = (matrix @ corner)[:2] / corner[2]
-            assert np.linalg.norm(seen - placing["corners_px"][0]) == pytest.approx(2.0, abs=0.1)
-    np.testing.assert_allclose(centers[0], centers[1], atol=1e-9)
-    np.testing.assert_allclose(corners[0], corners[1], atol=1e-9)
-    assert not np.allclose(cameras["00000"], cameras["00001"])
-    assert dataset.read_label(out / "frames/00001").block.any()
-
-
-def test_footage_needs_a_block() -> None:
-    kind: Footage = option("scene", "footage")
-    with pytest.raises(ConfigError, match="expected a block with a hole"):
-        replace(kind, kind=option("scene", "empty"))
 
 
 def test_a_score_counts_each_hole_once() -> None:

@@ -55,7 +55,7 @@ def folder(path: Path, **changes: Any) -> FrameFolder:
                 "needs": "depth",
                 "base_from_camera": None,
                 "stereo": load_part("stereo"),
-                "pair": option("perception/pair", "matched_features"),
+                "pair": load_part("pair_check"),
             }
             | changes
         ),
@@ -133,7 +133,6 @@ BREACHES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "empty colour": (lambda f: cut(f / "00000.color.png", 0.0), r"00000.color.png: empty"),
     "no picture": (lambda f: (f / "00000.color.png").write_text("hello"), r"00000.color.png: truncated or no picture"),
     "truncated depth": (lambda f: cut(f / "00000.depth.npy", 0.5), r"00000.depth.npy: truncated"),
-    "grey": (lambda f: save(f / "00000.color.png", np.zeros(SIZE, np.uint8)), r"00000.color.png: a grey picture, expected colour"),
     "16 bit colour": (lambda f: save(f / "00000.color.png", np.zeros((*SIZE, 3), np.uint16)), r"uint16 in each channel"),
     "8 bit depth": (lambda f: save(f / "00000.depth.png", np.full(SIZE, 9, np.uint8)), r"00000.depth.png: uint8, expected 16 bits"),
     "coloured depth": (lambda f: save(f / "00000.depth.png", np.zeros((*SIZE, 3), np.uint16)), r"3 channels, expected one"),
@@ -215,14 +214,15 @@ def test_a_camera_without_a_place_or_a_baseline_is_welcome(frames: Path) -> None
     assert first.base_from_camera is None and first.baseline_m is None and first.distortion is None
 
 
-def test_photographs_alone_will_do_for_ellipses(tmp_path: Path) -> None:
-    save(tmp_path / "grey.color.png", np.full(SIZE, 90, np.uint8))
-    found = read(tmp_path, needs="nothing")[0]
-    assert (
-        found.color.shape == (*SIZE, 3)
-        and (found.color == 90).all()
-        and np.isnan(found.depth_m).all()
-    )
+def test_grey_pictures_of_8_and_of_10_bits_are_welcome(frames: Path) -> None:
+    save(frames / "00000.color.png", np.full(SIZE, 90, np.uint8))
+    deep = np.full(SIZE, 512, np.uint16)
+    deep[0] = 1023
+    save(frames / "00001.color.png", deep)
+    first, second = read(frames)
+    assert first.color.shape == (*SIZE, 3) and (first.color == 90).all()
+    assert second.color.dtype == np.uint8
+    assert (second.color[0] == 255).all() and (second.color[1:] == 128).all()
 
 
 def test_a_camera_matrix_of_another_resolution_is_refused_by_its_name(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.signals import Frame
-from perception.face_depth import FaceDepth
+from perception.pair_depth import PairDepth
 from perception.stereo import PicturePart, Stereo, predict_face_error
 
 FOCAL_PX, BASELINE_M = 1056.0, 0.12
@@ -65,7 +65,7 @@ def test_a_part_in_a_band_is_matched_as_exactly_as_the_picture(stereo: Stereo, s
 def test_a_far_place_is_matched_again_and_a_near_one_is_not(stereo: Stereo) -> None:
     coarse_px = SLANT + 1.0
     frame = make_frame(SLANT, coarse_px, 4)
-    finer = FaceDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(
+    finer = PairDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(
         frame, np.ones_like(SLANT, bool)
     )
     assert finer is not None
@@ -84,14 +84,14 @@ def test_an_occluder_outside_the_band_keeps_its_coarse_depth(stereo: Stereo) -> 
     coarse_px[:, 280:300] = 90.0
     on_block = coarse_px < 60.0
     frame = make_frame(SLANT, coarse_px, 4)
-    finer = FaceDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(frame, on_block)
+    finer = PairDepth(stereo=stereo, radius_px=12.0, extent=6.0).build(frame, on_block)
     assert finer is not None
     seen = finer.match_around(hole_at(260, 120))
     assert np.array_equal(seen.depth_m[:, 280:300], frame.depth_m[:, 280:300])
 
 
 def test_fine_depth_and_depth_without_a_pair_stay() -> None:
-    faces = FaceDepth(stereo=instantiate(OmegaConf.load("conf/stereo.yaml")), radius_px=12.0, extent=6.0)  # fmt: skip
+    faces = PairDepth(stereo=instantiate(OmegaConf.load("conf/stereo.yaml")), radius_px=12.0, extent=6.0)  # fmt: skip
     frame, on = make_frame(SLANT, SLANT, 4), np.ones_like(SLANT, bool)
     assert faces.build(replace(frame, depth_shrink=1), on) is None
     assert faces.build(replace(frame, right=None), on) is None

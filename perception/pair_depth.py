@@ -1,0 +1,205 @@
+"""Depth of a pair where it is needed: coarse for the whole picture, fine around places.
+
+A coarse match of the whole picture is enough to find the block and places on it. Around each of
+them the pictures are matched again, in a narrow band of disparities around the coarse ones, or
+around the plane of a hole that was seen before. Near places are matched coarsely, far ones finely,
+so that a hole is as many pixels wide everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Annotated
+
+import cv2
+import numpy as np
+from annotated_types import Ge
+
+from brokk_rl.contracts.vision import Ellipse
+from brokk_rl.signals import Frame
+from brokk_rl.spec import Positive, spec
+from perception.calibrate.disparity_error import correct_depth
+from perception.pose.plane import compute_inverse_depth
+from perception.stereo import PicturePart, Stereo
+
+# Chosen by hand on rendered scenes (benchmarks/perception/table.py).
+LEAST = 50
+"""Pixels of coarse depth on the block around a place from which its band is known."""
+OUTER = 1.0, 99.0
+"""Percentiles of these disparities between which the face lies."""
+BEHIND_M = 0.3
+"""Depth behind the face that is matched too: the inside of a hole."""
+BEFORE_M, NEAREST_M = 0.2, 0.3
+"""Depth before a face that was seen before and is matched too, for an arm that hides it; and least
+depth that is matched there."""
+ON_FACE = 0.03
+"""Relative departure of depth from an expected face within which it may be it: the base may have
+moved by centimetres since."""
+BAND_PX = 2.0
+"""Margin of the band, and largest change, in pixels of the coarse match."""
+
+
+@spec
+class PairDepth:
+    """Match a pair coarsely, and the surroundings of a place as finely as it needs.
+
+    Attributes:
+        stereo: The matcher; its `shrink` serves where the whole picture is matched, and is chosen
+            for each place elsewhere.
+        radius_px: Least major semi-axis of a hole in the pictures that are matched.
+        extent: Half the side of the matched square in major semi-axes.
+    """
+
+    stereo: Stereo
+    radius_px: Positive
+    extent: Annotated[float, Ge(1)]
+
+    def match_whole(self, frame: Frame) -> Frame:
+        """Return a frame with the depth of its pair; the frame itself if it has depth, or no pair."""
+        if frame.right is None or frame.baseline_m is None or np.isfinite(frame.depth_m).any():
+            return frame
+        focal_px = float(frame.camera_matrix[0, 0])
+        depth_m = self.stereo.depth_m(frame.color, frame.right, focal_px, frame.baseline_m)
+        if any(frame.disparity_error_px):
+            place = (frame.camera_matrix, frame.baseline_m, frame.disparity_error_px)
+            depth_m = correct_depth(depth_m, *place)
+        return replace(frame, depth_m=depth_m, depth_shrink=self.stereo.shrink)
+
+    def match_near(
+        self, frame: Frame, places: Sequence[tuple[Ellipse, np.ndarray]]
+    ) -> tuple[Frame, np.ndarray]:
+        """Return a frame with depth around holes that were seen before, and the pixels of their faces.
+
+        Args:
+            frame: A frame with a right picture.
+            places: The ellipse of each rim and its face, the plane `m · P = 1`, as expected.
+        """
+        assert frame.right is not None and frame.baseline_m is not None
+        pair = [cv2.cvtColor(some, cv2.COLOR_RGB2GRAY) for some in (frame.color, frame.right)]
+        pull_px = float(frame.camera_matrix[0, 0]) * frame.baseline_m
+        height, width = pair[0].shape
+        depth_m = np.full((height, width), np.nan, np.float32)
+        face = np.zeros((height, width), np.float32)
+        finest = 1
+        for place, m in places:
+            shrink = max(1, int(place.a / self.radius_px))
+            finest = max(finest, shrink)
+            part = _build_square(place, self.extent * place.a, shrink, height, width)
+            square = np.s_[part.top : part.top + part.height, part.left : part.left + part.width]
+            columns = part.left + np.arange(part.width)[None, :]
+            rows = part.top + np.arange(part.height)[:, None]
+            inverse = compute_inverse_depth(m, frame.camera_matrix, columns, rows)
+            near_px, far_px = pull_px * inverse.max(), pull_px * max(inverse.min(), 1e-3)
+            least_px = max(0.0, pull_px / (pull_px / far_px + BEHIND_M) - BAND_PX * shrink)
+            largest_px = pull_px / max(pull_px / near_px - BEFORE_M, NEAREST_M)
+            matcher = replace(self.stereo, shrink=shrink)
+            found_px = matcher.match_part(pair[0], pair[1], part, least_px, largest_px)
+            found_m = _convert_to_depth(found_px, frame, part)
+            depth_m[square] = np.where(np.isfinite(found_m), found_m, depth_m[square])
+            with np.errstate(invalid="ignore"):
+                face[square] = np.abs(found_m * inverse - 1.0) < ON_FACE
+        return replace(frame, depth_m=depth_m, depth_shrink=finest), face
+
+    def build(self, frame: Frame, on_block: np.ndarray) -> FaceMatcher | None:
+        """Return the matcher of a frame; `None` where its depth is fine enough, or has no pair.
+
+        Args:
+            frame: The frame; it is not changed.
+            on_block: Pixels of the block, `(h, w)` bool.
+        """
+        if frame.right is None or frame.baseline_m is None or frame.depth_shrink == 1:
+            return None
+        return FaceMatcher(self, frame, frame.right, frame.baseline_m, on_block)
+
+
+class FaceMatcher:
+    """Depth of one frame, which grows finer place by place."""
+
+    def __init__(
+        self,
+        settings: PairDepth,
+        frame: Frame,
+        right: np.ndarray,
+        baseline_m: float,
+        on_block: np.ndarray,
+    ) -> None:
+        self._settings, self._coarse, self._on_block = settings, frame, on_block
+        self._baseline_m = baseline_m
+        self._pair = [cv2.cvtColor(some, cv2.COLOR_RGB2GRAY) for some in (frame.color, right)]
+        # One frame for each resolution: those who look at it keep what they computed of it.
+        self._fine: dict[int, Frame] = {}
+        self._matched: dict[int, list[PicturePart]] = {}
+
+    def match_around(self, place: Ellipse) -> Frame:
+        """Return the frame with depth as fine around a place as it needs."""
+        coarse = self._coarse
+        shrink = max(1, int(place.a / self._settings.radius_px))
+        if shrink >= coarse.depth_shrink:
+            return coarse
+        if shrink not in self._fine:
+            own = replace(coarse, depth_m=coarse.depth_m.copy(), depth_shrink=shrink)
+            self._fine[shrink], self._matched[shrink] = own, []
+        # A place near the middle of a matched square needs no other one.
+        if not any(_is_central(place, part) for part in self._matched[shrink]):
+            height, width = self._on_block.shape
+            part = _build_square(place, self._settings.extent * place.a, shrink, height, width)
+            self._matched[shrink].append(part)
+            self._match(part, shrink)
+        return self._fine[shrink]
+
+    def _match(self, part: PicturePart, shrink: int) -> None:
+        """Match a part; its depth counts where it agrees with the coarse one.
+
+        Outside the band, on an occluder or deep inside a hole, the coarse depth stays.
+        """
+        coarse, matcher = self._coarse, replace(self._settings.stereo, shrink=shrink)
+        pull_px = float(coarse.camera_matrix[0, 0]) * self._baseline_m
+        square = np.s_[part.top : part.top + part.height, part.left : part.left + part.width]
+        before_m = coarse.depth_m[square]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            before_px = pull_px / before_m
+        face_px = before_px[self._on_block[square] & np.isfinite(before_px)]
+        if len(face_px) < LEAST:
+            return
+        far_px, near_px = np.percentile(face_px, OUTER)
+        room_px = BAND_PX * coarse.depth_shrink
+        least_px = max(0.0, pull_px / (pull_px / far_px + BEHIND_M) - room_px)
+        largest_px = near_px + room_px
+        found_px = matcher.match_part(self._pair[0], self._pair[1], part, least_px, largest_px)
+        found_m = _convert_to_depth(found_px, coarse, part)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            differs = np.abs(pull_px / found_m - before_px) > room_px
+            outside = (before_px < least_px) | (before_px > largest_px)
+        # Where either is unknown, both comparisons are false: the fine match decides.
+        self._fine[shrink].depth_m[square] = np.where(differs | outside, before_m, found_m)
+
+
+def _convert_to_depth(found_px: np.ndarray, frame: Frame, part: PicturePart) -> np.ndarray:
+    """Return the depth of a part, m, from its disparities, without their known error."""
+    assert frame.baseline_m is not None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        found_m = float(frame.camera_matrix[0, 0]) * frame.baseline_m / found_px
+    if not any(frame.disparity_error_px):
+        return found_m
+    corner = np.array([[0.0, 0.0, part.left], [0.0, 0.0, part.top], [0.0, 0.0, 0.0]])
+    matrix = frame.camera_matrix - corner
+    return correct_depth(found_m, matrix, frame.baseline_m, frame.disparity_error_px)
+
+
+def _build_square(
+    place: Ellipse, reach_px: float, shrink: int, height: int, width: int
+) -> PicturePart:
+    """Return the square around a place; it begins at a pixel of the shrunk picture."""
+    left = int(np.clip(place.x - reach_px, 0, width - 1)) // shrink * shrink
+    top = int(np.clip(place.y - reach_px, 0, height - 1)) // shrink * shrink
+    right = int(np.clip(place.x + reach_px, 1, width))
+    bottom = int(np.clip(place.y + reach_px, 1, height))
+    return PicturePart(left, top, max(1, right - left), max(1, bottom - top))
+
+
+def _is_central(place: Ellipse, part: PicturePart) -> bool:
+    """Return whether a place lies in the middle third of a part."""
+    x = (place.x - part.left) / part.width
+    y = (place.y - part.top) / part.height
+    return 1 / 3 < x < 2 / 3 and 1 / 3 < y < 2 / 3
