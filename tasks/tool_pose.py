@@ -11,19 +11,20 @@ kinematics when starts are drawn, so that resets only pick rows.
 from __future__ import annotations
 
 import contextlib
-import logging
 import math
-import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
 import torch
 
+from brokk_rl import distributed
 from brokk_rl.errors import ConfigError
 from brokk_rl.history import History
 from brokk_rl.kinematics import Kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.observation import PITCH, PROPOSALS, TARGET
+from brokk_rl.progress import ItemProgress
 from brokk_rl.sim import scene
 from brokk_rl.symmetry import Mirror, compute_joint_signs
 from tasks.control import (
@@ -38,8 +39,6 @@ from tasks.settings import CommandBase, ToolPoseTask
 from tasks.term_task import ObservedTerm
 from tasks.terms import ToolState
 
-log = logging.getLogger(__name__)
-
 Starts = dict[str, torch.Tensor]
 
 BATCH_FACTOR, MIN_BATCH = 4, 256
@@ -50,8 +49,6 @@ than a second on one core."""
 MIN_CANDIDATES, MIN_SHARE = 16384, 1 / 256
 """Candidates after which a draw is given up, where no larger share of them can be done. Chosen
 by hand: the default tasks accept about one in four."""
-REPORT_S = 5.0
-"""Seconds between two lines about the progress. Chosen by hand."""
 
 REACH_STEPS, REACH_MAX_STEP = 40, 0.1
 """Damped Newton steps of the exclusive joints towards the working range, and their largest step
@@ -292,12 +289,16 @@ class ToolPoseProcess(EpisodeProcess):
 
 
 class DrawTally:
-    """Counts of a draw: reports progress, and ends a draw of which nearly nothing can be done."""
+    """Counts of a draw, which ends where nearly nothing can be done.
+
+    Args:
+        task_name: Name of the task, for the message.
+        count: Starts that are asked for.
+    """
 
     def __init__(self, task_name: str, count: int) -> None:
         self._task_name, self._count = task_name, count
         self._candidates = self._free = self._in_range = self.done = 0
-        self._begun_s = self._reported_s = time.monotonic()
 
     def add(self, free: torch.Tensor, in_range: torch.Tensor, reached: torch.Tensor) -> None:
         """Count a chunk.
@@ -314,21 +315,9 @@ class DrawTally:
         self._free += int(free.sum())
         self._in_range += int(in_range.sum())
         self.done += int((in_range & reached).sum())
-        if self.done >= self._count:
-            return
-        if self._candidates >= MIN_CANDIDATES and self.done < MIN_SHARE * self._candidates:
+        is_rare = self.done < MIN_SHARE * self._candidates
+        if self.done < self._count and self._candidates >= MIN_CANDIDATES and is_rare:
             raise ConfigError(self._explain())
-        now_s = time.monotonic()
-        if now_s - self._reported_s >= REPORT_S:
-            self._reported_s = now_s
-            log.info(
-                "%s: %d of %d starts drawn in %.0f s; %.1f %% of the candidates can be done",
-                self._task_name,
-                self.done,
-                self._count,
-                now_s - self._begun_s,
-                100 * self.done / self._candidates,
-            )
 
     def get_shares(self) -> dict[str, float]:
         """Return the shares of all candidates that meet one condition after the other."""
@@ -391,34 +380,38 @@ class StartSearch:
         Raises:
             ConfigError: Nearly none of the drawn starts can be done.
         """
-        task, generator = self._task, torch.Generator().manual_seed(seed)
-        batch = max(BATCH_FACTOR * count, MIN_BATCH)
+        task, drawn = self._task, list[Starts]()
+        tally = tally or DrawTally(type(task).__name__, count)
         down_m = torch.tensor([0.0, 0.0, task.aim_below_m])
+        chunks = self._draw_chunks(max(BATCH_FACTOR * count, MIN_BATCH), seed)
+        with ItemProgress("drawing starts", count, not distributed.read_rank().first) as progress:
+            while tally.done < count:
+                free, part = next(chunks)
+                aim_m, pitch_rad = part["target_m"] - down_m, part["target_pitch_rad"]
+                _, in_range, reached = self.move(part["q"], aim_m, pitch_rad, task.arms.margin_rad)
+                drawn.append({name: value[in_range & reached] for name, value in part.items()})
+                tally.add(free, in_range, reached)
+                progress.reach(tally.done)
+        return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
+
+    def _draw_chunks(self, batch: int, seed: int) -> Iterator[tuple[torch.Tensor, Starts]]:
+        """Yield which arms of a chunk begin in the open, and these candidates, without end."""
+        generator = torch.Generator().manual_seed(seed)
 
         def draw_uniform(bounds: tuple[float, float]) -> torch.Tensor:
             return bounds[0] + (bounds[1] - bounds[0]) * torch.rand(batch, generator=generator)
 
-        drawn: list[Starts] = []
-        tally = tally or DrawTally(type(task).__name__, count)
-        while tally.done < count:
-            targets = task.draw_targets(draw_uniform)
+        while True:
+            targets = self._task.draw_targets(draw_uniform)
             q, free = self._draw_arms(targets.object_z_m, generator)
             scenes = scene.make_nominal_scenes(batch)
             for name, value in targets.scene.items():
                 scenes[:, scene.COLUMNS.index(name)] = value
-            target_m = torch.stack(targets.place_m, 1)
-            pitch_rad = targets.pitch_rad
-            rows = {"q": q, "scene": scenes, "target_m": target_m, "target_pitch_rad": pitch_rad}
+            rows = {"q": q, "scene": scenes, "target_m": torch.stack(targets.place_m, 1)}
+            rows["target_pitch_rad"] = targets.pitch_rad
             for first in range(0, batch, CHUNK):
-                inside = free[first : first + CHUNK]
-                part = {name: value[first : first + CHUNK][inside] for name, value in rows.items()}
-                aim_m, pitch_rad = part["target_m"] - down_m, part["target_pitch_rad"]
-                _, in_range, reached = self.move(part["q"], aim_m, pitch_rad, task.arms.margin_rad)
-                drawn.append({name: value[in_range & reached] for name, value in part.items()})
-                tally.add(inside, in_range, reached)
-                if tally.done >= count:
-                    break
-        return {name: torch.cat([part[name] for part in drawn])[:count] for name in drawn[0]}
+                rest = slice(first, first + CHUNK)
+                yield free[rest], {name: value[rest][free[rest]] for name, value in rows.items()}
 
     def move_near(
         self, start: Starts, share: float, height_m: tuple[float, float], seed: int

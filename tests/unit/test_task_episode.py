@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import Any
 
@@ -125,22 +124,6 @@ def test_a_draw_of_which_little_can_be_done_goes_on(
     done = torch.arange(6000) % 10_000 == 0
     with pytest.raises(ConfigError, match=r"a task: .* 31 of 12000 candidates"):
         tally.add(free, done, done)
-
-
-def test_a_long_draw_tells_how_far_it_is(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    clock = iter([0.0, 4.0, 6.0, 7.0, 12.0])
-    monkeypatch.setattr(tool_pose.time, "monotonic", lambda: next(clock))
-    tally = tool_pose.DrawTally("a task", 1000)
-    some = torch.arange(200) % 2 == 0
-    with caplog.at_level(logging.INFO):
-        for _ in range(4):
-            tally.add(torch.ones(200, dtype=torch.bool), some, some)
-    assert [record.getMessage() for record in caplog.records] == [
-        "a task: 200 of 1000 starts drawn in 6 s; 50.0 % of the candidates can be done",
-        "a task: 400 of 1000 starts drawn in 12 s; 50.0 % of the candidates can be done",
-    ]
 
 
 def test_a_draw_checked_in_parts_is_the_draw_checked_at_once(
