@@ -1,6 +1,6 @@
 """Each process of the running loop stopped and woken: python benchmarks/deploy/stopped.py <json>.
 
-The loop commands the twin (`deploy=auto`, nominal machine), with page, terminal and log. Each
+The loop commands the twin (`deploy=auto`, nominal machine), with page and log. Each
 process gets SIGSTOP for 0.9 s while the machine moves, then SIGCONT. A listener on the bus notes when
 the valves got nothing, and whether they move again before the dead-man is pressed anew. At last two
 hundred connections to the page send half a request and nothing more.
@@ -36,7 +36,7 @@ CHANNEL = "239.74.163.78"
 STOPPED_S, WOKEN_S, PATIENCE_S = 0.9, 1.5, 60.0
 """Times for which a process is stopped and watched afterwards, and patience. The twin's operator lets go
 and presses anew where nothing is heard of the PC for a second."""
-NAMES = ("supervisor", "bus", "policy", "page", "terminal", "log")
+NAMES = ("supervisor", "bus", "policy", "page", "log")
 NUM_MUTE = 200
 
 

@@ -14,21 +14,16 @@ import struct
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
-from brokk_rl.errors import ConfigError, LinkError
+from brokk_rl.errors import LinkError
 from brokk_rl.machine import Machine
-from brokk_rl.registry import resolve_package_path
 from deploy.bus.can_bus import BusReplay, CanBus, CanFrame, OpenBusReplay, OpenCanBus
 from deploy.bus.description import BusDescription
-from deploy.bus.shapes import read_machine_shapes
+from deploy.guard_setup import build_envelope, build_observer
 from deploy.kernel.bus_logic import CYCLE_S, BusInputs, BusLogic
-from deploy.kernel.envelope import Envelope
 from deploy.kernel.guard import GuardDecision
 from deploy.kernel.limits import GuardLimits
-from deploy.kernel.observer import Observer
 from deploy.kernel.target_check import SeenTarget
-from deploy.kernel.valve_model import describe_sources, load_observer_file
 from deploy.runtime.operator_state import PageSignal
 from deploy.runtime.process import CycleTimer, Stop
 from deploy.runtime.shm_layout import LoopMemory
@@ -43,10 +38,6 @@ FRAME = struct.Struct("<dIBB")
 """Header of a frame in the log's pipe.
 
 Time, identifier, 1 where it was sent from here, and the number of data bytes that follow."""
-DESKS = ("udp_multicast", "virtual", "replay")
-"""Interfaces of buses without a machine: twins and recorded frames."""
-MACHINES = ("machine: ", "capture: ", "log: ")
-"""Beginnings of the sources of recordings that may be of a machine."""
 FRAMES, TEXT = b"F", b"J"
 """First byte of an entry in the log's pipe: frames, or a JSON text with topic and time."""
 
@@ -225,71 +216,3 @@ class BusProcess:
     def _log_text(self, topic: str, now_s: float, values: Mapping[str, object]) -> None:
         text = json.dumps({"topic": topic, "t_s": now_s, **values})
         self._memory.bus_log.put(TEXT + text.encode())
-
-
-def build_observer(
-    limits: GuardLimits, machine: Machine, interface: str, commands: bool
-) -> Observer | None:
-    """Return the observer, and log its thresholds; see `read_observer_content`."""
-    content = read_observer_content(limits, machine, interface, commands)
-    if content is None or limits.observer is None:
-        return None
-    thresholds, path = content["thresholds"], limits.observer.path
-    pairs = zip(machine.joint_names, thresholds["slack_s"], strict=True)
-    slack = ", ".join(f"{name} {slack_s:g} s" for name, slack_s in pairs)
-    text = "observer: thresholds of %s, %s, %.0f minutes: %s of full speed"
-    log.info(text, path, describe_sources(content), thresholds["minutes"], slack)
-    return Observer(content, machine)
-
-
-def read_observer_content(
-    limits: GuardLimits, machine: Machine, interface: str, commands: bool
-) -> dict[str, Any] | None:
-    """Return the observer's file; `None` where it is switched off, or not of this machine.
-
-    Args:
-        limits: Of the guard.
-        machine: The machine.
-        interface: Of the bus.
-        commands: Whether commands may be sent.
-
-    Raises:
-        ConfigError: the file cannot be read, or is not of this machine where commands are sent.
-    """
-    if limits.observer is None:
-        return None
-    path = limits.observer.path
-    content = load_observer_file(resolve_package_path(path))
-    if content["fingerprint"] != machine.fingerprint():
-        fault = f"made for machine {content['machine']}, which differs from {machine.name}"
-    elif interface not in DESKS and not all(map(is_from_machine, content["sources"])):
-        fault = f"made {describe_sources(content)}, and this bus is that of a machine"
-    else:
-        return content
-    if commands:
-        raise ConfigError(
-            f"guard.observer.path: {path} was {fault}; its thresholds would be wrong. Make a file from "
-            "recordings of this machine by brokk mode=observe, or go without by guard.observer=null"
-        )
-    log.warning("%s was %s: there is no observer; brokk mode=observe makes a file", path, fault)
-    return None
-
-
-def is_from_machine(source: str) -> bool:
-    """Return whether a recording's source is a machine, as far as it says so: no simulator, no desk."""
-    return source.startswith(MACHINES) and not any(name in source for name in DESKS)
-
-
-def build_envelope(limits: GuardLimits, machine: Machine) -> Envelope | None:
-    """Return the envelope of the arm; `None` where it is switched off or no geometry is known.
-
-    Raises:
-        ConfigError: the machine's shapes cannot be read.
-    """
-    if limits.envelope is None:
-        return None
-    shapes = read_machine_shapes(machine)
-    if shapes is None:
-        log.warning("machine %s has no geometry: there is no envelope of its arm", machine.name)
-        return None
-    return Envelope(limits.envelope, machine, shapes, limits.speed_margin, limits.reaction_s)

@@ -19,7 +19,7 @@ from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.session import Session, write_json
 from brokk_rl.spec import Positive, spec
-from deploy.kernel.bus_process import read_observer_content
+from deploy.guard_setup import read_observer_content
 from deploy.page.loop_feed import PageProcessConfig
 from deploy.page.settings import PageSettings
 from deploy.recorder.capture import CaptureConfig

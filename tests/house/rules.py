@@ -69,6 +69,11 @@ CLOSED = {
     "deploy.kernel.guard": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.kernel.limits": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
     "deploy.kernel.plausibility": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.kernel.under_way": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.kernel.flow_check": ("torch", "os", "pathlib", "socket", "io", "time", "numpy"),
+    "deploy.kernel.target_check": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.kernel.receiver": ("torch", "os", "pathlib", "socket", "io", "time"),
+    "deploy.kernel.bus_logic": ("torch", "os", "pathlib", "socket", "io", "time"),
     "deploy.kernel.envelope": ("torch", "os", "pathlib", "socket", "io", "time"),
     "deploy.kernel.observer": ("torch", "os", "pathlib", "socket", "io", "time"),
 }

@@ -15,7 +15,7 @@ from composed import option
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.record import Recording, make_motion, write_recording
-from deploy.kernel.bus_process import build_observer, is_from_machine, read_observer_content
+from deploy.guard_setup import build_observer, is_from_machine, read_observer_content
 from deploy.observer_file import FILE, ThresholdSettings, count_alarms, find_thresholds
 
 MACHINE = option("machine", "brokk170")
