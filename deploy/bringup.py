@@ -195,7 +195,9 @@ class BringupChecklist(BusAndPolicySettings):
         try:
             for one in companions:
                 group.start(one.name, one.target, one.arguments, one.realtime)
-            self.start_processes(group, machine, target_s=math.inf, pitch_rad=None)
+            self.start_processes(
+                group, machine, target_s=math.inf, pitch_rad=None, needs_page=False
+            )
             facts = {"source": "bring-up"}
             capture = CaptureConfig(session.folder, self.dbc, machine, facts, pictures_hz=0.0)
             group.start("log", "deploy.recorder.capture:run", (capture,))

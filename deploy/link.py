@@ -137,7 +137,7 @@ class CanLink:
         # Recordings are made before there is a model of this machine: no observer yet.
         # Nobody watches a page, and the operator stands at the machine.
         limits = replace(can.limits, observer=None, vigilance_s=None)
-        config = BusProcessConfig(can.wire, can.dbc, machine, limits)
+        config = BusProcessConfig(can.wire, can.dbc, machine, limits, needs_page=False)
         arguments, files = (config, self._memory), self._memory.files
         priority = BUS_PRIORITY if can.realtime else None
         target = "deploy.kernel.bus_process:run"

@@ -18,8 +18,8 @@ from brokk_rl.errors import RecordingError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
 from brokk_rl.record import Recording
-from study import permutation_tests, tlx
-from study.crossover_analysis import GuidanceEffect, estimate_effect
+from study import tlx
+from study.crossover import GuidanceEffect, adjust_by_holm, estimate_effect
 from study.design import CONDITIONS, PERIODS, Hole, Success
 from study.measures import GUIDED_ONLY, MEASURES, measure
 from study.study_folder import Remark, StudyData
@@ -151,7 +151,7 @@ def _estimate_effects(found: Analysis) -> None:
         for name in family:
             deciding = found.effects[name].p
             p.append(math.nan if deciding is None else deciding)
-        adjusted = permutation_tests.adjust_by_holm(np.array(p))
+        adjusted = adjust_by_holm(np.array(p))
         found.holm |= dict(zip(family, adjusted.tolist(), strict=True))
 
 

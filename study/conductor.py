@@ -54,7 +54,6 @@ class Conductor:
         times: Countdown and the like.
         facts: Further fields of every trial: `simulated`, `twin`.
         seed: From which the order of pairs comes: of participant and period.
-        operators: Who is simulated, by condition; empty where people take part.
         clock: Monotonic time, s.
     """
 
@@ -67,7 +66,6 @@ class Conductor:
         times: Times,
         facts: dict[str, Any],
         seed: Callable[[str], int],
-        operators: dict[str, str] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder, self._machine, self._stage, self._words, self._times = (
@@ -77,7 +75,7 @@ class Conductor:
             words,
             times,
         )
-        self._facts, self._seed, self._operators, self._clock = facts, seed, operators or {}, clock
+        self._facts, self._seed, self._clock = facts, seed, clock
         # Trials that an interruption left half saved.
         for path in sorted((folder / folders.TRIALS).glob("*.json")):
             with suppress(ValueError):  # a file that cannot be read is said in the report
@@ -241,12 +239,9 @@ class Conductor:
         if step.trial is not None:
             hole = self._data.plan["design"]["holes"][step.trial.hole]
             start = np.array(self._data.plan["design"]["starts"][step.trial.start])
-            facts = self._facts | (
-                {"operator": self._operators[step.condition]} if self._operators else {}
-            )
             self._attempt = Attempt(
                 self._folder, self._data.plan["design"], step.trial, hole, start, self._machine, self._stage, self._times,
-                facts, self._clock,
+                self._facts, self._clock,
             )  # fmt: skip
         elif step.kind == "questionnaire":
             # Seeded by participant and period, so that a resumed questionnaire asks the same

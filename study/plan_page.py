@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from brokk_rl.report import Cell, Report
-from study import sample_size
+from study import crossover
 from study.design import Design, Trial
 
+SIZES = (5, 6, 8, 12, 16, 20, 24)
+"""Numbers of participants in the table of a plan."""
 RULES = (
     "Names are pseudonyms (P01, …). Who is who is written on paper, kept apart, and destroyed after the study; "
     "study.do=erase deletes a participant on request.",
@@ -20,12 +20,7 @@ RULES = (
 
 
 def build_plan_page(
-    design: Design,
-    machine: str,
-    seed: int,
-    planned: list[Trial],
-    errors: dict[str, Any],
-    notice: str = "",
+    design: Design, machine: str, seed: int, planned: list[Trial], notice: str = ""
 ) -> Report:
     """Return the page.
 
@@ -34,12 +29,11 @@ def build_plan_page(
         machine: Name of the machine.
         seed: Seed of the draw.
         planned: All trials.
-        errors: How often simulated studies of this plan err; see `study.study_steps`.
         notice: Said on top.
     """
     num, num_trials, inside = design.num_participants, len(design.holes), design.success
     # Everything is computed for this plan, so that the page can be judged before the study.
-    paired_least, sequence_least = sample_size.find_smallest_sizes(design.alpha)
+    paired_least, sequence_least = crossover.find_smallest_sizes(design.alpha)
     summary, tone = _judge_design(design, sequence_least)
     found = Report(f"Plan of a study on {machine}", summary, tone)  # type: ignore[arg-type]
     found.add_text(notice, "warn")
@@ -55,7 +49,6 @@ def build_plan_page(
         }
     )
     _add_sample_sizes(found, design, paired_least, sequence_least)
-    _add_error_rates(found, errors)
     found.add_heading("Rules")
     found.add_list(RULES)
     found.add_heading("Places")
@@ -78,26 +71,25 @@ def build_plan_page(
 
 def _judge_design(design: Design, sequence_least: int) -> tuple[str, str]:
     """Return a sentence on the power of the design, and whether it is good, bad or a warning."""
-    num = design.num_participants
-    can = sample_size.evaluate_size(num, design.alpha)
-    wanted = sample_size.find_sufficient_size(design.alpha)
+    num, dz = design.num_participants, crossover.LARGE_DZ
     if design.order == "fixed":
-        summary, tone = (
+        return (
             "With guidance first for all, order and guidance cannot be told apart, whatever the numbers say.",
             "bad",
         )
-    elif can.smallest_p > design.alpha:
-        summary, tone = (
-            f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is {can.smallest_p:.3f}. It takes "
-            f"{sequence_least} to be able to, and {wanted} to find a large effect (dz 0.8) in four of five studies.",
+    smallest = crossover.get_smallest_p((num + 1) // 2)
+    if smallest > design.alpha:
+        return (
+            f"{num} participants cannot reach p < {design.alpha:g}: the smallest possible p is "
+            f"{smallest:.3f}. It takes {sequence_least} to be able to.",
             "bad",
         )
-    else:
-        summary = f"{num} participants find an effect of dz 0.8 in {100 * can.power[1]:.0f} of 100 studies."
-        # Four of five is the usual power; less is a warning.
-        tone = "good" if can.power[1] >= 0.8 else "warn"
-        summary += "" if tone == "good" else f" {wanted} would find it in four of five."
-    return summary, tone
+    power = crossover.estimate_power(num, dz, design.alpha)
+    tone = "good" if power >= crossover.SUFFICIENT_POWER else "warn"
+    return (
+        f"{num} participants find an effect of dz {dz:g} in {100 * power:.0f} of 100 studies.",
+        tone,
+    )
 
 
 def _add_sample_sizes(
@@ -107,55 +99,22 @@ def _add_sample_sizes(
     found.add_text(
         "An exact paired test cannot go below p = 0.0625 with five participants: such a study can never be significant at 0.05. "
         f"It takes {paired_least} for that, and {sequence_least} for the test that keeps practice apart from guidance. "
-        f"Power is the share of up to {sample_size.STUDIES} simulated studies that find the effect; dz is the mean difference in "
+        f"Power is the share of up to {crossover.NUM_STUDIES} simulated studies that find the effect; dz is the mean difference in "
         "standard deviations of it."
     )
-    columns = [
-        "participants",
-        "smallest p, paired",
-        "with the period in the model",
-        *(f"dz {dz:g}" for dz in sample_size.EFFECTS_DZ),
-    ]
-    # The plan's own number stands among the usual ones.
-    sizes = sorted({*sample_size.SIZES, design.num_participants})
+    columns = ["participants", "smallest p, paired", "with the period in the model"]
+    columns += [f"dz {dz:g}" for dz in crossover.EFFECTS_DZ]
     rows = []
-    for size in (sample_size.evaluate_size(num, design.alpha) for num in sizes):
-        here = size.num_participants == design.num_participants
-        name = Cell(str(size.num_participants), note="this plan" if here else "")
-        rows.append(
-            [
-                name,
-                f"{size.smallest_paired_p:.2g}",
-                f"{size.smallest_p:.2g}",
-                *(f"{power:.2f}" for power in size.power),
-            ]
-        )
+    # The plan's own number stands among the usual ones.
+    for num in sorted({*SIZES, design.num_participants}):
+        name = Cell(str(num), note="this plan" if num == design.num_participants else "")
+        least = crossover.get_smallest_p(num), crossover.get_smallest_p((num + 1) // 2)
+        row: list[str | Cell] = [name, f"{least[0]:.2g}", f"{least[1]:.2g}"]
+        for dz in crossover.EFFECTS_DZ:
+            row.append(f"{crossover.estimate_power(num, dz, design.alpha):.2f}")
+        rows.append(row)
     found.add_table(
         columns, rows, "smallest possible p of both tests, and power with the period in the model"
-    )
-
-
-def _add_error_rates(found: Report, errors: dict[str, Any]) -> None:
-    found.add_heading("How such a study errs")
-    found.add_text(
-        "Studies drawn from a fast model of people at work (skill, practice by the power law, holes, chance; no machine), "
-        "analysed as this one will be."
-    )
-    rows = []
-    for entry in errors["studies"]:
-        low, high = entry["ci95"]
-        rows.append(
-            [
-                entry["what"],
-                str(entry["num_participants"]),
-                f"{entry['planted_dz']:g}",
-                Cell(f"{entry['share']:.3f}", f"{low:.3f} to {high:.3f}"),
-            ]
-        )
-    found.add_table(
-        ["study", "participants", "true dz", "called significant"],
-        rows,
-        f"{errors['studies'][0]['studies']} studies each; below: 95 % interval",
     )
 
 

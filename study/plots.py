@@ -1,4 +1,4 @@
-"""The pictures of a study: the paper's two (tool paths, radar), each person, and intervals.
+"""The pictures of a study: the paper's two (tool paths, radar), and each person.
 
 Guided is always blue and solid, unguided orange and dotted.
 """
@@ -16,7 +16,6 @@ from brokk_rl.plot import BLUE, GREEN, GREY, ORANGE, RED, add_legend, make_figur
 from brokk_rl.statistics import compute_student_interval
 from study import tlx
 from study.analysis import Analysis, MeasuredTrial
-from study.crossover_analysis import GuidanceEffect
 from study.measures import MEASURES
 
 LOOK = {"guided": (BLUE, "-"), "unguided": (ORANGE, ":")}
@@ -121,29 +120,6 @@ def draw_pairs(found: Analysis, names: Sequence[str]) -> Figure:
     return figure
 
 
-def draw_effects(found: Analysis, names: Sequence[str]) -> Figure:
-    """Draw the effect of guidance on each measure in standard deviations of a person's difference, with 95 % intervals."""
-    figure = make_figure(8.0, 0.36 * len(names) + 1.4)
-    axis = figure.add_subplot()
-    axis.axvline(0.0, color=GREY, linewidth=1)
-    for row, name in enumerate(names):
-        dz, interval = standardize_effect(found.effects[name])
-        if dz is None or interval is None:
-            axis.text(0.0, row, "  too few", va="center", fontsize=8, color=GREY)
-            continue
-        # Scales of workload: less is better.
-        better = {each.name: each.better for each in MEASURES}.get(name, -1)
-        colour = GREY if not better else BLUE if dz * better > 0 else RED
-        axis.plot(interval, [row, row], color=colour, linewidth=2)
-        axis.plot([dz], [row], "o", color=colour)
-    # The first measure stands on top.
-    axis.set_yticks(range(len(names)), [get_title(name) for name in names], fontsize=8)
-    axis.invert_yaxis()
-    axis.set_xlabel("guided minus unguided, dz (blue: better with guidance, red: worse)")
-    remove_frame(axis)
-    return figure
-
-
 def get_title(name: str) -> str:
     """Return the title of a measure or scale."""
     if name.startswith("tlx_"):
@@ -151,15 +127,6 @@ def get_title(name: str) -> str:
         return f"TLX: {tlx.SCALES.get(scale, scale)}"
     each = next(each for each in MEASURES if each.name == name)
     return each.title + (f", {each.unit}" if each.unit else "")
-
-
-def standardize_effect(effect: GuidanceEffect) -> tuple[float | None, tuple[float, float] | None]:
-    """Return dz and its interval with the period in the model, without where sequences do not allow it."""
-    return (
-        (effect.dz, effect.dz_ci95)
-        if effect.dz is not None
-        else (effect.paired_dz, effect.paired_dz_ci95)
-    )
 
 
 def _draw_condition_paths(

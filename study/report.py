@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,8 @@ from brokk_rl.report import Cell, Report
 from brokk_rl.session import write_json, write_text
 from study import plots, tlx
 from study.analysis import Analysis
-from study.crossover_analysis import GuidanceEffect
+from study.crossover import get_smallest_p
 from study.measures import GUIDED_ONLY, MEASURES
-from study.permutation_tests import get_smallest_paired_p, get_smallest_sequence_p
 from study.simulation import NOTICE
 from study.study_folder import StudyData
 
@@ -29,7 +28,7 @@ SHOWN = ("time_s", "path_m", "efficiency", "several_joints", "joint_switches", "
 
 
 def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
-    """Write `report.html`, four pictures, `trials.csv`, `means.csv`, `effects.csv` and `report.json`; returns the page's path.
+    """Write `report.html`, three pictures, `trials.csv`, `means.csv` and `report.json`; returns the page's path.
 
     Raises:
         StorageError: a file could not be written.
@@ -38,7 +37,6 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
         folder.mkdir(parents=True, exist_ok=True)
         write_text(folder / "trials.csv", _format_trials(found))
         write_text(folder / "means.csv", _format_means(found, data.is_simulated))
-        write_text(folder / "effects.csv", _format_effects(found, data.is_simulated))
         effects = {name: asdict(effect) for name, effect in found.effects.items()}
         remarks = [asdict(remark) for remark in found.remarks]
         facts = {
@@ -58,7 +56,6 @@ def write_report(folder: Path, data: StudyData, found: Analysis) -> Path:
             "paths": plots.draw_paths(found),
             "tlx": plots.draw_radar(found),
             "pairs": plots.draw_pairs(found, (*SHOWN, "tlx_raw", "tlx_weighted")),
-            "effects": plots.draw_effects(found, (*COMPARED, *LOADS)),
         }
         for name, figure in drawn.items():
             if data.is_simulated:
@@ -81,7 +78,7 @@ def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str
     effect, title = found.effects[found.primary], plots.get_title(found.primary)
     # Measures differ in which direction is better.
     better = next(each.better for each in MEASURES if each.name == found.primary)
-    if effect.adjusted is None or effect.p is None or effect.adjusted_ci95 is None:
+    if effect.difference is None or effect.p is None or effect.ci95 is None:
         # Four persons are the least for a test over sequences.
         why = (
             "all had the same order, so guidance and order cannot be told apart"
@@ -89,15 +86,15 @@ def state_verdict(found: Analysis, is_simulated: bool = False) -> tuple[str, str
             else "too few participants"
         )
         return f"Nothing can be said about guidance: {why}.", "bad"
-    low, high = effect.adjusted_ci95
-    size = f"{title}: {effect.adjusted:+.3g} with guidance (95 % {low:+.3g} to {high:+.3g}), exact p = {effect.p:.3g}"
+    low, high = effect.ci95
+    size = f"{title}: {effect.difference:+.3g} with guidance (95 % {low:+.3g} to {high:+.3g}), exact p = {effect.p:.3g}"
     if effect.p > found.alpha:
         return (
             f"No effect of guidance is shown on the primary measure. {size}; {effect.num_persons} participants.",
             "warn",
         )
     # The sign says whether the change is for the better.
-    helps = effect.adjusted * better > 0
+    helps = effect.difference * better > 0
     who = "In this simulation guidance" if is_simulated else "Guidance"
     return (
         f"{who} {'helps' if helps else 'harms'}. {size}; {effect.num_persons} participants.",
@@ -113,10 +110,8 @@ def _build_page(folder: Path, data: StudyData, found: Analysis) -> Report:
         page.add_text(f"{NOTICE[0].upper()}{NOTICE[1:]}.", "warn")
     num, num_first = len(found.participants), int(found.guided_first.sum())
     # Both tests bound the attainable p: with few people no result can be significant.
-    least = max(
-        get_smallest_paired_p(num),
-        get_smallest_sequence_p(len(set(found.pairs.tolist()))) if 0 < num_first < num else 1.0,
-    )
+    num_pairs = len(set(found.pairs.tolist()))
+    least = get_smallest_p(num_pairs) if 0 < num_first < num else 1.0
     if least > found.alpha:
         page.add_text(
             f"With {num} participants no test here can reach p = {found.alpha:g}: the smallest possible is {least:.3g}.",
@@ -145,16 +140,14 @@ def _add_effects(page: Report, folder: Path, found: Analysis) -> None:
     page.add_heading("What guidance does")
     page.add_text(
         "Guided minus unguided, with the period in the model: what practice does between the first and the second period is not "
-        "counted as guidance. p is exact, over all ways in which the order could have been drawn. The primary measure decides; the "
+        "counted as guidance. p is exact, over all ways in which the order could have been drawn; beside it stands the "
+        "usual paired test, of which practice is a part. The primary measure decides; the "
         "others are corrected for looking at many (Holm, within the measures and within the six scales). dz is in standard "
         "deviations of a person's difference. Means of a participant are over trials; a trial without insertion has the limit as "
         "its time and no efficiency."
     )
     page.add_table(
         *_build_table(found, COMPARED), "of recordings; below each figure its 95 % interval"
-    )
-    page.add_picture(
-        folder / "effects.png", "Effect of guidance on every measure, with 95 % intervals"
     )
     page.add_picture(folder / "pairs.png", "Every participant, and means with 95 % intervals")
 
@@ -174,16 +167,7 @@ def _add_paths_and_workload(page: Report, folder: Path, found: Analysis) -> None
 
 
 def _add_comparisons(page: Report, found: Analysis) -> None:
-    """Add the usual tests, the following of the advice, and the remarks."""
-    page.add_heading("Without the period in the model")
-    page.add_text(
-        "The usual paired tests, for comparison; practice is part of the differences here, though not of their mean where as many "
-        "had one order as the other."
-    )
-    page.add_table(
-        *_build_paired_table(found),
-        "guided minus unguided; period: second minus first, with guidance in the model",
-    )
+    """Add the following of the advice, and the remarks."""
     page.add_heading("How the advice was followed")
     page.add_table(
         ["measure", "mean, guided"],
@@ -198,65 +182,20 @@ def _add_comparisons(page: Report, found: Analysis) -> None:
 
 def _build_table(found: Analysis, names: Sequence[str]) -> tuple[list[str], list[list[str | Cell]]]:
     columns = ["measure", "guided", "unguided", "difference", "dz", "p", "p, Holm"]
+    columns += ["p, paired", "second period minus first"]
     rows: list[list[str | Cell]] = []
     for name in names:
         # The primary measure decides alone and is not corrected.
-        e, is_primary = found.effects[name], name == found.primary
-        note = f"{e.num_persons} people" + ", the primary measure" * is_primary
-        means = [
-            Cell(plots.get_title(name), note),
-            _format_number(e.guided),
-            _format_number(e.unguided),
-        ]
-        size = [
-            Cell(_format_number(e.adjusted), _format_interval(e.adjusted_ci95)),
-            Cell(_format_number(e.dz), _format_interval(e.dz_ci95)),
-        ]
-        rows.append(
-            [
-                *means,
-                *size,
-                _format_p(e.p),
-                "decides" if is_primary else _format_p(found.holm.get(name)),
-            ]
-        )
-    return columns, rows
-
-
-def _build_paired_table(found: Analysis) -> tuple[list[str], list[list[str | Cell]]]:
-    columns = [
-        "measure",
-        "difference",
-        "Hodges-Lehmann",
-        "dz",
-        "p, permuted",
-        "p, Wilcoxon",
-        "period",
-        "p, carry-over",
-    ]
-    rows: list[list[str | Cell]] = []
-    for name in (*COMPARED, *LOADS):
-        e = found.effects[name]
-        mean, middle = (
-            Cell(_format_number(e.difference), _format_interval(e.paired_ci95)),
-            _format_interval(e.hodges_lehmann_ci95),
-        )
-        dz = Cell(_format_number(e.paired_dz), _format_interval(e.paired_dz_ci95))
-        tests = [
-            _format_p(e.paired_p),
-            _format_p(e.wilcoxon_p),
-            Cell(_format_number(e.period), f"p {_format_p(e.period_p)}"),
-            _format_p(e.carry_over_p),
-        ]
-        rows.append(
-            [
-                plots.get_title(name),
-                mean,
-                Cell(_format_number(e.hodges_lehmann), middle),
-                dz,
-                *tests,
-            ]
-        )
+        effect, is_primary = found.effects[name], name == found.primary
+        note = f"{effect.num_persons} people" + ", the primary measure" * is_primary
+        row: list[str | Cell] = [Cell(plots.get_title(name), note)]
+        row += [_format_number(effect.guided), _format_number(effect.unguided)]
+        row.append(Cell(_format_number(effect.difference), _format_interval(effect.ci95)))
+        row += [_format_number(effect.dz), _format_p(effect.p)]
+        row.append("decides" if is_primary else _format_p(found.holm.get(name)))
+        row.append(_format_p(effect.paired_p))
+        row.append(Cell(_format_number(effect.period), f"p {_format_p(effect.period_p)}"))
+        rows.append(row)
     return columns, rows
 
 
@@ -325,29 +264,6 @@ def _format_means(found: Analysis, is_simulated: bool) -> str:
                 ]
             )
     return _format_csv(["participant", "simulated", "condition", "period", *columns], rows)
-
-
-def _format_effects(found: Analysis, is_simulated: bool) -> str:
-    head: list[str] = []
-    # Intervals take two columns.
-    for key in asdict(GuidanceEffect(num_persons=0, num_guided_first=0)):
-        head += [f"{key}_low", f"{key}_high"] if key.endswith("_ci95") else [key]
-    rows = []
-    for name, effect in found.effects.items():
-        values = []
-        for field, value in asdict(effect).items():
-            values.append((None, None) if value is None and field.endswith("_ci95") else value)
-        rows.append([name, is_simulated, *_flatten(values), _blank(found.holm.get(name, math.nan))])
-    return _format_csv(["measure", "simulated", *head, "p_holm"], rows)
-
-
-def _flatten(values: Iterable) -> list:
-    """Return numbers and the ends of intervals in one row; '' for missing ones."""
-    row = []
-    for value in values:
-        for part in value if isinstance(value, tuple) else (value,):
-            row.append(part)
-    return ["" if part is None else part for part in row]
 
 
 def _blank(value: float) -> float | str:

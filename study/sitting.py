@@ -18,7 +18,6 @@ from deploy.runtime.target import FileTarget
 from deploy.twin.bench import TwinBench
 from study import study_folder as folders
 from study.conductor import Words
-from study.participant import Participant
 from study.study_server import StudyServerConfig
 from study.trial import Times
 
@@ -52,7 +51,7 @@ class Sitting:
 
     Attributes:
         loop: The loop on the machine's computer; listens, shows, records.
-        bench: The twin, and a simulated participant, in place of machine and person; `null` on a
+        bench: The twin in place of the machine; `null` on a
             machine.
         page: The operator's page.
         consent: Text of the consent.
@@ -60,7 +59,7 @@ class Sitting:
     """
 
     loop: DeploymentLoop
-    bench: TwinBench | Participant | None
+    bench: TwinBench | None
     page: PageSettings
     consent: Consent
     times: Times
@@ -70,9 +69,9 @@ class Sitting:
             raise ConfigError(
                 "study.do=run: in a study people move the machine; deploy=listen, not deploy=auto"
             )
-        if isinstance(self.bench, TwinBench) and self.bench.operator is not None:
+        if self.bench is not None and self.bench.operator is not None:
             raise ConfigError(
-                "study.do=run: that operator follows advice that is not shown; bench=participant, or bench=twin"
+                "study.do=run: that operator follows advice that is not shown; bench=twin"
             )
 
     def run(
@@ -98,15 +97,13 @@ class Sitting:
         loop = replace(
             self.loop, page=None, video=None, record=False, target=FileTarget(path=str(target))
         )
-        operators = self.bench.operators if isinstance(self.bench, Participant) else {}
         room = StudyServerConfig(
             page=loop.build_page_config(self.page, machine, session),
             folder=folder.resolve(),
             participant=participant,
             words=Words(self.consent.version, self.consent.text),
             times=self.times,
-            facts={"simulated": bool(operators), "twin": self.bench is not None, "run": session.folder.name},
-            operators=operators,
+            facts={"simulated": False, "twin": self.bench is not None, "run": session.folder.name},
             target=target,
             port=self.bench.twin.fault_port if self.bench else None,
         )  # fmt: skip

@@ -49,7 +49,6 @@ class StudyServerConfig:
         words: Texts of the lab for participants.
         times: Countdown and the like.
         facts: Further fields of every trial.
-        operators: Who is simulated, by condition; empty where people take part.
         target: File that says to the loop where the hole is.
         port: Where the twin can be put elsewhere; `None` on a machine.
     """
@@ -60,7 +59,6 @@ class StudyServerConfig:
     words: Words
     times: Times
     facts: dict[str, Any]
-    operators: dict[str, str]
     target: Path
     port: int | None
 
@@ -81,7 +79,6 @@ def run(stop: Stop, config: StudyServerConfig, memory: LoopMemory) -> None:
         config.times,
         config.facts,
         page.session.stream,
-        config.operators,
     )
     if config.participant:
         conductor.choose(config.participant)

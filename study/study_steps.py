@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
@@ -16,16 +16,11 @@ from study import plan_page, report
 from study import study_folder as folders
 from study.analysis import analyse
 from study.design import Design
-from study.practice import Practice, share_significant
 from study.simulation import NOTICE, Nowhere, simulate
 from study.sitting import Sitting, reserve_study
 from study.trial_contract import Operator, TrialGround
 
 log = logging.getLogger(__name__)
-
-PLANTED_DZ = 0.8
-"""A large effect, which a plan should be able to find."""
-PAPER_PERSONS = 5
 
 
 @spec
@@ -37,8 +32,6 @@ class Steps:
         folder: The study's folder; `null`: the run folder, where `plan` and `simulate` begin one.
         participant: Whom to erase, or whose sitting to begin with.
         design: The design of the plan.
-        practice: A fast model of people, from which the plan's errors are worked out.
-        num_studies: How many studies are drawn from it.
         sitting: How participants are led through it.
     """
 
@@ -46,8 +39,6 @@ class Steps:
     folder: str | None
     participant: str | None
     design: Design
-    practice: Practice
-    num_studies: int
     sitting: Sitting
 
     def run(
@@ -96,29 +87,15 @@ class Steps:
             raise ConfigError(
                 f"{folder} already holds a study; plan another one with study.folder=<folder>"
             )
-        errors = study_errors(
-            self.design, self.practice, self.num_studies, session.stream("study errors")
-        )
         folder.mkdir(parents=True, exist_ok=True)
         write_json(
             folder / folders.PLAN,
             designs.format_plan(self.design, machine, session.seed, plan)
             | {"simulated": is_simulated},
         )
-        write_json(folder / "plan_errors.json", errors)
         notice = f"The trials of this study are done by {NOTICE}." if is_simulated else ""
-        page = plan_page.build_plan_page(
-            self.design, machine.name, session.seed, plan, errors, notice
-        )
+        page = plan_page.build_plan_page(self.design, machine.name, session.seed, plan, notice)
         page.write(folder / "plan.html")
-        for entry in errors["studies"]:
-            log.info(
-                "%s, %d participants, true dz %g: significant in %.3f",
-                entry["what"],
-                entry["num_participants"],
-                entry["planted_dz"],
-                entry["share"],
-            )
         log.info("planned: %s", folder / "plan.html")
         return plan
 
@@ -156,43 +133,3 @@ def plan_study(design: Design, machine: Machine, session: Session) -> list[desig
     """Return all trials of a new study."""
     design.check_machine(machine)
     return designs.plan_trials(design, session.generator("study plan"))
-
-
-def study_errors(design: Design, practice: Practice, num_studies: int, seed: int) -> dict[str, Any]:
-    """Return rates of false findings and misses of studies like this one, beside those with a fixed order."""
-    num, trials = design.num_participants, len(design.holes)
-    cases = [
-        ("no effect, counterbalanced, period in the model", num, 0.0, False),
-        ("large effect, counterbalanced, period in the model", num, PLANTED_DZ, False),
-        ("no effect, guidance first for all, paired test", num, 0.0, True),
-        (
-            "no effect, guidance first for all, paired test: the paper's number",
-            PAPER_PERSONS,
-            0.0,
-            True,
-        ),
-    ]
-    found = []
-    for what, persons, dz, fixed in cases:
-        share = share_significant(
-            practice,
-            persons,
-            trials,
-            design.practice_trials,
-            design.limit_s,
-            dz,
-            design.alpha,
-            num_studies,
-            seed,
-            fixed,
-        )
-        found.append(
-            {
-                "what": what,
-                "num_participants": persons,
-                "planted_dz": dz,
-                "fixed_order": fixed,
-                **share,
-            }
-        )
-    return {"schema": 1, "alpha": design.alpha, "seed": seed, "studies": found}

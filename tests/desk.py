@@ -95,7 +95,7 @@ class Desk:
         self._description = BusDescription(DBC, machine)
         # The observer's file is of the hydraulic plant, not of the nominal machine of this desk.
         limits = replace(limits, observer=None)
-        self._setting = BusProcessConfig(self.wire, DBC, machine, limits)
+        self._setting = BusProcessConfig(self.wire, DBC, machine, limits, needs_page=False)
         twin = Twin(
             wire=self.wire,
             dbc=DBC,

@@ -285,7 +285,8 @@ class Stage:
             limits = replace(limits, observer=observer)
             if not watched:
                 limits = replace(limits, observer=None, envelope=None)
-            self.bus_process = BusProcess(BusProcessConfig(wire, DBC, machine, limits), self.memory)  # type: ignore[arg-type]
+            config = BusProcessConfig(wire, DBC, machine, limits, needs_page=False)  # type: ignore[arg-type]
+            self.bus_process = BusProcess(config, self.memory)
             policy = "tasks:policies/borehole_insertion"
             counsel = PolicyProcessConfig(
                 machine, policy, option("guidance", "machine"), limits.joints_s, 600.0, None

@@ -58,7 +58,7 @@ class BusProcessConfig:
     dbc: str
     machine: Machine
     limits: GuardLimits
-    needs_page: bool = False
+    needs_page: bool
 
 
 def run(stop: Stop, config: BusProcessConfig, memory: LoopMemory) -> None:
@@ -82,7 +82,7 @@ class BusProcess:
         self._joint_names = machine.joint_names
         self._gap_s = config.limits.gap_s
         self._bus: OpenCanBus | OpenBusReplay | None = None
-        self._was_down, self._reopen_s = False, 0.0
+        self._was_down, self._reopen_s = False, -math.inf
         self._log: list[bytes] = []
         self._timer = CycleTimer(CYCLE_S)
 
@@ -180,7 +180,7 @@ class BusProcess:
 
     def _open(self) -> None:
         try:
-            self._bus, self._was_down = self._wire.open(self._logic.receiver.frame_ids), False
+            self._bus = self._wire.open(self._logic.receiver.frame_ids)
             log.info("bus %s %s is open", self._wire.interface, self._wire.channel)
         except LinkError as error:
             self._close_after_error(error)

@@ -127,7 +127,7 @@ class BusAndPolicySettings:
         machine: Machine,
         target_s: float,
         pitch_rad: float | None,
-        needs_page: bool = False,
+        needs_page: bool,
     ) -> None:
         """Start bus and policy.
 

@@ -99,11 +99,11 @@ def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) ->
     effect = found.effects["time_s"]
     assert not found.remarks and len(found.trials) == 12 * 8  # practice is there, too …
     assert sum(trial.counts for trial in found.trials) == 12 * 6  # … and does not count
-    assert effect.adjusted == pytest.approx(-4.0, abs=0.06) and effect.period == pytest.approx(
+    assert effect.difference == pytest.approx(-4.0, abs=0.06) and effect.period == pytest.approx(
         -1.0, abs=0.06
     )
     assert effect.p == pytest.approx(2 / 64)
-    assert found.effects["tlx_raw"].adjusted == pytest.approx(-20.0)
+    assert found.effects["tlx_raw"].difference == pytest.approx(-20.0)
     assert found.loads["weighted"]["guided"].tolist() == [30.0] * 12
     assert found.holm["tlx_mental"] == pytest.approx(6 * 2 / 64)
     assert "time_s" not in found.holm  # the primary measure stands alone
@@ -111,7 +111,7 @@ def test_a_whole_study_says_what_was_put_in(machine: Machine, tmp_path: Path) ->
     page = path.read_text()
     assert "Guidance helps" in page and "imulated" not in page
     assert {p.name for p in (tmp_path / "out").iterdir()} >= {
-        "report.html", "report.json", "trials.csv", "means.csv", "effects.csv", "paths.png", "tlx.png", "pairs.png", "effects.png",
+        "report.html", "report.json", "trials.csv", "means.csv", "paths.png", "tlx.png", "pairs.png",
     }  # fmt: skip
     assert (tmp_path / "out" / "means.csv").read_text().count("\n") == 1 + 24
     json.loads((tmp_path / "out" / "report.json").read_text())

@@ -130,8 +130,8 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
 ) -> None:
     hole = "{_target_: study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
     done = brokk(
-        "mode=study", "study.do=simulate", "session.out=run", "study.num_studies=10", "study.design.num_participants=4",
-        "study.design.limit_s=2.0", "study.practice.base_s=1.0",
+        "mode=study", "study.do=simulate", "session.out=run", "study.design.num_participants=4",
+        "study.design.limit_s=2.0",
         "~study.design.holes", f"+study.design.holes={{A: {hole}, B: {hole}}}",
         "~study.design.starts", "+study.design.starts={a: [0.0, -0.95, 0.55, 1.15, 0.6], b: [0.1, -0.95, 0.55, 1.15, 0.6]}",
     )  # fmt: skip
@@ -145,7 +145,7 @@ def test_a_study_of_simulated_operators_from_nothing_by_one_command(
     assert trial["simulated"] is True and trial["operator"] in ("follower", "novice")
     assert (
         "simulated operators" in (run / "plan.html").read_text()
-        and "four of five" in (run / "plan.html").read_text()
+        and "of 100 studies" in (run / "plan.html").read_text()
     )
     erased = brokk(
         "mode=study",
@@ -178,7 +178,7 @@ def test_what_cannot_be_done_is_said(brokk: Callable[..., Any]) -> None:
     for override, said in (
         ("ground=none", "needs study.folder"),
         ("deploy=auto", "people move the machine"),
-        ("bench=guided", "bench=participant"),
+        ("bench=guided", "bench=twin"),
     ):
         done = brokk(
             "preset=study",

@@ -4,11 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
-import subprocess
-import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import SHOWN, Scripted
-from desk import free_port
 from sitting import FACTS, Arm, conductor, in_trial, machine, plan, saved
 
 from brokk_rl import record
@@ -333,81 +327,3 @@ def test_one_program_at_a_time_leads_sittings_of_a_study(tmp_path: Path) -> None
         pass
     with reserve_study(tmp_path):
         pass
-
-
-HOLE = "{_target_: study.design.Hole, center_in_base_m: [2.6, 0.0, 0.75], radius_m: 0.05}"
-SMALL = (
-    "study.design.num_participants=2", "study.design.practice_trials=0", "study.design.limit_s=9.0", "study.practice.base_s=4.0",
-    "~study.design.holes", f"+study.design.holes={{A: {HOLE}, B: {HOLE}}}",
-    "~study.design.starts", "+study.design.starts={a: [0.0, -0.95, 0.55, 1.15, 0.6], b: [0.3, -0.9, 0.5, 1.1, 0.6]}",
-)  # fmt: skip
-
-
-@pytest.mark.slow
-def test_a_simulated_participant_at_the_twin_in_real_time_goes_on_after_everything_was_killed(
-    tmp_path: Path, brokk: Callable[..., Any]
-) -> None:
-    planned = brokk(
-        "mode=study",
-        "study.do=plan",
-        "study.num_studies=10",
-        "ground=none",
-        "session.out=study",
-        *SMALL,
-    )
-    assert planned.code == 0, planned.err
-    ports = [f"bus.port={free_port()}", f"bench.twin.fault_port={free_port()}", "page.port=0"]
-    run = [
-        sys.executable,
-        "-P",
-        "-m",
-        "brokk_rl",
-        "preset=study",
-        "bench=participant",
-        "bench.sittings=1",
-        "study.folder=study",
-        *ports,
-    ]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
-    first = subprocess.Popen([*run, "session.out=first"], cwd=tmp_path, env=environment)
-    try:
-        end_s, done = time.monotonic() + 180, tmp_path / "study" / "trials"
-        while not any(read(path)["outcome"] != "aborted" for path in done.glob("*_02.json")):
-            assert first.poll() is None and time.monotonic() < end_s, (
-                "the second trial never came to its end"
-            )
-            time.sleep(0.3)
-    finally:
-        first.kill()  # its children die with it
-        first.wait()
-    again = subprocess.run(
-        [*run, "session.out=again"],
-        cwd=tmp_path,
-        env=environment,
-        timeout=240,
-        capture_output=True,
-        text=True,
-    )
-    assert again.returncode == 0, again.stderr
-    reported = brokk(
-        "mode=study", "study.do=report", "study.folder=study", "ground=none", "session.out=report"
-    )
-    assert reported.code == 0, reported.err
-    data = study_folder.read_study(tmp_path / "study")
-    trials = [trial for (who, _, _), trial in data.trials.items() if who == "P01"]
-    assert (
-        len(trials) == 4
-        and all(trial["simulated"] and trial["twin"] for trial in trials)
-        and data.is_simulated
-    )
-    assert {trial["run"] for trial in trials} == {"first", "again"}
-    guided = [trial for trial in trials if trial["condition"] == "guided"]
-    assert [trial["outcome"] for trial in guided] == ["inserted", "inserted"]
-    assert all(data.questionnaires["P01", period]["finished"] for period in (1, 2))
-    recording = record.read_recording(tmp_path / "study" / guided[0]["recording"], MACHINE)
-    assert (
-        max(np.nanmax(np.abs(recording.extra[f"advice_{joint}"])) for joint in recording.joints)
-        > 0.1
-        and np.abs(recording.u).max() > 0.1
-    )
-    assert "no person took part" in (tmp_path / "report" / "report.html").read_text()
