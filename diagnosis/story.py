@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +13,7 @@ from typing import Any
 import yaml
 
 from brokk_rl.errors import BrokkError, ConfigError, list_choices
-from brokk_rl.session import RESOLVED, Session, read_record, write_text
+from brokk_rl.session import RESOLVED, Session, write_text
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -81,66 +80,40 @@ def write_groups(
 def run_story(
     session: Session, stages: Mapping[str, StoryStage], write_page: Callable[[], None] | None = None
 ) -> None:
-    """Run the stages that are not finished.
+    """Run the stages one after another.
 
     Args:
         session: Folder and device of the story.
-        stages: The story, in order.
-        write_page: Is called after each stage that was run.
+        stages: The stages, in order.
+        write_page: Is called after each stage.
 
     Raises:
-        BrokkError: a stage failed; the story goes on from there with `resume=`.
+        BrokkError: a stage failed.
     """
     folder = session.folder.resolve()
     for number, (name, stage) in enumerate(stages.items(), 1):
         if stage.needs is not None and not _has_content(folder / stage.needs):
             log.warning("the story ends before '%s': %s holds nothing", name, stage.needs)
             break
-        before = read_record(folder / name) or {}
-        if before.get("outcome") == "finished":
-            _refuse_other_command(folder, name, stage, before)
-            log.info("%d of %d, %s: done already", number, len(stages), name)
-            continue
         log.info("%d of %d, %s: %s", number, len(stages), name, stage.title)
         _play_stage(session, name, stage, folder)
         if write_page is not None:
             write_page()
 
 
-def _list_words(stage: StoryStage, folder: Path) -> list[str]:
-    return [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
-
-
-def _refuse_other_command(
-    folder: Path, name: str, stage: StoryStage, before: Mapping[str, Any]
-) -> None:
-    """Raise a `ConfigError` where a finished stage answered another command than is asked for now."""
-    if "overrides" not in before:  # runs from before this field
-        return
-    new = [word for word in _list_words(stage, folder) if word not in before["overrides"]]
-    if new:
-        raise ConfigError(
-            f"{folder}: the stage '{name}' was run without {' '.join(new)}, so it cannot be gone on with; repeat the command "
-            "that began it, or give another session.out"
-        )
-
-
 def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) -> None:
     """Run one stage as a separate command, and wait for its end."""
-    place = folder / name
     for link, target in stage.links.items():
         path = folder / link
         path.parent.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         path.symlink_to(folder / target)
-    words = _list_words(stage, folder)
+    words = [word.replace(FOLDER_PLACEHOLDER, str(folder)) for word in stage.command]
     for group in stage.takes:
         if group != DEVICE:
             words.append(f"{group}=@{folder / HANDED_ON_FOLDER / group}.yaml")
     words += [f"session.device={session.device}"] if DEVICE in stage.takes else []
-    words += [f"session.out={place}"]
-    if place.exists():
-        shutil.rmtree(place)  # an unfinished stage begins anew
+    words += [f"session.out={folder / name}"]
     # The command sets this for Hydra; a stage that inherited it would print a traceback of user errors.
     env = {name: value for name, value in os.environ.items() if name != "HYDRA_FULL_ERROR"}
     with subprocess.Popen([sys.executable, "-P", "-m", "brokk_rl", *words], env=env) as process:
@@ -151,8 +124,7 @@ def _play_stage(session: Session, name: str, stage: StoryStage, folder: Path) ->
             raise
     if code:
         raise BrokkError(
-            f"the stage '{name}' failed, see above; what came before it is kept: go on with resume={session.out} "
-            f"session.out={session.out}"
+            f"the stage '{name}' failed, see above; {folder} keeps what came before it"
         )
 
 

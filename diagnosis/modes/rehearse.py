@@ -28,8 +28,6 @@ class Rehearse:
         withheld: Effects that the machine has and that no stage but it is told of:
             `<folder>/given/withheld.yaml`.
         stages: The story, in order.
-        resume: Run folder of an interrupted story; finished stages are kept. The same as
-            `session.out`.
     """
 
     session: Session
@@ -39,7 +37,6 @@ class Rehearse:
     evaluation: Evaluation
     withheld: dict[str, Effect]
     stages: dict[str, story.StoryStage]
-    resume: str | None
 
     def check(self) -> None:
         if not self.stages:
@@ -49,10 +46,10 @@ class Rehearse:
         story.check_stages(self.stages, HANDED_ON_GROUPS)
 
     def run(self) -> None:
-        """Run the stages that are not finished.
+        """Run the stages.
 
         Raises:
-            BrokkError: a stage failed; the story goes on from there with `resume=`.
+            BrokkError: a stage failed.
         """
         folder = self.session.folder.resolve()
         heads = {"withheld": "# @package effect\n"}

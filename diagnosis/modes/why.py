@@ -61,7 +61,6 @@ class Why:
         own: Runs a simulator of your own.
         sent: The commands of the log are those that the policy's loop sent.
         target_in_base_m: Target where the log has none.
-        resume: Run folder of an interrupted run to go on with; the same as `session.out`.
     """
 
     session: Session
@@ -73,7 +72,6 @@ class Why:
     own: OwnSimulator
     sent: bool
     target_in_base_m: tuple[float, float, float] | None
-    resume: str | None
 
     def check(self) -> None:
         if self._is_own:
@@ -95,15 +93,13 @@ class Why:
         self._try_inputs()
         folder = self.session.folder.resolve()
         write_groups(folder, HANDED_ON_GROUPS, {"machine": "", "evaluation": ""})
-        stages = {DOCTOR: self._examine()}
-        self._play(stages)
+        titles: dict[str, str] = {}
+        self._play({DOCTOR: self._examine()}, titles)
         told = json.loads((folder / DOCTOR / "doctor.json").read_text())
         if told["verdict"] != "code":
-            stages[DIAGNOSIS] = self._diagnose()
-            self._try_to_play(stages)
+            self._try_to_play({DIAGNOSIS: self._diagnose()}, titles)
             if effects := why_answer.read_effects(folder):
-                stages |= self._list_evaluations(folder, effects)
-                self._try_to_play(stages)
+                self._try_to_play(self._list_evaluations(folder, effects), titles)
         result = why_answer.read_result(folder, self._request)
         write_json(folder / WHY_FILE, result.to_json())
         self._print(result)
@@ -134,16 +130,18 @@ class Why:
                 print_text(line)
         print_text(f"page: {self.session.folder / WHY_PAGE}", "bold")
 
-    def _try_to_play(self, stages: Mapping[str, StoryStage]) -> None:
+    def _try_to_play(self, stages: Mapping[str, StoryStage], titles: dict[str, str]) -> None:
         """Run stages whose failure leaves the rest of the page true."""
         try:
-            self._play(stages)
+            self._play(stages, titles)
         except BrokkError as error:
             log.warning("%s", error)
 
-    def _play(self, stages: Mapping[str, StoryStage]) -> None:
+    def _play(self, stages: Mapping[str, StoryStage], titles: dict[str, str]) -> None:
+        """Run stages, add their titles to those of the page, and write the page."""
         folder = self.session.folder.resolve()
-        titles = {name: stage.title for name, stage in stages.items()}
+        for name, stage in stages.items():
+            titles[name] = stage.title
 
         def write_page() -> None:
             why_report.write_why_page(folder, titles, self.machine, self._request)
