@@ -58,7 +58,7 @@ class EllipseDetector(Protocol):
 
 
 class EllipseDetectorSpec(Protocol):
-    """A spec in `conf/perception/ellipse`."""
+    """The spec in `conf/ellipse.yaml`."""
 
     def build(self) -> EllipseDetector:
         """Return a detector."""

@@ -7,11 +7,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from composed import option
 from drawn_ellipses import count_matches, draw_negative, draw_occluded, draw_pattern, overlap
 
 from brokk_rl.contracts.vision import Ellipse
 from brokk_rl.errors import ConfigError
+from brokk_rl.extensions import load_part
 from perception.contracts import SizePrior
 from perception.ellipse import conic
 
@@ -20,7 +20,7 @@ K = np.array([[1056.0, 0.0, 959.5], [0.0, 1056.0, 539.5], [0.0, 0.0, 1.0]])
 
 @pytest.fixture(scope="module")
 def detector():
-    return option("perception/ellipse", "contour_arcs").build()
+    return load_part("ellipse").build()
 
 
 def rim(center: np.ndarray, axis: np.ndarray, radius_m: float) -> np.ndarray:
@@ -164,7 +164,7 @@ def test_only_the_region_is_looked_at(detector) -> None:
 
 def test_absurd_settings_are_refused() -> None:
     with pytest.raises(ConfigError, match="coverage"):
-        replace(option("perception/ellipse", "contour_arcs"), coverage=0.0)
+        replace(load_part("ellipse"), coverage=0.0)
 
 
 def row(one: Ellipse) -> np.ndarray:
