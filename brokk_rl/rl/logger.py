@@ -6,7 +6,6 @@ the host in every step; this one asks the control loop for its sums once an iter
 
 from __future__ import annotations
 
-import csv
 import logging
 import math
 import os
@@ -264,9 +263,6 @@ class TrainingLogger:
     def process_env_step(self, *args: Any, **kwargs: Any) -> None:
         """Do nothing: the control loop adds up finished episodes on the device."""
 
-    def save_model(self, path: str, it: int) -> None:
-        """Do nothing: checkpoints stay in the run folder."""
-
     def stop_logging_writer(self) -> None:
         """Do nothing: the tracker stays open until the whole run ends."""
 
@@ -347,17 +343,11 @@ class TrainingLogger:
         """Append new rows to `progress.csv`; called with every checkpoint so that both agree."""
         if not self._num_unwritten or self._quiet:
             return
-        rows, self._num_unwritten = self.rows[-self._num_unwritten :], 0
-        columns = list(rows[0])
-        if self._path.exists():  # perhaps of a version with fewer figures
-            with self._path.open(newline="") as file:
-                columns = next(csv.reader(file))
+        rows, self._num_unwritten = pd.DataFrame(self.rows[-self._num_unwritten :]), 0
         is_new = not self._path.exists()
-        with self._path.open("a", newline="") as file:
-            table = csv.DictWriter(file, fieldnames=columns, extrasaction="ignore")
-            if is_new:
-                table.writeheader()
-            table.writerows(rows)
+        if not is_new:  # perhaps of a version with fewer figures
+            rows = rows.reindex(columns=pd.read_csv(self._path, nrows=0).columns)
+        rows.to_csv(self._path, mode="a", header=is_new, index=False, lineterminator="\r\n")
 
     def state_dict(self) -> dict[str, float]:
         """Return the counts from which a resumed run goes on."""
@@ -368,10 +358,10 @@ class TrainingLogger:
         self.env_steps, self.seconds = int(state["env_steps"]), float(state["seconds"])
         if not self._path.exists() or self._quiet:
             return
-        with self._path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = pd.read_csv(self._path, dtype=str)
         self._path.unlink()
-        self.rows = [row for row in rows if float(row["env_steps"]) <= self.env_steps]
+        kept = rows["env_steps"].astype(float) <= self.env_steps
+        self.rows = rows[kept].to_dict("records")
         self._num_unwritten = len(self.rows)
         self.flush()
 
