@@ -152,7 +152,7 @@ def find_differences(runs: Sequence[EvaluatedRun]) -> list[str]:
     values = values[[key for key in values if key in overridden or str(key).startswith(inside)]]
     columns = []
     for table in (choices, values):
-        texts = table.map(repr)
+        texts: Any = table.map(repr)
         columns += sorted(name for name in texts if texts[name].nunique() > 1)
     return [*columns, EVALUATED_ON] if any(run.training for run in runs) else columns
 
@@ -218,7 +218,7 @@ def average_seeds(table: pd.DataFrame, columns: Sequence[str]) -> pd.DataFrame:
     A figure of several seeds has Student's interval over seeds, since training differs between
     seeds. A rate of a single run keeps the interval over its episodes.
     """
-    groups = table.groupby(["policy", *columns], sort=False)
+    groups: Any = table.groupby(["policy", *columns], sort=False)
     figures, rates = list_figures(table), list_rates(table)
     num, mean = groups[figures].count(), groups[figures].mean()
     half = groups[figures].sem() * stats.t.ppf(0.5 + CONFIDENCE / 2, (num - 1).where(num > 1))
@@ -259,7 +259,8 @@ def summarise_methods(
     if EVALUATED_ON not in rated:
         rated = rated.assign(**{EVALUATED_ON: ""})
     keys = ["policy", *(column for column in columns if column != EVALUATED_ON)]
-    methods = rated[keys].drop_duplicates().to_dict("records")
+    distinct: Any = rated[keys].drop_duplicates()
+    methods = distinct.to_dict("records")
     scores = []
     for method in methods:
         own = rated[(rated[keys] == pd.Series(method)).all(axis=1)]
@@ -279,7 +280,7 @@ def summarise_methods(
         bounds = compute_student_interval(by_seed.tolist()) or (None, None)
         summary["difference" + LOW], summary["difference" + HIGH] = bounds
         summaries.append(summary | {"by_seed": by_seed.to_dict()})
-    return pd.DataFrame(summaries)
+    return pd.DataFrame(summaries, columns=None if summaries else ["mean" + LOW])
 
 
 def _choose_baseline(methods: Sequence[Mapping[str, Any]], wanted: Mapping[str, Any] | None) -> int:

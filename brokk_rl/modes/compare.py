@@ -91,9 +91,10 @@ class Compare:
         generator = self.session.generator("compare")
         methods = summarise_methods(table, columns, self.compare.baseline, generator)
         folder = self.session.folder
-        content = {"schema": 2, "columns": columns}
+        content: dict[str, Any] = {"schema": 2, "columns": columns}
         for name, rows in (("groups", groups), ("runs", table), ("methods", methods)):
-            content[name] = json.loads(rows.to_json(orient="records", double_precision=15))
+            text = str(rows.to_json(orient="records", double_precision=15))
+            content[name] = json.loads(text)
         write_json(folder / "comparison.json", content)
         write_text(folder / "comparison.csv", table.to_csv(index=False, lineterminator="\n"))
         words = collect_words(runs, list_figures(table))
@@ -101,11 +102,12 @@ class Compare:
         save_figure(picture, folder / "comparison.png")
         _write_learning(runs, columns, folder)
         _print_groups(groups, columns, words, list_rates(table))
-        if not methods.empty and methods["mean" + LOW].notna().any():
+        bounds: Any = methods["mean" + LOW]
+        if bounds.count():
             seeds = build_seed_table(methods, columns)
             print_table(list(seeds.columns), seeds.to_numpy().tolist())
             write_text(folder / "comparison.tex", format_latex(seeds))
-            save_figure(draw_seeds(methods, seeds["method"]), folder / "seeds.png")
+            save_figure(draw_seeds(methods, seeds["method"].tolist()), folder / "seeds.png")
         log.info("%d runs compared in %s", len(runs), folder)
 
 
@@ -129,7 +131,7 @@ def _name_figure(figure: Figure) -> str:
 def _print_groups(
     groups: pd.DataFrame, columns: Sequence[str], words: Mapping[str, Figure], rates: Sequence[str]
 ) -> None:
-    settings = groups[list(columns)]
+    settings: Any = groups[list(columns)]
     if len(columns) > MOST_COLUMNS:
         settings = pd.DataFrame({"unlike most": describe_differences(settings)})
     cells = {}
@@ -144,7 +146,7 @@ def _print_groups(
     print_table(headings, table.astype(object).where(table.notna(), None).to_numpy().tolist())
 
 
-def label_rows(rows: pd.DataFrame, columns: Sequence[str]) -> list[str]:
+def label_rows(rows: Any, columns: Sequence[str]) -> list[str]:
     """Return a short name of each row: its policy, and the values that most others lack."""
     texts = describe_differences(rows[list(columns)])
     return [", ".join(filter(None, pair)) for pair in zip(rows["policy"], texts, strict=True)]
@@ -167,14 +169,14 @@ def build_seed_table(methods: pd.DataFrame, columns: Sequence[str]) -> pd.DataFr
 
 
 def _format_column(table: pd.DataFrame, name: str, form: str) -> pd.Series:
-    return (
-        table[name].astype(float).map(lambda value: "–" if pd.isna(value) else form.format(value))
-    )
+    values: Any = table[name].astype(float)
+    return values.map(lambda value: "–" if pd.isna(value) else form.format(value))
 
 
 def _format_interval(table: pd.DataFrame, name: str, form: str) -> pd.Series:
     low, high = _format_column(table, name + LOW, form), _format_column(table, name + HIGH, form)
-    return (low + " to " + high).mask(table[name + LOW].isna(), "")
+    joined: Any = low + " to " + high
+    return joined.mask(table[name + LOW].isna(), "")
 
 
 def format_latex(table: pd.DataFrame) -> str:

@@ -250,7 +250,8 @@ def describe_gain(trained: Mapping[str, Any], controller: Mapping[str, Any]) -> 
         table.append([successes, row["episodes"] - successes])
     own, other = trained[SUCCESS]["mean"], controller[SUCCESS]["mean"]
     verdict = "no gain shown"
-    if stats.fisher_exact(table, alternative="greater").pvalue < 1.0 - CONFIDENCE:
+    test: Any = stats.fisher_exact(table, alternative="greater")
+    if test.pvalue < 1.0 - CONFIDENCE:
         verdict = f"better than the controller by {own - other:.3f}"
     return f"success {own:.3f} against the controller's {other:.3f}: {verdict}"
 

@@ -360,8 +360,8 @@ class TrainingLogger:
             return
         rows = pd.read_csv(self._path, dtype=str)
         self._path.unlink()
-        kept = rows["env_steps"].astype(float) <= self.env_steps
-        self.rows = rows[kept].to_dict("records")
+        kept: Any = rows[rows["env_steps"].astype(float) <= self.env_steps]
+        self.rows = kept.to_dict("records")
         self._num_unwritten = len(self.rows)
         self.flush()
 
