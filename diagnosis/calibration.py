@@ -1,8 +1,8 @@
 """Calibration of probabilities: logistic regressions on a few signs, fitted to answers of known truth.
 
 A log-likelihood gain is no probability: simulator, noise and forms of effects are all a little
-wrong, so a Bayes factor of e to 40 is wrong once in twenty. `exam.do=calibrate` fits the weights to
-development exams; `conf/certainty` holds them. All signs mean the same on any machine.
+wrong, so a Bayes factor of e to 40 is wrong once in twenty. The weights in
+`conf/certainty` were fitted to development exams. All signs mean the same on any machine.
 Axes: `J` joints.
 """
 

@@ -1,7 +1,5 @@
 """From detected effects to an answer: rivals, probabilities, numbers with intervals, a verdict.
 
-The weights of the choice are recorded as plain JSON, enough to choose again at other penalties
-without a simulation.
 Axes: `J` joints, `E` entries, `B` blocks of entries that hang together.
 """
 
@@ -9,113 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
-from typing import Any, cast
 
 import numpy as np
 
 from brokk_rl.machine import Machine
 from diagnosis import calibration
 from diagnosis.answer import Estimate, Selected
-from diagnosis.detection import DetectionResult, choose_by_penalties
-from diagnosis.effect_library import DetectedEffect, EffectType, list_shared_effects
+from diagnosis.detection import DetectionResult
+from diagnosis.effect_library import DetectedEffect, EffectType
 from diagnosis.refine import drop_effects
 from diagnosis.request import Penalties, ProbabilityModel
-from diagnosis.residuals import ParameterRay, Residuals
-from diagnosis.responses import fit_faults
-from diagnosis.search import EffectSet, Subset, SubsetScore, SubsetTable, list_promising_subsets
-
-
-def record_weights(result: DetectionResult, penalties: Penalties) -> dict[str, Any]:
-    """Return all subsets with gains and penalties as plain JSON data."""
-    joints: list[dict[str, Any]] = []
-    common = list_shared_effects(ways[0].kind for ways in result.rays.values() if ways)
-    for j, table in enumerate(result.tables):
-        priced = {*list_promising_subsets(table, penalties.joint, penalties.share, common)}
-        rows = []
-        for subset in sorted(table.scores, key=sorted):
-            if subset in priced:
-                # The part of the penalty that does not depend on `penalties`, for other ones.
-                null = result.price(j, subset) - penalties.joint * len(subset - common)
-                known = {"null": round(null / max(penalties.reference, 1e-9), 2)}
-                rows.append(_record_subset(table, subset) | known)
-            elif subset and (len(subset) < 3 or any(subset < larger for larger in priced)):
-                # A smaller subset shows the gain that each effect adds to a larger one.
-                known = {"gain": round(table.scores[subset].total, 2)}
-                rows.append(_record_subset(table, subset) | known)
-        joints.append({"felt": sorted(table.shapes), "subsets": rows})
-    return {
-        "joints": joints,
-        "others": [{"effect": one.kind.name, "joints": one.joints.tolist(), "worth": one.net_gain, "gain": one.gain,
-                    "rivals": dict(one.rivals)} for one in result.detected],
-        "left": result.clue_gains.tolist(), "left_null": result.reference_clue_gains.tolist(), "scatter": result.scatter.tolist(),
-        "strays": result.strays.tolist(), "tool_left": result.tool_left, "entries": result.residuals.z.shape[1],
-        "blocks": int(result.residuals.block.max()) + 1,
-        "prices": {"joint": penalties.joint, "name": penalties.name},
-    }  # fmt: skip
-
-
-def _record_subset(table: SubsetTable, subset: Subset) -> dict[str, Any]:
-    scored = table.scores[subset]
-    sizes = {name: [round(float(v), 3) for v in size] for name, size in scored.sizes.items()}
-    gain = np.bincount(table.block, scored.gain)
-    return {"effects": sorted(subset), "gain": [round(float(v), 2) for v in gain], "sizes": sizes}
-
-
-def restore_result(
-    told: Mapping[str, Any], penalties: Penalties, kinds: Sequence[EffectType]
-) -> DetectionResult:
-    """Return the findings at other prices; evidence, repair and rays are those that choosing and saying need, no more."""
-    tables, left_out, count = [], [], told["blocks"]
-    for joint in told["joints"]:
-        table = SubsetTable(
-            fit_faults(np.zeros(count), []), {name: [] for name in joint["felt"]}, np.arange(count)
-        )
-        for row in joint["subsets"]:
-            sizes = {name: np.array(size) for name, size in row["sizes"].items()}
-            gain = np.array(row["gain"]) if "null" in row else np.full(count, row["gain"] / count)
-            table.scores[frozenset(row["effects"])] = SubsetScore(gain, sizes)
-        tables.append(table)
-        priced = [row for row in joint["subsets"] if "null" in row]
-        left_out.append({frozenset(row["effects"]): row["null"] for row in priced})
-
-    def price(j: int, subset: Subset) -> float:
-        return penalties.joint * len(
-            subset - list_shared_effects(kinds)
-        ) + penalties.reference * left_out[j].get(subset, 0.0)
-
-    chosen = choose_again(tables, price, penalties, kinds)
-    by_name = {kind.name: kind for kind in kinds}
-    others = []
-    for one in told["others"]:
-        mask, was = np.array(one["joints"]), told["prices"]
-        more = (was["joint"] - penalties.joint) * (
-            1 if by_name[one["effect"]].target.stochastic else mask.sum()
-        )
-        worth = one["worth"] + more + was["name"] - penalties.name
-        if worth > 0:
-            others.append(
-                DetectedEffect(
-                    by_name[one["effect"]], mask, {}, worth, one["gain"], 0.0, one["rivals"]
-                )
-            )
-    residuals = cast(Residuals, SimpleNamespace(z=np.zeros((len(tables), told["entries"]))))
-    rays = {}
-    for joint in told["joints"]:
-        rays |= {name: [] for name in joint["felt"]}
-    return DetectionResult(
-        residuals, tables, rays, price, chosen, None, others,
-        np.array(told["left"]), np.array(told["left_null"]), np.array(told["scatter"]),
-        np.array(told["strays"]), told["tool_left"],
-    )  # fmt: skip
-
-
-def choose_again(
-    tables: Sequence[SubsetTable], price: Any, penalties: Penalties, kinds: Sequence[EffectType]
-) -> EffectSet:
-    """Return the set with the largest net gain at these penalties."""
-    return choose_by_penalties(tables, price, penalties, list_shared_effects(kinds))
-
+from diagnosis.residuals import ParameterRay
+from diagnosis.search import EffectSet, Subset, SubsetTable
 
 SAME_SHARE = 0.9
 """An effect that earns so much of what another earns in its place cannot be told from it."""

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -138,20 +137,6 @@ def _list_others(result: DetectionResult, known: GapClosure, most: float) -> lis
 
 def _compress(nats: float) -> float:
     return float(np.arcsinh(nats / LITTLE_NATS))
-
-
-def read_hypotheses(rows: Sequence[Mapping[str, Any]]) -> list[Hypothesis]:
-    """Return the hypotheses of `serialize_hypotheses`."""
-    return [Hypothesis(row["name"], tuple(row["joints"]), row["signs"]) for row in rows]
-
-
-def serialize_hypotheses(known: Sequence[Hypothesis]) -> list[dict[str, Any]]:
-    """Return hypotheses with their signs as plain JSON data: the weights are learned from them."""
-    rows = []
-    for one in known:
-        signs = {name: round(value, 4) for name, value in one.signs.items()}
-        rows.append({"name": one.name, "joints": list(one.joints), "signs": signs})
-    return rows
 
 
 @dataclass(frozen=True)

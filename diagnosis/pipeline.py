@@ -122,12 +122,10 @@ class DiagnosisPipeline:
     def _outcome(
         self, result: DetectionResult, told: Sequence[Gate], curves: SpeedCurves
     ) -> Outcome:
-        weighed = decision.record_weights(result, self.penalties)
         field, machine = self.base.field, self.case.machine
         rivals = verdict.collect_rivals(self.base)
         shared = effect_library.list_shared_effects(self.kinds)
         known = hypotheses.list_hypotheses(result, self._known(), self.penalties, shared)
-        weighed["hypotheses"] = hypotheses.serialize_hypotheses(known)
         weighing, seen = self._settle(result, known, rivals)
         result, reach, named = seen.result, seen.reach, seen.verdict == "effects"
         foretold = reach.foretold()
@@ -153,7 +151,7 @@ class DiagnosisPipeline:
             next_experiment=self._next(result, selected),
             reason=self._reason(seen, selected, remainder),
             more=survey.more()
-            | self._more(result, weighed, foretold)
+            | self._more(result, foretold)
             | {"curves": speed_curves.serialize_curves(curves)}
             | {"unknown_remainder": remainder, "reference_error": reach.measure_reference()}
             | {"motion_delay_s": measure_motion_delays(before, after, machine, CURVE_SEED)}
@@ -335,23 +333,15 @@ class DiagnosisPipeline:
             np.concatenate(paths).astype(float),
         )
 
-    def _more(
-        self, result: DetectionResult, weighed: Mapping[str, Any], foretold: Estimate | None
-    ) -> dict[str, Any]:
+    def _more(self, result: DetectionResult, foretold: Estimate | None) -> dict[str, Any]:
         names = self.case.machine.joint_names
-        null = []
-        for joint in weighed["joints"]:
-            rows = [row for row in joint["subsets"] if len(row["effects"]) == 1]
-            null += [row["null"] for row in rows if "null" in row]
         return {
             "evidence": {
                 "rivals": _list_rivals(result, names),
                 "threshold": self.penalties.name + self.penalties.joint,
-                "null": null,
                 "unit": "log likelihood",
             },
             "remainder": _describe_remainder(result, names),
-            "weighed": weighed,
             "predicted_closed": foretold and serialize_estimate(foretold),
         }
 

@@ -10,7 +10,5 @@ score              one answer against one label
 answer_scoring     all answers of some candidates
 metrics            rates with intervals, calibration, confusion
 report             table, figures
-oracle             share of the gap that the true effects close
 constant_answer    a candidate to compare with
-calibration        penalties and probabilities from development exams
 """

@@ -23,8 +23,8 @@ from exam.metrics import compute_metrics
 
 log = logging.getLogger(__name__)
 
-BULK = ("weighed", "curves", "location", "evidence", "probes")
-"""Parts of an answer that fill pictures and calibration, nine in ten of its bytes, and no score."""
+BULK = ("curves", "location", "evidence")
+"""Parts of an answer that fill pictures, nine in ten of its bytes, and no score."""
 
 RUN_FILE = "run.json"
 """File beside answers: who gave them, at which commit, to which labels."""
@@ -41,7 +41,6 @@ class AnswerScoring:
         fit: Fit of the examiner's simulator.
         classes: Effects that recordings of commands and positions cannot tell apart.
         of_machine: Effects that all joints have together.
-        oracle: Share of the gap that the true effects close, by case.
     """
 
     exam: Path
@@ -50,7 +49,6 @@ class AnswerScoring:
     fit: ActuatorFit
     classes: Sequence[Sequence[str]]
     of_machine: Sequence[str]
-    oracle: Mapping[str, float | None]
 
     def examine(
         self, folders: Mapping[str, Path], place: Path, workers: int
@@ -125,7 +123,6 @@ class AnswerScoring:
                     self.classes,
                     self.of_machine,
                     run_cases.read_seconds(place),
-                    self.oracle.get(label["case"]),
                     examined.get(label["case"]),
                 )
             )

@@ -73,17 +73,6 @@ def open_labels(folder: Path) -> dict[str, Any]:
     return json.loads(text)
 
 
-def is_sealed(folder: Path) -> bool:
-    """Return whether the exam in `folder` is sealed: by its facts, or by its labels themselves.
-
-    The labels are protected by their hash, so that a changed `exam.json` opens nothing.
-    """
-    if json.loads((folder / "exam.json").read_text())["sealed"]:
-        return True
-    facts = open_labels(folder) if (folder / LABELS_FILE).is_file() else {}
-    return bool(facts.get("sealed") or facts.get("held_out"))
-
-
 CASES_FOLDER, WITHHELD_FOLDER = "cases", "withheld"
 PARTIAL_FILE = "labels.partial.jsonl"
 """Salt and labels of an exam that is being made."""

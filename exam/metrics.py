@@ -28,9 +28,6 @@ SIZES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.6, 0.8, 1.01)
 cases a bin in an exam of 220."""
 MOVED_RAD = (0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 1.0)
 """Edges of the same curve over the change of the motion, rad: each bin doubles."""
-MIN_ORACLE_CLOSED = 0.1
-"""Share of the gap that the true effects must close before a candidate is compared with them;
-chosen by hand: below it the ratio of two shares is noise."""
 
 Metric = dict[str, Any]
 
@@ -120,7 +117,6 @@ def compute_metrics(scores: Sequence[CaseScore], not_begun: int = 0) -> dict[str
         "parameter_error": bootstrap_over_cases(scores, compute_parameter_error),
         "cover_90": _rate_items(numbers, attrgetter("in_90")),
         "cover_95": _rate_items(numbers, attrgetter("in_95")),
-        "closed_of_oracle": bootstrap_over_cases(known, compute_closed_of_oracle),
         "closed_examined": bootstrap_over_cases(known, compute_examined_share),
         "closed_differs": _rate_items(_select_examined(known), attrgetter("differs")),
         "closed_missing": _rate_items(_select_named(scores), _is_without_share),
@@ -351,25 +347,6 @@ def _is_without_share(score: CaseScore) -> bool:
 def compute_examined_share(scores: Sequence[CaseScore]) -> float | None:
     """Return the median closed share of the gap by the examiner's own simulation."""
     return _take_median(score.examined for score in scores if score.examined is not None)
-
-
-def compute_closed_of_oracle(scores: Sequence[CaseScore]) -> float | None:
-    """Return the median ratio of the closed share of the gap to that of the oracle.
-
-    The closed share is the examiner's; only where nobody examined the answers, it is their own. The
-    median, as the gap itself is a difference of two errors: where it is small, its shares vary
-    wildly.
-    """
-    shares = []
-    for score in scores:
-        if score.oracle is None or score.oracle <= MIN_ORACLE_CLOSED:
-            continue
-        if score.was_examined:
-            if score.examined is not None:
-                shares.append(score.examined / score.oracle)
-        else:
-            shares.append((score.closed or 0.0) / score.oracle)
-    return _take_median(shares)
 
 
 def compute_prediction_error(scores: Sequence[CaseScore]) -> float | None:

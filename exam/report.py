@@ -34,7 +34,6 @@ ROWS = {
     "parameter_error": ("parameter error, median", False),
     "cover_90": ("90 % intervals cover", None),
     "cover_95": ("95 % intervals cover", None),
-    "closed_of_oracle": ("gap closed, of the oracle's", True),
     "closed_examined": ("gap closed on withheld parts, by the examiner, median", True),
     "closed_differs": ("stated closing disagrees with the examiner's", False),
     "closed_missing": ("effects named without a share", False),

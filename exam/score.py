@@ -80,8 +80,6 @@ class CaseScore:
             `effects.yaml`; `None` where there is no gap in the motion, or nobody examined it.
         was_examined: Whether the examiner simulated the answer.
         differs: Whether the examiner's share and the answer's own disagree.
-        oracle: Share of the gap that the true effects close when fitted, where somebody computed
-            it.
         seconds: Time the answer took.
         outside: Name of the fault outside the library.
     """
@@ -105,7 +103,6 @@ class CaseScore:
     examined: float | None
     was_examined: bool
     differs: bool
-    oracle: float | None
     seconds: float | None
     outside: str | None
 
@@ -116,7 +113,6 @@ def score_answer(
     classes: Sequence[Sequence[str]],
     of_machine: Sequence[str],
     seconds: float | None = None,
-    oracle: float | None = None,
     examination: Mapping[str, Any] | None = None,
 ) -> CaseScore:
     """Return the score of `answer`; `None` is a missing answer.
@@ -127,7 +123,6 @@ def score_answer(
         classes: Effects that recordings of commands and positions cannot tell apart.
         of_machine: Effects that all joints have together; nobody is asked for their joints.
         seconds: Time it took.
-        oracle: Share of the gap that the true effects close.
         examination: The examiner's own figures; see `examiner.Examination`.
     """
     kind = label["kind"]
@@ -183,7 +178,6 @@ def score_answer(
         examined=examination["closed"] if examination else None,
         was_examined=examination is not None,
         differs=bool(examination and examination["differs"]),
-        oracle=oracle,
         seconds=seconds,
         outside=outside["ailment"] if outside else None,
     )

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
 import secrets
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 
 from actuators.contracts import ActuatorFit
 from actuators.excite.schedule import Approach
@@ -24,19 +20,16 @@ from brokk_rl.progress import ItemProgress
 from brokk_rl.session import Session, describe_commit, write_json, write_text
 from brokk_rl.spec import spec
 from diagnosis import effect_library
-from diagnosis.request import Penalties, ProbabilityModel
-from exam import dataset, oracle, report, run_cases
+from exam import dataset, report, run_cases
 from exam.answer_scoring import RUN_FILE, AnswerScoring
-from exam.calibration import PenaltyFit, load_weighed_cases, split_by_family
 from exam.case_distribution import CaseDesign, CaseDistribution, PlantFamily
-from exam.dataset import CaseSet, end_on_interrupt
+from exam.dataset import CaseSet
 from exam.generate import CaseRecorder, Half, HalfPlan, restrict_machine
-from exam.metrics import compute_metrics
 from exam.run_cases import Candidate
 
 log = logging.getLogger(__name__)
 
-ORACLE_FILE, EXAMINED_FILE = "oracle.json", "examined.json"
+EXAMINED_FILE = "examined.json"
 
 
 @spec
@@ -44,18 +37,13 @@ class ExamSettings:
     """The step to do, and the cases.
 
     Attributes:
-        do: `make` cases into the run folder, `run` a candidate on them, ask the `oracle`, `score`
-            the answers of one or several, `calibrate` prices by the answers to development exams.
+        do: `make` cases into the run folder, `run` a candidate on them, or `score` the
+            answers of one or several.
         folder: The exam that all but `make` are about: the folder that `make` left.
         candidate: Who answers.
-        workers: Cases answered, recorded or weighed at once.
-        answers: Of `score`: a name for each candidate, and the run folder with its
-            answers. `calibrate`: answers of the diagnosis to one or several exams.
-        prices: Of `calibrate`: prices that it begins at.
-        certainty: The same of the weights that say how sure an answer is.
-        trials: Of `calibrate`: other prices that it tries.
-        oracle: Fit of the simulator whose gap the oracle closes; that of the candidate.
-        oracles: Of `score`: run folder of `exam.do=oracle`; `null`: nobody asked it.
+        workers: Cases answered or recorded at once.
+        answers: Of `score`: a name for each candidate, and the run folder with its answers.
+        fit: Of `score`: fit of the examiner's simulator, the same as the candidate's.
         mix: Which cases there are.
         plants: Machines, written apart from the library.
         roughness: How much of a machine no tidy model has: a name of the family's, `mild` or
@@ -73,16 +61,12 @@ class ExamSettings:
         salt: That salt, to make the cases of an opened exam again; `null` draws one.
     """
 
-    do: Literal["make", "run", "oracle", "score", "calibrate"]
+    do: Literal["make", "run", "score"]
     folder: str | None
     candidate: Candidate
     workers: int
     answers: dict[str, str]
-    oracle: ActuatorFit
-    oracles: str | None
-    prices: Penalties
-    certainty: ProbabilityModel
-    trials: int
+    fit: ActuatorFit
     mix: CaseDistribution
     plants: PlantFamily
     roughness: str
@@ -96,20 +80,19 @@ class ExamSettings:
     salt: str | None
 
     def check(self) -> None:
-        if self.do not in ("make", "calibrate") and self.folder is None:
+        if self.do != "make" and self.folder is None:
             raise ConfigError(
                 f"exam.do={self.do}: expected exam.folder=<folder>, the one that exam.do=make wrote"
             )
-        if self.do in ("score", "calibrate") and not self.answers:
+        if self.do == "score" and not self.answers:
             raise ConfigError(
                 f"exam.do={self.do}: expected +exam.answers.<name>=<folder>, a folder that exam.do=run wrote; one or several"
             )
-        for name in ("workers", "trials"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"exam.{name}: expected 1 or more, got {getattr(self, name)}")
-        if self.do in ("make", "calibrate") and self.plants.is_held_out and not self.sealed:
+        if self.workers < 1:
+            raise ConfigError(f"exam.workers: expected 1 or more, got {self.workers}")
+        if self.do == "make" and self.plants.is_held_out and not self.sealed:
             raise ConfigError(
-                "exam_plants=held_out: this make is held out from development and calibration; only a sealed exam draws "
+                "exam_plants=held_out: this make is held out from development; only a sealed exam draws "
                 "from it (exam_protocol=sealed), development has exam_plants=valves"
             )
         for name in self.mix.troubles:
@@ -128,8 +111,7 @@ class Exam:
         machine: The machine of all cases.
         excitation: Excitations by name; `exam.reference` and `exam.field` give the file.
         exam: The step and the cases.
-        resume: Run folder of an interrupted `exam.do=make`, `run`, `oracle` or `score` to go on
-            with; the same as `session.out`.
+        resume: Run folder of an interrupted step to go on with; the same as `session.out`.
     """
 
     session: Session
@@ -141,14 +123,9 @@ class Exam:
     def check(self) -> None:
         if self.resume is None:
             return
-        if Path(self.resume).resolve() != self.session.folder.resolve() or self.exam.do not in (
-            "make",
-            "run",
-            "oracle",
-            "score",
-        ):
+        if Path(self.resume).resolve() != self.session.folder.resolve():
             raise ConfigError(
-                f"resume={self.resume}: exam.do=make, run, oracle or score goes on in its own folder; add "
+                f"resume={self.resume}: a step goes on in its own folder; add "
                 f"session.out={self.resume} and give exam.do as before"
             )
 
@@ -272,81 +249,6 @@ class Exam:
         """The machine as the candidates of the exam in `exam.folder` know it."""
         return restrict_machine(self.machine, self._facts.get("known", "full"))
 
-    def _oracle(self) -> None:
-        """Open the labels; write `oracle.json`: shares of the gap that true effects close."""
-        cases = dataset.open_labels(self._folder)["cases"]
-        # only these have effects that a simulator could repair
-        labels = [label for label in cases if label["kind"] in ("one", "several")]
-        place, found = self.session.folder / ORACLE_FILE, {}
-        if place.is_file():
-            found = json.loads(place.read_text())  # of a run that was interrupted
-        todo = [label for label in labels if label["case"] not in found]
-        job = partial(
-            oracle.close_labelled_gap,
-            self._folder / dataset.CASES_FOLDER,
-            self.exam.oracle,
-            self._known,
-        )
-        with (
-            ItemProgress("cases repaired", len(labels)) as progress,
-            ProcessPoolExecutor(self.exam.workers, initializer=end_on_interrupt) as pool,
-        ):
-            progress.skip(len(labels) - len(todo))
-            for label, share in zip(todo, pool.map(job, todo), strict=True):
-                found[label["case"]] = share
-                write_json(place, found)
-                progress.advance()
-        shares = [share for share in found.values() if share is not None]
-        log.info(
-            "the true effects close %.2f of the gap (median of %d cases with one)",
-            np.median(shares or [0.0]),
-            len(shares),
-        )
-
-    def _calibrate(self) -> None:
-        """Open development labels; write `prices.yaml` and `certainty.yaml`; print the change."""
-        settings = self.exam
-        cases = load_weighed_cases([Path(folder) for folder in settings.answers.values()])
-        classes, of_machine = settings.mix.classes, self._of_machine()
-        seed, kinds = self.session.stream("prices"), effect_library.load_effects(self.machine)
-        fit = PenaltyFit(
-            self.machine, kinds, classes, of_machine, settings.trials, seed, settings.workers
-        )
-        title = f"{settings.trials} prices on {len(cases)} cases"
-        with ItemProgress(title, settings.trials // 2 * 2) as progress:
-            found = fit.fitted(cases, settings.prices, settings.certainty, progress.advance)
-            parts = split_by_family(cases)
-            apart = []
-            for part in parts:
-                apart.append(fit.fitted(part, settings.prices, settings.certainty, lambda: None))
-        before = compute_metrics(fit.marks(cases, settings.prices, settings.certainty))
-        after = compute_metrics(fit.marks(cases, *found))
-        # the numbers of each half are judged by the causes of the other: no cause is in both
-        crosswise = compute_metrics(fit.marks(parts[1], *apart[0]) + fit.marks(parts[0], *apart[1]))
-        for name, one in zip(("prices", "certainty"), found, strict=True):
-            numbers = {
-                "_target_": f"{type(one).__module__}.{type(one).__name__}",
-                **dataclasses.asdict(one),
-            }  # pyright: ignore[reportArgumentType]
-            write_text(
-                self.session.folder / f"{name}.yaml", yaml.safe_dump(numbers, sort_keys=False)
-            )
-        write_json(
-            self.session.folder / "calibration.json",
-            {"cases": len(cases), "before": before, "after": after, "cross": crosswise},
-        )
-        _show({"before": before, "after": after, "after, on the other half": crosswise})
-        log.info(
-            "%s: prices.yaml and certainty.yaml; they stand in conf/prices, conf/certainty",
-            self.session.folder,
-        )
-
-    def _read_oracle(self) -> dict[str, float | None]:
-        """Return the share that the true effects close by case; empty where nobody asked."""
-        if self.exam.oracles is None:
-            return {}
-        return json.loads((Path(self.exam.oracles) / ORACLE_FILE).read_text())
-
     def _of_machine(self) -> list[str]:
         shared = []
         for name, trouble in self.exam.mix.troubles.items():
@@ -363,10 +265,9 @@ class Exam:
             exam=self._folder,
             labels=labels,
             machine=self._known,
-            fit=self.exam.oracle,
+            fit=self.exam.fit,
             classes=self.exam.mix.classes,
             of_machine=self._of_machine(),
-            oracle=self._read_oracle(),
         )
         examined = marking.examine(folders, out / EXAMINED_FILE, self.exam.workers)
         tables = {}

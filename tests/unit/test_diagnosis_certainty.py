@@ -22,7 +22,6 @@ from diagnosis.refine import FittedSet
 from diagnosis.request import Penalties, ProbabilityModel
 from diagnosis.residuals import INCREMENT_SAMPLES, Residuals
 from diagnosis.search import EffectSet
-from exam.calibration import WeighedCase, fit_logistic, split_by_family
 
 
 @pytest.fixture
@@ -160,24 +159,6 @@ def test_the_error_of_a_form_is_added_to_that_of_a_size() -> None:
     )
 
 
-def test_weights_of_signs_are_those_that_made_the_truth() -> None:
-    random = np.random.default_rng(2)
-    signs = [
-        {"constant": 1.0, "margin": m, "names": n} for m, n in random.standard_normal((6000, 2))
-    ]
-    true = [
-        random.random()
-        < calibration.compute_probability({"constant": -1.0, "margin": 2.0, "names": 0.0}, one)
-        for one in signs
-    ]
-    begin = {"constant": 0.0, "margin": 0.5, "names": 1.0}
-    found = fit_logistic(signs, true, begin)
-    assert found == pytest.approx({"constant": -1.0, "margin": 2.0, "names": 0.0}, abs=0.15)
-    # A handful of answers changes little but how often anything is true.
-    few = fit_logistic(signs[:4], true[:4], begin)
-    assert [few[name] for name in ("margin", "names")] == pytest.approx([0.5, 1.0], abs=0.2)
-
-
 def found(subsets: tuple[str, ...], others: tuple[str, ...] = ()) -> DetectionResult:
     """Returns effects by joint, named by a letter each, and what sensors, frames and tool points show."""
     fields = {field.name: None for field in dataclasses.fields(DetectionResult)}
@@ -229,23 +210,14 @@ def test_a_missing_or_unknown_sign_is_named(weights: ProbabilityModel) -> None:
         dataclasses.replace(weights, right={**weights.right, "margins": 0.0})
 
 
-def test_halves_to_fit_and_to_judge_share_no_family() -> None:
-    def item(effects: list[str], outside: str | None) -> WeighedCase:
-        return WeighedCase(
-            {
-                "effects": [{"effect": e} for e in effects],
-                "outside": {"ailment": outside} if outside else None,
-            },
-            {},
-        )
+def test_the_form_of_an_effect_takes_the_place_of_that_of_its_stage(
+    weights: ProbabilityModel,
+) -> None:
+    own = dataclasses.replace(weights, form_of_effect={"lag": 0.5})
+    assert own.get_form_error("lag", "actuation") == 0.5
+    assert own.get_form_error("dead_band", "actuation") == weights.form["actuation"]
 
-    cases = [
-        item(["lag"], None),
-        item([], "fading"),
-        item(["backlash", "lag"], None),
-        item([], None),
-        item([], None),
-    ] * 3
-    first, second = split_by_family(cases)
-    assert len(first) + len(second) == len(cases)
-    assert {one.family for one in first} & {one.family for one in second} <= {"none"}
+
+def test_a_negative_form_is_refused_by_name(weights: ProbabilityModel) -> None:
+    with pytest.raises(ConfigError, match=r"certainty.form_of_effect.lag: expected 0 or more"):
+        dataclasses.replace(weights, form_of_effect={"lag": -0.1})

@@ -1,8 +1,7 @@
-"""The held-out make: closed to development and calibration, physics worked by hand, causes that show."""
+"""The held-out make: closed to development, physics worked by hand, causes that show."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,8 +14,6 @@ from composed import names, option
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.signals import Command
-from exam import dataset
-from exam.calibration import load_weighed_cases
 from exam.case_distribution import PlantRun, UnknownFault
 from exam.held_out import causes, parameters
 from exam.held_out.arm import HeldOutPlants, SensingArm
@@ -79,16 +76,11 @@ def find_speeds(machine: Machine, runs: list[tuple[ArmParameters, float]]) -> np
 def test_development_cannot_draw_the_held_out_make(
     brokk: Callable[..., Any], machine: Machine, tmp_path: Path
 ) -> None:
-    for step in ("make", "calibrate"):
-        done = brokk(
-            "mode=exam",
-            f"exam.do={step}",
-            "exam_plants=held_out",
-            "+exam.answers.a=a",
-            f"session.out={tmp_path / 'x'}",
-        )
-        assert done.code != 0 and "held out from development" in done.err
-        assert not (tmp_path / "x").exists()
+    done = brokk(
+        "mode=exam", "exam.do=make", "exam_plants=held_out", f"session.out={tmp_path / 'x'}"
+    )
+    assert done.code != 0 and "held out from development" in done.err
+    assert not (tmp_path / "x").exists()
     # not by its own option either, nor from Python
     plants = HeldOutPlants(roughness={"mild": 1.0}, sealed=False, outside_not_on={})
     run = PlantRun(seed=1, roughness="mild", chance=1, elapsed_s=0.0)
@@ -104,15 +96,6 @@ def test_what_the_held_out_make_has_no_other_make_has() -> None:
     for one in others:
         assert not set(one.outside_faults) & set(causes.CAUSES)
     assert not set(out_of_library_faults.KINDS) & set(causes.CAUSES)
-
-
-def test_calibration_refuses_a_sealed_exam_whatever_its_facts_say(tmp_path: Path) -> None:
-    exam, answers = tmp_path / "exam", tmp_path / "exam" / "answers"
-    answers.mkdir(parents=True)
-    dataset.seal_labels(exam, {"sealed": True, "held_out": True, "cases": []}, "salt")
-    (exam / "exam.json").write_text(json.dumps({"sealed": False}))  # as somebody might edit it
-    with pytest.raises(ConfigError, match="development exams only"):
-        load_weighed_cases([answers])
 
 
 def test_a_clean_machine_goes_at_full_speed_and_by_its_notches_below(machine: Machine) -> None:

@@ -186,19 +186,6 @@ def test_auroc_counts_ties_half() -> None:
     assert metrics.compute_auroc(marks[:2]) is None
 
 
-def test_the_gap_closed_is_held_against_what_the_oracle_closes() -> None:
-    truth = label("one", ("lag", "q3", 1.0))
-    marks = [
-        score_answer(truth, answered(chosen("lag")), CLASSES, (), 1.0, oracle)
-        for oracle in (1.0, 0.8, 0.01)
-    ]
-    # each closes 0.9, so 0.9 and 1.125 of it; where nothing can be closed nobody is asked
-    assert metrics.compute_closed_of_oracle(marks) == pytest.approx((0.9 + 1.125) / 2)
-    assert (
-        metrics.compute_closed_of_oracle([score_answer(truth, None, CLASSES, (), None, 0.9)]) == 0.0
-    )
-
-
 def test_intervals_hold_their_figure_and_shrink_with_the_number_of_cases(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

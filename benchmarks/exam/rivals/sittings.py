@@ -36,7 +36,7 @@ SITTINGS = {
     "servos": Sitting(
         name="servos",
         rivals=("servo_sysid", "servo_pace", "servo_bam"),
-        options=(*SERVOS, "fit@exam.oracle=servo"),
+        options=(*SERVOS, "fit@exam.fit=servo"),
         run_options=SERVOS,
         development=("session.seed=702", "exam.mix.num_cases=24"),
     ),

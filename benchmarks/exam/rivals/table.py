@@ -210,10 +210,9 @@ def main(
         exam=exam,
         labels=sat,
         machine=machine,
-        fit=settings.oracle,
+        fit=settings.fit,
         classes=settings.mix.classes,
         of_machine=[n for n, one in settings.mix.troubles.items() if one.joints == "all"],
-        oracle={},
     )
     # numbers taken as they are repair the rival's own simulator only: `own_gap.py`
     repairs = {name: folder for name, folder in folders.items() if "as fitted" not in name}
