@@ -8,11 +8,11 @@ from typing import Any
 from brokk_rl.errors import ConfigError
 from brokk_rl.machine import Machine
 from brokk_rl.registry import resolve_package_path
-from deploy.bus.shapes import read_machine_shapes
 from deploy.kernel.envelope import Envelope
 from deploy.kernel.limits import GuardLimits
 from deploy.kernel.observer import Observer
 from deploy.kernel.valve_model import describe_sources, load_observer_file
+from deploy.shapes import read_machine_shapes
 
 log = logging.getLogger(__name__)
 
@@ -75,16 +75,28 @@ def is_from_machine(source: str) -> bool:
     return source.startswith(MACHINES) and not any(name in source for name in DESKS)
 
 
-def build_envelope(limits: GuardLimits, machine: Machine) -> Envelope | None:
-    """Return the envelope of the arm; `None` where it is switched off or no geometry is known.
+def build_envelope(limits: GuardLimits, machine: Machine, commands: bool) -> Envelope | None:
+    """Return the envelope of the arm; `None` where it is switched off or the shapes are not known.
+
+    Args:
+        limits: Of the guard.
+        machine: The machine.
+        commands: Whether commands may be sent.
 
     Raises:
-        ConfigError: the machine's shapes cannot be read.
+        ConfigError: the shapes cannot be read, or are not of this machine where commands are sent.
     """
     if limits.envelope is None:
         return None
-    shapes = read_machine_shapes(machine)
-    if shapes is None:
-        log.warning("machine %s has no geometry: there is no envelope of its arm", machine.name)
-        return None
-    return Envelope(limits.envelope, machine, shapes, limits.speed_margin, limits.reaction_s)
+    path = limits.envelope.shapes
+    shapes = read_machine_shapes(resolve_package_path(path), machine)
+    if shapes is not None:
+        return Envelope(limits.envelope, machine, shapes, limits.speed_margin, limits.reaction_s)
+    fault = f"{path} holds no shapes of machine {machine.name}"
+    if commands and machine.has_bodies:
+        raise ConfigError(
+            f"guard.envelope.shapes: {fault}; brokk mode=export writes such a file, and "
+            "guard.envelope=null goes without"
+        )
+    log.warning("%s: there is no envelope of its arm", fault)
+    return None

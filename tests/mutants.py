@@ -43,7 +43,7 @@ CORE = {
     "deploy.twin.gateway": ["test_deploy_gateway.py"],
     "deploy.policy.policy_process": ["test_deploy_adviser.py"],
     "deploy.kernel.envelope": ["test_deploy_envelope.py"],
-    "deploy.bus.shapes": ["test_deploy_envelope.py"],
+    "deploy.shapes": ["test_deploy_envelope.py"],
     "deploy.kernel.valve_model": ["test_deploy_observer.py"],
     "deploy.kernel.observer": ["test_deploy_observer.py"],
 }

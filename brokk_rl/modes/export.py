@@ -18,6 +18,7 @@ from brokk_rl.policy_folder import (
 from brokk_rl.rl.export import NOT_DEPLOYABLE, export_onnx
 from brokk_rl.rl.policy import TrainedPolicy, observe_once, restore_actor
 from brokk_rl.session import Session
+from brokk_rl.sim.shapes import write_shapes
 from brokk_rl.spec import spec
 
 log = logging.getLogger(__name__)
@@ -62,6 +63,8 @@ class Export:
         folder, answers = self.session.folder, content["answers"]
         write_policy(folder, contract, actor.state_dict())
         largest = export_onnx(folder, actor, task, self.machine, contract, answers)
+        if self.machine.mjcf is not None:
+            write_shapes(self.machine, folder)
         log.info(
             "%s: onnxruntime and the training run differ by at most %.1e over %d observations",
             folder,

@@ -93,6 +93,17 @@ def compile_model(
     return spec.compile()
 
 
+def compile_machine(machine: Machine) -> mujoco.MjModel:
+    """Return the model of `machine` alone, without block and drives.
+
+    Raises:
+        ConfigError: See `compile_model`.
+    """
+    spec = _read_mjcf(machine)
+    _write_machine(spec, machine)
+    return spec.compile()
+
+
 def find_mjcf(machine: Machine) -> Path:
     """Return the path of the machine's MJCF.
 

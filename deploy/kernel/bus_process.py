@@ -74,7 +74,7 @@ class BusProcess:
         description = BusDescription(config.dbc, config.machine)
         commands = memory.request is not None
         limits, machine = config.limits, config.machine
-        envelope = build_envelope(limits, machine)
+        envelope = build_envelope(limits, machine, commands)
         observer = build_observer(limits, machine, config.wire.interface, commands)
         checks = (envelope, observer)
         self._logic = BusLogic(description, machine, limits, *checks, commands, config.needs_page)

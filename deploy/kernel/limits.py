@@ -41,6 +41,7 @@ class EnvelopeLimits:
     """Limits of the envelope; see `deploy.kernel.envelope`.
 
     Attributes:
+        shapes: File with the machine's shapes, from `brokk mode=export`: a path, or `package:path`.
         margin_m: Distance to obstacles below which the arm is brought no nearer.
         release_m: Further distance that it must have before a withheld command passes again.
         ground_m: Height of the ground in the base frame; `null`: there is none.
@@ -52,6 +53,7 @@ class EnvelopeLimits:
         face_speed_m_s: Largest speed of the tip there.
     """
 
+    shapes: str
     margin_m: Positive
     release_m: Positive
     ground_m: float | None

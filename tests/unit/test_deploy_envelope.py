@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 from collections import deque
 from dataclasses import replace
@@ -18,24 +19,20 @@ import brokk_rl.sim
 from brokk_rl.errors import ConfigError
 from brokk_rl.kinematics import compute_tool_kinematics
 from brokk_rl.machine import Machine
-from deploy.bus import shapes
-from deploy.bus.shapes import (
-    LinkCapsule,
-    MachineShapes,
-    RoundedBox,
-    _compute_volume,
-    _fit_capsule,
-    fit_capsules,
-    read_machine_shapes,
-)
+from brokk_rl.registry import resolve_package_path
+from brokk_rl.sim import shapes
+from brokk_rl.sim.shapes import describe_shapes
+from deploy import guard_setup
 from deploy.kernel.envelope import Envelope, measure_segment_to_box
 from deploy.kernel.limits import EnvelopeLimits, Numbers, StayOutBox
 from deploy.kernel.under_way import CommandsUnderWay
+from deploy.shapes import LinkCapsule, MachineShapes, read_machine_shapes
 
 MACHINE = option("machine", "brokk170")
 GUARD = option("guard", "default")
 LIMITS = GUARD.envelope
-SHAPES = read_machine_shapes(MACHINE)
+SHIPPED = resolve_package_path(LIMITS.shapes)
+SHAPES = read_machine_shapes(SHIPPED, MACHINE)
 assert SHAPES is not None
 MJCF = Path(brokk_rl.sim.__file__).parent / "assets" / "brokk170.xml"
 BODIES = ("undercarriage", *(f"{name}_link" for name in MACHINE.joint_names))
@@ -330,10 +327,16 @@ def test_a_command_that_leads_nowhere_is_not_withheld() -> None:
     assert limit(envelope, outward, at) == (outward, False)
 
 
-def list_corners(box: RoundedBox) -> np.ndarray:
+def list_corners(box: dict[str, Any]) -> np.ndarray:
     """Corners of a box, worked by hand."""
     signs = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
-    return np.array([box.center_m + box.rotation @ (one * box.half_m) for one in signs])
+    corners = [box["center_m"] + box["rotation"] @ (one * box["half_m"]) for one in signs]
+    return np.array(corners)
+
+
+def make_box(link: int, center: Any, rotation: Any, half: Any, radius_m: float) -> dict[str, Any]:
+    names = ("link", "center_m", "rotation", "half_m", "radius_m")
+    return dict(zip(names, (link, center, rotation, half, radius_m), strict=True))
 
 
 @pytest.mark.parametrize("end_m", [(2.0, 0.0, 0.0), (1.0, 0.7, -0.5)])
@@ -345,168 +348,65 @@ def test_capsules_enclose_boxes_and_balls(end_m: tuple[float, float, float]) -> 
         radius_m = 0.1 if number % 2 else 0.0
         half = draw.uniform(0.01, 0.2, 3)
         boxes.append(
-            RoundedBox(
+            make_box(
                 1, draw.uniform(-0.3, 0.3, 3) + np.array([number, 0, 0]), rotation, half, radius_m
             )
         )
-    capsules = fit_capsules(boxes, np.array(end_m))
+    capsules = shapes.fit_capsules(boxes, np.array(end_m))
     assert 1 <= len(capsules) <= 2
     for box in boxes:
         inside, corners_m = [], list_corners(box)
         for one in capsules:
-            along = one.end_m - one.begin_m
-            t = ((corners_m - one.begin_m) @ along / (along @ along)).clip(0, 1)
-            off = np.linalg.norm(corners_m - one.begin_m - t[:, None] * along, axis=1)
-            inside.append((off + box.radius_m <= one.radius_m + 1e-9).all())
+            along = one["end_m"] - one["begin_m"]
+            t = ((corners_m - one["begin_m"]) @ along / (along @ along)).clip(0, 1)
+            off = np.linalg.norm(corners_m - one["begin_m"] - t[:, None] * along, axis=1)
+            inside.append((off + box["radius_m"] <= one["radius_m"] + 1e-9).all())
         assert any(inside)
 
 
 def test_capsules_are_no_larger_than_needed() -> None:
     # One ball alone: the capsule is the ball.
-    ball = RoundedBox(2, np.array([0.3, 0.1, -0.2]), np.eye(3), np.zeros(3), 0.25)
-    (one,) = fit_capsules([ball], np.array([1.0, 0.0, 0.0]))
-    assert one.radius_m == pytest.approx(0.25) and one.link == 2
-    for end_m in (one.begin_m, one.end_m):
-        assert end_m == pytest.approx(ball.center_m)
+    ball = make_box(2, np.array([0.3, 0.1, -0.2]), np.eye(3), np.zeros(3), 0.25)
+    (one,) = shapes.fit_capsules([ball], np.array([1.0, 0.0, 0.0]))
+    assert one["radius_m"] == pytest.approx(0.25) and one["link"] == 2
+    for end_m in (one["begin_m"], one["end_m"]):
+        assert end_m == pytest.approx(ball["center_m"])
     # A breaker with a chisel: two capsules, the thin one over the chisel.
-    housing = RoundedBox(2, np.array([0.3, 0, 0]), np.eye(3), np.array([0.3, 0.1, 0.1]), 0.0)
-    chisel = RoundedBox(2, np.array([1.0, 0, 0]), np.eye(3), np.array([0.4, 0, 0]), 0.04)
-    thick, thin = fit_capsules([chisel, housing], np.array([1.4, 0.0, 0.0]))
-    assert thin.radius_m == pytest.approx(0.04) and thick.radius_m == pytest.approx(
+    housing = make_box(2, np.array([0.3, 0, 0]), np.eye(3), np.array([0.3, 0.1, 0.1]), 0.0)
+    chisel = make_box(2, np.array([1.0, 0, 0]), np.eye(3), np.array([0.4, 0, 0]), 0.04)
+    thick, thin = shapes.fit_capsules([chisel, housing], np.array([1.4, 0.0, 0.0]))
+    assert thin["radius_m"] == pytest.approx(0.04) and thick["radius_m"] == pytest.approx(
         math.hypot(0.1, 0.1)
     )
-    assert sorted([thin.begin_m[0], thin.end_m[0]]) == pytest.approx([0.6, 1.4])
+    assert sorted([thin["begin_m"][0], thin["end_m"][0]]) == pytest.approx([0.6, 1.4])
 
     # Two balls along the link: the capsule ends where the smaller one ends.
     ends_m = np.array([[0.1, 0.0, 0.0], [0.5, 0.0, 0.0]])
     balls = [
-        RoundedBox(2, at_m, np.eye(3), np.zeros(3), radius_m)
+        make_box(2, at_m, np.eye(3), np.zeros(3), radius_m)
         for at_m, radius_m in zip(ends_m, (0.2, 0.1), strict=True)
     ]
-    both = _fit_capsule(balls, np.array([1.0, 0.0, 0.0]))
-    assert (both.radius_m, both.begin_m[0], both.end_m[0]) == pytest.approx((0.2, 0.1, 0.4))
+    both = shapes._fit_capsule(balls, np.array([1.0, 0.0, 0.0]))
+    assert (both["radius_m"], both["begin_m"][0], both["end_m"][0]) == pytest.approx(
+        (0.2, 0.1, 0.4)
+    )
     # One on top of the other: two capsules would take more room than one.
-    same = [RoundedBox(2, np.zeros(3), np.eye(3), np.full(3, 0.1), 0.0)] * 3
-    assert len(fit_capsules(same, np.array([1.0, 0.0, 0.0]))) == 1
+    same = [make_box(2, np.zeros(3), np.eye(3), np.full(3, 0.1), 0.0)] * 3
+    assert len(shapes.fit_capsules(same, np.array([1.0, 0.0, 0.0]))) == 1
 
 
 def test_the_volume_of_a_capsule_worked_by_hand() -> None:
-    capsule = LinkCapsule(1, np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 5.0]), 0.5)
+    ends = np.array([1.0, 2.0, 3.0]), np.array([1.0, 2.0, 5.0])
+    capsule = {"begin_m": ends[0], "end_m": ends[1], "radius_m": 0.5}
     # A cylinder of 2 m and two half balls.
     expected = math.pi * 0.25 * 2.0 + 4.0 / 3.0 * math.pi * 0.125
-    assert _compute_volume(capsule) == pytest.approx(expected)
-
-
-STICK = """<mujoco>COMPILER<worldbody><geom type="sphere" size="0.2" pos="3 0 0"/>LINKS</worldbody></mujoco>"""
-
-
-def write_stick(path: Path, geoms: dict[int, str], places: dict[int, str], site: str) -> None:
-    """An arm of five links of 1 m along x, the last one to the site `tip`."""
-    links = ""
-    for number, name in enumerate(MACHINE.joint_names):
-        place = places.get(number, "1 0 0")
-        links += f'<body pos="{place}"><joint name="{name}"/>{geoms.get(number, "")}'
-    links += f'<site name="tip" pos="{site}"/>' if site else ""
-    path.write_text(STICK.replace("COMPILER", "").replace("LINKS", links + "</body>" * 5))
-
-
-def test_a_box_is_stretched_along_its_link_worked_by_hand(tmp_path: Path) -> None:
-    path = tmp_path / "stick.xml"
-    # The first link ends where the second joint is: [0.2, 0, 0.6] from the machine's file.
-    body = MACHINE.joints[1].body
-    assert body is not None
-    origin_m = np.array([one.value for one in body.origin_m])
-    length_m, drawn_m = float(np.linalg.norm(origin_m)), 0.5
-    along = origin_m / length_m
-    place = " ".join(map(str, (drawn_m * along).tolist()))
-    # A box at the middle of the link, half of it along x.
-    middle = " ".join(map(str, (0.4 * drawn_m * along).tolist()))
-    geom = f'<geom type="box" size="0.1 0.2 0.3" pos="{middle}"/>'
-    write_stick(path, {0: geom}, {1: place}, "")
-    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
-    assert shapes is not None and shapes.arm == ()
-    base, box = sorted(shapes.body, key=lambda one: one.link)
-    # What stands still is not stretched.
-    assert base.link == -1 and base.center_m == pytest.approx([3.0, 0.0, 0.0])
-    growth = length_m / drawn_m - 1.0
-    assert box.link == 0 and box.center_m == pytest.approx(0.4 * length_m * along)
-    expected = np.array([0.1, 0.2, 0.3]) * (1.0 + growth * along**2)
-    assert box.half_m == pytest.approx(expected) and growth != pytest.approx(0.0, abs=0.1)
-
-
-def test_a_link_without_length_is_not_stretched_and_the_last_one_to_its_tip(tmp_path: Path) -> None:
-    path, cube = tmp_path / "stick.xml", '<geom type="box" size="0.1 0.1 0.1" pos="0.5 0 0"/>'
-    write_stick(path, {0: cube, 4: cube}, {1: "0 0 0"}, "0.5 0 0")
-    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
-    assert shapes is not None
-    (first,) = (one for one in shapes.body if one.link == 0)
-    assert first.center_m == pytest.approx([0.5, 0.0, 0.0]) and first.half_m == pytest.approx(0.1)
-    tip_m = float(np.linalg.norm(MACHINE.tip_m))
-    (last,) = shapes.arm
-    # Drawn half a metre long, with the box at its end.
-    middle_m = (last.begin_m + last.end_m) / 2
-    assert last.link == 4 and middle_m == pytest.approx([tip_m, 0.0, 0.0])
-    # Without a tip in the file the machine's own is taken for drawn.
-    write_stick(path, {4: cube}, {}, "")
-    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
-    assert shapes is not None
-    (last,) = shapes.arm
-    assert (last.begin_m + last.end_m) / 2 == pytest.approx([0.5, 0.0, 0.0])
+    assert shapes._compute_volume(capsule) == pytest.approx(expected)
 
 
 def test_the_first_link_is_an_obstacle_to_the_others() -> None:
     assert SHAPES is not None
     assert {box.link for box in SHAPES.body} == {-1, 0}
     assert {one.link for one in SHAPES.arm} == {1, 2, 3, 4}
-
-
-@pytest.mark.parametrize(
-    ("compiler", "rad_per_unit"),
-    [
-        ("", math.pi / 180.0),
-        ("<compiler/>", math.pi / 180.0),
-        ('<compiler angle="degree"/>', math.pi / 180.0),
-        ('<compiler angle="radian"/>', 1.0),
-    ],
-)
-def test_angles_have_the_unit_of_the_file(
-    tmp_path: Path, compiler: str, rad_per_unit: float
-) -> None:
-    path = tmp_path / "stick.xml"
-    write_stick(path, {0: '<geom type="box" size="1 1 1" euler="0 0 0.7"/>'}, {}, "")
-    path.write_text(path.read_text().replace("<worldbody>", compiler + "<worldbody>"))
-    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
-    assert shapes is not None
-    (box,) = (one for one in shapes.body if one.link == 0)
-    angle_rad = 0.7 * rad_per_unit
-    assert box.rotation[:2, 0] == pytest.approx([math.cos(angle_rad), math.sin(angle_rad)])
-
-
-def test_without_a_file_or_without_links_there_are_no_shapes(tmp_path: Path) -> None:
-    assert read_machine_shapes(replace(MACHINE, mjcf=None)) is None
-    joints = tuple(replace(one, body=None) for one in MACHINE.joints)
-    assert read_machine_shapes(replace(MACHINE, joints=joints, tool_m=None)) is None
-    path = tmp_path / "empty.xml"
-    path.write_text("<mujoco/>")
-    with pytest.raises(ConfigError, match="got none of q1, q2"):
-        read_machine_shapes(replace(MACHINE, mjcf=str(path)))
-
-
-def test_links_are_stretched_as_the_simulator_stretches_them() -> None:
-    joints = list(MACHINE.joints)
-    body = joints[3].body
-    assert body is not None and SHAPES is not None
-    longer = replace(body.origin_m[0], value=2.5)
-    joints[3] = replace(joints[3], body=replace(body, origin_m=(longer, *body.origin_m[1:])))
-    shapes = read_machine_shapes(replace(MACHINE, joints=tuple(joints)))
-    assert shapes is not None
-    for link, factor in ((1, 1.0), (2, 2.0), (3, 1.0)):
-        ends = [
-            max(one.end_m[0] + one.radius_m for one in found.arm if one.link == link)
-            for found in (SHAPES, shapes)
-        ]
-        # Radii stay; the ends of the boxes move with the link.
-        assert ends[1] == pytest.approx(factor * ends[0], rel=0.12)
 
 
 class Arm:
@@ -731,71 +631,54 @@ def test_the_tip_is_slow_when_it_arrives_not_only_when_it_is_there() -> None:
     assert max(fastest) > 0.5 and near and max(near) < 1.1 * LIMITS.face_speed_m_s
 
 
-def test_a_machine_without_geometry_has_no_shapes() -> None:
-    assert read_machine_shapes(option("machine", "mini_excavator")) is None
+def test_the_shipped_shapes_are_those_of_the_machine() -> None:
+    assert json.loads(SHIPPED.read_text()) == json.loads(json.dumps(describe_shapes(MACHINE)))
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ('<geom type="mesh" mesh="boom"/>', r"expected geoms of sphere.*got mesh"),
-        ('<geom type="box" size="1 1 1" zaxis="0 1 0"/>', r"expected quat or euler.*got zaxis"),
-    ],
-)
-def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str, expected: str) -> None:
-    path = tmp_path / "machine.xml"
-    path.write_text(MJCF.read_text().replace('<body name="q2_link"', f'{text}<body name="q2_link"'))
-    with pytest.raises(ConfigError, match=expected):
-        read_machine_shapes(replace(MACHINE, mjcf=str(path)))
-    with pytest.raises(ConfigError, match="cannot be read from"):
-        read_machine_shapes(replace(MACHINE, mjcf=str(tmp_path / "none.xml")))
+def test_shapes_of_another_machine_are_none(tmp_path: Path) -> None:
+    assert read_machine_shapes(SHIPPED, replace(MACHINE, tool_m=MACHINE.tool_m[::-1])) is None
+    renamed = replace(MACHINE, name="other", levers=MACHINE.levers[:-1])
+    assert read_machine_shapes(SHIPPED, renamed) is not None
+    other = replace(MACHINE, tool_m=MACHINE.tool_m[::-1])
+    assert guard_setup.build_envelope(GUARD, other, commands=False) is None
+    with pytest.raises(ConfigError, match="holds no shapes of machine brokk170"):
+        guard_setup.build_envelope(GUARD, other, commands=True)
+    bare = option("machine", "mini_excavator")
+    assert guard_setup.build_envelope(GUARD, bare, commands=True) is None
+    assert guard_setup.build_envelope(replace(GUARD, envelope=None), MACHINE, True) is None
+    assert guard_setup.build_envelope(GUARD, MACHINE, commands=True) is not None
 
 
-def test_degrees_quaternions_classes_and_nested_bodies_are_read_as_mujoco_reads_them(
-    tmp_path: Path,
-) -> None:
-    text = """<mujoco><compiler autolimits="true"/>
-      <default><geom type="box"/><default class="rod"><geom type="capsule" size="0.05 0.3"/>
-        <default class="thick"><geom size="0.2 0.3"/></default></default></default>
-      <worldbody><geom type="plane" size="1 1 1"/><body name="base" childclass="rod">
-        <geom name="a" pos="1 2 3" euler="30 40 50"/><geom name="b" class="thick" quat="0.5 0.1 0.2 0.3"/>
-        <body pos="0.1 0.2 0.3" euler="0 90 20"><geom name="c" type="box" size="1 2 3" euler="10 0 0"/>
-          <geom name="d" fromto="0 0 0 1 2 3"/><geom name="e" type="cylinder" size="0.1 0.4"/>
-          <geom name="f" type="sphere" size="0.3"/>
-          <geom name="g" type="box" size="0.1 0.2" fromto="0 0 0 1 2 3"/>
-          <geom name="h" type="ellipsoid" size="0.1" fromto="0 0 3 0 0 1"/>
-          <geom name="i" type="box" size="0.1" fromto="0 0 1 0 0 3"/></body>
-        LINKS</body></worldbody></mujoco>"""
-    links = "".join(
-        f'<body name="{name}_link" pos="1 0 0"><joint name="{name}"/><geom type="sphere" size="0.1"/>'
-        for name in MACHINE.joint_names
-    )
-    path = tmp_path / "machine.xml"
-    path.write_text(text.replace("LINKS", links + "</body>" * 5))
-    shapes = read_machine_shapes(replace(MACHINE, mjcf=str(path)))
-    assert shapes is not None
-    model = mujoco.MjModel.from_xml_path(str(path))
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    found = [box for box in shapes.body if box.link == -1]
-    assert len(found) == 9
-    for name, box in zip("abcdefghi", found, strict=True):
-        geom = data.geom(name)
-        assert box.center_m == pytest.approx(geom.xpos, abs=1e-9)
-        turn = geom.xmat.reshape(3, 3)
-        size = model.geom(name).size
-        if name in "ceghi":
-            expected = np.array([size[0], size[0], size[1]]) if name == "e" else size
-            assert box.half_m == pytest.approx(expected) and box.radius_m == 0.0
-            assert box.rotation == pytest.approx(turn, abs=1e-9)
-        else:
-            length = 0.0 if name == "f" else size[1]
-            assert box.half_m == pytest.approx([0, 0, length]) and box.radius_m == pytest.approx(
-                size[0]
-            )
-            if name != "f":
-                assert np.abs(box.rotation[:, 2] @ turn[:, 2]) == pytest.approx(1.0)
-    assert np.linalg.det(found[3].rotation) == pytest.approx(1.0)
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"schema": 2}', "[" * 50_000])
+def test_shapes_that_cannot_be_read_are_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "shapes.json"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_machine_shapes(path, MACHINE)
+    content = json.loads(SHIPPED.read_text())
+    content["arm"][0]["link"] = "first"
+    path.write_text(json.dumps(content))
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_machine_shapes(path, MACHINE)
+    with pytest.raises(ConfigError, match="cannot be read"):
+        read_machine_shapes(tmp_path / "none.json", MACHINE)
+
+
+def test_a_longer_link_has_longer_capsules() -> None:
+    joints = list(MACHINE.joints)
+    body = joints[3].body
+    assert body is not None
+    longer = replace(body.origin_m[0], value=2.5)
+    joints[3] = replace(joints[3], body=replace(body, origin_m=(longer, *body.origin_m[1:])))
+    found = describe_shapes(replace(MACHINE, joints=tuple(joints)))["arm"]
+    before = describe_shapes(MACHINE)["arm"]
+    for link, factor in ((1, 1.0), (2, 2.0), (3, 1.0)):
+        ends = []
+        for arm in (before, found):
+            own = [one["end_m"][0] + one["radius_m"] for one in arm if one["link"] == link]
+            ends.append(max(own))
+        # Radii stay; the ends of the boxes move with the link.
+        assert ends[1] == pytest.approx(factor * ends[0], rel=0.12)
 
 
 @pytest.mark.parametrize(
@@ -813,14 +696,3 @@ def test_limits_that_make_no_sense_are_refused(change: dict[str, object]) -> Non
 def test_a_stay_out_box_upside_down_is_refused() -> None:
     with pytest.raises(ConfigError, match="lower_m below upper_m"):
         StayOutBox(lower_m=(0.0, 0.0, 1.0), upper_m=(1.0, 1.0, 1.0))
-
-
-@pytest.mark.parametrize(
-    "axis", [(0, 0, 1), (0, 0, -1), (0, 1, 0), (0.6, 0, 0.8), (-0.48, 0.6, -0.64)]
-)
-def test_a_part_that_two_points_place_is_turned_as_mujoco_turns_it(axis: tuple[float, ...]) -> None:
-    quaternion, rotation = np.zeros(4), np.zeros(9)
-    mujoco.mju_quatZ2Vec(quaternion, np.array(axis, float))
-    mujoco.mju_quat2Mat(rotation, quaternion)
-    found = shapes._compute_rotation_to(np.array(axis, float))
-    np.testing.assert_allclose(found, rotation.reshape(3, 3), atol=1e-12)
