@@ -15,7 +15,7 @@ import numpy as np
 from brokk_rl.contracts.vision import Ellipse, FrameDetections, HolePose, Masks, Rejection
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, NonNegative, Positive, spec
-from perception import pair_check, search
+from perception import pair_check, rim_scale, search
 from perception.contracts import EllipseDetectorSpec, PoseEstimatorSpec, SegmenterSpec
 from perception.pair_check import PairCheck
 from perception.pair_depth import FaceMatcher, PairDepth
@@ -23,6 +23,7 @@ from perception.pose import consistency
 from perception.pose.plane_conic import convert_to_gray
 from perception.pose.rim import build_chart
 from perception.pose.wall_light import IN_DUST
+from perception.rim_scale import RimScale
 
 SAME_ELLIPSE = 0.15
 """Distance and difference in size, as parts of an ellipse's size, below which two ellipses are the
@@ -41,6 +42,7 @@ SHAPE_REASONS = ("part of a circle on the face with a rim", "radius, m", "axis r
 
 EXPLANATIONS = {
     **pair_check.EXPLANATIONS,
+    **rim_scale.EXPLANATIONS,
     "part of the picture that is block": (
         "too little of the picture is block",
         "Is the block in sight, the segmenter the right one?",
@@ -151,6 +153,8 @@ class StagedPerception:
         apart: Holes nearer to each other than this many radii are one; the outer rim wins.
         depth: Matches pairs of frames that come without depth, and candidates again where depth is
             coarse; `null` for never.
+        rims: Says whether rims of another size than that of the holes show a wrong scale of depth
+            where no hole is found; `null` for never.
         search_every: Frames of which one is searched as a whole; in the others `follow` looks at
             known holes alone.
         pair: Check of the camera pair before anything else; `null` for none.
@@ -167,6 +171,7 @@ class StagedPerception:
     roi: Literal["mask", "box"]
     apart: float
     depth: PairDepth | None
+    rims: RimScale | None
     search_every: Count
     pair: PairCheck | None
 
@@ -220,8 +225,9 @@ class StagedFinder:
         share = cv2.countNonZero(on_block.view(np.uint8)) / on_block.size
         if share < s.smallest_block:
             reason = "part of the picture that is block"
-            rejection = Rejection("segment", reason, share, s.smallest_block)
-            return FrameDetections([], [rejection], [], masks, ms)
+            rejected = [Rejection("segment", reason, share, s.smallest_block)]
+            rejected += self._name_scale(frame, ms)
+            return FrameDetections([], rejected, [], masks, ms)
         judged = _Judged([], [], [])
         finer = s.depth.build(frame, on_block) if s.depth else None
         with _time_stage(ms, "ellipse"):
@@ -229,7 +235,21 @@ class StagedFinder:
         judged.rejected.extend(wrong_size)
         with _time_stage(ms, "pose"):
             self._judge(frame, masks, candidates, judged, finer)
+        if not judged.found:
+            judged.rejected.extend(self._name_scale(frame, ms))
         return self._conclude(judged, masks, frame, ms)
+
+    def _name_scale(self, frame: Frame, ms: dict[str, float]) -> list[Rejection]:
+        """Return that all rims have another size than the holes, if that is why none was found."""
+        s = self.settings
+        if s.rims is None:
+            return []
+        with _time_stage(ms, "scale"):
+            scale = s.rims.measure_scale(frame, self._detector, s.radius_m)
+        if scale is None:
+            return []
+        reason = rim_scale.OF_DEPTH if frame.right is None else rim_scale.OF_PAIR
+        return [Rejection("ellipse", reason, scale, 1.0)]
 
     @property
     def search_every(self) -> int:

@@ -24,6 +24,7 @@ ROWS = "vertical disparity of the pair, px"
 UNSURE = "standard deviation of the vertical disparity, px"
 CANNOT_TELL = (FEW, UNSURE)
 """Reasons that say nothing of the pair."""
+RANGE = "median depth of the pair's features, m"
 SCALE = "depth by disparity over the depth told"
 EXPLANATIONS = {
     ROWS: (
@@ -45,6 +46,10 @@ EXPLANATIONS = {
     UNSURE: (
         "the shared features are too uncertain to tell whether the pair is rectified",
         "Is there light, are the pictures sharp?",
+    ),
+    RANGE: (
+        "what both pictures show lies at an impossible depth",
+        "K or baseline_m is wrong by a large factor: is baseline_m in m?",
     ),
     SCALE: (
         "depth and pair disagree by this factor",
@@ -120,6 +125,7 @@ class PairCheck:
         limit_px: Largest root mean square of the vertical disparity over the features.
         num_sigma: Standard deviations by which it must exceed the limit.
         most_std_px: Standard deviation of that, from which nothing can be told.
+        range_m: Median depth of the features between which it is possible.
         scale: Largest departure from 1 of depth by disparity over a depth that was measured.
         every: Frames of the same pair of which one is checked.
     """
@@ -138,6 +144,7 @@ class PairCheck:
     limit_px: Positive
     num_sigma: NonNegative
     most_std_px: Positive
+    range_m: tuple[Positive, Positive]
     scale: Share
     every: Count
 
@@ -168,6 +175,10 @@ class PairCheck:
             return Rejection("frame", ROWS, found.rms_px, self.limit_px)
         if found.std_px > self.most_std_px:
             return Rejection("frame", UNSURE, found.std_px, self.most_std_px)
+        depth_m = measure_depth(matches, frame)
+        if depth_m is not None and not self.range_m[0] <= depth_m <= self.range_m[1]:
+            limit_m = self.range_m[0] if depth_m < self.range_m[0] else self.range_m[1]
+            return Rejection("frame", RANGE, depth_m, limit_m)
         scale = measure_depth_scale(matches, frame, self.least_matches)
         if scale is not None and abs(np.log(scale)) > np.log1p(self.scale):
             return Rejection("frame", SCALE, scale, 1.0)
@@ -266,6 +277,14 @@ def fit_alignment(matches: PairMatches, frame: Frame) -> PairAlignment:
     rms_px = float(np.sqrt(max(float(solution @ gram @ solution) - noise, 0.0)))
     pitch, roll, focal = (float(value) for value in solution)
     return PairAlignment(pitch, roll, focal, rms_px, float(np.sqrt(noise)))
+
+
+def measure_depth(matches: PairMatches, frame: Frame) -> float | None:
+    """Return the median depth of the matches, m; `None` without a baseline."""
+    disparity_px = float(np.median((matches.left - matches.right)[:, 0]))
+    if frame.baseline_m is None or disparity_px <= 0:
+        return None
+    return float(frame.camera_matrix[0, 0]) * frame.baseline_m / disparity_px
 
 
 def measure_depth_scale(matches: PairMatches, frame: Frame, least: int) -> float | None:

@@ -153,6 +153,8 @@ class FolderSource:
                 disparity_std_px=place.disparity_std_px,
                 disparity_error_px=place.disparity_error_px,
             )
+        if camera.base_from_camera is not None:
+            validation.check_upright(camera.base_from_camera, str(path))
         self._camera = camera
         return self
 
@@ -238,7 +240,9 @@ class FolderSource:
         try:
             checked = validation.check_depth(matched, f"{stem}: matching left and right", least)
         except FrameError as error:
-            pair = Frame(color, matched, camera.matrix, None, 0.0, right=right)
+            pair = Frame(
+                color, matched, camera.matrix, None, 0.0, right=right, baseline_m=camera.baseline_m
+            )
             fault = self._settings.pair.find_fault(pair)
             if fault is None:
                 raise

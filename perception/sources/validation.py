@@ -21,6 +21,9 @@ difference, from which the matrix is one of pictures of another size: that of a 
 pictures of HD1080 departs by 0.15, alike in both."""
 _FARTHEST_M = 200.0
 """Median depth beyond which the unit must be mm."""
+_FARTHEST_CAMERA_M, _SLANT = 50.0, 0.7
+"""Largest distance of a camera from the base; sine of the angle by which a camera may roll, or look
+up: 45 degrees."""
 _RIGID = 1e-3
 """Largest departure of a rotation from orthonormality: of matrices written with three digits."""
 
@@ -134,11 +137,37 @@ def check_pose(value: Any, where: str) -> np.ndarray:
     return found
 
 
+def check_upright(base_from_camera: np.ndarray, where: str) -> None:
+    """Refuse a pose by which the picture stands on its side or head, or shows the sky.
+
+    The base's z axis points up, the camera's y axis down and its z axis ahead. Poses of other
+    conventions, inverse ones, and shifts in mm look like that. A pose without a turn says nothing.
+    """
+    turn, shift_m = base_from_camera[:3, :3], base_from_camera[:3, 3]
+    if np.linalg.norm(shift_m) > _FARTHEST_CAMERA_M:
+        raise FrameError(
+            f"{where}: T_base_cam puts the camera {np.linalg.norm(shift_m):.0f} m away, expected up to "
+            f"{_FARTHEST_CAMERA_M:g} m; is the shift in mm?"
+        )
+    right, down, ahead = turn[2]
+    if np.allclose(turn, np.eye(3)):
+        return
+    if abs(right) > _SLANT or ahead > _SLANT or down > _SLANT:
+        raise FrameError(
+            f"{where}: by T_base_cam the picture's right, lower and far side rise by {right:.2f}, {down:.2f} "
+            f"and {ahead:.2f} per unit, expected about 0, and not above {_SLANT:g}; it must turn camera "
+            "coordinates (x right, y down, z ahead) into those of the base (z up): is it the inverse, "
+            "or of another convention?"
+        )
+
+
 def check_baseline(value: Any, where: str) -> float:
     """Return a baseline in m, or raises a `FrameError` where it is none."""
     found = float(_parse_numbers(value, (), f"{where}: baseline_m"))
     if not 1e-3 <= found <= 3.0:
-        raise FrameError(f"{where}: baseline_m is {found:g}, expected 0.001 to 3 m; is it in mm?")
+        raise FrameError(
+            f"{where}: baseline_m is {found:g}, expected 0.001 to 3 m; is it in mm, or negative?"
+        )
     return found
 
 

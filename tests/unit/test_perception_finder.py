@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from composed import option
-from drawn import AXIS, CENTER, K, drawn
+from drawn import AXIS, CENTER, K, both_views, drawn
 
 from brokk_rl.contracts.vision import Ellipse, HolePose, Masks
-from perception import dataset, search
+from perception import dataset, rim_scale, search
 from perception.benchmark.scoring import FinderScore, match_holes, score_frame
 from perception.contracts import SizePrior
 from perception.finder import StagedFinder, rectify
@@ -56,6 +57,44 @@ def test_a_flat_disc_is_refused_in_words() -> None:
     found = finder.find(frame)
     assert not found.holes
     assert any("flat dark disc" in finder.explain(one) for one in found.rejected)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 10.0])
+def test_depth_of_a_wrong_scale_is_named_by_its_factor(factor: float) -> None:
+    frame, masks, _ = drawn()
+    wrong = replace(frame, depth_m=(factor * frame.depth_m).astype(np.float32))
+    finder = finder_with(masks)
+    found = finder.find(wrong)
+    assert not found.holes
+    (named,) = [one for one in found.rejected if one.reason == rim_scale.OF_DEPTH]
+    assert named.value == pytest.approx(factor, rel=0.1)
+    assert "unit of depth" in finder.explain(named)
+    assert not any(one.reason == rim_scale.OF_DEPTH for one in finder.find(frame).rejected)
+
+
+def test_known_holes_are_followed_where_they_are_and_nowhere_else() -> None:
+    frame, masks, _ = drawn()
+    u, v = np.meshgrid(np.arange(640.0), np.arange(480.0))
+    views = both_views(AXIS / (AXIS @ CENTER), K[0, 0] * 0.12, np.random.default_rng(5))
+    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY).astype(float)
+    shift = K[0, 0] * 0.12 / frame.depth_m
+    moved = cv2.remap(
+        gray.astype(np.float32), (u + shift).astype(np.float32), v.astype(np.float32), 1
+    )
+    left, right = gray + 12 * views[0], moved + 12 * views[1]
+    color, other = (
+        np.repeat(np.clip(one, 0, 255).astype(np.uint8)[..., None], 3, 2) for one in (left, right)
+    )
+    nothing = np.full_like(frame.depth_m, np.nan)
+    pair = replace(frame, color=color, right=other, baseline_m=0.12, depth_m=nothing)
+    finder = finder_with(masks)
+    known = HolePose(
+        CENTER + 0.005, AXIS, 0.05, 1e-6 * np.eye(3), np.zeros((3, 3)), "camera", 1.0, 0.0
+    )
+    (hole,) = finder.follow(pair, [known]).holes
+    assert hole.center_m == pytest.approx(CENTER, abs=4e-3)
+    elsewhere = replace(known, center_m=CENTER + np.array([0.25, 0.0, 0.0]))
+    assert not finder.follow(pair, [elsewhere]).holes
 
 
 def test_lens_distortion_is_taken_out() -> None:

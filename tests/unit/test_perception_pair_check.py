@@ -137,6 +137,7 @@ def test_every_slip_of_a_pair_has_its_name() -> None:
     assert fault(replace(good, color=blank, right=blank)) == pair_check.FEW
     assert fault(replace(good, depth_m=0.1 * good.depth_m)) == pair_check.SCALE
     assert fault(replace(good, baseline_m=0.063)) == pair_check.SCALE
+    assert fault(replace(unknown, baseline_m=12.0)) == pair_check.RANGE
 
 
 def test_a_pair_that_is_not_rectified_is_refused_and_calibration_is_asked_for() -> None:

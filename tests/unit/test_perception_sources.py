@@ -214,6 +214,27 @@ def test_a_camera_without_a_place_or_a_baseline_is_welcome(frames: Path) -> None
     assert first.base_from_camera is None and first.baseline_m is None and first.distortion is None
 
 
+def test_a_pose_of_the_camera_of_another_convention_is_refused_by_its_name(frames: Path) -> None:
+    # looks ahead and down by 0.6 rad
+    c, sine = np.cos(0.6), np.sin(0.6)
+    good = np.array([[0, -sine, c, 0.3], [-1, 0, 0, 0.4], [0, -c, -sine, 1.9], [0, 0, 0, 1]])
+    forward_left_up = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1.0]])
+    in_mm = good.copy()
+    in_mm[:3, 3] *= 1000
+    slips = {
+        "inverse": np.linalg.inv(good),
+        "OpenGL": good @ np.diag([1.0, -1.0, -1.0, 1.0]),
+        "ahead, left, up": good @ forward_left_up,
+        "in mm": in_mm,
+    }
+    camera(frames, T_base_cam=good.tolist())
+    assert len(read(frames)) == 2
+    for pose in slips.values():
+        camera(frames, T_base_cam=pose.tolist())
+        with pytest.raises(FrameError, match="T_base_cam"):
+            read(frames)
+
+
 def test_grey_pictures_of_8_and_of_10_bits_are_welcome(frames: Path) -> None:
     save(frames / "00000.color.png", np.full(SIZE, 90, np.uint8))
     deep = np.full(SIZE, 512, np.uint16)
