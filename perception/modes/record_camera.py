@@ -1,17 +1,21 @@
-"""`brokk mode=record_camera`: frames of any stereo camera, as files that the other modes read."""
+"""`brokk mode=record_camera`: frames of any camera, as files that the other modes read."""
 
 from __future__ import annotations
 
 import logging
 from pathlib import Path
 
+import numpy as np
+
 from brokk_rl.errors import FrameError
 from brokk_rl.session import Session
 from brokk_rl.spec import Count, spec
 from perception import dataset
 from perception.sources import validation
-from perception.sources.folder import CameraModel, read_camera
-from perception.sources.recorded import ExportedPictures, RawFrame, StereoVideo
+from perception.sources.folder import read_camera, read_yaml
+from perception.sources.lens_file import PairLens, read_pair_lens
+from perception.sources.recorded import ExportedPictures, RawFrame, SourceCapture, StereoVideo
+from perception.sources.ros_log import RosLog
 
 log = logging.getLogger(__name__)
 
@@ -20,19 +24,20 @@ FOLDER = "frames"
 
 @spec
 class RecordCamera:
-    """Write frames of a video, a device or exported files, with the camera's numbers.
+    """Write frames of any camera, rectified, with the camera's numbers.
 
     Attributes:
         session: Folder to write into.
-        capture: The pictures, of a rectified pair.
-        lens: `camera.yaml` of the camera: `K`, `dist`, `baseline_m`.
+        capture: The pictures.
+        lens: `camera.yaml` of rectified pictures; for raw pairs a ZED's factory `.conf`, or YAML of
+            OpenCV's `stereoCalibrate` (`K1 D1 K2 D2 R T`); `null` where the capture tells it.
         every: One in so many frames is kept.
         count: Frames that are kept at most; `null` for all, which a device has no end of.
     """
 
     session: Session
-    capture: StereoVideo | ExportedPictures
-    lens: str
+    capture: SourceCapture | StereoVideo | ExportedPictures | RosLog
+    lens: str | None
     every: Count
     count: Count | None
 
@@ -43,26 +48,18 @@ class RecordCamera:
             FrameError: the camera file or a picture cannot be used, or there is none.
             StorageError: a file could not be written.
         """
-        model = read_camera(Path(self.lens))
         folder = self.session.folder / FOLDER
         kept = 0
+        lens: PairLens | None = None
         for number, frame in enumerate(self.capture.read()):
             if number % self.every:
                 continue
-            self._check_frame(frame, model)
-            if kept == 0:
-                distortion = () if model.distortion is None else tuple(model.distortion.ravel())
-                dataset.write_camera(
-                    folder,
-                    model.matrix,
-                    frame.color.shape[1::-1],
-                    model.base_from_camera,
-                    model.baseline_m,
-                    distortion,
-                    model.disparity_std_px,
-                    model.gamma,
-                )
-            dataset.write_frame(folder / f"{kept:05d}", frame.color, frame.depth_m, frame.right)
+            if lens is None:
+                lens, extra = self._find_lens(frame)
+                distortion = tuple(lens.distortion.ravel())
+                place = (lens.matrix, lens.size_px, None, lens.baseline_m, distortion)
+                dataset.write_camera(folder, *place, *extra)
+            self._write(folder / f"{kept:05d}", frame, lens)
             kept += 1
             if kept == self.count:
                 break
@@ -70,17 +67,46 @@ class RecordCamera:
             raise FrameError("record_camera: the camera gave no picture")
         log.info("%d frames: %s", kept, folder)
 
-    def _check_frame(self, frame: RawFrame, model: CameraModel) -> None:
-        """Refuse pictures that do not fit the camera's numbers."""
-        height, width = frame.color.shape[:2]
-        validation.check_size(model.size_px, height, width, self.lens, frame.name)
-        validation.check_matrix_fits(model.matrix, height, width, self.lens)
-        if frame.right is not None:
-            validation.check_same_size(frame.color, frame.right, frame.name, "the right picture")
-            if model.baseline_m is None or model.distortion is not None:
+    def _find_lens(self, frame: RawFrame) -> tuple[PairLens, tuple[float | None, ...]]:
+        """Return the lens of the pictures, and deviation of the disparity and tone curve if told."""
+        size_px = frame.color.shape[1], frame.color.shape[0]
+        if self.lens is None:
+            if frame.lens is None:
                 raise FrameError(
-                    f"{self.lens}: a pair needs baseline_m and rectified pictures (dist 0); "
-                    "export rectified pictures, or record with capture.layout=single"
+                    f"{frame.name}: the camera does not tell its lens; expected lens=camera.yaml, or "
+                    "the factory file of the camera"
                 )
+            return frame.lens, ()
+        path = Path(self.lens)
+        content = None if path.suffix == ".conf" else read_yaml(path)
+        if content is None or "K1" in content:
+            return read_pair_lens(path, content, size_px), ()
+        model = read_camera(path)
+        where, picture = self.lens, frame.name
+        validation.check_size(model.size_px, size_px[1], size_px[0], where, picture)
+        validation.check_matrix_fits(model.matrix, size_px[1], size_px[0], where)
+        bent = np.zeros(0) if model.distortion is None else model.distortion
+        if frame.right is not None and (model.baseline_m is None or model.distortion is not None):
+            raise FrameError(
+                f"{self.lens}: a pair needs baseline_m and rectified pictures (dist 0); take the lens "
+                "of both raw cameras (K1 D1 K2 D2 R T), or capture.layout=single"
+            )
+        lens = PairLens(model.matrix, bent, model.baseline_m, size_px, ())
+        return lens, (model.disparity_std_px, model.gamma)
+
+    def _write(self, stem: Path, frame: RawFrame, lens: PairLens) -> None:
+        """Write a frame, rectified."""
+        pictures = [frame.color]
+        if frame.right is not None:
+            what = "the right picture"
+            validation.check_same_size(frame.color, frame.right, frame.name, what)
+            pictures.append(frame.right)
         if frame.depth_m is not None:
             validation.check_same_size(frame.color, frame.depth_m, frame.name, "depth")
+            if lens.maps:
+                raise FrameError(
+                    f"{frame.name}: depth belongs to the raw picture, which is rectified; record "
+                    "rectified pictures, or without depth"
+                )
+        color, *right = lens.rectify(pictures, frame.name)
+        dataset.write_frame(stem, color, frame.depth_m, right[0] if right else None)

@@ -96,7 +96,8 @@ class PlaneConic:
             across which it is grown.
         max_pixels: Largest number of pixels of the face.
         cell_px: Side of the squares within which depth noise is correlated.
-        noise_floor_per_m: Least standard deviation of inverse depth, 1/m.
+        noise_floor_per_m: Least standard deviation of inverse depth, 1/m; like the next three that of
+            the usual pair, see `plane.compare_pair`.
         noise_limit_per_m: Largest standard deviation of inverse depth on the face, 1/m.
         matcher_alike: Factor on the covariance of the plane from depth alone: errors of a matcher
             are correlated over wide stretches.
@@ -182,7 +183,7 @@ class PlaneConicEstimator:
                 row,
                 s.inner,
                 s.cell_px,
-                s.matcher_bias_per_m * frame.depth_shrink,
+                s.matcher_bias_per_m * plane.compare_pair(frame) * frame.depth_shrink,
             )
             # `None` says that the pictures disagree: then parallax means nothing either.
             both, face = (None, face) if agreed is None else (both, agreed)
@@ -214,7 +215,9 @@ class PlaneConicEstimator:
         """Return the plane of the face from depth; `None` where `without_depth` serves in its place."""
         s = self.settings
         # A fixed seed for each ellipse: the result must not depend on the order of ellipses.
-        face = plane.fit_plane(points, s.rings, s.noise_floor_per_m, np.random.default_rng(0))
+        pair = plane.compare_pair(frame)
+        floor_per_m = s.noise_floor_per_m * pair
+        face = plane.fit_plane(points, s.rings, floor_per_m, np.random.default_rng(0))
         if face is None:
             # Without depth the ellipse alone gives a pose if the camera's place is known.
             is_blind = frame.base_from_camera is not None and points.known < s.blind
@@ -223,9 +226,10 @@ class PlaneConicEstimator:
             reason, num_points = "pixels of the face with depth", float(len(points.inverse))
             return Rejection("pose", reason, num_points, float(plane.LEAST), ellipse)
         # Noise above that of any matcher: the surroundings are no single plane.
-        if face.sigma > s.noise_limit_per_m:
+        limit_per_m = s.noise_limit_per_m * max(pair, 1.0)
+        if face.sigma > limit_per_m:
             reason = "depth noise on the face, 1/m"
-            return Rejection("pose", reason, face.sigma, s.noise_limit_per_m, ellipse)
+            return Rejection("pose", reason, face.sigma, limit_per_m, ellipse)
         # Errors of neighbouring pixels are alike, so the count of pixels overstates the
         # precision.
         # Those of a coarse match grow with its pixels.
@@ -331,7 +335,7 @@ class PlaneConicEstimator:
             return refused
         # A network that marks mouths has decided already; without it the doubt stays.
         doubt = UNDECIDED_SCORE if undecided and masks.hole_mask is None else 1.0
-        own_m2 = compute_center_covariance(face, circle, s.bias_per_m)
+        own_m2 = compute_center_covariance(face, circle, s.bias_per_m * plane.compare_pair(frame))
         own_rad2 = face.normal_cov_rad2()
         shared_m2, shared_rad2 = self._compute_rig_covariances(frame, face, circle.center_m)
         return HolePose(

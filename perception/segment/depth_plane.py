@@ -17,7 +17,7 @@ from brokk_rl.contracts.vision import Masks
 from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.signals import Frame
 from brokk_rl.spec import Count, Positive, spec
-from perception.pose.plane import DEGENERATE
+from perception.pose.plane import DEGENERATE, compare_pair
 
 ONE, X, Y, XX, XY, YY = (0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)
 """Powers of y and x: indices of the sums over pixels."""
@@ -71,10 +71,11 @@ class SightGrid:
 def scale_noise(noise_per_m: float, frame: Frame) -> float:
     """Return the standard deviation of a frame's inverse depth, 1/m, from that of a full match.
 
-    A coarse match is noisier, but less than its pixels are larger: it averages them. With the
+    It is that of the pair of `perception.pose.plane.USUAL_PULL_PX_M`, and follows focal length and
+    baseline. A coarse match is noisier, but less than its pixels are larger: it averages them. With the
     square root the segmenter finds the block in haze and in the dark as often as before.
     """
-    return noise_per_m * float(np.sqrt(frame.depth_shrink))
+    return noise_per_m * compare_pair(frame) * float(np.sqrt(frame.depth_shrink))
 
 
 def arrange_squares(sums: np.ndarray) -> np.ndarray:
@@ -91,8 +92,7 @@ class DepthPlane:
     Attributes:
         width_px: Width of the picture in which planes are looked for.
         min_known: Part of the pixels whose depth must be known; a frame with less is refused.
-        noise_per_m: Standard deviation of inverse depth, 1/m: disparity noise in px over focal
-            length in px and baseline in m.
+        noise_per_m: Standard deviation of inverse depth of the usual pair, 1/m; see `scale_noise`.
         num_sigma: Tolerance of a plane in standard deviations.
         num_trials: Planes through three pixels that are tried for each plane kept.
         num_samples: Pixels that judge a trial.

@@ -68,23 +68,37 @@ class CameraModel:
     size_px: tuple[int, int] | None = None
 
 
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the mapping of a YAML file of a camera.
+
+    Raises:
+        FrameError: it is missing, or is no YAML of a mapping.
+    """
+    try:
+        told = yaml.safe_load(path.read_text())
+    except FileNotFoundError as error:
+        raise FrameError(
+            f"{path}: no such file; a camera needs it (K, size_px, dist, baseline_m, T_base_cam)"
+        ) from error
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise FrameError(f"{path}: cannot be read as YAML ({error})") from error
+    if not isinstance(told, dict):
+        raise FrameError(
+            f"{path}: expected a mapping with K, size_px, dist, baseline_m; K is missing"
+        )
+    return told
+
+
 def read_camera(path: Path) -> CameraModel:
     """Read `camera.yaml`.
 
     Raises:
         FrameError: it is missing, is no YAML, or holds impossible values.
     """
-    try:
-        told = yaml.safe_load(path.read_text())
-    except FileNotFoundError as error:
+    told = read_yaml(path)
+    if "K" not in told:
         raise FrameError(
-            f"{path}: no such file; a folder of frames needs it (K, dist, baseline_m, T_base_cam)"
-        ) from error
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise FrameError(f"{path}: cannot be read as YAML ({error})") from error
-    if not isinstance(told, dict) or "K" not in told:
-        raise FrameError(
-            f"{path}: expected a mapping with K, dist, baseline_m and T_base_cam, K is missing"
+            f"{path}: expected a mapping with K, size_px, dist, baseline_m; K is missing"
         )
     where = str(path)
     optional: dict[str, Any] = {}

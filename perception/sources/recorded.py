@@ -1,4 +1,4 @@
-"""Pictures of a stereo camera as its owner has them: a video, a live device, or exported files."""
+"""Pictures of a camera as its owner has them: its library, a video, a device, or exported files."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from typing import Literal
 import cv2
 import numpy as np
 
+from brokk_rl.contracts.vision import FrameSourceSpec
 from brokk_rl.errors import FrameError
 from brokk_rl.spec import Positive, spec
 from perception.sources import validation
 from perception.sources.folder import read_picture
+from perception.sources.lens_file import PairLens
 
 NUMBER = re.compile(r"(\d+)(?!.*\d)")
 """The last number of a file's name: which frame it belongs to."""
@@ -29,12 +31,40 @@ class RawFrame:
         color: Left or only picture, RGB, `(h, w, 3)` uint8.
         right: Right picture, RGB; `None` where there is none.
         depth_m: Depth along z, `(h, w)` float32, NaN where unknown; `None` where there is none.
+        lens: The camera's own lens, which rectifies the pictures; `None` where it tells none.
     """
 
     name: str
     color: np.ndarray
     right: np.ndarray | None
     depth_m: np.ndarray | None
+    lens: PairLens | None = None
+
+
+@spec
+class SourceCapture:
+    """Frames of a camera with a library of its own: an option of `conf/perception/source`.
+
+    Attributes:
+        source: The camera, or a recording of it.
+    """
+
+    source: FrameSourceSpec
+
+    def read(self) -> Iterator[RawFrame]:
+        """Yield frames until a recording ends; a camera has no end.
+
+        Raises:
+            FrameError: the camera cannot be opened, or gives no frame in time.
+        """
+        with self.source.build() as source:
+            number = 0
+            while (frame := source.read_latest()) is not None:
+                bent = np.zeros(0) if frame.distortion is None else frame.distortion
+                size_px = frame.color.shape[1], frame.color.shape[0]
+                lens = PairLens(frame.camera_matrix, bent, frame.baseline_m, size_px, ())
+                yield RawFrame(f"frame {number}", frame.color, frame.right, frame.depth_m, lens)
+                number += 1
 
 
 @spec

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from brokk_rl.contracts.vision import FrameDetections, HolePose
-from brokk_rl.errors import ConfigError
+from brokk_rl.errors import ConfigError, FrameError
 from brokk_rl.session import Session
 from brokk_rl.signals import Frame
 from perception.label.camera_pose import CameraPose
@@ -22,6 +22,7 @@ from perception.modes.score_camera import ScoreCamera, ScoreOptions, read_measur
 from perception.render.materials import Material, read_photograph
 from perception.render.photographed_surfaces import PhotographedSurfaces
 from perception.segment.network import NetworkSegmenter
+from perception.sources.lens_file import read_pair_lens
 from perception.train.samples import list_pictures, read_views
 
 SIZE_PX = (96, 64)
@@ -206,3 +207,144 @@ def test_a_gate_drops_the_blocks_that_it_does_not_see() -> None:
     gates.append(build())
     masks = build(4, 40).segment(frame)
     assert not (masks.block > 0.5).any() and not np.asarray(masks.hole_mask).any()
+
+
+def write_ros_log(path: Path, pictures: list[tuple[np.ndarray, np.ndarray]], bent: float) -> None:
+    """Writes raw grey pairs with their `camera_info` as a bag of ROS 1, or as MCAP."""
+    import mcap.writer
+    from rosbags.rosbag1 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    is_bag = path.suffix == ".bag"
+    store = get_typestore(Stores.ROS1_NOETIC if is_bag else Stores.ROS2_HUMBLE)
+    types: Any = store.types
+    messages = []
+    for number, pair in enumerate(pictures):
+        stamp = types["builtin_interfaces/msg/Time"](sec=7, nanosec=100_000_000 * number)
+        head: dict[str, Any] = {"stamp": stamp, "frame_id": ""} | (
+            {"seq": number} if is_bag else {}
+        )
+        header = types["std_msgs/msg/Header"](**head)
+        for side, gray, pull in (("left", pair[0], 0.0), ("right", pair[1], -80 * 0.12)):
+            height, width = gray.shape
+            kind = "sensor_msgs/msg/Image"
+            image = types[kind](
+                header=header, height=height, width=width, encoding="mono8", is_bigendian=0, step=width,
+                data=gray.ravel(),
+            )  # fmt: skip
+            matrix = np.array([80, 0, 47.5, 0, 80, 31.5, 0, 0, 1.0])
+            d, k, r, p = ("D", "K", "R", "P") if is_bag else ("d", "k", "r", "p")
+            roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
+            told = {
+                d: np.array([bent, 0, 0, 0, 0.0]), k: matrix, r: np.eye(3).ravel(),
+                p: np.insert(matrix.reshape(3, 3), 3, [pull, 0, 0], axis=1).ravel(),
+            }  # fmt: skip
+            info = types["sensor_msgs/msg/CameraInfo"](
+                header=header, height=height, width=width, distortion_model="plumb_bob",
+                binning_x=0, binning_y=0, roi=roi, **told,
+            )  # fmt: skip
+            messages.append((f"/cam/{side}/camera_info", "sensor_msgs/msg/CameraInfo", info))
+            messages.append((f"/cam/{side}/image_raw", kind, image))
+    if is_bag:
+        with Writer(path) as bag:
+            topics: dict[str, Any] = {}
+            for number, (topic, kind, message) in enumerate(messages):
+                if topic not in topics:
+                    topics[topic] = bag.add_connection(topic, kind, typestore=store)
+                bag.write(topics[topic], number, store.serialize_ros1(message, kind))
+        return
+    with path.open("wb") as file:
+        writer = mcap.writer.Writer(file)
+        writer.start()
+        channels: dict[str, int] = {}
+        for number, (topic, kind, message) in enumerate(messages):
+            if topic not in channels:
+                schema = writer.register_schema(kind, "ros2msg", b"")
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            data = bytes(store.serialize_cdr(message, kind))
+            writer.add_message(channels[topic], number, data, number)
+        writer.finish()
+
+
+@pytest.mark.parametrize("ending", ["bag", "mcap"])
+def test_raw_grey_pairs_of_a_ros_log_are_rectified_by_their_own_lens(
+    brokk: Callable[..., Any], tmp_path: Path, ending: str
+) -> None:
+    chance = np.random.default_rng(0)
+    grain = cv2.GaussianBlur(chance.uniform(0, 255, (64, 104)), (0, 0), 2.0).astype(np.uint8)
+    # 8 px everywhere: 80 px * 0.12 m / 8 px = 1.2 m
+    straight = grain[:, :96], grain[:, 8:]
+    matrix = np.array([[80, 0, 47.5], [0, 80, 31.5], [0, 0, 1.0]])
+    columns, rows = np.meshgrid(np.arange(96.0), np.arange(64.0))
+    seen = np.stack([columns, rows], -1).reshape(-1, 1, 2)
+    # where the straight picture shows what a bent one has at each pixel
+    place = cv2.undistortPoints(seen, matrix, np.array([-0.2, 0, 0, 0]), P=matrix)
+    place = place.reshape(64, 96, 2).astype(np.float32)
+    raw = [cv2.remap(one, place[..., 0], place[..., 1], cv2.INTER_CUBIC) for one in straight]
+    path = tmp_path / f"walk.{ending}"
+    write_ros_log(path, [(raw[0], raw[1])] * 2, -0.2)
+    done = brokk("mode=record_camera", "capture=ros", f"capture.input={path}", "session.out=out")
+    assert done.code == 0, done.err
+    told = yaml.safe_load((tmp_path / "out/frames/camera.yaml").read_text())
+    assert told["size_px"] == [96, 64] and told["baseline_m"] == pytest.approx(0.12)
+    assert not any(told["dist"])
+    assert len(list((tmp_path / "out/frames").glob("*.color.png"))) == 2
+    for side, true in zip(("color", "right"), straight, strict=True):
+        written = cv2.imread(str(tmp_path / f"out/frames/00000.{side}.png"), 0)
+        assert written is not None
+        middle = np.s_[12:-12, 16:-16]
+        assert np.abs(written[middle].astype(float) - true[middle]).mean() < 3.0
+    refused = brokk(
+        "mode=record_camera", "capture=ros", f"capture.input={path}", "capture.depth=/no/depth",
+        "session.out=x",
+    )  # fmt: skip
+    assert refused.code == 2 and "capture.depth=/no/depth" in refused.err
+
+
+FACTORY = """[LEFT_CAM_VGA]
+fx=264
+fy=264
+cx=335
+cy=188
+k1=-0.04
+[RIGHT_CAM_VGA]
+fx=265
+fy=265
+cx=338
+cy=186
+k1=-0.03
+[STEREO]
+Baseline=120
+TY=0.4
+TZ=-0.6
+RX_VGA=0.004
+CV_VGA=-0.006
+RZ_VGA=0.003
+"""
+
+
+def test_rows_correspond_after_a_factory_file_and_another_size_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "SN1.conf"
+    path.write_text(FACTORY)
+    lens = read_pair_lens(path, None, (672, 376))
+    points = np.random.default_rng(0).uniform([-0.6, -0.4, 1.5], [0.6, 0.4, 3.0], (40, 3))
+    turn = np.array([0.004, -0.006, 0.003])
+    shift_m = -np.array([0.12, 0.0004, -0.0006])
+    cameras = (
+        (np.array([[264, 0, 335], [0, 264, 188], [0, 0, 1.0]]), -0.04, np.zeros(3), np.zeros(3)),
+        (np.array([[265, 0, 338], [0, 265, 186], [0, 0, 1.0]]), -0.03, turn, shift_m),
+    )
+    places = []
+    for (matrix, bent, turned, moved), maps in zip(cameras, lens.maps, strict=True):
+        raw = cv2.projectPoints(points, turned, moved, matrix, np.array([bent, 0, 0, 0]))[0][:, 0]
+        # the rectified pixel that takes its light from where the raw camera shows the point
+        off = np.hypot(maps[0][None] - raw[:, :1, None], maps[1][None] - raw[:, 1:, None])
+        nearest = off.reshape(len(raw), -1).argmin(1)
+        places.append(np.column_stack(np.unravel_index(nearest, maps[0].shape)))
+    down_px = places[1][:, 0] - places[0][:, 0]
+    assert np.abs(down_px).max() <= 1 and abs(down_px.mean()) < 0.3
+    across_px = places[0][:, 1] - places[1][:, 1]
+    depth_m = lens.matrix[0, 0] * 0.12 / across_px
+    assert depth_m == pytest.approx(points[:, 2], rel=0.1)
+    with pytest.raises(FrameError, match="none of a ZED"):
+        read_pair_lens(path, None, (640, 480))

@@ -16,7 +16,7 @@ import yaml
 from composed import option
 
 from brokk_rl.errors import ConfigError, FrameError
-from brokk_rl.extensions import load_part
+from brokk_rl.extensions import load_mode, load_part
 from brokk_rl.signals import Frame
 from perception import dataset
 from perception.calibrate.extrinsics import CameraExtrinsics
@@ -430,6 +430,22 @@ def test_a_zed_gives_its_left_picture_and_depth_without_invented_values(
     # The picture is rectified; the coefficients are those of the raw one.
     assert frame.distortion is None
     np.testing.assert_array_equal(frame.camera_matrix, MATRIX)
+
+
+def test_a_zed_is_recorded_with_the_lens_that_its_library_tells(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    pyzed(monkeypatch)
+    out = tmp_path / "out"
+    mode = load_mode("mode=record_camera", "capture=zed", "count=1", f"session.out={out}")
+    mode.run()
+    told = yaml.safe_load((out / "frames/camera.yaml").read_text())
+    assert told["size_px"] == [WIDTH, HEIGHT] and told["K"] == MATRIX.tolist()
+    assert told["baseline_m"] == pytest.approx(0.11986) and not any(told["dist"])
+    with folder(out / "frames").build() as source:
+        frame = source.read_latest()
+    assert frame is not None and frame.right is not None
+    assert frame.color[0, 0].tolist() == [12, 11, 10] and (frame.depth_m[1:] == 1.5).all()
 
 
 def test_a_recording_of_a_zed_ends_and_knows_where_the_camera_was(
