@@ -35,9 +35,8 @@ class DeadBand(EffectSpec):
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`(|u| - band) / (1 - band)` beyond the band of its side, else 0."""
-        return open_valve(
-            now.history.u, now.value["extend"][:, None], now.value["retract"][:, None]
-        ), {}
+        extend, retract = now.value["extend"][:, None], now.value["retract"][:, None]
+        return open_valve(now.history.u, extend, retract), {}
 
 
 @spec
@@ -59,7 +58,7 @@ class Saturation(EffectSpec):
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """`u` cut off at plus and minus `level`."""
         level = now.value["level"][:, None]
-        return torch.minimum(torch.maximum(now.history.u, -level), level), {}
+        return now.history.u.clamp(-level, level), {}
 
 
 @spec
@@ -86,13 +85,9 @@ class RateLimit(EffectSpec):
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """The command, no further than `period / stroke` from the one before."""
-        before, reach = (
-            now.memory["sent"][:, -1],
-            now.plant.period_s / now.value["stroke_s"].clamp(min=1e-6),
-        )
-        return append_command(
-            now, torch.minimum(torch.maximum(now.history.u[:, -1], before - reach), before + reach)
-        )
+        before = now.memory["sent"][:, -1]
+        reach = now.plant.period_s / now.value["stroke_s"].clamp(min=1e-6)
+        return append_command(now, now.history.u[:, -1].clamp(before - reach, before + reach))
 
 
 @spec
@@ -119,17 +114,14 @@ class Stiction(EffectSpec):
     def begin(self, now: StepInputs) -> Memory:
         """A joint whose command was beyond `start` is moving."""
         before = now.history.u[:, -2]
-        return {
-            "sent": now.history.u[:, :-1],
-            "moving": before.sign() * (before.abs() > now.value["start"]),
-        }
+        moving = before.sign() * (before.abs() > now.value["start"])
+        return {"sent": now.history.u[:, :-1], "moving": moving}
 
     def commands(self, now: StepInputs) -> tuple[torch.Tensor, Memory]:
         """The command while the joint moves, else 0; a reversal is a new start."""
         u, start = now.history.u[:, -1], now.value["start"]
-        goes_on = (now.memory["moving"] == u.sign()) & (
-            u.abs() > torch.minimum(now.value["stop"], start)
-        )
+        stop = torch.minimum(now.value["stop"], start)
+        goes_on = (now.memory["moving"] == u.sign()) & (u.abs() > stop)
         moving = u.sign() * ((u.abs() > start) | goes_on)
         sent, memory = append_command(now, u * moving.abs())
         return sent, memory | {"moving": moving}

@@ -40,7 +40,7 @@ class Library:
         for name, share in self._get_shares().items():
             if not 0 <= share <= 1:
                 raise ConfigError(f"effect.library.share: expected 0 to 1, got {share} for {name}")
-        known = (*self.effects, OTHER)
+        known, where = (*self.effects, OTHER), "effect.library.effects"
         for name in self.share if isinstance(self.share, dict) else ():
             if name not in known:
                 raise ConfigError(
@@ -49,17 +49,14 @@ class Library:
         on_commands = [name for name, effect in self.effects.items() if effect.side == "command"]
         for name, effect in self.effects.items():
             if effect.side not in LIBRARY_SIDES:
-                raise ConfigError(
-                    f"effect.library.effects.{name}: acts on {effect.side}; put it beside the library, effect=[library,{name}]"
-                )
+                mend = f"put it beside the library, effect=[library,{name}]"
+                raise ConfigError(f"{where}.{name}: acts on {effect.side}; {mend}")
             if effect.delays and name != on_commands[0]:
-                raise ConfigError(
-                    f"effect.library.effects: '{name}' must come before {on_commands[0]}: nearest to the machine"
-                )
+                place = f"before {on_commands[0]}: nearest to the machine"
+                raise ConfigError(f"{where}: '{name}' must come {place}")
             if isinstance(effect, DelayJitter) and name != on_commands[-1]:
-                raise ConfigError(
-                    f"effect.library.effects: '{name}' must come behind {on_commands[-1]}: it delays what is sent"
-                )
+                place = f"behind {on_commands[-1]}: it delays what is sent"
+                raise ConfigError(f"{where}: '{name}' must come {place}")
 
     def _get_shares(self) -> dict[str, float]:
         share: PerJoint = self.share

@@ -83,16 +83,14 @@ class BaseTilt(GeometryEffect):
         plant: MachineTensors,
     ) -> torch.Tensor:
         """Turn the point with the base."""
-        return rotate_points(
-            point_m, value["roll_rad"], value["pitch_rad"], torch.zeros_like(value["roll_rad"])
-        )
+        roll_rad, pitch_rad = value["roll_rad"], value["pitch_rad"]
+        return rotate_points(point_m, roll_rad, pitch_rad, torch.zeros_like(roll_rad))
 
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """Turn it back: the camera stands on the base."""
         none = torch.zeros_like(value["roll_rad"])
-        return rotate_points(
-            rotate_points(point_m, none, -value["pitch_rad"], none), -value["roll_rad"], none, none
-        )
+        levelled_m = rotate_points(point_m, none, -value["pitch_rad"], none)
+        return rotate_points(levelled_m, -value["roll_rad"], none, none)
 
 
 @spec
@@ -122,10 +120,8 @@ class Extrinsics(GeometryEffect):
     def target(self, point_m: torch.Tensor, value: dict[str, torch.Tensor]) -> torch.Tensor:
         """Turn the point about the base and displaces it."""
         shift_m = torch.cat((value["x_m"], value["y_m"], value["z_m"]), 1)
-        return (
-            rotate_points(point_m, value["roll_rad"], value["pitch_rad"], value["yaw_rad"])
-            + shift_m
-        )
+        angles_rad = (value[name] for name in ("roll_rad", "pitch_rad", "yaw_rad"))
+        return rotate_points(point_m, *angles_rad) + shift_m
 
 
 def rotate_points(

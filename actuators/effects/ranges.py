@@ -112,108 +112,75 @@ class ParameterRanges:
         where: str,
         shares: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
+        def tensor(values: np.ndarray, dtype: torch.dtype = torch.float32) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=dtype, device=device)
+
         self.value: dict[str, torch.Tensor] = {}
-        drawn: dict[str, _Column] = {}
+        drawn: dict[str, tuple[np.ndarray, ...]] = {}
+        drawn_effects: list[str] = []
         idle: dict[str, list[str]] = {}
         active: set[str] = set()
         for column, (name, number) in enumerate(numbers.items()):
             effect, _, _ = name.rpartition(".")
             acted_on = joints[effect] if isinstance(joints, Mapping) else joints
-            chosen = _select_joints(
-                acted_on, machine, ".".join(filter(None, (where, effect, "joints")))
-            )
+            place = ".".join(filter(None, (where, effect, "joints")))
+            chosen = _select_joints(acted_on, machine, place)
             low, high = _resolve_range(fields[name], number, chosen, machine, f"{where}.{name}")
             neutral = low if number.none is None else np.full_like(low, number.none)
+            does_something = bool((low != neutral).any() or (high != neutral).any())
             if number.none is not None and not number.is_on(machine):
-                if (low != neutral).any() or (high != neutral).any():
+                if does_something:
                     idle.setdefault(effect, []).append(name)
                 low, high = neutral, neutral
-            elif (low != neutral).any() or (high != neutral).any():
+            elif does_something:
                 active.add(effect)
-            if (low < high).any() or (shares.get(effect, 1.0) < 1 and (low != neutral).any()):
-                drawn[name] = _Column(
-                    low, high, neutral, column * 256 + np.arange(len(low)), effect
-                )
-            else:
-                self.value[name] = (
-                    torch.as_tensor(low, dtype=torch.float32, device=device)
-                    .expand(num_envs, -1)
-                    .clone()
-                )
+            share = shares.get(effect, 1.0)
+            if not (low < high).any() and (share == 1 or not (low != neutral).any()):
+                self.value[name] = tensor(low).expand(num_envs, -1).clone()
+                continue
+            if effect not in drawn_effects:
+                drawn_effects.append(effect)
+            own, present = column * 256, 256 * PRESENT + drawn_effects.index(effect)
+            keys = own + np.arange(len(low)), np.full(len(low), present)
+            drawn[name] = (low, high, neutral, np.full(len(low), share), *keys)
         for effect, names in idle.items():
             if effect not in active:
                 raise ConfigError(_explain_idle(machine, names, where, numbers, effect))
         self._draw = start_counter(num_envs, salt, device) if stochastic or drawn else None
         self.state = {} if self._draw is None else {"draw": self._draw}
-        self._drawn = _Drawn(list(drawn.values()), shares, device) if drawn else None
-        if self._drawn is not None:
-            # one tensor, of which each number has its columns
-            self._all = self._drawn.low.expand(num_envs, -1).clone()
-            widths = [len(column.low) for column in drawn.values()]
-            for name, columns in zip(drawn, self._all.split(widths, 1), strict=True):
-                self.value[name] = self.state[f"drawn.{name}"] = columns
+        self._drawn: torch.Tensor | None = None
+        if not drawn:
+            return
+        # One tensor, of which each number has its columns: one draw costs as many launches as ten.
+        low, high, neutral, share, key, present = map(
+            np.concatenate, zip(*drawn.values(), strict=True)
+        )
+        self._low, self._high, self._none = tensor(low), tensor(high), tensor(neutral)
+        self._share = tensor(share) if any(one < 1 for one in shares.values()) else None
+        self._key, self._present = tensor(key, torch.int64), tensor(present, torch.int64)
+        self._drawn = self._low.expand(num_envs, -1).clone()
+        widths = [len(columns[0]) for columns in drawn.values()]
+        for name, columns in zip(drawn, self._drawn.split(widths, 1), strict=True):
+            self.value[name] = self.state[f"drawn.{name}"] = columns
 
     def redraw(self, mask: torch.Tensor) -> None:
         """Draw the ranges anew in the environments of `mask`, shape `(N,)` bool."""
         if self._draw is None:
             return
         self._draw.add_(mask.to(torch.int64))
-        if self._drawn is not None:
-            self._all.copy_(torch.where(mask[:, None], self._drawn.fresh(self._draw), self._all))
+        if self._drawn is None:
+            return
+        counter = self._draw[:, None] * 65_536
+        value = self._low + (self._high - self._low) * hash_uniform(counter + self._key)
+        value = torch.minimum(value, self._high)
+        if self._share is not None:
+            is_there = hash_uniform(counter + self._present) < self._share
+            value = torch.where(is_there, value, self._none)
+        self._drawn.copy_(torch.where(mask[:, None], value, self._drawn))
 
     def advance(self) -> torch.Tensor | None:
         """Advance to the next draws and return the counter, `(N,)`; `None` without draws."""
         return None if self._draw is None else self._draw.add_(1)
-
-
-@dataclass(frozen=True)
-class _Column:
-    """One drawn number: range, neutral value, keys of its draws, each `(J,)` or `(1,)`; its effect."""
-
-    low: np.ndarray
-    high: np.ndarray
-    none: np.ndarray
-    key: np.ndarray
-    effect: str
-
-
-class _Drawn:
-    """All drawn numbers side by side in `W` columns: one draw costs as many launches as ten."""
-
-    def __init__(
-        self, columns: Sequence[_Column], shares: Mapping[str, float], device: torch.device
-    ) -> None:
-        def tensor(parts: Sequence[np.ndarray], dtype: torch.dtype = torch.float32) -> torch.Tensor:
-            return torch.as_tensor(np.concatenate(parts), dtype=dtype, device=device)
-
-        self.low = tensor([column.low for column in columns])
-        self.high = tensor([column.high for column in columns])
-        self._key = tensor([column.key for column in columns], torch.int64)
-        self._some = any(share < 1 for share in shares.values())
-        if self._some:
-            effects = list(dict.fromkeys(column.effect for column in columns))
-            self._none = tensor([column.none for column in columns])
-            self._share = torch.tensor(
-                [shares.get(effect, 1.0) for effect in effects], device=device
-            )
-            self._share_key = 256 * PRESENT + torch.arange(
-                len(effects), dtype=torch.int64, device=device
-            )
-            self._effect = tensor(
-                [np.full(len(column.low), effects.index(column.effect)) for column in columns],
-                torch.int64,
-            )
-
-    def fresh(self, counter: torch.Tensor) -> torch.Tensor:
-        """Return fresh values, `(N, W)`, for the counter `(N,)`."""
-        counter = counter[:, None] * 65_536
-        value = torch.minimum(
-            self.low + (self.high - self.low) * hash_uniform(counter + self._key), self.high
-        )
-        if not self._some:
-            return value
-        there = hash_uniform(counter + self._share_key) < self._share
-        return torch.where(there.index_select(1, self._effect), value, self._none)
 
 
 def _select_joints(joints: Joints, machine: Machine, where: str) -> np.ndarray:
@@ -238,16 +205,13 @@ def _explain_idle(
     """Return the message about numbers that the machine does not have, with those that it has."""
     others = []
     for name, number in numbers.items():
-        if (
-            name.rpartition(".")[0] == effect
-            and number.masses is not None
-            and number.is_on(machine)
-        ):
+        is_of_it = name.rpartition(".")[0] == effect
+        if is_of_it and number.masses is not None and number.is_on(machine):
             others.append(name)
-    known = "has known masses" if machine.has_bodies else "is known by its joints only"
-    mend = (
-        "" if machine.has_bodies else ", or add joints[].body (axis, origin, mass, …) to its file"
-    )
+    known, mend = "has known masses", ""
+    if not machine.has_bodies:
+        known = "is known by its joints only"
+        mend = ", or add joints[].body (axis, origin, mass, …) to its file"
     return (
         f"{where}.{', '.join(names)}: machine '{machine.name}' {known}, so that they do nothing; "
         f"give {', '.join(others)}{mend}"
@@ -279,10 +243,8 @@ def _resolve_range(
     if (low > high).any():
         raise ConfigError(f"{where}: expected a range [low, high] with low <= high, got {value}")
     if (low < least).any() or (high > most).any():
-        raise ConfigError(
-            f"{where}: expected {least.min():.3g} to {most.max():.3g} {number.unit.replace('1', '')}".rstrip()
-            + f", got {value}"
-        )
+        span = f"{least.min():.3g} to {most.max():.3g} {number.unit.replace('1', '')}".rstrip()
+        raise ConfigError(f"{where}: expected {span}, got {value}")
     return low, high
 
 

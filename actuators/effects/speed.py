@@ -11,6 +11,9 @@ from actuators.effects.ranges import EffectNumber, Joints, Value
 from actuators.effects.targets import TargetBacklash, TargetLag
 from brokk_rl.spec import spec
 
+WARM_UPS_S = (60.0, 150.0, 400.0, 1200.0, 3600.0)
+"""Time constants of warming up that a diagnosis tries."""
+
 
 @spec
 class FlowGain(EffectSpec):
@@ -160,11 +163,8 @@ class Compliance(EffectSpec):
         ringing, fade = w * torch.sqrt(1.0 - damping.square()), damping * w
         speed = now.moved / period_s
         d, rate = now.memory["deflection"], now.memory["rate"] + now.memory["speed"] - speed
-        decay, cos, sin = (
-            torch.exp(-fade * period_s),
-            torch.cos(ringing * period_s),
-            torch.sin(ringing * period_s),
-        )
+        decay, turn = torch.exp(-fade * period_s), ringing * period_s
+        cos, sin = torch.cos(turn), torch.sin(turn)
         after = decay * (d * cos + (rate + fade * d) / ringing * sin)
         rate = decay * (rate * cos - (fade * rate + w.square() * d) / ringing * sin)
         return after - d, {"deflection": after, "rate": rate, "speed": speed}
@@ -195,13 +195,7 @@ class ThermalDrift(EffectSpec):
         "change": EffectNumber("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
         # Trials reach from a small tank in the cold to a whole shift: oil warms as slowly on a small
         # machine, so the time does not grow with the joints.
-        "time_s": EffectNumber(
-            "s",
-            none=None,
-            typical=1200.0,
-            bounds=(1.0, 36_000.0),
-            trials=(60.0, 150.0, 400.0, 1200.0, 3600.0),
-        ),
+        "time_s": EffectNumber("s", None, 1200.0, (1.0, 36_000.0), trials=WARM_UPS_S),
         "elapsed_s": EffectNumber("s", none=None, typical=0.0, bounds=(0.0, 360_000.0)),
         "cold_change": EffectNumber("1", none=0.0, typical=0.1, bounds=(-0.7, 2.0)),
     }

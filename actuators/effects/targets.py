@@ -55,7 +55,7 @@ class TargetBacklash(EffectSpec):
 
 def _hold(held: torch.Tensor, u: torch.Tensor, now: StepInputs) -> torch.Tensor:
     half = 0.5 * now.value["gap_rad"] / now.plant.half_travel
-    return torch.minimum(torch.maximum(held, u - half), u + half)
+    return held.clamp(u - half, u + half)
 
 
 @spec

@@ -30,10 +30,9 @@ class _Delayed(EffectSpec):
 
     def _shifted(self, now: StepInputs, shift_s: torch.Tensor) -> tuple[torch.Tensor, Memory]:
         u = now.history.u
-        known = torch.cat((now.memory["older"], u), 1)
-        return _delay_commands(known, shift_s / now.plant.period_s, u.shape[1]), {
-            "older": known[:, 1 : u.shape[1]]
-        }
+        known, size = torch.cat((now.memory["older"], u), 1), u.shape[1]
+        shifted = _delay_commands(known, shift_s / now.plant.period_s, size)
+        return shifted, {"older": known[:, 1:size]}
 
 
 @spec
@@ -158,9 +157,8 @@ class FrameLoss(EffectSpec):
         """
         kept = now.value["persistence"]
         lost = now.chance < (1.0 - kept) * now.value["probability"] + kept * now.memory["was_lost"]
-        sent, memory = append_command(
-            now, torch.where(lost, now.memory["sent"][:, -1], now.history.u[:, -1])
-        )
+        newest = torch.where(lost, now.memory["sent"][:, -1], now.history.u[:, -1])
+        sent, memory = append_command(now, newest)
         return sent, memory | {"was_lost": lost.to(now.moved.dtype)}
 
 

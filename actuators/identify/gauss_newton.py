@@ -14,6 +14,7 @@ Axes: `C` candidates, `P` parameters, `J` joints, `W` windows, `K` steps, `D` co
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import torch
@@ -150,9 +151,8 @@ class CandidateRuns:
         `None` for a joint that is never active.
         """
         steps = self.cut.measured.shape[1]
-        last = self.errors(np.repeat(x[None], len(self.active), 0), np.arange(len(self.active)))[
-            :, -1
-        ]
+        windows = np.arange(len(self.active))
+        last = self.errors(np.repeat(x[None], len(windows), 0), windows)[:, -1]
         square = np.square(last, dtype=np.float64).sum(0) * steps * self._ahead[-1]
         rmse = []
         for s, n in zip(square, self.active.sum(0), strict=True):
@@ -168,24 +168,20 @@ class CandidateRuns:
         each other; only joints that are active there are varied.
         """
         num, joints = x.shape
-        columns = [
-            (p, j) for p in range(num) for j in (range(joints) if self.coupled else [slice(None)])
-        ]
-        pairs = [
-            (w, column)
-            for column, (_, j) in enumerate(columns)
-            for w in np.flatnonzero(self.active[:, j] if self.coupled else self.active.any(1))
-        ]
+        varied_joints = range(joints) if self.coupled else [slice(None)]
+        columns = list(product(range(num), varied_joints))
+        pairs = []
+        for column, (_, j) in enumerate(columns):
+            active = self.active[:, j] if self.coupled else self.active.any(1)
+            pairs += [(w, column) for w in np.flatnonzero(active)]
         step = np.where(x + size <= 1.0, size, -size)
         varied = np.repeat(x[None], len(columns), 0)
         for column, place in enumerate(columns):
             varied[(column, *place)] += step[place]
         rows = np.array(pairs)
         base = np.arange(len(self.active))
-        error = self.errors(
-            np.concatenate([np.repeat(x[None], len(base), 0), varied[rows[:, 1]]]),
-            np.concatenate([base, rows[:, 0]]),
-        )
+        candidates = np.concatenate([np.repeat(x[None], len(base), 0), varied[rows[:, 1]]])
+        error = self.errors(candidates, np.concatenate([base, rows[:, 0]]))
         error, moved = error[: len(base)], error[len(base) :]
         slopes = np.zeros((*error.shape, num, joints), dtype=np.float32)
         each = np.arange(joints)

@@ -6,6 +6,7 @@ import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -49,10 +50,8 @@ def tabulate_parameters(
     sure: ParameterUncertainty,
 ) -> dict[str, Any]:
     """Return each parameter with standard error, interval and whether it is determined."""
-    low, high = (
-        runs.values(np.clip(x - sure.half, 0.0, 1.0)),
-        runs.values(np.clip(x + sure.half, 0.0, 1.0)),
-    )
+    low = runs.values(np.clip(x - sure.half, 0.0, 1.0))
+    high = runs.values(np.clip(x + sure.half, 0.0, 1.0))
     width = runs.values(np.ones_like(x)) - runs.values(np.zeros_like(x))
     parameters = {}
     for p, (name, row) in enumerate(found.items()):
@@ -74,16 +73,11 @@ def find_correlated_pairs(
     machine: Machine, runs: CandidateRuns, sure: ParameterUncertainty
 ) -> list[dict[str, Any]]:
     """Return the pairs of parameters whose correlation exceeds `TANGLED`."""
-    labels = []
-    for name in runs.names:
-        for joint in machine.joint_names:
-            labels.append(f"{name} {joint}")
-    pairs = np.argwhere(np.triu(np.abs(sure.correlation), 1) > TANGLED)
+    labels = [" ".join(pair) for pair in product(runs.names, machine.joint_names)]
     correlated = []
-    for a, b in pairs:
-        correlated.append(
-            {"pair": [labels[a], labels[b]], "correlation": round(float(sure.correlation[a, b]), 3)}
-        )
+    for a, b in np.argwhere(np.triu(np.abs(sure.correlation), 1) > TANGLED):
+        correlation = round(float(sure.correlation[a, b]), 3)
+        correlated.append({"pair": [labels[a], labels[b]], "correlation": correlation})
     return correlated
 
 
@@ -111,26 +105,18 @@ def describe_option(fitted: Any, facts: dict[str, Any]) -> str:
 def log_undetermined(facts: dict[str, Any]) -> None:
     """Log the parameters that the recordings do not determine."""
     for name, row in facts["parameters"].items():
-        if vague := [joint for joint, cell in row.items() if not cell["told"]]:
-            log.warning(
-                "%s: the recordings do not tell it for %s (interval over half of fit.free.%s)",
-                name,
-                ", ".join(vague),
-                name,
-            )
+        vague = [joint for joint, cell in row.items() if not cell["told"]]
         # A number that ended at 0 is not needed: no wider range would make sense.
-        ends = {joint: cell["value"] for joint, cell in row.items() if cell["at_bound"]}
-        if stuck := [joint for joint, value in ends.items() if value != 0.0]:
-            log.warning(
-                "%s: at the end of fit.free.%s for %s; widen it if that makes sense",
-                name,
-                name,
-                ", ".join(stuck),
-            )
+        stuck = [joint for joint, cell in row.items() if cell["at_bound"] and cell["value"] != 0.0]
+        if vague:
+            text = "%s: the recordings do not tell it for %s (interval over half of fit.free.%s)"
+            log.warning(text, name, ", ".join(vague), name)
+        if stuck:
+            text = "%s: at the end of fit.free.%s for %s; widen it if that makes sense"
+            log.warning(text, name, name, ", ".join(stuck))
     for pair in facts["tangled"]:
-        log.warning(
-            "%s and %s stand for each other (correlation %.2f)", *pair["pair"], pair["correlation"]
-        )
+        text = "%s and %s stand for each other (correlation %.2f)"
+        log.warning(text, *pair["pair"], pair["correlation"])
 
 
 REFIT_STEPS = 6

@@ -153,26 +153,21 @@ class SpreadParameters:
                 raise ConfigError(
                     f"{where}.{name}: expected a relative half width in [0, 1), got {width}"
                 )
-        self.value = {
-            name: torch.as_tensor(value, dtype=torch.float32, device=device)
-            .expand(num_envs, -1)
-            .clone()
-            for name, value in nominal.items()
-        }
-        self.state: dict[str, torch.Tensor] = {}
+
+        def fill(value: np.ndarray) -> torch.Tensor:
+            found = torch.as_tensor(value, dtype=torch.float32, device=device)
+            return found.expand(num_envs, -1).clone()
+
+        self.value = {name: fill(value) for name, value in nominal.items()}
         self._width = dict(spread)
-        self._nominal = {name: self.value[name].clone() for name in spread}
+        self._nominal = {name: fill(nominal[name]) for name in spread}
+        self.state: dict[str, torch.Tensor] = {}
         if spread:
-            seed = torch.initial_seed() % 2**31
-            self._draw = (
-                torch.arange(num_envs, dtype=torch.int64, device=device) * 2_654_435_761 + seed
-            )
-            self.state = {
-                "draw": self._draw,
-                **{f"drawn_{name}": self.value[name] for name in spread},
-            }
-            num_joints = next(iter(self.value.values())).shape[1]
+            num_joints = len(next(iter(nominal.values())))
             self._joint = torch.arange(num_joints, dtype=torch.int64, device=device) * 40_503
+            self._draw = start_counter(num_envs, 0, device)
+            drawn = {f"drawn_{name}": self.value[name] for name in spread}
+            self.state = {"draw": self._draw, **drawn}
 
     def redraw(self, mask: torch.Tensor) -> None:
         """Draw new values in the environments of `mask`, shape `(N,)` bool."""

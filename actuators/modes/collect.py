@@ -4,6 +4,7 @@ import json
 import logging
 import time
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -89,14 +90,8 @@ class Collect:
         """
         self.session.seed_all()
         settings, run_s = self.collect, self.collect.run_minutes * 60.0
-        plan = plan_runs(
-            self.excitation,
-            self.machine,
-            settings.approach,
-            settings.num_runs,
-            run_s,
-            self.session.generator("collect"),
-        )
+        count, generator = settings.num_runs, self.session.generator("collect")
+        plan = plan_runs(self.excitation, self.machine, settings.approach, count, run_s, generator)
         self._show(plan)
         if settings.only_plan:
             return
@@ -106,19 +101,13 @@ class Collect:
         title = f"control periods of {settings.num_runs} runs"
         with link as opened, ItemProgress(title, num_periods) as progress:
             try:
-                for sample in drive(
-                    opened, self._runner(plan), self.machine, settings.num_runs, run_s
-                ):
+                for sample in drive(opened, self._runner(plan), self.machine, count, run_s):
                     writer.add(sample)
                     progress.advance()
             finally:
                 writer.close()  # what was recorded before an interruption is kept
-        log.info(
-            "%d recordings of %.1f minutes in all in %s",
-            writer.files,
-            writer.recorded_s / 60.0,
-            self._folder,
-        )
+        minutes = writer.recorded_s / 60.0
+        log.info("%d recordings of %.1f minutes in all in %s", writer.files, minutes, self._folder)
 
     @property
     def _folder(self) -> Path:
@@ -137,31 +126,20 @@ class Collect:
         preview = self._preview(track)
         told = {"preview": preview.plain()} if preview else {}
         write_json(self.session.folder / "plan.json", summary | told)
-        plan_report.draw_plan(
-            plan,
-            track,
-            machine,
-            predict_tool_speed(machine, track.q[:, 0]),
-            self.session.folder / "plan.png",
-            preview=preview,
-        )
+        tool_speed_m_s = predict_tool_speed(machine, track.q[:, 0])
+        path = self.session.folder / "plan.png"
+        plan_report.draw_plan(plan, track, machine, tool_speed_m_s, path, preview)
         if preview:
             preview_report.show_preview(preview, machine)
         unplayed = set()
-        for run in summary["runs"]:
-            for entry in run:
-                if entry["cut_s"] > CUT * entry["program_s"]:
-                    unplayed.add(entry["name"])
+        for entry in chain.from_iterable(summary["runs"]):
+            if entry["cut_s"] > CUT * entry["program_s"]:
+                unplayed.add(entry["name"])
         if unplayed:
-            log.warning(
-                "plan: no time for %s in some of the runs; raise collect.run_minutes",
-                ", ".join(sorted(unplayed)),
-            )
+            text = "plan: no time for %s in some of the runs; raise collect.run_minutes"
+            log.warning(text, ", ".join(sorted(unplayed)))
         log.info(
-            "plan: %d segments in the first of %d runs; see %s",
-            len(plan.runs[0]),
-            count,
-            self.session.folder / "plan.png",
+            "plan: %d segments in the first of %d runs; see %s", len(plan.runs[0]), count, path
         )
 
     def _preview(self, track: PlanTrack) -> PreviewResult | None:
@@ -200,12 +178,8 @@ class Writer:
         settings: Collection,
         metadata: dict[str, str],
     ) -> None:
-        self._plan, self._folder, self._period_s, self._flush_s = (
-            plan,
-            folder,
-            machine.period_s,
-            settings.flush_s,
-        )
+        self._plan, self._folder = plan, folder
+        self._period_s, self._flush_s = machine.period_s, settings.flush_s
         self._per_file = max(2, round(settings.file_minutes * 60.0 / machine.period_s))
         self._names = [f"{'-'.join(plan.names)}_{n:02d}" for n in range(len(plan.runs))]
         self._created, self._begin_s = record.format_now(), 0.0
@@ -254,10 +228,9 @@ class Writer:
             return
         samples = self._samples
         track, begin_s = PlanTrack(samples), samples[0].t_s
-        extra = {
-            name: np.stack([sample.extra[name] for sample in samples], 1)
-            for name in samples[0].extra
-        }
+        extra = {}
+        for name in samples[0].extra:
+            extra[name] = np.stack([sample.extra[name] for sample in samples], 1)
         for n, name in enumerate(self._names):
             notes = plan_report.describe_run(track, n, self._plan.runs[n], self._period_s)
             metadata = {
@@ -267,12 +240,6 @@ class Writer:
                 "excitation": json.dumps(notes),
             }
             columns = {key: values[n] for key, values in extra.items()}
-            recording = replace(
-                self._template,
-                t_s=track.t_s - begin_s,
-                u=track.u[:, n],
-                q=track.q[:, n],
-                extra=columns,
-                metadata=metadata,
-            )
+            motion = {"t_s": track.t_s - begin_s, "u": track.u[:, n], "q": track.q[:, n]}
+            recording = replace(self._template, **motion, extra=columns, metadata=metadata)
             record.write_recording(recording, self._folder / f"{name}_{self._part:02d}.parquet")

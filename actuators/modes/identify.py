@@ -99,12 +99,10 @@ class Identify:
         with _limit_threads(self.identify.threads):
             for stage, cut in zip(stages, cuts, strict=True):
                 chosen = models if cut or not self.identify.folds else {self.fit.name: self.fit}
-                done.append(
-                    {
-                        name: self._fitted(stage, name, fit, cut, device)
-                        for name, fit in chosen.items()
-                    }
-                )
+                fitted = {}
+                for name, fit in chosen.items():
+                    fitted[name] = self._fitted(stage, name, fit, cut, device)
+                done.append(fitted)
         identified = IdentificationRun(
             self.machine, self.fit.name, stages, cuts, done, tuple(horizons_s), HORIZONS_S
         )
@@ -135,57 +133,44 @@ class Identify:
         options, folder = self.identify, self.session.folder
         runs = group_by_run(record.read_recordings(options.recordings, self.machine))
         if options.folds:
-            check_commanded(
-                runs, self.machine, 3, "for every fold to have one to fit to and one to stop by"
-            )
+            purpose = "for every fold to have one to fit to and one to stop by"
+            check_commanded(runs, self.machine, 3, purpose)
             if len(runs) < options.folds:
                 raise RecordingError(
                     f"too little data: identify.folds={options.folds}, but there are {len(runs)} runs"
                 )
+            shares = {str(number): 1.0 / options.folds for number in range(options.folds)}
             stages = []
-            for number, tested in enumerate(
-                split_runs(
-                    runs, dict.fromkeys(map(str, range(options.folds)), 1.0 / options.folds)
-                ).values()
-            ):
-                name, rest = (
-                    f"fold {number + 1} of {options.folds}",
-                    {key: runs[key] for key in runs if key not in tested},
-                )
+            for number, tested in enumerate(split_runs(runs, shares).values(), 1):
                 test = {key: runs[key] for key in tested}
-                stages.append(self._stage(name, folder / "folds" / str(number + 1), rest, test))
+                rest = {key: runs[key] for key in runs if key not in tested}
+                name = f"fold {number} of {options.folds}"
+                stages.append(self._stage(name, folder / "folds" / str(number), rest, test))
             return [*stages, self._stage("all runs", folder, runs, {})]
         if options.test is not None:
             test = group_by_run(record.read_recordings(options.test, self.machine))
             self._check_unseen(runs, test)
             check_commanded(runs, self.machine, 2, "one to fit to and one to stop the fit by")
             return [self._stage("", folder, runs, test)]
-        check_commanded(
-            runs,
-            self.machine,
-            3,
-            "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)",
+        purpose = (
+            "one to fit to, one to stop the fit by and one to judge by (identify.test, or folds)"
         )
+        check_commanded(runs, self.machine, 3, purpose)
         share = 1.0 / options.hold_out
         parts = split_runs(runs, {"rest": 1.0 - share, "test": share})
         rest, test = ({name: runs[name] for name in parts[part]} for part in ("rest", "test"))
         return [self._stage("", folder, rest, test)]
 
     def _stage(self, name: str, folder: Path, rest: Runs, test: Runs) -> FitStage:
-        check_commanded(
-            rest,
-            self.machine,
-            2,
-            f"{f'in {name} ' if name else ''}one to fit to and one to stop the fit by",
-        )
+        where = f"in {name} " if name else ""
+        purpose = f"{where}one to fit to and one to stop the fit by"
+        check_commanded(rest, self.machine, 2, purpose)
         share = 1.0 / self.identify.hold_out
         parts = split_runs(rest, {"train": 1.0 - share, "validation": share})
-        train, validation = (
-            {key: rest[key] for key in parts[part]} for part in ("train", "validation")
-        )
-        return FitStage(
-            name, folder, self.session.stream(f"fit {name}".strip()), train, validation, test
-        )
+        train = {key: rest[key] for key in parts["train"]}
+        validation = {key: rest[key] for key in parts["validation"]}
+        seed = self.session.stream(f"fit {name}".strip())
+        return FitStage(name, folder, seed, train, validation, test)
 
     def _check_unseen(self, runs: Runs, test: Runs) -> None:
         files = []
@@ -199,12 +184,9 @@ class Identify:
     def _cut(self, stage: FitStage, horizons_s: Sequence[float]) -> open_loop.FreeRunWindows | None:
         if not stage.test and self.identify.folds:
             return None
-        shortest, longest = (
-            (horizons_s[0], horizons_s[-1]) if horizons_s else (HORIZONS_S[0], HORIZONS_S[0])
-        )
-        return open_loop.cut_windows(
-            list_recordings(stage.test), self.machine, longest, self.identify.stride_s, shortest
-        )
+        fitting = horizons_s or HORIZONS_S[:1]
+        judged, stride_s = list_recordings(stage.test), self.identify.stride_s
+        return open_loop.cut_windows(judged, self.machine, fitting[-1], stride_s, fitting[0])
 
     def _fitted(
         self,
@@ -232,26 +214,19 @@ def _limit_threads(count: int) -> Iterator[None]:
 def _print_results(result: Mapping, findings: Sequence[VerdictSentence], folder: Path) -> None:
     horizons = list(result["overall"][result["model"]])
     table: list[list[TableCell]] = []
-    blocks = [
-        (joint, models, "rmse", 4, result["delay_s"][joint])
-        for joint, models in result["joints"].items()
-    ]
-    for joint, models, key, digits, delay in (
-        *blocks,
-        ("all joints", result["overall"], "percent", 2, None),
-    ):
-        for row, name in enumerate(models):
+    for joint, models in (*result["joints"].items(), ("all joints", result["overall"])):
+        delay = result["delay_s"].get(joint)
+        key, digits = ("rmse", 4) if joint in result["joints"] else ("percent", 2)
+        least = {}
+        for horizon in horizons:
+            given = [rows[horizon][key] for rows in models.values() if rows[horizon]]
+            least[horizon] = min(given, default=None)
+        for row, (name, rows) in enumerate(models.items()):
             cells: list[TableCell] = []
             for horizon in horizons:
-                given = {}
-                for other, rows in models.items():
-                    if rows[horizon]:
-                        given[other] = rows[horizon][key]
-                if not given:
-                    cells.append(None)
-                    continue
-                style = "bold" if given[name] == min(given.values()) else ""
-                cells.append(Text(f"{given[name]:.{digits}f}", style))
+                value = rows[horizon][key] if rows[horizon] else None
+                style = "bold" if value == least[horizon] else ""
+                cells.append(None if value is None else Text(f"{value:.{digits}f}", style))
             after = "" if row or delay is None else f"{delay['value']:.2f} s"
             table.append(["" if row else joint, name, *cells, after])
     print_table(
